@@ -1,0 +1,92 @@
+//! What is recorded of every frame. One line of `records.jsonl`, and the JSON header of a published frame.
+
+use serde::{Deserialize, Serialize};
+
+/// One frame's figures. Shares are in [0, 1]; residuals of `optical` kind have no unit, those of `log_stretch` kind neither.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+pub struct FrameRecord {
+    /// Frame number in this run, from 0.
+    pub frame: u64,
+    /// Window slide that the frame belongs to, from 0.
+    pub slide: u64,
+    /// Seed time t0 of the FTLE, in time units of the source.
+    pub time: f64,
+    /// The same as a date, where the source has a calendar.
+    pub date: Option<String>,
+    /// |tau|.
+    pub tau: f64,
+    /// `forward` or `backward`.
+    pub direction: String,
+    /// `reference`, `surrogate` or `gated`.
+    pub method: String,
+    /// `table`, `network` or `residual`; none for `reference`.
+    pub surrogate: Option<String>,
+    /// Pixels across and down.
+    pub size: [usize; 2],
+    /// Samples a pixel.
+    pub samples_per_pixel: usize,
+    /// Log-stretch queries that the renderer made.
+    pub queries: u64,
+    /// Of them, answered by RK4.
+    pub traced: u64,
+    /// `traced / queries`.
+    pub traced_share: f64,
+    /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within.
+    pub over_tolerance: Option<f64>,
+    /// Error measured on audit points of the trusted region; none when nothing is trusted.
+    pub trusted: Option<TrustedError>,
+    /// Share of the domain's volume that is trusted.
+    pub trusted_share: f64,
+    /// The same error measured on fresh points with the same weights after the frame (`--verify`).
+    pub verified: Option<TrustedError>,
+    /// Audit points traced for this frame.
+    pub audited: u64,
+    /// Mean lived share of the audit points (1 when every particle lived the whole tau).
+    pub lived_share: f64,
+    /// Queries whose extinction exceeded the majorant in force.
+    pub majorant_exceeded: u64,
+    /// Training since the last frame.
+    pub training: Option<crate::surrogate::Learned>,
+    /// Samples in the ring.
+    pub ring: u64,
+    /// Wall-clock seconds of each stage.
+    pub seconds: StageSeconds,
+    /// Warnings that arose since the last frame, in words.
+    pub warnings: Vec<String>,
+}
+
+/// Residuals of the surrogate in the trusted region.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
+pub struct TrustedError {
+    /// Points measured.
+    pub points: u64,
+    /// Mean |ramp(predicted) - ramp(traced)|.
+    pub optical_mean: f64,
+    /// Root mean square of it.
+    pub optical_rms: f64,
+    /// 95 % interval of the root mean square.
+    pub optical_rms_interval: [f64; 2],
+    /// 99th percentile of it.
+    pub optical_p99: f64,
+    /// Root mean square residual of the log-stretch.
+    pub log_stretch_rms: f64,
+}
+
+/// Where a frame's time went.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
+pub struct StageSeconds {
+    /// Waiting for snapshots.
+    pub waiting: f64,
+    /// Rendering without its traces.
+    pub render: f64,
+    /// Tracing inside rendering.
+    pub trace: f64,
+    /// Prediction inside rendering.
+    pub predict: f64,
+    /// Audit points and trust.
+    pub audit: f64,
+    /// Training.
+    pub train: f64,
+    /// The whole frame.
+    pub total: f64,
+}

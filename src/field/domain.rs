@@ -1,0 +1,48 @@
+//! The box in which seeds are placed.
+
+/// An axis-aligned box in the coordinates of the data (degrees on the sphere). `[f32; 3]` points everywhere in the program
+/// are in these coordinates. Two-dimensional flows are extruded: their third extent is a slab thickness that no velocity
+/// depends on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Domain {
+    /// Lower corner.
+    pub min: [f64; 3],
+    /// Upper corner.
+    pub max: [f64; 3],
+    /// Number of axes along which the flow varies: 2 or 3. Axes at and beyond it are extruded.
+    pub dimensions: usize,
+}
+
+impl Domain {
+    /// A two-dimensional domain with a slab from `z.0` to `z.1`.
+    pub fn slab(min: [f64; 2], max: [f64; 2], z: (f64, f64)) -> Self {
+        Self { min: [min[0], min[1], z.0], max: [max[0], max[1], z.1], dimensions: 2 }
+    }
+
+    /// A three-dimensional domain.
+    pub fn cuboid(min: [f64; 3], max: [f64; 3]) -> Self {
+        Self { min, max, dimensions: 3 }
+    }
+
+    /// Edge lengths.
+    pub fn extent(&self) -> [f64; 3] {
+        std::array::from_fn(|k| self.max[k] - self.min[k])
+    }
+
+    /// Point of the domain at `unit` coordinates in [0, 1].
+    pub fn from_unit(&self, unit: [f32; 3]) -> [f32; 3] {
+        let extent = self.extent();
+        std::array::from_fn(|k| (self.min[k] + extent[k] * f64::from(unit[k])) as f32)
+    }
+
+    /// Unit coordinates of a point, clamped into [0, 1].
+    pub fn to_unit(&self, point: [f32; 3]) -> [f32; 3] {
+        let extent = self.extent();
+        std::array::from_fn(|k| (((f64::from(point[k]) - self.min[k]) / extent[k]) as f32).clamp(0.0, 1.0))
+    }
+
+    /// Whether the point lies in the closed box.
+    pub fn contains(&self, point: [f32; 3]) -> bool {
+        (0..3).all(|k| f64::from(point[k]) >= self.min[k] && f64::from(point[k]) <= self.max[k])
+    }
+}

@@ -1,0 +1,20 @@
+//! Velocity data: axes and grids, snapshots, missing cells, the sliding window, closed-form flows.
+//!
+//! In: numbers from `source`. Out: what `flow` integrates. This room calls no other room.
+
+mod axis;
+mod domain;
+mod grid;
+mod snapshot;
+mod window;
+
+pub mod analytic;
+
+pub use axis::{Axis, AxisFault};
+pub use domain::Domain;
+pub use grid::{Geometry, Grid};
+pub use snapshot::Snapshot;
+pub use window::{Pushed, Window, WindowFault, WindowWarning};
+
+/// Radius of the sphere on which longitude-latitude data are advected, in metres (IUGG mean radius R1).
+pub const EARTH_RADIUS: f64 = 6_371_008.8;

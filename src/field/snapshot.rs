@@ -1,0 +1,66 @@
+//! The velocity at one time.
+
+use super::{Geometry, Grid};
+use std::sync::Arc;
+
+/// The velocity on a grid at one time.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    /// Time in the scene's unit (seconds for CF archives).
+    pub time: f64,
+    /// The grid.
+    pub grid: Arc<Grid>,
+    /// One node each: `[u, v, w, mark]`, x fastest, then y, then z. `mark` is 0 where the velocity is known and NaN where it is
+    /// missing (land, fill value, NaN), so that a missing corner shows in every interpolation that touches it. Velocities
+    /// of missing nodes are 0. On the sphere `u, v, w` are geocentric Cartesian components (see [`Geometry::Sphere`]).
+    pub nodes: Vec<[f32; 4]>,
+}
+
+/// Where a velocity is unknown.
+pub const MISSING: [f32; 4] = [0.0, 0.0, 0.0, f32::NAN];
+
+impl Snapshot {
+    /// Builds the node array from separate components (`w` empty in two dimensions); any non-finite component makes the node
+    /// missing. On the sphere `u` is eastward and `v` northward.
+    ///
+    /// # Panics
+    /// When a component has not one value a node: readers check shapes before.
+    pub fn from_components(time: f64, grid: Arc<Grid>, u: &[f32], v: &[f32], w: &[f32]) -> Self {
+        let count = grid.nodes();
+        assert!(u.len() == count && v.len() == count && (w.is_empty() || w.len() == count), "one value a node");
+        let [nx, ny, _] = grid.shape();
+        let mut nodes = Vec::with_capacity(count);
+        for i in 0..count {
+            let up = if w.is_empty() { 0.0 } else { w[i] };
+            if !(u[i].is_finite() && v[i].is_finite() && up.is_finite()) {
+                nodes.push(MISSING);
+                continue;
+            }
+            nodes.push(match grid.geometry {
+                Geometry::Cartesian => [u[i], v[i], up, 0.0],
+                Geometry::Sphere { .. } => {
+                    let (sin_lon, cos_lon) = grid.axes[0].coordinates()[i % nx].to_radians().sin_cos();
+                    let (sin_lat, cos_lat) = grid.axes[1].coordinates()[i / nx % ny].to_radians().sin_cos();
+                    let (east, north) = (f64::from(u[i]), f64::from(v[i]));
+                    [
+                        (-east * sin_lon - north * sin_lat * cos_lon) as f32,
+                        (east * cos_lon - north * sin_lat * sin_lon) as f32,
+                        (north * cos_lat) as f32,
+                        0.0,
+                    ]
+                }
+            });
+        }
+        Self { time, grid, nodes }
+    }
+
+    /// Number of nodes whose velocity is missing.
+    pub fn missing(&self) -> usize {
+        self.nodes.iter().filter(|n| n[3].is_nan()).count()
+    }
+
+    /// Memory of the nodes, in bytes.
+    pub fn bytes(&self) -> usize {
+        size_of_val(self.nodes.as_slice())
+    }
+}

@@ -1,0 +1,220 @@
+//! The sliding window: the snapshots that [t0, t0 + tau] needs, and no more.
+
+use super::{Grid, Snapshot};
+use std::collections::VecDeque;
+use std::sync::Arc;
+use thiserror::Error;
+
+/// Snapshots in ascending time, all on one grid.
+#[derive(Debug, Clone, Default)]
+pub struct Window {
+    snapshots: VecDeque<Arc<Snapshot>>,
+    span: f64,
+}
+
+/// What became of a snapshot that was accepted.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Pushed {
+    /// Snapshots that the window let go.
+    pub dropped: usize,
+    /// What was odd about it.
+    pub warning: Option<WindowWarning>,
+}
+
+/// Odd, but with a defined result.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum WindowWarning {
+    /// The newer one replaced the older one.
+    #[error("snapshot repeats time {time}: the newer one replaces the older")]
+    Duplicate {
+        /// Its time.
+        time: f64,
+    },
+    /// Put where it belongs.
+    #[error("snapshot at time {time} came after {newest}: it was put in its place")]
+    OutOfOrder {
+        /// Its time.
+        time: f64,
+        /// The newest time before it came.
+        newest: f64,
+    },
+    /// Many values are not numbers.
+    #[error("{missing} of {nodes} velocities at time {time} are missing; the snapshots before had {before}")]
+    MissingBurst {
+        /// Its time.
+        time: f64,
+        /// Missing nodes.
+        missing: usize,
+        /// All nodes.
+        nodes: usize,
+        /// Missing nodes of the snapshot before.
+        before: usize,
+    },
+}
+
+/// Why a snapshot was refused; the window is as before.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum WindowFault {
+    /// Older than everything that the window still needs.
+    #[error("snapshot at time {time} is late: the window already starts at {oldest}")]
+    Late {
+        /// Its time.
+        time: f64,
+        /// Oldest time held.
+        oldest: f64,
+    },
+    /// Another grid than the window's.
+    #[error("snapshot at time {time} has another grid ({found:?} nodes) than the window ({expected:?} nodes)")]
+    GridChanged {
+        /// Its time.
+        time: f64,
+        /// Its shape.
+        found: [usize; 3],
+        /// The window's shape.
+        expected: [usize; 3],
+    },
+    /// Time is not a number.
+    #[error("snapshot has no finite time ({time})")]
+    NoTime {
+        /// What it says.
+        time: f64,
+    },
+}
+
+impl Window {
+    /// An empty window for integrations over `span` = |tau|, in time units.
+    pub fn new(span: f64) -> Self {
+        Self { snapshots: VecDeque::new(), span }
+    }
+
+    /// Takes a snapshot in, and lets go of those that an integration over `span` ending at the newest time no longer needs.
+    pub fn push(&mut self, snapshot: Arc<Snapshot>) -> Result<Pushed, WindowFault> {
+        let time = snapshot.time;
+        if !time.is_finite() {
+            return Err(WindowFault::NoTime { time });
+        }
+        let mut warning = None;
+        if let Some(front) = self.snapshots.front() {
+            if !Arc::ptr_eq(&front.grid, &snapshot.grid) && *front.grid != *snapshot.grid {
+                return Err(WindowFault::GridChanged { time, found: snapshot.grid.shape(), expected: front.grid.shape() });
+            }
+            // A full window never moves back in time.
+            if time < front.time && self.is_full() {
+                return Err(WindowFault::Late { time, oldest: front.time });
+            }
+        }
+        let place = self.snapshots.partition_point(|s| s.time < time);
+        if self.snapshots.get(place).is_some_and(|s| s.time == time) {
+            self.snapshots[place] = snapshot;
+            return Ok(Pushed { dropped: 0, warning: Some(WindowWarning::Duplicate { time }) });
+        }
+        if place < self.snapshots.len() {
+            warning = Some(WindowWarning::OutOfOrder { time, newest: self.newest().unwrap_or(time) });
+        } else if let Some(last) = self.snapshots.back() {
+            let (missing, before, nodes) = (snapshot.missing(), last.missing(), snapshot.nodes.len());
+            if missing > before + nodes / 20 {
+                warning = Some(WindowWarning::MissingBurst { time, missing, nodes, before });
+            }
+        }
+        self.snapshots.insert(place, snapshot);
+        Ok(Pushed { dropped: self.release(), warning })
+    }
+
+    /// Drops what lies wholly before `newest - span`.
+    fn release(&mut self) -> usize {
+        let Some(newest) = self.newest() else { return 0 };
+        let start = newest - self.span;
+        let slack = self.span * 1e-9;
+        let mut dropped = 0;
+        while self.snapshots.len() > 2 && self.snapshots[1].time <= start + slack {
+            self.snapshots.pop_front();
+            dropped += 1;
+        }
+        dropped
+    }
+
+    /// Whether the snapshots cover an integration over the whole span.
+    pub fn is_full(&self) -> bool {
+        match (self.oldest(), self.newest()) {
+            (Some(oldest), Some(newest)) => self.snapshots.len() >= 2 && newest - oldest >= self.span * (1.0 - 1e-9),
+            _ => false,
+        }
+    }
+
+    /// Integration span |tau| that the window is kept for.
+    pub fn span(&self) -> f64 {
+        self.span
+    }
+
+    /// Time of the oldest snapshot.
+    pub fn oldest(&self) -> Option<f64> {
+        self.snapshots.front().map(|s| s.time)
+    }
+
+    /// Time of the newest snapshot.
+    pub fn newest(&self) -> Option<f64> {
+        self.snapshots.back().map(|s| s.time)
+    }
+
+    /// Snapshots, oldest first.
+    pub fn snapshots(&self) -> impl ExactSizeIterator<Item = &Arc<Snapshot>> {
+        self.snapshots.iter()
+    }
+
+    /// Grid, once a snapshot is there.
+    pub fn grid(&self) -> Option<&Arc<Grid>> {
+        self.snapshots.front().map(|s| &s.grid)
+    }
+
+    /// Memory of all nodes, in bytes.
+    pub fn bytes(&self) -> usize {
+        self.snapshots.iter().map(|s| s.bytes()).sum()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Axis, Geometry};
+
+    fn grid(nodes: usize) -> Arc<Grid> {
+        let axis = |name| Axis::uniform(name, "m", 0.0, 1.0, nodes).unwrap();
+        Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) })
+    }
+
+    fn at(time: f64, grid: &Arc<Grid>) -> Arc<Snapshot> {
+        let zeros = vec![0.0; grid.nodes()];
+        Arc::new(Snapshot::from_components(time, grid.clone(), &zeros, &zeros, &[]))
+    }
+
+    #[test]
+    fn holds_what_the_span_needs_and_no_more() {
+        let grid = grid(2);
+        let mut window = Window::new(2.5);
+        for t in 0..10 {
+            window.push(at(f64::from(t), &grid)).unwrap();
+        }
+        let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
+        assert_eq!(times, [6.0, 7.0, 8.0, 9.0], "6 is needed to interpolate at 6.5");
+        assert!(window.is_full());
+    }
+
+    #[test]
+    fn odd_snapshots_have_defined_results() {
+        let grid_2 = grid(2);
+        let mut window = Window::new(2.0);
+        for t in [0.0, 1.0, 3.0] {
+            window.push(at(t, &grid_2)).unwrap();
+        }
+        let pushed = window.push(at(3.0, &grid_2)).unwrap();
+        assert_eq!(pushed.warning, Some(WindowWarning::Duplicate { time: 3.0 }));
+        let pushed = window.push(at(2.0, &grid_2)).unwrap();
+        assert_eq!(pushed.warning, Some(WindowWarning::OutOfOrder { time: 2.0, newest: 3.0 }));
+        assert!(matches!(window.push(at(0.5, &grid_2)), Err(WindowFault::Late { .. })));
+        assert!(matches!(window.push(at(4.0, &grid(3))), Err(WindowFault::GridChanged { .. })));
+        assert!(matches!(window.push(at(f64::NAN, &grid_2)), Err(WindowFault::NoTime { .. })));
+        let nan = vec![f32::NAN; 4];
+        let burst = window.push(Arc::new(Snapshot::from_components(4.0, grid_2, &nan, &nan, &[]))).unwrap();
+        assert!(matches!(burst.warning, Some(WindowWarning::MissingBurst { missing: 4, .. })));
+    }
+}

@@ -1,0 +1,164 @@
+//! Ground truth: integrators, tangent flow map, Cauchy-Green, log-stretch and FTLE.
+//!
+//! In: a velocity (closed form or window) and seeds. Out: the log-stretch s = ln sigma_max(J) = |tau| FTLE at each seed. This room
+//! calls only `field`; it knows nothing of networks, images or sockets.
+
+use crate::field::{Domain, Window, analytic::Analytic};
+use serde::{Deserialize, Serialize};
+use std::sync::Arc;
+
+/// Which way particles travel from the seed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Direction {
+    /// From t0 to t0 + tau: ridges repel.
+    Forward,
+    /// From t0 to t0 - tau: ridges attract.
+    Backward,
+}
+
+impl Direction {
+    /// +1 or -1.
+    pub fn sign(self) -> f64 {
+        match self {
+            Direction::Forward => 1.0,
+            Direction::Backward => -1.0,
+        }
+    }
+}
+
+/// How the flow map's gradient is found.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Integrator {
+    /// dJ/dt = (grad v) J along one path, Runge-Kutta of order 4.
+    Tangent,
+    /// Central differences of 2 particles an axis, `gap` apart from the seed, Runge-Kutta of order 4 (the published way).
+    Differences,
+    /// Tangent flow by the adaptive pair of Dormand and Prince in f64: the reference.
+    DormandPrince,
+}
+
+/// Floating-point type of the integration.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Precision {
+    /// Single.
+    F32,
+    /// Double.
+    F64,
+}
+
+/// What happens to a particle at the edge of the domain.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Boundary {
+    /// It stops and keeps the stretch it had; it is counted.
+    Stop,
+    /// Velocity outside is the velocity at the nearest point of the edge.
+    Clamp,
+    /// The domain repeats along every axis.
+    Periodic,
+    /// Closed-form flows go on outside the box.
+    Unbounded,
+    /// It stops and its FTLE is 0 (the published small renderer).
+    Zero,
+}
+
+/// What the log-stretch of a particle that stopped early is divided by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Normalisation {
+    /// |tau|: a particle stopped at a coast shows no ridge there.
+    Tau,
+    /// The time it lived (tends to the local strain rate).
+    Lived,
+}
+
+/// Spatial interpolation of gridded velocity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Interpolation {
+    /// Linear along each axis.
+    Linear,
+    /// Catmull-Rom along each axis, continuously differentiable.
+    Cubic,
+}
+
+/// How many Runge-Kutta steps a path gets.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Steps {
+    /// The fewest whose log-stretch differs from twice as many by at most this root mean square, on a few thousand points.
+    Auto {
+        /// Root mean square of the log-stretch.
+        tolerance: f64,
+    },
+    /// This many.
+    Fixed(usize),
+}
+
+/// Everything that defines one flow map, but for its start time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FlowMap {
+    /// |tau|, in time units.
+    pub tau: f64,
+    /// Forward or backward.
+    pub direction: Direction,
+    /// How J is found.
+    pub integrator: Integrator,
+    /// Floating-point type.
+    pub precision: Precision,
+    /// Number of steps.
+    pub steps: Steps,
+    /// Distance of the difference particles from the seed, in coordinate units.
+    pub gap: f64,
+    /// Edge policy.
+    pub boundary: Boundary,
+    /// Divisor for particles that stopped early.
+    pub normalisation: Normalisation,
+    /// Interpolation of gridded velocity.
+    pub interpolation: Interpolation,
+}
+
+/// The velocity that is integrated.
+#[derive(Debug, Clone)]
+pub enum VelocitySource {
+    /// A closed form, anywhere and at any time, over this domain.
+    Analytic(Analytic, Domain),
+    /// Snapshots; the window covers [t0, t0 + tau].
+    Window(Arc<Window>),
+}
+
+/// What a trace should return besides the log-stretch.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Extras {
+    /// Arrival positions phi(x), in domain coordinates.
+    pub arrival: bool,
+    /// J = d phi / d x, row-major 3x3 (2-D flows: upper left 2x2).
+    pub jacobian: bool,
+}
+
+/// One entry a seed, in the order of the seeds.
+#[derive(Debug, Clone, Default)]
+pub struct Traced {
+    /// Log-stretch s = ln sigma_max(J), no unit; FTLE = s / |tau| (see [`Normalisation`], which is already applied).
+    pub log_stretch: Vec<f32>,
+    /// Share of |tau| that the particle lived, in [0, 1].
+    pub lived: Vec<f32>,
+    /// Arrival positions; empty unless asked for.
+    pub arrival: Vec<[f32; 3]>,
+    /// Jacobians; empty unless asked for.
+    pub jacobian: Vec<[f32; 9]>,
+}
+
+/// Traces seeds in large batches; shared by all threads. [`cpu_tracer`] makes the CPU's.
+pub trait Tracer: Send + Sync {
+    /// Where seeds may lie.
+    fn domain(&self) -> &Domain;
+    /// |tau|.
+    fn tau(&self) -> f64;
+    /// Runge-Kutta steps a path gets.
+    fn steps(&self) -> usize;
+    /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
+}

@@ -1,0 +1,17 @@
+//! ridgewatch shows the Lagrangian coherent structures of a flow while it runs.
+//!
+//! The rooms, and the one way of the arrows (a room calls only those to its left):
+//!
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`], the command line.
+//!
+//! One cycle: take the newest snapshots, slide the window, render with the weights of the previous cycle, test every traced
+//! sample against the surrogate (this feeds the trust map), then train on it.
+
+pub mod engine;
+pub mod field;
+pub mod flow;
+pub mod publish;
+pub mod render;
+pub mod source;
+pub mod surrogate;
+pub mod trust;

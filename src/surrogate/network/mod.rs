@@ -1,0 +1,88 @@
+//! The network: encoding, MLP in burn, loss; stock path, fused autodiff operation and `train_steps(k)`.
+
+use serde::{Deserialize, Serialize};
+
+/// How a position is shown to the MLP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Encoding {
+    /// Multiresolution hash grid (Müller et al. 2022).
+    HashGrid,
+    /// sin and cos of 2^0 .. 2^(L-1) (Mildenhall et al. 2020).
+    Frequency,
+}
+
+/// What the network outputs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// The log-stretch.
+    Ftle,
+    /// The arrival position; the FTLE follows by differentiating the network.
+    FlowMap,
+}
+
+/// What training minimises.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Loss {
+    /// Mean square of the log-stretch.
+    MeanSquare,
+    /// Mean |sign(y) ln(1+|y|) - yhat|^2 with y = FTLE, plus the penalty on the difference of the batch means in linear scale.
+    Published,
+}
+
+/// `[network]` of a scene file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NetworkSettings {
+    /// Encoding of the position.
+    pub encoding: Encoding,
+    /// Hash-grid levels.
+    pub levels: usize,
+    /// Features a level.
+    pub features: usize,
+    /// Entries a level at most, as a power of two.
+    pub log2_table: u32,
+    /// Nodes along each axis of the coarsest level.
+    pub base_resolution: usize,
+    /// Resolution ratio from level to level.
+    pub growth: f32,
+    /// Octaves of the frequency encoding.
+    pub octaves: usize,
+    /// Hidden layers.
+    pub hidden_layers: usize,
+    /// Neurons a hidden layer.
+    pub width: usize,
+    /// Output.
+    pub target: Target,
+    /// Loss.
+    pub loss: Loss,
+    /// Weight of the published penalty on the difference of the batch means.
+    pub mean_penalty: f32,
+    /// Adam's rate; None: 1e-2 for hash grids, 1e-4 for frequency encodings.
+    pub learning_rate: Option<f32>,
+    /// Samples an optimizer step.
+    pub batch: usize,
+}
+
+impl Default for NetworkSettings {
+    fn default() -> Self {
+        Self {
+            encoding: Encoding::HashGrid,
+            levels: 8,
+            features: 2,
+            log2_table: 16,
+            base_resolution: 16,
+            growth: 1.6,
+            octaves: 10,
+            hidden_layers: 2,
+            width: 64,
+            target: Target::Ftle,
+            loss: Loss::MeanSquare,
+            mean_penalty: 1.0,
+            learning_rate: None,
+            batch: 1 << 14,
+        }
+    }
+}
