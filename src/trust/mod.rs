@@ -26,6 +26,14 @@ pub struct TrustSettings {
 
 impl Default for TrustSettings {
     fn default() -> Self {
-        Self { tolerance: 0.03, cells: None, min_samples: 16.0, audit_share: 0.01, audit_min: 4096, slide_inflation: 4.0, trace_budget: None }
+        Self {
+            tolerance: 0.03,
+            cells: None,
+            min_samples: 16.0,
+            audit_share: 0.01,
+            audit_min: 4096,
+            slide_inflation: 4.0,
+            trace_budget: None,
+        }
     }
 }
