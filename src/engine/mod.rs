@@ -4,7 +4,8 @@
 
 mod record;
 
-pub use record::{FrameRecord, StageSeconds, TrustedError};
+pub use crate::trust::TrustedError;
+pub use record::{FrameRecord, StageSeconds};
 
 /// A finished frame on its way out.
 #[derive(Debug, Clone)]

@@ -1,5 +1,6 @@
 //! What is recorded of every frame. One line of `records.jsonl`, and the JSON header of a published frame.
 
+use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
 
 /// One frame's figures. Shares are in [0, 1]; residuals of `optical` kind have no unit, those of `log_stretch` kind neither.
@@ -53,23 +54,6 @@ pub struct FrameRecord {
     pub seconds: StageSeconds,
     /// Warnings that arose since the last frame, in words.
     pub warnings: Vec<String>,
-}
-
-/// Residuals of the surrogate in the trusted region.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
-pub struct TrustedError {
-    /// Points measured.
-    pub points: u64,
-    /// Mean |ramp(predicted) - ramp(traced)|.
-    pub optical_mean: f64,
-    /// Root mean square of it.
-    pub optical_rms: f64,
-    /// 95 % interval of the root mean square.
-    pub optical_rms_interval: [f64; 2],
-    /// 99th percentile of it.
-    pub optical_p99: f64,
-    /// Root mean square residual of the log-stretch.
-    pub log_stretch_rms: f64,
 }
 
 /// Where a frame's time went.

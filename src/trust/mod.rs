@@ -1,6 +1,13 @@
 //! Loss per cell, the gate between surrogate and RK4, drift.
 //!
-//! In: residuals of traced samples that the surrogate had not been trained on. Out: which cells may be answered by it.
+//! In: residuals of traced samples that the surrogate had not been trained on. Out: which cells may be answered by it, and what
+//! error its answers have. Calls no other room: residuals come in already measured.
+
+mod error;
+mod map;
+
+pub use error::TrustedError;
+pub use map::{Gate, Residual, TrustMap};
 
 use serde::{Deserialize, Serialize};
 
@@ -10,30 +17,24 @@ use serde::{Deserialize, Serialize};
 pub struct TrustSettings {
     /// Root mean square of the optical residual |ramp(predicted) - ramp(traced)| up to which a cell is trusted.
     pub tolerance: f64,
-    /// Cells along x, y, z; None: chosen from the domain.
+    /// Cells along x, y, z; None: about 512 in two dimensions, 4096 in three, as cubic as the domain allows.
     pub cells: Option<[usize; 3]>,
-    /// Samples below which a cell is not trusted.
+    /// Samples (decayed count) below which a cell is not trusted.
     pub min_samples: f64,
     /// Share of all queries that is drawn uniformly over the domain and traced whatever the gate says.
     pub audit_share: f64,
     /// Audit points a frame at least.
     pub audit_min: usize,
-    /// Factor on every cell's residual when the window slides.
+    /// Factor on every cell's mean square residual when the window slides, at least; the growth measured at the last slide counts
+    /// where it is larger.
     pub slide_inflation: f64,
-    /// Seconds a frame may spend on tracing; beyond it the frame is flagged `over_tolerance`.
+    /// Seconds a frame may spend on tracing; beyond it untrusted cells are answered by the surrogate all the same and the frame is
+    /// flagged `over_tolerance`.
     pub trace_budget: Option<f64>,
 }
 
 impl Default for TrustSettings {
     fn default() -> Self {
-        Self {
-            tolerance: 0.03,
-            cells: None,
-            min_samples: 16.0,
-            audit_share: 0.01,
-            audit_min: 4096,
-            slide_inflation: 4.0,
-            trace_budget: None,
-        }
+        Self { tolerance: 0.03, cells: None, min_samples: 16.0, audit_share: 0.01, audit_min: 4096, slide_inflation: 4.0, trace_budget: None }
     }
 }

@@ -1,0 +1,133 @@
+//! TOML scene files: what they may say, and errors that point at the line.
+//!
+//! In: a file, `--set table.key=value`. Out: a [`SceneFile`] whose every value lies in its accepted range. The settings of a room
+//! are defined in that room; this file puts them together.
+
+mod error;
+mod sections;
+mod validate;
+
+pub use error::ConfigError;
+pub use sections::{DomainSettings, FlowSettings, SourceKind, SourceSettings, StepsSetting, TimeSettings, TimeSpan, TrainingSettings};
+
+use crate::publish::PublishSettings;
+use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
+use crate::source::NetCdfSettings;
+use crate::surrogate::{SurrogateSettings, network::NetworkSettings};
+use crate::trust::TrustSettings;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// A whole scene file. Every table but `[source]` may be left out.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneFile {
+    /// A line for people.
+    #[serde(default)]
+    pub title: String,
+    /// Seed of every random number.
+    #[serde(default)]
+    pub seed: u64,
+    /// Where velocity comes from.
+    pub source: SourceSettings,
+    /// Which files, variables and metric, for `source.kind = "archive"`.
+    #[serde(default)]
+    pub archive: NetCdfSettings,
+    /// The box in which seeds lie; needed by closed forms.
+    pub domain: Option<DomainSettings>,
+    /// Integration time, direction and the slides of the window.
+    #[serde(default)]
+    pub time: TimeSettings,
+    /// Integration.
+    #[serde(default)]
+    pub flow: FlowSettings,
+    /// Which surrogate.
+    #[serde(default)]
+    pub surrogate: SurrogateSettings,
+    /// Its network.
+    #[serde(default)]
+    pub network: NetworkSettings,
+    /// How much training a frame gets.
+    #[serde(default)]
+    pub training: TrainingSettings,
+    /// When the surrogate is believed.
+    #[serde(default)]
+    pub trust: TrustSettings,
+    /// The picture.
+    #[serde(default)]
+    pub render: RenderSettings,
+    /// View; none: an overview of the domain.
+    pub camera: Option<CameraSettings>,
+    /// Light; none: from above, over the shoulder.
+    pub light: Option<LightSettings>,
+    /// Extinction and albedo; none: scaled to the first frame's FTLE.
+    pub transfer: Option<TransferSettings>,
+    /// Frames out.
+    #[serde(default)]
+    pub publish: PublishSettings,
+}
+
+impl SceneFile {
+    /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
+    /// Paths in `archive.files` are relative to the scene file's folder.
+    pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
+        let text =
+            std::fs::read_to_string(path).map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
+        let mut scene = Self::parse(path, &text, overrides)?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        for file in &mut scene.archive.files {
+            if file.is_relative() {
+                *file = folder.join(&*file);
+            }
+        }
+        Ok(scene)
+    }
+
+    /// Checks the text of a scene file; `path` appears in errors only.
+    pub fn parse(path: &Path, text: &str, overrides: &[String]) -> Result<Self, ConfigError> {
+        let plain: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(path, text, &e))?;
+        let scene = if overrides.is_empty() { plain } else { Self::overridden(&plain, overrides)? };
+        validate::check(&scene).map_err(|fault| fault.locate(path, text, overrides))?;
+        Ok(scene)
+    }
+
+    /// A scene for files given by name alone: every default.
+    pub fn for_archive(files: Vec<PathBuf>, overrides: &[String]) -> Result<Self, ConfigError> {
+        let origin = Path::new("(command line)");
+        let mut scene = Self::parse(origin, "[source]\nkind = \"archive\"\n", &[])?;
+        scene.archive.files = files;
+        if !overrides.is_empty() {
+            scene = Self::overridden(&scene, overrides)?;
+            validate::check(&scene).map_err(|fault| fault.locate(origin, "", overrides))?;
+        }
+        Ok(scene)
+    }
+
+    /// The scene with `table.key=value` applied.
+    fn overridden(scene: &Self, overrides: &[String]) -> Result<Self, ConfigError> {
+        let mut tree = toml::Table::try_from(scene).map_err(|e| ConfigError::Override { given: String::new(), message: e.to_string() })?;
+        for given in overrides {
+            let fail = |message: String| ConfigError::Override { given: given.clone(), message };
+            let (key, value) = given.split_once('=').ok_or_else(|| fail("accepted: table.key=value".into()))?;
+            let value: toml::Value = format!("value = {value}")
+                .parse::<toml::Table>()
+                .ok()
+                .and_then(|mut t| t.remove("value"))
+                .unwrap_or_else(|| toml::Value::String(value.to_owned()));
+            let mut path: Vec<&str> = key.trim().split('.').collect();
+            let last = path.pop().filter(|k| !k.is_empty()).ok_or_else(|| fail("the key is empty".into()))?;
+            let mut table = &mut tree;
+            for part in path {
+                let entry = table.entry(part).or_insert_with(|| toml::Value::Table(toml::Table::new()));
+                table = entry.as_table_mut().ok_or_else(|| fail(format!("`{part}` is a value, not a table")))?;
+            }
+            table.insert(last.to_owned(), value);
+            // Deserialise after each, so that the error names the one at fault.
+            let _: Self = tree.clone().try_into().map_err(|e: toml::de::Error| fail(error::with_suggestion(e.message())))?;
+        }
+        tree.try_into().map_err(|e: toml::de::Error| ConfigError::Override { given: overrides.join(" "), message: e.message().to_owned() })
+    }
+}
+
+#[cfg(test)]
+mod tests;

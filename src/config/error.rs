@@ -1,0 +1,117 @@
+//! Errors that point at the line.
+
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Why a scene is refused.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum ConfigError {
+    /// The file cannot be read.
+    #[error("cannot read {path}: {message}")]
+    Unreadable {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        message: String,
+    },
+    /// The file is no TOML, has an unknown key, or a value of the wrong type.
+    #[error("{path}:{line}: {message}\n  {line:>4} | {excerpt}")]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// That line.
+        excerpt: String,
+        /// What is wrong with it.
+        message: String,
+    },
+    /// A value is outside its range, or does not go with another one.
+    #[error("{place}: `{key}` {found}; accepted: {accepted}{}", excerpt(.line))]
+    Value {
+        /// File and line, or `--set`.
+        place: String,
+        /// Dotted key.
+        key: String,
+        /// What was found, as in `is -1`.
+        found: String,
+        /// What is accepted.
+        accepted: String,
+        /// Line number and line, where the file has it.
+        line: Option<(usize, String)>,
+    },
+    /// A `--set` that cannot be applied.
+    #[error("--set {given}: {message}")]
+    Override {
+        /// As given.
+        given: String,
+        /// What is wrong with it.
+        message: String,
+    },
+}
+
+fn excerpt(line: &Option<(usize, String)>) -> String {
+    line.as_ref().map_or_else(String::new, |(number, text)| format!("\n  {number:>4} | {text}"))
+}
+
+impl ConfigError {
+    /// From a TOML error, with its line and, for an unknown key, the nearest known one.
+    pub(super) fn from_toml(path: &Path, text: &str, error: &toml::de::Error) -> Self {
+        let (line, excerpt) = line_at(text, error.span().map_or(0, |s| s.start));
+        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: with_suggestion(error.message()) }
+    }
+}
+
+/// A fault found after parsing, not yet located.
+#[derive(Debug)]
+pub(super) struct Fault {
+    pub key: String,
+    pub found: String,
+    pub accepted: String,
+}
+
+impl Fault {
+    /// Finds the line that set the key: the last `--set` that names it, else the file.
+    pub(super) fn locate(self, path: &Path, text: &str, overrides: &[String]) -> ConfigError {
+        let Fault { key, found, accepted } = self;
+        let set = overrides.iter().rev().find(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
+        let line = if set.is_none() { span_of(text, &key).map(|at| line_at(text, at)) } else { None };
+        let place = match (set, &line) {
+            (Some(set), _) => format!("--set {set}"),
+            (None, Some((number, _))) => format!("{}:{number}", path.display()),
+            (None, None) => path.display().to_string(),
+        };
+        ConfigError::Value { place, key, found, accepted, line }
+    }
+}
+
+/// Byte offset of the value at a dotted key, or of the nearest table above it.
+fn span_of(text: &str, key: &str) -> Option<usize> {
+    let document = toml_edit::Document::parse(text).ok()?;
+    let mut item = document.as_item();
+    let mut best = None;
+    for part in key.split('.') {
+        item = item.get(part)?;
+        best = item.span().map(|s| s.start).or(best);
+    }
+    best
+}
+
+/// Line number (from 1) and text of the line that holds byte `at`.
+fn line_at(text: &str, at: usize) -> (usize, String) {
+    let at = at.min(text.len());
+    let before = text.get(..at).unwrap_or("");
+    let number = before.matches('\n').count();
+    (number + 1, text.lines().nth(number).unwrap_or("").to_owned())
+}
+
+/// Adds the nearest accepted name to serde's message on an unknown field or variant.
+pub(super) fn with_suggestion(message: &str) -> String {
+    let mut quoted = message.split('`').skip(1).step_by(2);
+    let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown")) else { return message.to_owned() };
+    let nearest = quoted.map(|known| (strsim::damerau_levenshtein(unknown, known), known)).min();
+    match nearest {
+        Some((distance, known)) if distance <= unknown.len().max(3) / 2 => format!("{message}. Did you mean `{known}`?"),
+        _ => message.to_owned(),
+    }
+}

@@ -1,0 +1,240 @@
+//! The trust map: what each cell of the domain is known to err by.
+
+use super::TrustSettings;
+use crate::field::Domain;
+
+/// A traced sample held against the surrogate's prediction, made with weights that had not seen it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Residual {
+    /// Unit coordinates.
+    pub point: [f32; 3],
+    /// |ramp(predicted) - ramp(traced)|, in [0, 1].
+    pub optical: f32,
+    /// predicted - traced log-stretch.
+    pub log_stretch: f32,
+}
+
+/// Decayed sums of one cell.
+#[derive(Debug, Clone, Copy, Default)]
+struct Cell {
+    weight: f64,
+    optical_square: f64,
+    optical_fourth: f64,
+}
+
+/// Residual statistics per cell of the unit cube.
+#[derive(Debug, Clone)]
+pub struct TrustMap {
+    shape: [usize; 3],
+    cells: Vec<Cell>,
+    settings: TrustSettings,
+    /// Mean square over all residuals of the last frame before a slide, and of the first one after: their ratio is the drift.
+    before_slide: Option<f64>,
+    just_slid: bool,
+    measured_growth: f64,
+}
+
+/// Which cells the surrogate answers, frozen for one frame.
+#[derive(Debug, Clone)]
+pub struct Gate {
+    shape: [usize; 3],
+    trusted: Vec<bool>,
+}
+
+/// One-sided 95 % quantile of the normal distribution.
+const Z95: f64 = 1.645;
+/// What a frame leaves of the older frames' sums: the weights change, so old residuals lose their meaning.
+const DECAY: f64 = 0.6;
+/// What a slide leaves of them.
+const SLIDE_DECAY: f64 = 0.25;
+
+fn cell_of(shape: [usize; 3], point: [f32; 3]) -> usize {
+    let index = |k: usize| ((point[k].clamp(0.0, 1.0) * shape[k] as f32) as usize).min(shape[k] - 1);
+    (index(2) * shape[1] + index(1)) * shape[0] + index(0)
+}
+
+/// About `count` cells over the axes along which the flow varies, as cubic as the domain's extents allow.
+pub(crate) fn cubic_cells(domain: &Domain, count: usize) -> [usize; 3] {
+    let extent = domain.extent();
+    let axes = domain.dimensions;
+    let volume: f64 = extent[..axes].iter().product();
+    let edge = (volume / count as f64).powf(1.0 / axes as f64);
+    std::array::from_fn(|k| if k < axes { ((extent[k] / edge).round() as usize).clamp(1, count) } else { 1 })
+}
+
+impl TrustMap {
+    /// A map that trusts nothing yet.
+    pub fn new(settings: &TrustSettings, domain: &Domain) -> Self {
+        let shape = match settings.cells {
+            Some([x, y, z]) => [x, y, if domain.dimensions == 3 { z } else { 1 }],
+            None => cubic_cells(domain, if domain.dimensions == 3 { 4096 } else { 512 }),
+        };
+        let cells = vec![Cell::default(); shape.iter().product()];
+        Self { shape, cells, settings: settings.clone(), before_slide: None, just_slid: false, measured_growth: 1.0 }
+    }
+
+    /// Cells along x, y and z.
+    pub fn shape(&self) -> [usize; 3] {
+        self.shape
+    }
+
+    /// Takes in one frame's residuals, older ones decaying. Call once a frame, after it was rendered.
+    pub fn observe(&mut self, residuals: &[Residual]) {
+        // Drift is read off all residuals of a frame; audit points make them comparable from frame to frame.
+        if !residuals.is_empty() {
+            let mean = residuals.iter().map(|r| f64::from(r.optical).powi(2)).sum::<f64>() / residuals.len() as f64;
+            if self.just_slid
+                && let Some(before) = self.before_slide.filter(|b| *b > 0.0)
+            {
+                self.measured_growth = mean / before;
+            }
+            self.before_slide = Some(mean);
+            self.just_slid = false;
+        }
+        for cell in &mut self.cells {
+            cell.weight *= DECAY;
+            cell.optical_square *= DECAY;
+            cell.optical_fourth *= DECAY;
+        }
+        for residual in residuals.iter().filter(|r| r.optical.is_finite()) {
+            let cell = &mut self.cells[cell_of(self.shape, residual.point)];
+            let square = f64::from(residual.optical).powi(2);
+            cell.weight += 1.0;
+            cell.optical_square += square;
+            cell.optical_fourth += square * square;
+        }
+    }
+
+    /// The window slid: labels and predictions are of an older field. Residuals grow by the larger of the setting and the growth
+    /// measured at the slide before, and count for less, so that trust must be earned again.
+    pub fn window_slid(&mut self) {
+        let inflation = self.settings.slide_inflation.max(self.measured_growth);
+        for cell in &mut self.cells {
+            cell.weight *= SLIDE_DECAY;
+            cell.optical_square *= SLIDE_DECAY * inflation;
+            cell.optical_fourth *= SLIDE_DECAY * inflation * inflation;
+        }
+        self.just_slid = true;
+    }
+
+    /// Forgets everything: tau, direction or the transfer function changed.
+    pub fn reset(&mut self) {
+        self.cells.fill(Cell::default());
+        self.before_slide = None;
+        self.just_slid = false;
+    }
+
+    /// Upper 95 % bound of a cell's mean square optical residual; none with too few samples.
+    ///
+    /// The bound is that of the normal approximation; one pseudo-sample at twice the tolerance stands for what so few samples
+    /// cannot have seen.
+    fn upper_bound(&self, cell: &Cell) -> Option<f64> {
+        if cell.weight < self.settings.min_samples * (1.0 - 1e-9) {
+            return None;
+        }
+        let unseen = (2.0 * self.settings.tolerance).powi(2);
+        let n = cell.weight + 1.0;
+        let mean = (cell.optical_square + unseen) / n;
+        let variance = ((cell.optical_fourth + unseen * unseen) / n - mean * mean).max(0.0);
+        Some(mean + Z95 * (variance / n).sqrt())
+    }
+
+    /// The gate for the next frame.
+    pub fn gate(&self) -> Gate {
+        let limit = self.settings.tolerance.powi(2);
+        let trusted = self.cells.iter().map(|cell| self.upper_bound(cell).is_some_and(|bound| bound <= limit)).collect();
+        Gate { shape: self.shape, trusted }
+    }
+}
+
+impl Gate {
+    /// A gate that trusts every cell (`all` true) or none.
+    pub fn uniform(all: bool) -> Self {
+        Self { shape: [1; 3], trusted: vec![all] }
+    }
+
+    /// Whether the surrogate answers at this unit point.
+    pub fn trusts(&self, point: [f32; 3]) -> bool {
+        self.trusted[cell_of(self.shape, point)]
+    }
+
+    /// Trusted share of the domain's volume.
+    pub fn share(&self) -> f64 {
+        self.trusted.iter().filter(|t| **t).count() as f64 / self.trusted.len() as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn domain() -> Domain {
+        Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0))
+    }
+
+    fn filled(map: &mut TrustMap, optical: f32, per_cell: usize) {
+        let [nx, ny, _] = map.shape();
+        let mut residuals = Vec::new();
+        for cell in 0..nx * ny {
+            let point = [(cell % nx) as f32 / nx as f32 + 1e-4, (cell / nx) as f32 / ny as f32 + 1e-4, 0.5];
+            residuals.extend((0..per_cell).map(|_| Residual { point, optical, log_stretch: 0.0 }));
+        }
+        map.observe(&residuals);
+    }
+
+    #[test]
+    fn cells_are_as_cubic_as_the_domain_allows() {
+        assert_eq!(TrustMap::new(&TrustSettings::default(), &domain()).shape(), [32, 16, 1]);
+        let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
+        assert_eq!(TrustMap::new(&TrustSettings::default(), &cube).shape(), [16, 16, 16]);
+    }
+
+    #[test]
+    fn trust_is_earned_lost_on_a_slide_and_earned_again() {
+        let mut map = TrustMap::new(&TrustSettings::default(), &domain());
+        assert_eq!(map.gate().share(), 0.0, "nothing is known");
+        filled(&mut map, 0.01, 8);
+        assert_eq!(map.gate().share(), 0.0, "too few samples");
+        filled(&mut map, 0.01, 20);
+        assert_eq!(map.gate().share(), 1.0);
+        map.window_slid();
+        assert_eq!(map.gate().share(), 0.0);
+        filled(&mut map, 0.012, 40);
+        assert_eq!(map.gate().share(), 1.0);
+    }
+
+    #[test]
+    fn a_bad_cell_is_answered_by_rk4_and_its_neighbours_are_not() {
+        let mut map = TrustMap::new(&TrustSettings::default(), &domain());
+        filled(&mut map, 0.01, 64);
+        let bad = [0.51, 0.51, 0.0];
+        map.observe(&(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>());
+        let gate = map.gate();
+        assert!(!gate.trusts(bad));
+        assert!(gate.trusts([0.45, 0.51, 0.0]));
+        assert!((gate.share() - 511.0 / 512.0).abs() < 1e-12);
+    }
+
+    #[test]
+    fn residuals_at_the_tolerance_are_not_trusted_and_nan_is_ignored() {
+        let mut map = TrustMap::new(&TrustSettings::default(), &domain());
+        filled(&mut map, 0.03, 1000);
+        assert_eq!(map.gate().share(), 0.0);
+        let mut map = TrustMap::new(&TrustSettings::default(), &domain());
+        filled(&mut map, f32::NAN, 1000);
+        assert_eq!(map.gate().share(), 0.0);
+    }
+
+    #[test]
+    fn a_field_that_drifts_fast_is_inflated_by_what_was_measured() {
+        let mut map = TrustMap::new(&TrustSettings { slide_inflation: 1.0, ..TrustSettings::default() }, &domain());
+        filled(&mut map, 0.001, 100);
+        map.window_slid();
+        filled(&mut map, 0.02, 100);
+        for _ in 0..20 {
+            filled(&mut map, 0.002, 100);
+        }
+        map.window_slid();
+        assert_eq!(map.gate().share(), 0.0, "400-fold growth was seen at the last slide; 0.002 would become 0.04");
+    }
+}
