@@ -1,2 +1,25 @@
-//! The command line.
-fn main() {}
+//! The command line: parses, calls, and turns the result into an exit status (0 done, 1 failed, 2 usage or config).
+
+mod cli;
+
+use clap::Parser;
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    let arguments = match cli::Arguments::try_parse() {
+        Ok(arguments) => arguments,
+        Err(error) => {
+            // Help and version are no failures; clap knows which stream each belongs to.
+            let failed = error.use_stderr();
+            return if error.print().is_ok() && !failed { ExitCode::SUCCESS } else { ExitCode::from(2) };
+        }
+    };
+    cli::messages::start(arguments.common.verbose);
+    match cli::run(arguments) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            cli::messages::fail(&error);
+            ExitCode::from(cli::exit_status(&error))
+        }
+    }
+}

@@ -159,7 +159,7 @@ fn check_trust(scene: &SceneFile) -> Result<(), Fault> {
     let t = &scene.trust;
     positive("trust.tolerance", t.tolerance)?;
     require((0.01..=1.0).contains(&t.audit_share), "trust.audit_share", t.audit_share, "a number from 0.01 to 1")?;
-    count("trust.audit_min", t.audit_min, 256, 1 << 24)?;
+    count("trust.audit_per_cell", t.audit_per_cell, 1, 65_536)?;
     require(t.min_samples.is_finite() && t.min_samples >= 4.0, "trust.min_samples", t.min_samples, "a number from 4 up")?;
     require(t.slide_inflation.is_finite() && t.slide_inflation >= 1.0, "trust.slide_inflation", t.slide_inflation, "a number from 1 up")?;
     if let Some(seconds) = t.trace_budget {

@@ -23,8 +23,8 @@ pub struct TrustSettings {
     pub min_samples: f64,
     /// Share of all queries that is drawn uniformly over the domain and traced whatever the gate says.
     pub audit_share: f64,
-    /// Audit points a frame at least.
-    pub audit_min: usize,
+    /// Audit points a frame and cell at least: enough that a trusted cell keeps its trust by audits alone.
+    pub audit_per_cell: usize,
     /// Factor on every cell's mean square residual when the window slides, at least; the growth measured at the last slide counts
     /// where it is larger.
     pub slide_inflation: f64,
@@ -35,6 +35,6 @@ pub struct TrustSettings {
 
 impl Default for TrustSettings {
     fn default() -> Self {
-        Self { tolerance: 0.03, cells: None, min_samples: 16.0, audit_share: 0.01, audit_min: 4096, slide_inflation: 4.0, trace_budget: None }
+        Self { tolerance: 0.03, cells: None, min_samples: 16.0, audit_share: 0.01, audit_per_cell: 8, slide_inflation: 4.0, trace_budget: None }
     }
 }

@@ -1,0 +1,24 @@
+//! `ridgewatch compare`.
+
+use super::{Common, print_json, print_text};
+use anyhow::Result;
+use std::path::PathBuf;
+
+/// Options of `compare`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// Picture.
+    a: PathBuf,
+    /// Reference picture.
+    b: PathBuf,
+    /// Tone map in front of PSNR and SSIM: contrast, brightness, gamma.
+    #[arg(long, num_args = 3, value_names = ["CONTRAST", "BRIGHTNESS", "GAMMA"], default_values_t = [1.85, 0.75, 1.4])]
+    tone_map: Vec<f64>,
+}
+
+/// Compares.
+pub fn run(common: &Common, options: &Options) -> Result<()> {
+    let tone_map = [options.tone_map[0], options.tone_map[1], options.tone_map[2]];
+    let comparison = ridgewatch::publish::compare_files(&options.a, &options.b, tone_map)?;
+    if common.json { print_json(&comparison) } else { Ok(print_text(comparison)) }
+}

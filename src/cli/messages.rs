@@ -1,0 +1,48 @@
+//! What is said on standard error.
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use std::io::IsTerminal;
+use tracing_subscriber::EnvFilter;
+
+/// Sends log lines to standard error; `RIDGEWATCH_LOG` overrides the level.
+pub fn start(verbose: u8) {
+    let level = match verbose {
+        0 => "ridgewatch=warn",
+        1 => "ridgewatch=info",
+        _ => "ridgewatch=debug",
+    };
+    let filter = EnvFilter::try_from_env("RIDGEWATCH_LOG").unwrap_or_else(|_| EnvFilter::new(level));
+    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().with_target(false).compact().init();
+}
+
+/// The one line that says why a command failed.
+#[allow(clippy::print_stderr)]
+pub fn fail(error: &anyhow::Error) {
+    let mut message = error.to_string();
+    for cause in error.chain().skip(1) {
+        let cause = cause.to_string();
+        // Transparent errors repeat their cause.
+        if !message.contains(&cause) {
+            message = format!("{message}: {cause}");
+        }
+    }
+    eprintln!("ridgewatch: {message}");
+}
+
+/// A line of information.
+#[allow(clippy::print_stderr)]
+pub fn note(text: impl std::fmt::Display) {
+    eprintln!("ridgewatch: {text}");
+}
+
+/// A progress bar over `length` steps (a spinner where unknown), drawn only when standard error is a terminal.
+pub fn progress(length: Option<u64>) -> ProgressBar {
+    let target = if std::io::stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+    let (bar, style) = match length {
+        Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} eta {eta} {msg}"),
+        None => (ProgressBar::new_spinner(), "{spinner} {pos} {elapsed_precise} {msg}"),
+    };
+    bar.set_draw_target(target);
+    bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    bar
+}

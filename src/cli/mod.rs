@@ -1,0 +1,147 @@
+//! What can be asked on the command line, one file a command.
+
+mod compare;
+mod doctor;
+mod ftle;
+mod inspect;
+pub mod messages;
+mod render;
+mod replay;
+
+use anyhow::{Result, bail};
+use clap::{Args, Parser, Subcommand};
+use ridgewatch::config::{ConfigError, SceneFile};
+use ridgewatch::engine::EngineError;
+use std::path::{Path, PathBuf};
+
+/// Shows the Lagrangian coherent structures of a flow simulation while it runs.
+#[derive(Debug, Parser)]
+#[command(name = "ridgewatch", version, max_term_width = 110, propagate_version = true)]
+pub struct Arguments {
+    #[command(subcommand)]
+    command: Command,
+    #[command(flatten)]
+    pub common: Common,
+}
+
+/// Options that every command has.
+#[derive(Debug, Args)]
+pub struct Common {
+    /// Where to compute: auto, cpu, or cuda:N.
+    #[arg(long, global = true, default_value = "auto", value_name = "DEVICE")]
+    pub device: String,
+    /// Worker threads; 0: as many as this process may use.
+    #[arg(long, global = true, default_value_t = 0, value_name = "N")]
+    pub threads: usize,
+    /// Overrides one key of the scene, e.g. `--set render.samples=64`; may be repeated.
+    #[arg(long = "set", global = true, value_name = "TABLE.KEY=VALUE")]
+    pub overrides: Vec<String>,
+    /// Seed of every random number; overrides the scene's.
+    #[arg(long, global = true, value_name = "N")]
+    pub seed: Option<u64>,
+    /// Prints a machine-readable result on standard output; everything else goes to standard error.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Says more on standard error; twice for details.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Runs the whole loop over an archive or a closed-form flow: frames, records and a summary into a folder.
+    Replay(replay::Options),
+    /// Renders one picture.
+    Render(render::Options),
+    /// Computes the FTLE field on a grid, as NetCDF; `--check` holds it against the truth.
+    Ftle(ftle::Options),
+    /// Compares two EXR pictures: PSNR, SSIM, relative error.
+    Compare(compare::Options),
+    /// Says what would be read from files, and why.
+    Inspect(inspect::Options),
+    /// Says which devices and libraries are found.
+    Doctor,
+}
+
+/// Runs a command.
+pub fn run(arguments: Arguments) -> Result<()> {
+    let common = arguments.common;
+    check_device(&common.device)?;
+    match arguments.command {
+        Command::Replay(options) => replay::run(&common, options),
+        Command::Render(options) => render::run(&common, options),
+        Command::Ftle(options) => ftle::run(&common, &options),
+        Command::Compare(options) => compare::run(&common, &options),
+        Command::Inspect(options) => inspect::run(&common, &options),
+        Command::Doctor => doctor::run(&common),
+    }
+}
+
+/// A request that cannot be met as put: exit status 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Usage(pub String);
+
+fn check_device(device: &str) -> Result<()> {
+    match device {
+        "auto" | "cpu" => Ok(()),
+        _ if device.strip_prefix("cuda:").is_some_and(|n| n.parse::<u32>().is_ok()) => {
+            bail!(Usage(format!("--device {device}: this version computes on the CPU only; accepted: auto, cpu")))
+        }
+        _ => bail!(Usage(format!("--device {device}: accepted: auto, cpu"))),
+    }
+}
+
+/// 2 for usage and config errors, 1 for everything else.
+pub fn exit_status(error: &anyhow::Error) -> u8 {
+    let configuration = error.chain().any(|cause| {
+        cause.is::<ConfigError>()
+            || cause.is::<Usage>()
+            || matches!(cause.downcast_ref(), Some(EngineError::TauUnit | EngineError::NoDomain | EngineError::Render(_) | EngineError::Surrogate(_)))
+    });
+    if configuration { 2 } else { 1 }
+}
+
+/// The scene that paths on the command line mean: one TOML file, or data files by name.
+fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
+    let is_config = |p: &Path| p.extension().is_some_and(|e| e == "toml");
+    let mut scene = match paths {
+        [] => bail!(Usage("a scene file (.toml) or data files are needed".into())),
+        [one] if is_config(one) => SceneFile::read(one, &common.overrides)?,
+        many => {
+            if let Some(config) = many.iter().find(|p| is_config(p)) {
+                bail!(Usage(format!("{} is a scene file: give one scene file, or data files, not both", config.display())));
+            }
+            SceneFile::for_archive(many.to_vec(), &common.overrides)?
+        }
+    };
+    if let Some(seed) = common.seed {
+        scene.seed = seed;
+    }
+    Ok(scene)
+}
+
+/// A method by its name in scene files.
+fn method(word: &str) -> Result<ridgewatch::render::Method, String> {
+    use serde::Deserialize;
+    use serde::de::{IntoDeserializer, value::Error};
+    ridgewatch::render::Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word)).map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
+}
+
+/// Runs `work` on a pool of `--threads` threads.
+fn on_threads<T: Send>(common: &Common, work: impl FnOnce() -> T + Send) -> Result<T> {
+    Ok(rayon::ThreadPoolBuilder::new().num_threads(common.threads).build()?.install(work))
+}
+
+/// Prints the machine-readable result.
+#[allow(clippy::print_stdout)]
+fn print_json(value: &impl serde::Serialize) -> Result<()> {
+    println!("{}", serde_json::to_string_pretty(value)?);
+    Ok(())
+}
+
+/// Prints the result for people.
+#[allow(clippy::print_stdout)]
+fn print_text(text: impl std::fmt::Display) {
+    println!("{text}");
+}

@@ -1,0 +1,96 @@
+//! `ridgewatch render`.
+
+use super::{Common, Usage, messages, print_json, print_text, scene};
+use anyhow::{Context, Result, bail};
+use ridgewatch::engine::{self, Event, Frame, RunOptions, Setup};
+use ridgewatch::publish::{write_exr, write_preview};
+use ridgewatch::render::Method;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// Options of `render`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), or data files and globs.
+    #[arg(required = true, value_name = "CONFIG | FILES")]
+    paths: Vec<PathBuf>,
+    /// reference, surrogate (neural) or gated; overrides the scene's.
+    #[arg(long, value_parser = super::method)]
+    method: Option<Method>,
+    /// Samples a pixel; overrides the scene's.
+    #[arg(long, value_name = "N")]
+    spp: Option<usize>,
+    /// Frames rendered and thrown away first, with the scene's samples: they train the surrogate and tighten the majorants.
+    /// Without it: the scene's time.warmup_frames.
+    #[arg(long, value_name = "N")]
+    warmup: Option<usize>,
+    /// Checks the stated error on N fresh points.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    verify: usize,
+    /// Starts from a surrogate written by `replay --checkpoint`.
+    #[arg(long, value_name = "FILE")]
+    resume: Option<PathBuf>,
+    /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it.
+    #[arg(long, short, default_value = "render.exr")]
+    out: PathBuf,
+}
+
+/// Renders.
+pub fn run(common: &Common, options: Options) -> Result<()> {
+    let mut scene = scene(common, &options.paths)?;
+    if let Some(method) = options.method {
+        scene.render.method = method;
+    }
+    let extension = options.out.extension().and_then(|e| e.to_str()).unwrap_or("").to_ascii_lowercase();
+    if !["exr", "png"].contains(&extension.as_str()) {
+        bail!(Usage(format!("--out {}: accepted: a name that ends in .exr or .png", options.out.display())));
+    }
+    check_folder(&options.out)?;
+    if let Some(0) = options.spp {
+        bail!(Usage("--spp 0: accepted: 1 or more".into()));
+    }
+    let warmup_samples = scene.render.samples;
+    scene.render.samples = options.spp.unwrap_or(scene.render.samples);
+    scene.time.slides = Some(1);
+    scene.time.frames_per_slide = 1;
+    scene.time.warmup_frames = options.warmup.unwrap_or(scene.time.warmup_frames);
+    scene.training.resume = options.resume.clone().or(scene.training.resume);
+    let run_options = RunOptions {
+        verify_points: options.verify,
+        threads: common.threads,
+        warmup_samples: Some(warmup_samples),
+        ..RunOptions::default()
+    };
+    let bar = messages::progress(Some(100));
+    let mut picture: Option<Frame> = None;
+    let sink = &mut |event: Event| match event {
+        Event::Begin { notes, .. } => notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text))),
+        Event::Progress(share) => bar.set_position((share * 100.0) as u64),
+        Event::Frame(frame) => picture = Some(frame),
+    };
+    engine::run(Setup::new(scene)?, &run_options, sink, &AtomicBool::new(false))?;
+    bar.finish_and_clear();
+    let frame = picture.context("no frame was made")?;
+    if extension == "exr" {
+        write_exr(&options.out, &frame)?;
+        write_preview(&options.out.with_extension("png"), &frame)?;
+    } else {
+        write_preview(&options.out, &frame)?;
+    }
+    if common.json {
+        return print_json(&*frame.record);
+    }
+    for warning in &frame.record.warnings {
+        messages::note(warning);
+    }
+    print_text(format_args!("{}: {}", options.out.display(), super::replay::line(&frame.record)));
+    Ok(())
+}
+
+/// Fails before the work rather than after it.
+pub(super) fn check_folder(out: &Path) -> Result<()> {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
+    Ok(())
+}

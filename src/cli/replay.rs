@@ -1,0 +1,195 @@
+//! `ridgewatch replay`.
+
+use super::{Common, Usage, messages, print_json, print_text, scene};
+use anyhow::{Context, Result, bail};
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
+use ridgewatch::publish::{Output, OutputOptions};
+use ridgewatch::render::Method;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Options of `replay`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), or data files and globs that just get the defaults.
+    #[arg(required = true, value_name = "CONFIG | FILES")]
+    paths: Vec<PathBuf>,
+    /// Run folder.
+    #[arg(long, short, default_value = "out/run")]
+    out: PathBuf,
+    /// Replaces an earlier run in that folder.
+    #[arg(long)]
+    overwrite: bool,
+    /// Keeps only the newest N frames on disk.
+    #[arg(long, value_name = "N")]
+    keep: Option<usize>,
+    /// reference, surrogate (neural) or gated; overrides the scene's.
+    #[arg(long, value_parser = super::method)]
+    method: Option<Method>,
+    /// Publishes frames at this ZeroMQ endpoint, e.g. tcp://127.0.0.1:5577 (port 0: any free one, which is printed).
+    #[arg(long, value_name = "ENDPOINT")]
+    publish: Option<String>,
+    /// Checks each frame's stated error on N fresh points afterwards and records that too.
+    #[arg(long, value_name = "N", default_value_t = 0)]
+    verify: usize,
+    /// Writes the trained surrogate here at the end.
+    #[arg(long, value_name = "FILE")]
+    checkpoint: Option<PathBuf>,
+    /// Starts from a surrogate written by --checkpoint.
+    #[arg(long, value_name = "FILE")]
+    resume: Option<PathBuf>,
+}
+
+/// Replays.
+pub fn run(common: &Common, options: Options) -> Result<()> {
+    let mut scene = scene(common, &options.paths)?;
+    if let Some(method) = options.method {
+        scene.render.method = method;
+    }
+    if let Some(keep) = options.keep {
+        if keep == 0 {
+            bail!(Usage("--keep 0: accepted: 1 or more".into()));
+        }
+        scene.publish.keep = Some(keep);
+    }
+    scene.publish.endpoint = options.publish.clone().or(scene.publish.endpoint);
+    scene.training.resume = options.resume.clone().or(scene.training.resume);
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
+    runtime.block_on(replay(common, &options, scene))
+}
+
+async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
+    let setup = Setup::new(scene)?;
+    let scene = setup.scene.clone();
+    let output = Output::start(&scene.publish, OutputOptions { folder: Some(options.out.clone()), overwrite: options.overwrite }).await?;
+    if let Some(endpoint) = output.endpoint() {
+        messages::note(format_args!("publishing at {endpoint}"));
+    }
+    let stop = Arc::new(AtomicBool::new(false));
+    let signals = tokio::spawn(watch_signals(stop.clone()));
+    let run_options = RunOptions {
+        verify_points: options.verify,
+        threads: common.threads,
+        checkpoint: options.checkpoint.clone(),
+        ..RunOptions::default()
+    };
+    // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.
+    let sender = output.sender();
+    let worker = {
+        let stop = stop.clone();
+        tokio::task::spawn_blocking(move || {
+            let mut bar = messages::progress(None);
+            let mut last: Option<Arc<FrameRecord>> = None;
+            let result = engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &sender), &stop);
+            bar.finish_and_clear();
+            (result, last)
+        })
+    };
+    let (result, last) = worker.await.context("the cycle stopped unexpectedly")?;
+    signals.abort();
+    // Whatever happened, the frames made so far and their records are completed first.
+    let report = result.as_ref().ok().cloned();
+    let mut extra = serde_json::Map::new();
+    extra.insert("title".into(), scene.title.clone().into());
+    extra.insert("seed".into(), scene.seed.into());
+    if let Some(report) = &report {
+        extra.insert("run".into(), run_json(report));
+    }
+    if let Err(error) = &result {
+        extra.insert("failed".into(), error.to_string().into());
+    }
+    let summary = output.finish(extra).await;
+    let report = result?;
+    let summary = summary?;
+    if common.json {
+        return print_json(&summary);
+    }
+    if report.interrupted {
+        messages::note("stopped by a signal; the run folder is complete up to the last finished frame");
+    }
+    print_text(format_args!(
+        "{} frames of {} slides; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps",
+        report.frames,
+        report.slides,
+        report.integration_steps,
+        report.surrogate_bytes as f64 / 1e6,
+        report.train_steps
+    ));
+    if let Some(last) = last {
+        print_text(format_args!("last frame: {}", line(&last)));
+    }
+    print_text(format_args!("frames in {}", options.out.join("frames").display()));
+    Ok(())
+}
+
+fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<FrameRecord>>, sender: &ridgewatch::publish::FrameSender) {
+    match event {
+        Event::Begin { frames, notes } => {
+            *bar = messages::progress(frames);
+            for text in notes {
+                bar.suspend(|| messages::note(text));
+            }
+        }
+        Event::Progress(share) => bar.set_message(format!("frame {:3.0} %", share * 100.0)),
+        Event::Frame(frame) => {
+            for warning in &frame.record.warnings {
+                bar.suspend(|| messages::note(format_args!("frame {}: {warning}", frame.record.frame)));
+            }
+            tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
+            *last = Some(frame.record.clone());
+            sender.send(frame);
+            bar.inc(1);
+        }
+    }
+}
+
+/// A frame in one line.
+pub(super) fn line(record: &FrameRecord) -> String {
+    let mut text = match &record.date {
+        Some(date) => format!("{date}, "),
+        None => format!("t = {}, ", record.time),
+    };
+    text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries);
+    if let Some(error) = &record.trusted {
+        text += &format!(
+            ", error where trusted {:.4} [{:.4}, {:.4}] rms",
+            error.optical_rms, error.optical_rms_interval[0], error.optical_rms_interval[1]
+        );
+    }
+    if let Some(over) = record.over_tolerance {
+        text += &format!(", OVER TOLERANCE by {over:.4}");
+    }
+    text + &format!(", {:.2} s", record.seconds.total)
+}
+
+fn run_json(report: &RunReport) -> serde_json::Value {
+    serde_json::json!({
+        "frames": report.frames,
+        "slides": report.slides,
+        "interrupted": report.interrupted,
+        "waited_seconds": report.waited,
+        "optimizer_steps": report.train_steps,
+        "integration_steps": report.integration_steps,
+        "surrogate_bytes": report.surrogate_bytes,
+        "window_bytes_peak": report.window_bytes,
+    })
+}
+
+/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process.
+async fn watch_signals(stop: Arc<AtomicBool>) {
+    use tokio::signal::unix::{SignalKind, signal};
+    let (Ok(mut interrupt), Ok(mut terminate)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
+        messages::note("cannot watch for signals: an interrupt will end the run at once");
+        return;
+    };
+    loop {
+        let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
+        if stop.swap(true, Ordering::Relaxed) {
+            messages::note("stopped at once; the current frame is lost");
+            std::process::exit(status);
+        }
+        messages::note("finishing the current frame; once more to stop at once");
+    }
+}

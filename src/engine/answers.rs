@@ -1,0 +1,168 @@
+//! Answers the renderer's queries: the surrogate where the gate trusts it, RK4 elsewhere.
+
+use crate::field::Domain;
+use crate::flow::{Extras, Traced, Tracer};
+use crate::render::LogStretch;
+use crate::surrogate::{Samples, Surrogate};
+use crate::trust::Gate;
+use std::time::{Duration, Instant};
+
+/// Whom to ask, and what was found out on the way.
+pub struct Answers<'a> {
+    tracer: &'a dyn Tracer,
+    surrogate: Option<&'a dyn Surrogate>,
+    gate: &'a Gate,
+    /// Time after which even untrusted cells are answered by the surrogate.
+    trace_budget: Option<Duration>,
+    keep: usize,
+    keep_arrival: bool,
+    /// Traced queries, kept evenly over the frame (at most `keep`), with the log-stretch that was traced.
+    pub samples: Samples,
+    /// Figures of the frame so far.
+    pub tally: Tally,
+    traced: Traced,
+    scratch: Scratch,
+}
+
+/// Counts and times of one frame's answers.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Tally {
+    /// Queries answered.
+    pub queries: u64,
+    /// Of them by RK4.
+    pub traced: u64,
+    /// Queries of untrusted cells that the surrogate answered because the tracing budget was spent.
+    pub over_budget: u64,
+    /// Seconds spent tracing.
+    pub trace_seconds: f64,
+    /// Seconds spent predicting.
+    pub predict_seconds: f64,
+}
+
+#[derive(Default)]
+struct Scratch {
+    to_trace: Vec<u32>,
+    to_predict: Vec<u32>,
+    points: Vec<[f32; 3]>,
+    unit: Vec<[f32; 3]>,
+    values: Vec<f32>,
+}
+
+impl<'a> Answers<'a> {
+    /// Answers by RK4 alone where `surrogate` is none. At most `keep` traced samples are kept for training.
+    pub fn new(tracer: &'a dyn Tracer, surrogate: Option<&'a dyn Surrogate>, gate: &'a Gate, trace_budget: Option<f64>, keep: usize) -> Self {
+        Self {
+            tracer,
+            surrogate,
+            gate,
+            trace_budget: trace_budget.map(Duration::from_secs_f64),
+            keep,
+            keep_arrival: false,
+            samples: Samples::default(),
+            tally: Tally::default(),
+            traced: Traced::default(),
+            scratch: Scratch::default(),
+        }
+    }
+
+    /// Keeps arrival and Jacobian with each sample, for surrogates that learn the flow map.
+    pub fn with_flow_map(mut self, yes: bool) -> Self {
+        self.keep_arrival = yes;
+        self
+    }
+
+    fn domain(&self) -> &'a Domain {
+        self.tracer.domain()
+    }
+
+    fn budget_spent(&self) -> bool {
+        self.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget.as_secs_f64())
+    }
+
+    fn keep_samples(&mut self) {
+        // Every stride-th traced query: wavefront order mixes pixels, so this is an even draw.
+        let stride = (self.tally.traced as usize / self.keep.max(1)).max(1);
+        let room = self.keep.saturating_sub(self.samples.len());
+        let domain = self.domain();
+        let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
+        let chosen = (0..self.scratch.points.len()).step_by(stride).filter(|&i| self.traced.lived[i] > 0.0).take(room);
+        for i in chosen {
+            push_sample(&mut self.samples, domain, self.scratch.points[i], &self.traced, i, extras);
+        }
+    }
+}
+
+/// Appends traced seed `i` to `samples`, in unit coordinates.
+pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3], traced: &Traced, i: usize, extras: Extras) {
+    samples.points.push(domain.to_unit(point));
+    samples.log_stretch.push(traced.log_stretch[i]);
+    let extent = domain.extent();
+    if extras.arrival {
+        let arrival = traced.arrival[i];
+        samples.arrival.push(std::array::from_fn(|k| ((f64::from(arrival[k]) - domain.min[k]) / extent[k]) as f32));
+    }
+    if extras.jacobian {
+        let j = traced.jacobian[i];
+        samples.jacobian.push(std::array::from_fn(|e| (f64::from(j[e]) * extent[e % 3] / extent[e / 3]) as f32));
+    }
+}
+
+impl LogStretch for Answers<'_> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        self.tally.queries += points.len() as u64;
+        let domain = self.domain();
+        let mut scratch = std::mem::take(&mut self.scratch);
+        scratch.to_trace.clear();
+        scratch.to_predict.clear();
+        match self.surrogate {
+            None => scratch.to_trace.extend(0..points.len() as u32),
+            Some(_) => {
+                let spent = self.budget_spent();
+                for (i, &point) in points.iter().enumerate() {
+                    if self.tracer.is_void(point) {
+                        log_stretch[i] = f32::NAN;
+                        traced[i] = false;
+                    } else if self.gate.trusts(domain.to_unit(point)) {
+                        scratch.to_predict.push(i as u32);
+                    } else if spent {
+                        self.tally.over_budget += 1;
+                        scratch.to_predict.push(i as u32);
+                    } else {
+                        scratch.to_trace.push(i as u32);
+                    }
+                }
+            }
+        }
+        if let Some(surrogate) = self.surrogate.filter(|_| !scratch.to_predict.is_empty()) {
+            let start = Instant::now();
+            scratch.unit.clear();
+            scratch.unit.extend(scratch.to_predict.iter().map(|&i| domain.to_unit(points[i as usize])));
+            scratch.values.resize(scratch.unit.len(), 0.0);
+            surrogate.predict(&scratch.unit, &mut scratch.values);
+            for (&i, &value) in scratch.to_predict.iter().zip(&scratch.values) {
+                log_stretch[i as usize] = value;
+                traced[i as usize] = false;
+            }
+            self.tally.predict_seconds += start.elapsed().as_secs_f64();
+        }
+        if !scratch.to_trace.is_empty() {
+            let start = Instant::now();
+            scratch.points.clear();
+            scratch.points.extend(scratch.to_trace.iter().map(|&i| points[i as usize]));
+            let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
+            self.tracer.trace(&scratch.points, extras, &mut self.traced);
+            for (k, &i) in scratch.to_trace.iter().enumerate() {
+                // A particle that never lived started on land: there is no FTLE here.
+                log_stretch[i as usize] = if self.traced.lived[k] > 0.0 { self.traced.log_stretch[k] } else { f32::NAN };
+                traced[i as usize] = true;
+            }
+            self.tally.traced += scratch.to_trace.len() as u64;
+            self.tally.trace_seconds += start.elapsed().as_secs_f64();
+        }
+        let any_traced = !scratch.to_trace.is_empty();
+        self.scratch = scratch;
+        if any_traced && self.keep > 0 {
+            self.keep_samples();
+        }
+    }
+}

@@ -1,0 +1,91 @@
+//! Audit points: drawn evenly over the domain and traced whatever the gate says.
+
+use super::answers::push_sample;
+use crate::flow::{Extras, Traced, Tracer};
+use crate::render::{TransferFunction, rng::Counter};
+use crate::surrogate::{Samples, Surrogate};
+use crate::trust::{Gate, Residual, TrustedError};
+
+/// Stratified uniform points in the unit cube: `per_cell` in each of `cells`, jittered.
+pub fn stratified_points(cells: [usize; 3], per_cell: usize, seed: u64, stream: u64) -> Vec<[f32; 3]> {
+    let counter = Counter::new(seed, stream);
+    let mut points = Vec::with_capacity(cells.iter().product::<usize>() * per_cell);
+    for cell in 0..cells.iter().product::<usize>() {
+        let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
+        for _ in 0..per_cell {
+            let n = points.len() as u32;
+            points.push(std::array::from_fn(|k| (index[k] as f32 + counter.uniform(n, k as u32)) / cells[k] as f32));
+        }
+    }
+    points
+}
+
+/// Traced audit points, voids (land) left out.
+pub struct Audit {
+    /// As labelled samples for the ring.
+    pub samples: Samples,
+    /// Points drawn, voids included.
+    pub drawn: usize,
+    /// Mean lived share over points that lived at all.
+    pub lived_share: f64,
+}
+
+/// Traces `unit` points.
+pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
+    let domain = tracer.domain();
+    let points: Vec<[f32; 3]> = unit.iter().map(|&u| domain.from_unit(u)).collect();
+    let extras = Extras { arrival: flow_map, jacobian: flow_map };
+    let mut traced = Traced::default();
+    tracer.trace(&points, extras, &mut traced);
+    let mut samples = Samples::default();
+    let mut lived = 0.0;
+    for (i, &point) in points.iter().enumerate() {
+        if traced.lived[i] > 0.0 {
+            push_sample(&mut samples, domain, point, &traced, i, extras);
+            lived += f64::from(traced.lived[i]);
+        }
+    }
+    let lived_share = lived / samples.len().max(1) as f64;
+    Audit { samples, drawn: points.len(), lived_share }
+}
+
+/// Residuals of `surrogate` on traced samples that it has not seen. `tau` turns log-stretch into FTLE for the ramp.
+pub fn residuals(surrogate: &dyn Surrogate, samples: &Samples, transfer: &TransferFunction, tau: f64) -> Vec<Residual> {
+    let mut predicted = vec![0.0; samples.len()];
+    surrogate.predict(&samples.points, &mut predicted);
+    let ramp = |s: f32| transfer.ramp(s / tau as f32);
+    let pairs = predicted.iter().zip(&samples.log_stretch).zip(&samples.points);
+    pairs
+        .filter(|((_, traced), _)| traced.is_finite())
+        .map(|((&predicted, &traced), &point)| {
+            // A prediction that is no number is as wrong as can be.
+            let optical = if predicted.is_finite() { (ramp(predicted) - ramp(traced)).abs() } else { 1.0 };
+            let log_stretch = if predicted.is_finite() { predicted - traced } else { traced.abs() };
+            Residual { point, optical, log_stretch }
+        })
+        .collect()
+}
+
+/// Error over the residuals whose points the gate trusts.
+pub fn trusted_error(residuals: &[Residual], gate: &Gate) -> Option<TrustedError> {
+    let trusted: Vec<Residual> = residuals.iter().copied().filter(|r| gate.trusts(r.point)).collect();
+    TrustedError::of(&trusted)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn every_cell_gets_its_points() {
+        let cells = [4, 3, 1];
+        let points = stratified_points(cells, 5, 7, 9);
+        let mut count = [0; 12];
+        for p in &points {
+            assert!(p.iter().all(|u| (0.0..1.0).contains(u)));
+            count[(p[1] * 3.0) as usize * 4 + (p[0] * 4.0) as usize] += 1;
+        }
+        assert_eq!(count, [5; 12]);
+        assert_ne!(points, stratified_points(cells, 5, 7, 10), "another frame draws other points");
+    }
+}

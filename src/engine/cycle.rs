@@ -1,0 +1,421 @@
+//! The cycle: slide, render with the weights of the cycle before, test, then train.
+//!
+//! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames
+//! before. Samples traced for frame n are held against the frozen weights, which have not seen them, before they go to the ring.
+
+use super::answers::Answers;
+use super::audit;
+use super::feed::Slide;
+use super::setup::Setup;
+use super::{EngineError, Frame, FrameRecord, StageSeconds};
+use crate::config::TrainingSettings;
+use crate::flow::{Tracer, cpu_tracer};
+use crate::render::{Method, Renderer, Scene, TransferFunction, TransferSettings};
+use crate::surrogate::{Kind, Learned, SampleRing, Samples, Surrogate, network::Target};
+use crate::trust::{Gate, TrustMap};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// What a run may be told besides its scene.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
+    pub verify_points: usize,
+    /// Worker threads; 0: all that the process may use.
+    pub threads: usize,
+    /// Where to write the trained surrogate at the end.
+    pub checkpoint: Option<PathBuf>,
+    /// Samples a pixel of warm-up frames; none: the scene's.
+    pub warmup_samples: Option<usize>,
+}
+
+/// What a run tells while it goes.
+pub enum Event {
+    /// Before the first frame: frames to come, where known.
+    Begin {
+        /// How many.
+        frames: Option<u64>,
+        /// What should be known.
+        notes: Vec<String>,
+    },
+    /// A finished frame.
+    Frame(Frame),
+    /// Share of the current frame that is rendered.
+    Progress(f32),
+}
+
+/// What a run came to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RunReport {
+    /// Frames made.
+    pub frames: u64,
+    /// Slides seen.
+    pub slides: u64,
+    /// Whether it was stopped from outside.
+    pub interrupted: bool,
+    /// Seconds spent waiting for input.
+    pub waited: f64,
+    /// Optimizer steps.
+    pub train_steps: u64,
+    /// Runge-Kutta steps a path.
+    pub integration_steps: usize,
+    /// Size of the surrogate, bytes.
+    pub surrogate_bytes: usize,
+    /// Largest size of the window, bytes.
+    pub window_bytes: usize,
+}
+
+/// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
+const RENDER_RESIDUALS: usize = 1 << 16;
+
+struct Threads {
+    render: rayon::ThreadPool,
+    train: Option<rayon::ThreadPool>,
+}
+
+impl Threads {
+    /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
+    fn new(threads: usize, share: f64, learns: bool) -> Result<Self, EngineError> {
+        let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
+        let pool = |n: usize, name: &'static str| {
+            rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
+        };
+        if !learns || all == 1 || share == 0.0 {
+            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None });
+        }
+        let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
+        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pool(train, "ridgewatch-train")?) })
+    }
+}
+
+/// The state that goes from frame to frame.
+struct Cycle<'a> {
+    setup: &'a Setup,
+    options: &'a RunOptions,
+    threads: Threads,
+    renderer: Renderer,
+    transfer: TransferFunction,
+    trust: TrustMap,
+    ring: SampleRing,
+    live: Option<Box<dyn Surrogate>>,
+    frame: u64,
+    report: RunReport,
+}
+
+/// Runs the whole scene. `sink` gets every event; `stop` ends the run after the current frame.
+pub fn run(mut setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
+    let time = &setup.scene.time;
+    let frames = setup.slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    sink(Event::Begin { frames, notes: std::mem::take(&mut setup.notes) });
+    let first = setup.feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
+    let feed = std::mem::replace(&mut setup.feed, super::feed::Feed::ended());
+    let mut feed = feed;
+    let mut tracer = cpu_tracer(first.velocity.clone(), &setup.map, first.time)?;
+    let mut cycle = Cycle::new(&setup, options, &*tracer, &first)?;
+    let mut slide = first;
+    loop {
+        let extra = if slide.index == 0 { setup.scene.time.warmup_frames } else { 0 };
+        for number in 0..setup.scene.time.frames_per_slide + extra {
+            if stop.load(Ordering::Relaxed) {
+                cycle.report.interrupted = true;
+                return cycle.finish();
+            }
+            let frame = cycle.frame(&*tracer, &mut slide, number == 0, sink)?;
+            sink(Event::Frame(frame));
+        }
+        if stop.load(Ordering::Relaxed) {
+            cycle.report.interrupted = true;
+            return cycle.finish();
+        }
+        let Some(next) = feed.next_slide()? else { return cycle.finish() };
+        slide = next;
+        // The number of steps is settled once, on the first slide, so that frames compare.
+        let mut map = setup.map.clone();
+        map.steps = crate::flow::Steps::Fixed(tracer.steps());
+        tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
+        cycle.slid(&*tracer);
+    }
+}
+
+impl<'a> Cycle<'a> {
+    fn new(setup: &'a Setup, options: &'a RunOptions, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
+        let scene = &setup.scene;
+        let (transfer_settings, transfer) = settle_transfer(setup, tracer, first.time)?;
+        let renderer = Renderer::new(render_scene(setup, transfer_settings), &setup.domain, setup.map.tau)?;
+        let method = scene.render.method;
+        let mut live = if method == Method::Reference {
+            None
+        } else {
+            Some(crate::surrogate::build(&scene.surrogate, &scene.network, &setup.domain, scene.seed, tracer)?)
+        };
+        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live) {
+            surrogate.load(path)?;
+        }
+        let learns = live.as_ref().is_some_and(|s| s.learns());
+        Ok(Self {
+            setup,
+            options,
+            threads: Threads::new(options.threads, scene.training.share, learns)?,
+            renderer,
+            transfer,
+            trust: TrustMap::new(&scene.trust, &setup.domain),
+            ring: SampleRing::new(scene.training.ring, scene.seed),
+            live,
+            frame: 0,
+            report: RunReport { integration_steps: tracer.steps(), ..RunReport::default() },
+        })
+    }
+
+    fn wants_flow_map(&self) -> bool {
+        self.setup.scene.network.target == Target::FlowMap && self.setup.scene.surrogate.kind != Kind::Table
+    }
+
+    /// The window moved: tables are traced anew, weights carry over, labels are old, trust must be earned again.
+    fn slid(&mut self, tracer: &dyn Tracer) {
+        if let Some(live) = &mut self.live {
+            self.threads.render.install(|| live.window_slid(tracer));
+            self.trust.window_slid();
+            self.ring.mark_stale();
+        }
+        self.renderer.window_slid();
+    }
+
+    fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, first_of_slide: bool, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
+        let start = Instant::now();
+        let scene = &self.setup.scene;
+        let method = scene.render.method;
+        let gate = match method {
+            Method::Gated => self.trust.gate(),
+            Method::Reference => Gate::uniform(false),
+            Method::Surrogate => Gate::uniform(true),
+        };
+        // Frozen weights: what is rendered with has not seen this frame's samples.
+        let front: Option<Arc<dyn Surrogate>> = self.live.as_ref().map(|live| live.freeze());
+        let per_cell = scene.trust.audit_per_cell;
+        let cells = self.trust.shape();
+        let rendered = AtomicBool::new(false);
+        let (mut learned, mut work) = (None, None);
+        {
+            let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
+            let (renderer, frame, seed) = (&mut self.renderer, self.frame, scene.seed);
+            let flow_map = scene.network.target == Target::FlowMap && scene.surrogate.kind != Kind::Table;
+            std::thread::scope(|scope| {
+                let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
+                    let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
+                    match &threads.train {
+                        Some(pool) => Trainer::Beside(scope.spawn(move || pool.install(|| train(&mut **live, ring.samples(), settings, Some(rendered))))),
+                        None => Trainer::After(live, ring),
+                    }
+                });
+                let mut render = || {
+                    let mut answers =
+                        Answers::new(tracer, front.as_deref(), &gate, scene.trust.trace_budget, if front.is_some() { scene.training.ring } else { 0 })
+                            .with_flow_map(flow_map);
+                    let progress = std::sync::Mutex::new(&mut *sink);
+                    let report = |share: f32| {
+                        if let Ok(mut sink) = progress.lock() {
+                            (*sink)(Event::Progress(share));
+                        }
+                    };
+                    let walk = Instant::now();
+                    let (film, stats) = renderer.render(frame, &mut answers, scene.render.samples, Some(&report), &AtomicBool::new(false));
+                    let render_seconds = walk.elapsed().as_secs_f64();
+                    let (tally, samples) = (answers.tally, answers.samples);
+                    let auditing = Instant::now();
+                    let per_cell = front.as_ref().map_or(1, |_| {
+                        let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
+                        per_cell.max(wanted.div_ceil(cells.iter().product()))
+                    });
+                    let unit = audit::stratified_points(cells, per_cell, seed, 2 * frame);
+                    let audit = audit::trace(tracer, &unit, flow_map);
+                    let residuals = front.as_deref().map(|front| audit::residuals(front, &audit.samples, &self.transfer, tracer.tau()));
+                    Rendered { film, stats, tally, samples, audit, residuals, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() }
+                };
+                work = Some(threads.render.install(&mut render));
+                rendered.store(true, Ordering::Release);
+                learned = match training {
+                    Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
+                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| train(&mut **live, ring.samples(), &scene.training, None))),
+                    None => None,
+                };
+            });
+        }
+        let Some(work) = work else { return Err(EngineError::EndedEarly) };
+        let auditing = Instant::now();
+        let mut record = FrameRecord {
+            frame: self.frame,
+            slide: slide.index,
+            time: slide.time,
+            date: slide.date.clone(),
+            tau: tracer.tau(),
+            direction: match self.setup.map.direction {
+                crate::flow::Direction::Forward => "forward".into(),
+                crate::flow::Direction::Backward => "backward".into(),
+            },
+            method: match method {
+                Method::Reference => "reference".into(),
+                Method::Surrogate => "surrogate".into(),
+                Method::Gated => "gated".into(),
+            },
+            surrogate: front.as_ref().map(|s| s.name().to_owned()),
+            size: [work.film.width, work.film.height],
+            samples_per_pixel: scene.render.samples,
+            queries: work.tally.queries,
+            traced: work.tally.traced,
+            traced_share: work.tally.traced as f64 / work.tally.queries.max(1) as f64,
+            audited: work.audit.drawn as u64,
+            lived_share: work.audit.lived_share,
+            majorant_exceeded: work.stats.majorant_exceeded,
+            warnings: std::mem::take(&mut slide.warnings),
+            ..FrameRecord::default()
+        };
+        if let (Some(front), Some(audited)) = (front.as_deref(), &work.residuals) {
+            record.trusted_share = gate.share();
+            record.trusted = audit::trusted_error(audited, &gate);
+            // Over budget the surrogate answers everywhere, so all audit points speak for the picture.
+            let answering = if work.tally.over_budget > 0 { crate::trust::TrustedError::of(audited) } else { record.trusted };
+            record.over_tolerance = answering.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0);
+            if work.tally.over_budget > 0 {
+                record.warnings.push(format!("the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate", work.tally.over_budget));
+            }
+            if self.options.verify_points > 0 {
+                let per_cell = self.options.verify_points.div_ceil(cells.iter().product());
+                let unit = audit::stratified_points(cells, per_cell, scene.seed, 2 * self.frame + 1);
+                record.verified = self.threads.render.install(|| {
+                    let fresh = audit::trace(tracer, &unit, false);
+                    audit::trusted_error(&audit::residuals(front, &fresh.samples, &self.transfer, tracer.tau()), &gate)
+                });
+            }
+            let mut residuals = audited.clone();
+            let stride = work.samples.len().div_ceil(RENDER_RESIDUALS).max(1);
+            let some = every(&work.samples, stride);
+            residuals.extend(self.threads.render.install(|| audit::residuals(front, &some, &self.transfer, tracer.tau())));
+            self.trust.observe(&residuals);
+            if first_of_slide && slide.index > 0 {
+                // Old labels stay only where the new window's traces say that they still hold.
+                self.threads.render.install(|| self.ring.revalidate(tracer, scene.trust.tolerance, &self.transfer));
+            }
+            self.ring.push(&work.audit.samples);
+            self.ring.push(&work.samples);
+        }
+        let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
+        if let Some(learned) = &learned {
+            self.report.train_steps += learned.steps;
+            if learned.rollbacks > 0 {
+                record.warnings.push(format!("training diverged {} time(s): rolled back to the last good weights at a lower rate", learned.rollbacks));
+            }
+        }
+        record.training = learned;
+        record.ring = self.ring.len() as u64;
+        record.seconds = StageSeconds {
+            waiting: std::mem::take(&mut slide.waited),
+            render: work.render_seconds - work.tally.trace_seconds - work.tally.predict_seconds,
+            trace: work.tally.trace_seconds,
+            predict: work.tally.predict_seconds,
+            audit: work.audit_seconds + auditing.elapsed().as_secs_f64(),
+            train: train_seconds,
+            total: start.elapsed().as_secs_f64(),
+        };
+        self.report.frames += 1;
+        self.report.waited += record.seconds.waiting;
+        self.report.slides = slide.index + 1;
+        self.frame += 1;
+        Ok(Frame { record: Arc::new(record), film: Arc::new(work.film), tone_map: scene.render.tone_map })
+    }
+
+    fn finish(mut self) -> Result<RunReport, EngineError> {
+        if let (Some(path), Some(live)) = (&self.options.checkpoint, &self.live) {
+            live.save(path)?;
+        }
+        self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
+        Ok(self.report)
+    }
+}
+
+/// What the rendering threads hand back.
+struct Rendered {
+    film: crate::render::Film,
+    stats: crate::render::RenderStats,
+    tally: super::answers::Tally,
+    samples: Samples,
+    audit: audit::Audit,
+    residuals: Option<Vec<crate::trust::Residual>>,
+    render_seconds: f64,
+    audit_seconds: f64,
+}
+
+enum Trainer<'scope, 'b> {
+    Beside(std::thread::ScopedJoinHandle<'scope, Learned>),
+    After(&'b mut Box<dyn Surrogate>, &'b SampleRing),
+}
+
+/// Trains in slices until the frame is rendered and the frame's share of training is done.
+fn train(live: &mut dyn Surrogate, samples: &Samples, settings: &TrainingSettings, rendered: Option<&AtomicBool>) -> Learned {
+    if let Some(steps) = settings.steps_per_frame {
+        return live.learn(samples, f64::INFINITY, steps);
+    }
+    const SLICE: f64 = 0.1;
+    let start = Instant::now();
+    let mut sum = Learned::default();
+    let mut losses = (0.0, 0.0);
+    loop {
+        let left = settings.seconds_per_frame - start.elapsed().as_secs_f64();
+        if left <= 0.0 && rendered.is_none_or(|done| done.load(Ordering::Acquire)) {
+            break;
+        }
+        let slice = live.learn(samples, if rendered.is_some() { SLICE } else { left.min(SLICE) }, u64::MAX);
+        if slice.steps == 0 {
+            break;
+        }
+        sum.steps += slice.steps;
+        sum.samples += slice.samples;
+        sum.dropped += slice.dropped;
+        sum.rollbacks += slice.rollbacks;
+        if let Some(loss) = slice.loss {
+            losses = (losses.0 + loss * slice.steps as f64, losses.1 + slice.steps as f64);
+        }
+    }
+    sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
+    sum.seconds = start.elapsed().as_secs_f64();
+    sum
+}
+
+fn every(samples: &Samples, stride: usize) -> Samples {
+    Samples {
+        points: samples.points.iter().copied().step_by(stride).collect(),
+        log_stretch: samples.log_stretch.iter().copied().step_by(stride).collect(),
+        ..Samples::default()
+    }
+}
+
+/// The transfer function of the run: as given, or scaled to the FTLE of the first slide and kept for the whole run, so that
+/// colours compare.
+fn settle_transfer(setup: &Setup, tracer: &dyn Tracer, time: f64) -> Result<(TransferSettings, TransferFunction), EngineError> {
+    let mut settings = setup.scene.transfer.clone().unwrap_or_else(TransferSettings::published_colours);
+    if settings.low.is_none() || settings.high.is_none() {
+        const PROBES: usize = 64;
+        let z = if setup.domain.dimensions == 3 { 16 } else { 1 };
+        let unit = audit::stratified_points([PROBES, PROBES, z], 1, setup.scene.seed, u64::MAX);
+        let mut ftle: Vec<f32> =
+            audit::trace(tracer, &unit, false).samples.log_stretch.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
+        if ftle.is_empty() {
+            return Err(EngineError::AllMissing { points: unit.len(), time });
+        }
+        settings.scale_to(&mut ftle);
+    }
+    let transfer = TransferFunction::new(&settings, &setup.domain)?;
+    Ok((settings, transfer))
+}
+
+fn render_scene(setup: &Setup, transfer: TransferSettings) -> Scene {
+    let scene = &setup.scene;
+    Scene {
+        camera: scene.camera.clone().unwrap_or_else(|| crate::render::CameraSettings::overview(&setup.domain)),
+        light: scene.light.clone().unwrap_or_else(|| crate::render::LightSettings::overview(&setup.domain)),
+        transfer,
+        settings: scene.render.clone(),
+        seed: scene.seed,
+    }
+}

@@ -1,0 +1,61 @@
+//! Why a run could not start or go on.
+
+use crate::flow::FlowError;
+use crate::render::RenderError;
+use crate::source::SourceError;
+use crate::surrogate::{CheckpointError, SurrogateError};
+use thiserror::Error;
+
+/// Why a run could not start or go on.
+#[derive(Debug, Error)]
+pub enum EngineError {
+    /// The source.
+    #[error(transparent)]
+    Source(#[from] SourceError),
+    /// The flow map.
+    #[error(transparent)]
+    Flow(#[from] FlowError),
+    /// The picture's settings.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// The surrogate's settings.
+    #[error(transparent)]
+    Surrogate(#[from] SurrogateError),
+    /// A checkpoint.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// A closed form without a box.
+    #[error("a closed form needs [domain] with min and max")]
+    NoDomain,
+    /// "30 days" where time has no seconds.
+    #[error("time.tau has a unit, but the source's time is not in seconds (with the index metric it counts snapshots): give a plain number")]
+    TauUnit,
+    /// The archive is shorter than tau.
+    #[error(
+        "the archive is too short: tau = {tau} needs at least {needed} snapshots, {found} are there (they span {span}); give a shorter time.tau or more files"
+    )]
+    TooFewSnapshots {
+        /// |tau|.
+        tau: f64,
+        /// From the first to the last time.
+        span: f64,
+        /// Snapshots that tau needs at the archive's spacing.
+        needed: usize,
+        /// Snapshots there.
+        found: usize,
+    },
+    /// The source gave fewer snapshots than its times promised.
+    #[error("the source ended before its window was full")]
+    EndedEarly,
+    /// Every point is land.
+    #[error("no velocity anywhere: all {points} points probed at time {time} lie on missing cells")]
+    AllMissing {
+        /// Points probed.
+        points: usize,
+        /// Their time.
+        time: f64,
+    },
+    /// The thread pool.
+    #[error("cannot start worker threads: {0}")]
+    Threads(#[from] rayon::ThreadPoolBuildError),
+}

@@ -1,0 +1,212 @@
+//! One velocity after another: the slides of the window.
+
+use super::EngineError;
+use crate::config::{SceneFile, SourceKind, SourceSettings};
+use crate::field::analytic::Analytic;
+use crate::field::turbulence::{Turbulence, TurbulenceSettings};
+use crate::field::{Domain, Window};
+use crate::flow::{Direction, VelocitySource};
+use crate::source::{MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, read_ahead};
+use std::sync::Arc;
+use std::time::Instant;
+
+/// One position of the window.
+pub struct Slide {
+    /// From 0.
+    pub index: u64,
+    /// Seed time t0.
+    pub time: f64,
+    /// The same as a date, where the source has a calendar.
+    pub date: Option<String>,
+    /// What is integrated.
+    pub velocity: VelocitySource,
+    /// What was odd on the way here.
+    pub warnings: Vec<String>,
+    /// Seconds spent waiting for snapshots.
+    pub waited: f64,
+}
+
+/// Where slides come from.
+pub enum Feed {
+    /// Closed form: the seed time moves.
+    Closed {
+        /// The flow.
+        flow: Analytic,
+        /// Its box.
+        domain: Domain,
+        /// Seed time of the first slide.
+        start: f64,
+        /// How far it moves.
+        step: f64,
+        /// Slides given so far.
+        given: u64,
+        /// Slides to give.
+        slides: u64,
+    },
+    /// Snapshots: the window moves.
+    Archive {
+        /// Read ahead by one I/O thread.
+        reader: ReadAhead,
+        /// Dates of times.
+        dates: Arc<dyn Fn(f64) -> Option<String> + Send + Sync>,
+        /// The sliding window.
+        window: Window,
+        /// Forward seeds start at the oldest time, backward ones at the newest.
+        direction: Direction,
+        /// Snapshots a slide.
+        stride: usize,
+        /// Slides given so far.
+        given: u64,
+        /// Slides to give at most.
+        slides: u64,
+        /// Snapshots taken in since the last slide.
+        taken: usize,
+        /// Warnings since the last slide.
+        warnings: Vec<String>,
+    },
+}
+
+/// The closed form that `[source]` describes; none for gridded kinds.
+pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
+    let or = |given: Option<f64>, default: f64| given.unwrap_or(default);
+    Some(match source.kind {
+        SourceKind::DoubleGyre => Analytic::DoubleGyre {
+            amplitude: or(source.amplitude, 0.1),
+            epsilon: or(source.epsilon, 0.25),
+            omega: or(source.omega, std::f64::consts::TAU / 10.0),
+        },
+        SourceKind::Abc => Analytic::Abc {
+            a: or(source.a, 3f64.sqrt()),
+            b: or(source.b, 2f64.sqrt()),
+            c: or(source.c, 1.0),
+            growth: or(source.growth, 0.0),
+        },
+        SourceKind::Saddle => Analytic::Saddle { rate: or(source.rate, 1.0) },
+        SourceKind::Rotation => Analytic::Rotation { omega: or(source.omega, 1.0) },
+        SourceKind::Shear => Analytic::Shear { rate: or(source.rate, 1.0) },
+        SourceKind::Turbulence | SourceKind::Archive => return None,
+    })
+}
+
+/// A gridded source, opened.
+pub fn open_snapshots(scene: &SceneFile) -> Result<Box<dyn SnapshotSource>, EngineError> {
+    let source = &scene.source;
+    if source.kind == SourceKind::Archive {
+        return Ok(Box::new(NetCdfArchive::open(&scene.archive)?));
+    }
+    let settings = TurbulenceSettings {
+        nodes: source.nodes.unwrap_or([96, 48, 48]),
+        modes: source.modes.unwrap_or(48),
+        k_max: source.k_max.unwrap_or(14.0),
+        amplitude: source.amplitude.unwrap_or(3.0),
+        seed: scene.seed,
+    };
+    let turbulence = Turbulence::new(&settings);
+    let times = (0..source.snapshots.unwrap_or(12)).map(|t| t as f64).collect();
+    Ok(Box::new(MemorySource::new(turbulence.grid(), times, move |time| turbulence.snapshot(time))))
+}
+
+impl Feed {
+    /// The feed of a scene whose |tau| is known.
+    pub fn open(scene: &SceneFile, snapshots: Option<Box<dyn SnapshotSource>>, tau: f64, direction: Direction) -> Result<Self, EngineError> {
+        let slides = scene.time.slides.map(|n| n as u64);
+        match (closed_form(&scene.source), snapshots) {
+            (Some(flow), _) => {
+                let box_ = scene.domain.as_ref().ok_or(EngineError::NoDomain)?;
+                let domain = Domain { min: box_.min, max: box_.max, dimensions: flow.dimensions() };
+                Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
+            }
+            (None, Some(source)) => {
+                let times = source.times();
+                check_covered(times, tau)?;
+                let dates = source.dates();
+                let range = 0..times.len();
+                Ok(Feed::Archive {
+                    reader: read_ahead(source, range, 2),
+                    dates,
+                    window: Window::new(tau),
+                    direction,
+                    stride: scene.time.stride,
+                    given: 0,
+                    slides: slides.unwrap_or(u64::MAX),
+                    taken: 0,
+                    warnings: Vec::new(),
+                })
+            }
+            (None, None) => Err(EngineError::NoDomain),
+        }
+    }
+
+    /// The next slide; none when the source has ended.
+    pub fn next_slide(&mut self) -> Result<Option<Slide>, EngineError> {
+        match self {
+            Feed::Closed { flow, domain, start, step, given, slides } => {
+                if *given == *slides {
+                    return Ok(None);
+                }
+                let time = *start + *step * *given as f64;
+                *given += 1;
+                Ok(Some(Slide {
+                    index: *given - 1,
+                    time,
+                    date: None,
+                    velocity: VelocitySource::Analytic(flow.clone(), domain.clone()),
+                    warnings: Vec::new(),
+                    waited: 0.0,
+                }))
+            }
+            Feed::Archive { reader, dates, window, direction, stride, given, slides, taken, warnings } => {
+                if *given == *slides {
+                    return Ok(None);
+                }
+                let start = Instant::now();
+                while !(window.is_full() && (*given == 0 || *taken >= *stride)) {
+                    let Some(snapshot) = reader.next() else { return Ok(None) };
+                    match window.push(snapshot?) {
+                        Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
+                        Err(fault) => warnings.push(fault.to_string()),
+                    }
+                    *taken += 1;
+                }
+                *taken = 0;
+                *given += 1;
+                let ends = match direction {
+                    Direction::Forward => window.oldest(),
+                    Direction::Backward => window.newest(),
+                };
+                let time = ends.unwrap_or(f64::NAN);
+                Ok(Some(Slide {
+                    index: *given - 1,
+                    time,
+                    date: dates(time),
+                    velocity: VelocitySource::Window(Arc::new(window.clone())),
+                    warnings: std::mem::take(warnings),
+                    waited: start.elapsed().as_secs_f64(),
+                }))
+            }
+        }
+    }
+
+    /// Slides that will come in all, where that is known.
+    pub fn expected_slides(&self, times: Option<&[f64]>, tau: f64) -> Option<u64> {
+        match self {
+            Feed::Closed { slides, .. } => Some(*slides),
+            Feed::Archive { slides, stride, .. } => {
+                let times = times?;
+                let first = times.iter().position(|t| t - times[0] >= tau * (1.0 - 1e-9))?;
+                Some((*slides).min(((times.len() - 1 - first) / *stride + 1) as u64))
+            }
+        }
+    }
+}
+
+/// Whether the times cover one integration; the error says how many snapshots that would take.
+fn check_covered(times: &[f64], tau: f64) -> Result<(), EngineError> {
+    let span = times.last().copied().unwrap_or(0.0) - times.first().copied().unwrap_or(0.0);
+    if times.len() >= 2 && span >= tau * (1.0 - 1e-9) {
+        return Ok(());
+    }
+    let interval = span / (times.len().max(2) - 1) as f64;
+    let needed = if interval > 0.0 { (tau / interval - 1e-9).ceil() as usize + 1 } else { 2 };
+    Err(EngineError::TooFewSnapshots { tau, span, needed: needed.max(2), found: times.len() })
+}

@@ -1,0 +1,87 @@
+//! From a scene file to everything a run needs, checked before any work is done.
+
+use super::EngineError;
+use super::feed::{Feed, closed_form, open_snapshots};
+use crate::config::{SceneFile, SourceKind, StepsSetting};
+use crate::field::Domain;
+use crate::flow::{Boundary, Direction, FlowMap, Steps};
+
+/// A scene whose open questions (tau, direction, boundary, domain) are answered.
+pub struct Setup {
+    /// The file.
+    pub scene: SceneFile,
+    /// The flow map, but for its start time.
+    pub map: FlowMap,
+    /// Where seeds lie.
+    pub domain: Domain,
+    /// The slides of the window.
+    pub feed: Feed,
+    /// Slides to come, where known.
+    pub slides: Option<u64>,
+    /// What should be told before work starts.
+    pub notes: Vec<String>,
+}
+
+impl Setup {
+    /// Opens the source and settles what the scene leaves open.
+    pub fn new(scene: SceneFile) -> Result<Self, EngineError> {
+        let mut notes = Vec::new();
+        let closed = closed_form(&scene.source);
+        let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
+        let archive = scene.source.kind == SourceKind::Archive;
+        let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
+        let tau = match (&scene.time.tau, &snapshots) {
+            (Some(tau), source) => {
+                if tau.has_unit() && source.as_ref().is_some_and(|s| !s.time_in_seconds()) {
+                    return Err(EngineError::TauUnit);
+                }
+                tau.value().ok_or(EngineError::TauUnit)?
+            }
+            (None, Some(source)) => {
+                let tau = default_tau(source.times())?;
+                notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", if source.time_in_seconds() { "seconds" } else { "snapshots" }));
+                tau
+            }
+            (None, None) => return Err(EngineError::TauUnit),
+        };
+        let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
+            SourceKind::Archive => Boundary::Stop,
+            SourceKind::Turbulence => Boundary::Clamp,
+            _ => Boundary::Unbounded,
+        });
+        let map = FlowMap {
+            tau,
+            direction,
+            integrator: scene.flow.integrator,
+            precision: scene.flow.precision,
+            steps: match scene.flow.steps {
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance },
+                StepsSetting::Fixed(n) => Steps::Fixed(n),
+            },
+            gap: scene.flow.gap,
+            boundary,
+            normalisation: scene.flow.normalisation,
+            interpolation: scene.flow.interpolation,
+        };
+        let domain = match (&closed, &scene.domain, &snapshots) {
+            (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },
+            (_, _, Some(source)) => source.grid().domain(),
+            _ => return Err(EngineError::NoDomain),
+        };
+        let times = snapshots.as_ref().map(|s| s.times().to_vec());
+        let feed = Feed::open(&scene, snapshots, tau, direction)?;
+        let slides = feed.expected_slides(times.as_deref(), tau);
+        Ok(Self { scene, map, domain, feed, slides, notes })
+    }
+}
+
+/// Half of the span, at least two intervals.
+fn default_tau(times: &[f64]) -> Result<f64, EngineError> {
+    if times.len() < 3 {
+        return Err(EngineError::TooFewSnapshots { tau: f64::NAN, span: 0.0, needed: 3, found: times.len() });
+    }
+    let span = times[times.len() - 1] - times[0];
+    // A whole number of snapshots, so that no window is held for a fraction of an interval.
+    let half = times.iter().rev().find(|t| *t - times[0] <= span / 2.0 + span * 1e-9).copied().unwrap_or(times[2]);
+    Ok((half - times[0]).max(times[2] - times[0]))
+}
