@@ -1,0 +1,46 @@
+//! What can be wrong with a scene.
+
+use thiserror::Error;
+
+/// Why a scene cannot be rendered, or two films cannot be merged.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum RenderError {
+    /// A setting is out of range.
+    #[error("`{key}` is {found}; accepted: {accepted}")]
+    Invalid {
+        /// Key in the scene file, e.g. `render.width`.
+        key: &'static str,
+        /// What was found.
+        found: String,
+        /// What is accepted.
+        accepted: &'static str,
+    },
+    /// Films of different size cannot be merged.
+    #[error("a film of {found:?} pixels cannot be merged into one of {expected:?}")]
+    FilmSize {
+        /// Width and height of the other film.
+        found: [usize; 2],
+        /// Width and height of this film.
+        expected: [usize; 2],
+    },
+    /// More samples than a frame can number.
+    #[error("samples {first}..{end} were asked for; accepted: a range that ends at most at {limit}")]
+    Samples {
+        /// First sample.
+        first: u32,
+        /// One after the last.
+        end: u32,
+        /// Largest end.
+        limit: u32,
+    },
+}
+
+/// Refuses unless `holds`.
+pub(super) fn require(holds: bool, key: &'static str, found: impl std::fmt::Debug, accepted: &'static str) -> Result<(), RenderError> {
+    if holds { Ok(()) } else { Err(RenderError::Invalid { key, found: format!("{found:?}"), accepted }) }
+}
+
+/// Refuses a vector with a component that is not a finite number.
+pub(super) fn require_finite(key: &'static str, vector: &[f64]) -> Result<(), RenderError> {
+    require(vector.iter().all(|v| v.is_finite()), key, vector, "finite numbers")
+}

@@ -1,0 +1,258 @@
+//! The majorant grid: a bound on the extinction in each cell, learned from the queries.
+//!
+//! Cells start at the largest extinction of the transfer function, which is safe since its ramp saturates, and tighten as queries
+//! come. What a frame observes takes effect in later frames only, so that a frame's majorants do not depend on its own random
+//! numbers. Cells keep the largest FTLE, not extinction, so that another transfer function re-derives them without a query.
+
+use super::Transfer;
+use crate::field::Domain;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+
+/// Ramp above the highest value seen that a cell's bound always keeps: what no sample showed must stay reachable, or it would be
+/// invisible rather than noisy.
+const FLOOR: f32 = 0.02;
+/// The bound keeps `UNSEEN / samples` of ramp besides: with n samples, a share of about 3/n of the cell may still hold anything.
+const UNSEEN: f32 = 8.0;
+/// Relative margin on what this window showed, and on what the window before it showed.
+const MARGIN: f32 = 1.1;
+const SLID_MARGIN: f32 = 1.25;
+/// What a sample of the window before counts against one of this window.
+const SLID_WEIGHT: f32 = 0.25;
+/// Optical depth that a cell with missing values keeps across the box's shortest edge: 1 - exp(-6) of the rays through land see it.
+const MISSING_DEPTH: f32 = 6.0;
+
+/// What was seen in one cell.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Seen {
+    count: u32,
+    highest: f32,
+    missing: bool,
+}
+
+const NOTHING: Seen = Seen { count: 0, highest: f32::NEG_INFINITY, missing: false };
+
+impl Seen {
+    fn join(self, other: Self) -> Self {
+        Self {
+            count: self.count.saturating_add(other.count),
+            highest: self.highest.max(other.highest),
+            missing: self.missing | other.missing,
+        }
+    }
+}
+
+/// What the frame in progress sees. Counts, maxima and flags do not depend on the order in which threads come.
+#[derive(Debug, Default)]
+struct Watch {
+    count: AtomicU32,
+    /// Order-preserving image of the highest FTLE; 0 is none.
+    highest: AtomicU32,
+    missing: AtomicBool,
+}
+
+/// Maps floats to integers of the same order (no NaN).
+fn ordered(value: f32) -> u32 {
+    let bits = value.to_bits();
+    if bits >> 31 == 1 { !bits } else { bits | 1 << 31 }
+}
+
+fn from_ordered(image: u32) -> f32 {
+    f32::from_bits(if image >> 31 == 1 { image ^ 1 << 31 } else { !image })
+}
+
+/// Bounds on the extinction, x fastest, then y, then z.
+#[derive(Debug)]
+pub struct MajorantGrid {
+    cells: [usize; 3],
+    majorants: Vec<f32>,
+    watch: Vec<Watch>,
+    current: Vec<Seen>,
+    previous: Vec<Seen>,
+}
+
+impl MajorantGrid {
+    /// All cells at the transfer function's largest extinction.
+    pub(super) fn new(cells: [usize; 3], transfer: &Transfer) -> Self {
+        let count = cells.iter().product();
+        Self {
+            cells,
+            majorants: vec![transfer.extinction_max(); count],
+            watch: std::iter::repeat_with(Watch::default).take(count).collect(),
+            current: vec![NOTHING; count],
+            previous: vec![NOTHING; count],
+        }
+    }
+
+    /// Cells of about equal edges: 96 along the longest edge in two dimensions (one along z), 40 in three.
+    pub(super) fn default_cells(domain: &Domain, scale: [f64; 3]) -> [usize; 3] {
+        let edges: [f64; 3] = std::array::from_fn(|k| domain.extent()[k] * scale[k]);
+        let seen = &edges[..domain.dimensions];
+        let longest = seen.iter().copied().fold(0.0, f64::max);
+        let most = if domain.dimensions == 2 { 96.0 } else { 40.0 };
+        std::array::from_fn(|k| if k < domain.dimensions { (most * edges[k] / longest).ceil().clamp(1.0, most) as usize } else { 1 })
+    }
+
+    /// Cells along x, y and z.
+    pub fn cells(&self) -> [usize; 3] {
+        self.cells
+    }
+
+    /// The majorants in force, per unit of length.
+    pub fn majorants(&self) -> &[f32] {
+        &self.majorants
+    }
+
+    /// Plants majorants.
+    #[cfg(test)]
+    pub(super) fn set_for_test(&mut self, majorants: Vec<f32>) {
+        assert_eq!(majorants.len(), self.majorants.len());
+        self.majorants = majorants;
+    }
+
+    /// Notes an FTLE seen in a cell.
+    #[inline]
+    pub(super) fn observe(&self, cell: usize, ftle: f32) {
+        let watch = &self.watch[cell];
+        watch.count.fetch_add(1, Relaxed);
+        let image = ordered(ftle);
+        if image > watch.highest.load(Relaxed) {
+            watch.highest.fetch_max(image, Relaxed);
+        }
+    }
+
+    /// Notes a missing value in a cell.
+    #[inline]
+    pub(super) fn observe_missing(&self, cell: usize) {
+        let watch = &self.watch[cell];
+        watch.count.fetch_add(1, Relaxed);
+        if !watch.missing.load(Relaxed) {
+            watch.missing.store(true, Relaxed);
+        }
+    }
+
+    /// Puts what the frames so far have seen into force.
+    pub(super) fn commit(&mut self, transfer: &Transfer, shortest_edge: f64) {
+        for (watch, current) in self.watch.iter_mut().zip(&mut self.current) {
+            let watch = std::mem::take(watch);
+            let image = watch.highest.into_inner();
+            let highest = if image == 0 { f32::NEG_INFINITY } else { from_ordered(image) };
+            *current = current.join(Seen { count: watch.count.into_inner(), highest, missing: watch.missing.into_inner() });
+        }
+        self.derive(transfer, shortest_edge);
+    }
+
+    /// The window has moved: what was seen counts for less, and may have moved into a neighbouring cell.
+    pub(super) fn slide(&mut self, transfer: &Transfer, shortest_edge: f64) {
+        self.commit(transfer, shortest_edge);
+        let [nx, ny, nz] = self.cells;
+        let around = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
+        for z in 0..nz {
+            for y in 0..ny {
+                for x in 0..nx {
+                    let here = (z * ny + y) * nx + x;
+                    let mut joined = NOTHING;
+                    for (k, j) in around(z, nz).flat_map(|k| around(y, ny).map(move |j| (k, j))) {
+                        joined = around(x, nx).fold(joined, |all, i| all.join(self.current[(k * ny + j) * nx + i]));
+                    }
+                    self.previous[here] = Seen { count: self.current[here].count, ..joined };
+                }
+            }
+        }
+        self.current.fill(NOTHING);
+        self.derive(transfer, shortest_edge);
+    }
+
+    /// Derives the majorants from what was seen.
+    pub(super) fn derive(&mut self, transfer: &Transfer, shortest_edge: f64) {
+        let largest = transfer.extinction_max();
+        let missing_floor = (MISSING_DEPTH / shortest_edge as f32).min(largest);
+        // An empty interval has an empty ramp.
+        let ramp = |highest: f32| if highest == f32::NEG_INFINITY { 0.0 } else { transfer.ramp(highest) };
+        for ((majorant, current), previous) in self.majorants.iter_mut().zip(&self.current).zip(&self.previous) {
+            let count = current.count as f32 + SLID_WEIGHT * previous.count as f32;
+            let seen = (MARGIN * ramp(current.highest)).max(SLID_MARGIN * ramp(previous.highest));
+            // With count 0 the bound is the largest extinction.
+            let bound = largest * (seen + FLOOR + UNSEEN / count).min(1.0);
+            *majorant = if current.missing | previous.missing { bound.max(missing_floor) } else { bound };
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::TransferSettings;
+
+    fn transfer(extinction: f64) -> Transfer {
+        Transfer::new(&TransferSettings { low: Some(0.0), high: Some(1.0), extinction: Some(extinction), ..Default::default() }, 1.0)
+            .unwrap()
+    }
+
+    #[test]
+    fn ordered_images_keep_the_order() {
+        let values = [f32::NEG_INFINITY, -2.0, -1e-30, 0.0, 1e-30, 3.0, f32::INFINITY];
+        for pair in values.windows(2) {
+            assert!(ordered(pair[0]) < ordered(pair[1]));
+        }
+        values.iter().for_each(|&v| assert_eq!(from_ordered(ordered(v)), v));
+        assert!(ordered(f32::NEG_INFINITY) > 0, "0 stands for none");
+    }
+
+    #[test]
+    fn cells_tighten_with_evidence_and_only_on_commit() {
+        let transfer = transfer(100.0);
+        let mut grid = MajorantGrid::new([2, 1, 1], &transfer);
+        assert_eq!(grid.majorants(), [100.0, 100.0]);
+        (0..800).for_each(|_| grid.observe(0, 0.2));
+        assert_eq!(grid.majorants()[0], 100.0, "a frame's own samples change nothing in it");
+        grid.commit(&transfer, 1.0);
+        // 1.1 * 0.2 seen + 0.02 floor + 8/800 unseen, times 100; f32 rounding.
+        assert!((grid.majorants()[0] - 25.0).abs() < 1e-3);
+        assert_eq!(grid.majorants()[1], 100.0, "nothing seen, nothing known");
+        grid.observe(0, 0.7);
+        grid.commit(&transfer, 1.0);
+        assert!(grid.majorants()[0] > 77.0, "a value above its majorant raises it");
+    }
+
+    #[test]
+    fn another_transfer_function_re_derives() {
+        let mut grid = MajorantGrid::new([1, 1, 1], &transfer(100.0));
+        (0..8000).for_each(|_| grid.observe(0, 0.5));
+        grid.commit(&transfer(100.0), 1.0);
+        grid.derive(&transfer(10.0), 1.0);
+        // 1.1 * 0.5 + 0.02 + 8/8000 of 10; f32 rounding.
+        assert!((grid.majorants()[0] - 5.71).abs() < 1e-4);
+    }
+
+    #[test]
+    fn a_slide_loosens_and_spreads_and_two_forget() {
+        let transfer = transfer(100.0);
+        let mut grid = MajorantGrid::new([4, 1, 1], &transfer);
+        for cell in 0..4 {
+            (0..8000).for_each(|_| grid.observe(cell, if cell == 0 { 0.5 } else { 0.0 }));
+        }
+        grid.commit(&transfer, 1.0);
+        let before = grid.majorants().to_vec();
+        grid.slide(&transfer, 1.0);
+        assert!(grid.majorants()[1] > 60.0, "the ridge may have moved over: {:?}", grid.majorants());
+        assert!((0..4).all(|k| grid.majorants()[k] > before[k]));
+        assert!(grid.majorants()[3] < 10.0, "two cells away it has not");
+        grid.slide(&transfer, 1.0);
+        assert_eq!(grid.majorants(), [100.0; 4], "a window in which nothing was seen proves nothing");
+    }
+
+    #[test]
+    fn land_stays_visible() {
+        let transfer = transfer(100.0);
+        let mut grid = MajorantGrid::new([1, 1, 1], &transfer);
+        (0..100_000).for_each(|_| grid.observe_missing(0));
+        grid.commit(&transfer, 0.25);
+        assert_eq!(grid.majorants()[0], 24.0, "optical depth 6 over an edge of 0.25");
+    }
+
+    #[test]
+    fn maps_need_one_cell_in_z() {
+        assert_eq!(MajorantGrid::default_cells(&Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), [1.0; 3]), [96, 48, 1]);
+        assert_eq!(MajorantGrid::default_cells(&Domain::cuboid([0.0; 3], [4.0, 2.0, 1.0]), [1.0; 3]), [40, 20, 10]);
+    }
+}

@@ -1,0 +1,124 @@
+//! The tables of a scene file that belong to this room.
+
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// Which answers a picture is made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// RK4 only.
+    Reference,
+    /// The surrogate only.
+    #[serde(alias = "neural")]
+    Surrogate,
+    /// The surrogate where it is trusted, RK4 elsewhere.
+    Gated,
+}
+
+/// `[camera]` of a scene file. `half_width = |look_at - eye| tan(field_of_view/2)`, `half_height = |look_at - eye| tan(field_of_view/(2 aspect))`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CameraSettings {
+    /// Position.
+    pub eye: [f64; 3],
+    /// Point looked at.
+    pub look_at: [f64; 3],
+    /// Up.
+    pub up: [f64; 3],
+    /// Horizontal field of view, degrees.
+    #[serde(default = "ninety")]
+    pub field_of_view: f64,
+    /// Parallel projection, whose film plane is `half_width` by `half_width / aspect` as above: a map without perspective.
+    #[serde(default)]
+    pub orthographic: bool,
+}
+
+fn ninety() -> f64 {
+    90.0
+}
+
+/// `[light]` of a scene file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LightSettings {
+    /// Direction in which photons fly (directional light); exactly one of `direction` and `position` is given.
+    pub direction: Option<[f64; 3]>,
+    /// Position of a point light.
+    pub position: Option<[f64; 3]>,
+    /// Radiance (directional) or radiant intensity (point).
+    pub radiance: [f64; 3],
+}
+
+/// `[transfer]` of a scene file: extinction = `extinction` * ramp(FTLE), ramp = saturate((FTLE - low) / (high - low)); albedo per
+/// channel is a polynomial in t = 1 - ramp, lowest power first.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TransferSettings {
+    /// FTLE at which extinction begins; None: median of the first frame's FTLE.
+    pub low: Option<f64>,
+    /// FTLE at which it saturates; None: 99.5th percentile of the first frame's FTLE.
+    pub high: Option<f64>,
+    /// Largest extinction, per unit of length; None: 50 over the domain's shortest visible edge.
+    pub extinction: Option<f64>,
+    /// Polynomial coefficients of the red, green and blue albedo, lowest power first. A scene file may give the name of a preset
+    /// instead ([`super::ALBEDO_PRESETS`]).
+    #[serde(deserialize_with = "albedo_or_preset")]
+    pub albedo: [Vec<f64>; 3],
+}
+
+impl Default for TransferSettings {
+    /// Scaled to the first frame, colours of the published renderer.
+    fn default() -> Self {
+        Self { low: None, high: None, extinction: None, albedo: super::transfer::published_albedo() }
+    }
+}
+
+fn albedo_or_preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[Vec<f64>; 3], D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "accepted: the name of a preset, or three lists of polynomial coefficients")]
+    enum Given {
+        Preset(String),
+        Coefficients([Vec<f64>; 3]),
+    }
+    match Given::deserialize(deserializer)? {
+        Given::Coefficients(albedo) => Ok(albedo),
+        Given::Preset(name) => super::albedo_preset(&name).map_err(serde::de::Error::custom),
+    }
+}
+
+/// `[render]` of a scene file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct RenderSettings {
+    /// Method.
+    pub method: Method,
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// Samples a pixel and frame.
+    pub samples: usize,
+    /// Background colour, linear.
+    pub background: [f64; 3],
+    /// Colour, linear, of camera paths that leave after meeting missing values: land, as opposed to background.
+    pub missing: [f64; 3],
+    /// Majorant cells along x, y, z; None: chosen from the domain.
+    pub majorant_cells: Option<[usize; 3]>,
+    /// Tone map: `((c - 0.5) * contrast + brightness)^(1/gamma)`: `[contrast, brightness, gamma]`.
+    pub tone_map: [f64; 3],
+}
+
+impl Default for RenderSettings {
+    fn default() -> Self {
+        Self {
+            method: Method::Gated,
+            width: 320,
+            height: 160,
+            samples: 16,
+            background: [1.0; 3],
+            missing: [0.3; 3],
+            majorant_cells: None,
+            tone_map: [1.85, 0.75, 1.4],
+        }
+    }
+}

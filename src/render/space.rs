@@ -1,0 +1,176 @@
+//! Three frames of reference: the domain (data coordinates), the scene (lengths, in which camera, light and extinction live), and
+//! the grid (majorant cells).
+
+use crate::field::Domain;
+
+/// A factor per axis from domain to scene coordinates, for views that the program chooses itself: the longest edge becomes 1 and x
+/// and y keep their ratio. The third axis keeps it too, unless the flow is two-dimensional (the slab's thickness has no meaning) or
+/// its edge would come out shorter than a twentieth or longer than the others (other units: heights in metres over degrees); then
+/// the edge becomes a quarter.
+///
+/// A scene that names its camera, a light's position or its extinction is rendered at scale 1: its numbers are lengths in domain
+/// coordinates.
+pub fn overview_scale(domain: &Domain) -> [f64; 3] {
+    let extent = domain.extent();
+    let horizontal = 1.0 / extent[0].max(extent[1]);
+    let edge = extent[2] * horizontal;
+    let vertical = if domain.dimensions == 2 || !(0.05..=1.0).contains(&edge) { 0.25 / extent[2] } else { horizontal };
+    [horizontal, horizontal, vertical]
+}
+
+/// The rendered box.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct SceneBox {
+    /// Corners in scene units.
+    min: [f64; 3],
+    max: [f64; 3],
+    /// Domain coordinates of the lower corner.
+    domain_min: [f64; 3],
+    /// The closed box in f32, rounded inward, so that no query lies outside of it.
+    inward_min: [f32; 3],
+    inward_max: [f32; 3],
+    /// Scene units per majorant cell.
+    cell_edge: [f64; 3],
+    /// Domain units per majorant cell.
+    cell_extent: [f64; 3],
+    cells: [usize; 3],
+}
+
+impl SceneBox {
+    pub(super) fn new(domain: &Domain, scale: [f64; 3], cells: [usize; 3]) -> Self {
+        let extent = domain.extent();
+        let inward = |value: f64, up: bool| {
+            let nearest = value as f32;
+            match up {
+                true if f64::from(nearest) < value => nearest.next_up(),
+                false if f64::from(nearest) > value => nearest.next_down(),
+                _ => nearest,
+            }
+        };
+        Self {
+            min: std::array::from_fn(|k| domain.min[k] * scale[k]),
+            max: std::array::from_fn(|k| domain.max[k] * scale[k]),
+            domain_min: domain.min,
+            inward_min: domain.min.map(|v| inward(v, true)),
+            inward_max: domain.max.map(|v| inward(v, false)),
+            cell_edge: std::array::from_fn(|k| extent[k] * scale[k] / cells[k] as f64),
+            cell_extent: std::array::from_fn(|k| extent[k] / cells[k] as f64),
+            cells,
+        }
+    }
+
+    pub(super) fn cells(&self) -> [usize; 3] {
+        self.cells
+    }
+
+    /// Distances at which a ray enters and leaves the box; none when it misses or the box lies behind.
+    pub(super) fn intersect(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<(f64, f64)> {
+        let (mut enter, mut leave) = (0.0_f64, f64::INFINITY);
+        for k in 0..3 {
+            if direction[k] == 0.0 {
+                if origin[k] < self.min[k] || origin[k] > self.max[k] {
+                    return None;
+                }
+                continue;
+            }
+            let (a, b) = ((self.min[k] - origin[k]) / direction[k], (self.max[k] - origin[k]) / direction[k]);
+            enter = enter.max(a.min(b));
+            leave = leave.min(a.max(b));
+        }
+        (enter < leave).then_some((enter, leave))
+    }
+
+    /// Grid coordinates of a scene point, within the grid.
+    pub(super) fn grid_point(&self, point: [f64; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32))
+    }
+
+    /// Cells per scene length along a scene direction.
+    #[inline]
+    pub(super) fn grid_direction(&self, direction: [f64; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| (direction[k] / self.cell_edge[k]) as f32)
+    }
+
+    /// Scene point of grid coordinates.
+    #[inline]
+    pub(super) fn scene_point(&self, grid: [f32; 3]) -> [f64; 3] {
+        std::array::from_fn(|k| self.min[k] + f64::from(grid[k]) * self.cell_edge[k])
+    }
+
+    /// Domain point of grid coordinates, within the box.
+    #[inline]
+    pub(super) fn domain_point(&self, grid: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| {
+            ((self.domain_min[k] + f64::from(grid[k]) * self.cell_extent[k]) as f32).max(self.inward_min[k]).min(self.inward_max[k])
+        })
+    }
+
+    /// Scene length along `direction` (grid) from `from` (grid) to where it leaves the grid.
+    #[inline]
+    pub(super) fn exit(&self, from: [f32; 3], direction: [f32; 3]) -> f32 {
+        let mut leave = f32::INFINITY;
+        for k in 0..3 {
+            if direction[k] != 0.0 {
+                let wall = if direction[k] > 0.0 { self.cells[k] as f32 } else { 0.0 };
+                leave = leave.min((wall - from[k]) / direction[k]);
+            }
+        }
+        leave.max(0.0)
+    }
+}
+
+pub(super) fn subtract(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+pub(super) fn scaled(a: [f64; 3], factor: f64) -> [f64; 3] {
+    a.map(|v| v * factor)
+}
+
+pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(super) fn length(a: [f64; 3]) -> f64 {
+    dot(a, a).sqrt()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rays_meet_the_box_where_they_should() {
+        let space = SceneBox::new(&Domain::cuboid([0.0; 3], [2.0, 1.0, 1.0]), [1.0; 3], [4, 2, 2]);
+        assert_eq!(space.intersect([1.0, 0.5, 3.0], [0.0, 0.0, -1.0]), Some((2.0, 3.0)));
+        assert_eq!(space.intersect([1.0, 0.5, 0.25], [0.0, 0.0, -1.0]), Some((0.0, 0.25)), "an eye inside starts at itself");
+        assert_eq!(space.intersect([1.0, 0.5, -1.0], [0.0, 0.0, -1.0]), None, "behind");
+        assert_eq!(space.intersect([1.0, 1.5, 3.0], [0.0, 0.0, -1.0]), None, "beside, parallel to a face");
+        let oblique = space.intersect([-1.0, -1.0, 0.5], [0.6, 0.8, 0.0]).unwrap();
+        // Enters x = 0 at 1/0.6, leaves y = 1 at 2/0.8; f64 rounding.
+        assert!((oblique.0 - 1.0 / 0.6).abs() < 1e-12 && (oblique.1 - 2.5).abs() < 1e-12);
+    }
+
+    #[test]
+    fn queries_never_leave_the_domain() {
+        // 0.1 and 0.7 round up and down in f32.
+        let domain = Domain::cuboid([0.1, 0.7, -0.3], [0.7, 1.1, 0.1]);
+        let space = SceneBox::new(&domain, [3.0; 3], [3, 5, 7]);
+        for grid in [[0.0, 0.0, 0.0], [3.0, 5.0, 7.0]] {
+            assert!(domain.contains(space.domain_point(grid)), "{grid:?}");
+        }
+        let middle = space.domain_point(space.grid_point([1.2, 2.7, -0.3]));
+        (0..3).for_each(|k| assert!((middle[k] - [0.4, 0.9, -0.1][k]).abs() < 1e-6, "f32 rounding: {middle:?}"));
+    }
+
+    #[test]
+    fn overviews_keep_shapes_and_tame_units() {
+        assert_eq!(overview_scale(&Domain::cuboid([0.0; 3], [2.0, 1.0, 0.5])), [0.5; 3]);
+        assert_eq!(overview_scale(&Domain::cuboid([0.0; 3], [360.0, 180.0, 30_000.0]))[2], 0.25 / 30_000.0);
+        assert_eq!(overview_scale(&Domain::slab([0.0; 2], [50.0, 100.0], (0.0, 1.0))), [0.01, 0.01, 0.25]);
+    }
+}
