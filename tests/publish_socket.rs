@@ -1,5 +1,7 @@
 //! Frames through a real socket.
 
+#![allow(clippy::unwrap_used)]
+
 use ridgewatch::engine::{Frame, FrameRecord};
 use ridgewatch::publish::{
     FRAME_TOPIC, FrameHeader, Output, Payload, PublishError, PublishSettings, Publisher, RECORD_TOPIC, RunFolder, Summary, decode_exr,

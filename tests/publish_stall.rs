@@ -1,5 +1,7 @@
 //! A subscriber that stalls, beside a healthy one: memory stays bounded and the healthy one goes on.
 
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
 use ridgewatch::engine::{Frame, FrameRecord};
 use ridgewatch::publish::{FRAME_TOPIC, FrameHeader, Payload, PublishSettings, PublishStatistics, Publisher, peak_memory_bytes};
 use ridgewatch::render::Film;
