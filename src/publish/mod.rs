@@ -1,3 +1,28 @@
-//! Frames out: ZeroMQ, EXR, PNG, records.
+//! Frames out: ZeroMQ, EXR, PNG, records; and the comparison of pictures.
 //!
 //! In: finished frames. Out: files and messages. Failure stays here: a slow subscriber or a full disk never stops the cycle.
+//! [`Output`] is the door that the cycle uses; docs/protocol.md describes what comes out. Calls `engine` and `render` for their types only.
+
+mod compare;
+mod error;
+mod exr;
+mod file_writer;
+mod mailbox;
+mod message;
+mod output;
+mod preview;
+mod run_folder;
+mod settings;
+mod summary;
+mod zmq;
+
+pub use compare::{CompareError, Comparison, compare_files, compare_films};
+pub use error::PublishError;
+pub use exr::{decode_exr, encode_exr, read_exr, write_exr};
+pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
+pub use output::Output;
+pub use preview::{jpeg, png, raw};
+pub use run_folder::{RunFolder, Written};
+pub use settings::{DEFAULT_ENDPOINT, Payload, PublishSettings, WhenFull};
+pub use summary::{FileStatistics, Summary, Totals, peak_memory_bytes};
+pub use zmq::{PublishStatistics, Publisher};

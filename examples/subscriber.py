@@ -1,0 +1,67 @@
+#!/usr/bin/env python3
+"""Prints a line for each frame that ridgewatch publishes, and saves the pictures if asked. Needs pyzmq.
+
+    python3 examples/subscriber.py tcp://127.0.0.1:5577 --save pictures
+"""
+
+import argparse
+import json
+import pathlib
+import sys
+import time
+
+import zmq
+
+SUFFIX = {"jpeg": "jpg", "png": "png", "exr": "exr", "raw": "f32"}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("endpoint", nargs="?", default="tcp://127.0.0.1:5577")
+    parser.add_argument("--save", type=pathlib.Path, help="folder for the pictures")
+    parser.add_argument("--frames", type=int, default=0, help="stop after so many frames")
+    parser.add_argument("--records", action="store_true", help="print the record messages too")
+    options = parser.parse_args()
+    if options.save:
+        options.save.mkdir(parents=True, exist_ok=True)
+
+    socket = zmq.Context().socket(zmq.SUB)
+    # Two waiting messages are enough: an old frame is worth nothing.
+    socket.setsockopt(zmq.RCVHWM, 2)
+    # Reconnecting is libzmq's default (every 100 ms): after a cut-off the frames come again by themselves.
+    socket.connect(options.endpoint)
+    socket.subscribe(b"frame")
+    if options.records:
+        socket.subscribe(b"record")
+
+    last, seen = None, 0
+    while not options.frames or seen < options.frames:
+        topic, *parts = socket.recv_multipart()
+        if topic == b"record":
+            record = json.loads(parts[0])
+            print(f"record {record['frame']}: traced {100 * record['traced_share']:.1f} %", flush=True)
+            continue
+        header, payload = json.loads(parts[0]), parts[1]
+        if header["protocol"] != 1 or len(payload) != header["payload_bytes"]:
+            print(f"not understood: protocol {header['protocol']}, {len(payload)} bytes", file=sys.stderr)
+            continue
+        now, record = time.monotonic(), header["record"]
+        gap = 0.0 if last is None else now - last
+        last, seen = now, seen + 1
+        print(
+            f"frame {header['frame']}: time {record['time']:g}, {header['shape'][1]}x{header['shape'][0]} {header['encoding']}, "
+            f"{len(payload)} bytes, traced {100 * record['traced_share']:.1f} %, gap {gap:.3f} s",
+            flush=True,
+        )
+        for warning in record["warnings"]:
+            print(f"  {warning}", flush=True)
+        if options.save:
+            name = f"frame_{header['frame']:06d}.{SUFFIX[header['encoding']]}"
+            (options.save / name).write_bytes(payload)
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except KeyboardInterrupt:
+        pass

@@ -1,0 +1,74 @@
+//! Prints a line for each frame that ridgewatch publishes, and saves the pictures if asked.
+//!
+//! ```text
+//! cargo run --release --example subscriber -- tcp://127.0.0.1:5577 pictures
+//! ```
+#![allow(clippy::print_stdout)]
+
+use anyhow::{Context, bail};
+use serde_json::Value;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};
+
+#[tokio::main]
+async fn main() -> anyhow::Result<()> {
+    let mut arguments = std::env::args().skip(1);
+    let endpoint = arguments.next().unwrap_or_else(|| "tcp://127.0.0.1:5577".to_owned());
+    let save = arguments.next().map(PathBuf::from);
+    if let Some(folder) = &save {
+        std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
+    }
+
+    let mut socket = SubSocket::new();
+    // Waits for the publisher if it is not there yet, and reconnects by itself after a cut-off.
+    socket.connect(&endpoint).await.with_context(|| endpoint.clone())?;
+    socket.subscribe("frame").await?;
+
+    let mut last: Option<Instant> = None;
+    loop {
+        let message = tokio::select! {
+            message = socket.recv() => message,
+            _ = tokio::signal::ctrl_c() => return Ok(()),
+        };
+        let message = match message {
+            Ok(message) => message,
+            Err(error) => {
+                // A message torn by a cut-off ends up here; the connection comes back in the background.
+                eprintln!("{error}");
+                tokio::time::sleep(Duration::from_millis(50)).await;
+                continue;
+            }
+        };
+        let gap = last.replace(Instant::now()).map_or(0.0, |before| before.elapsed().as_secs_f64());
+        match show(&message, gap, save.as_deref()) {
+            Ok(line) => println!("{line}"),
+            Err(error) => eprintln!("not understood: {error:#}"),
+        }
+    }
+}
+
+fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyhow::Result<String> {
+    let (Some(header), Some(payload)) = (message.get(1), message.get(2)) else { bail!("{} parts", message.len()) };
+    let header: Value = serde_json::from_slice(header)?;
+    let length = header["payload_bytes"].as_u64().context("no payload_bytes")?;
+    if header["protocol"] != 1 || length != payload.len() as u64 {
+        bail!("protocol {}, {} of {length} bytes", header["protocol"], payload.len());
+    }
+    let number = header["frame"].as_u64().context("no frame number")?;
+    let encoding = header["encoding"].as_str().context("no encoding")?;
+    if let Some(folder) = save {
+        let suffix = match encoding {
+            "jpeg" => "jpg",
+            "raw" => "f32",
+            other => other,
+        };
+        std::fs::write(folder.join(format!("frame_{number:06}.{suffix}")), payload)?;
+    }
+    let (record, shape) = (&header["record"], &header["shape"]);
+    let traced = 100.0 * record["traced_share"].as_f64().unwrap_or(f64::NAN);
+    Ok(format!(
+        "frame {number}: time {}, {}x{} {encoding}, {length} bytes, traced {traced:.1} %, gap {gap:.3} s",
+        record["time"], shape[1], shape[0]
+    ))
+}

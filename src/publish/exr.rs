@@ -1,0 +1,216 @@
+//! The film as OpenEXR and back: one part, channels R, G, B, A and the layers `ftle.mean`, `trust.traced`, `variance`, `samples.count`,
+//! all f32, sorted by name, ZIP-compressed without loss.
+
+use super::{PublishError, run_folder::write_whole};
+use crate::{engine::FrameRecord, render::Film};
+use exr::meta::MetaData;
+use exr::prelude::*;
+use std::io::Cursor;
+use std::path::Path;
+
+/// Largest picture that is read: samples of all channels. A damaged header must not ask for all memory.
+const MOST_SAMPLES: usize = 1 << 30;
+
+/// The film as an EXR file in memory. The record goes into the attributes `ridgewatch.frame`, `ridgewatch.time` and
+/// `ridgewatch.record` (JSON). A layer that the film lacks (no entries) is left out; one of the wrong length is an error in words.
+pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Result<Vec<u8>, String> {
+    let pixels = film.width * film.height;
+    if pixels == 0 || film.rgba.len() != pixels {
+        return Err(format!("a film of {} x {} pixels has {} colours; one a pixel is accepted", film.width, film.height, film.rgba.len()));
+    }
+    let colour = |k: usize| film.rgba.iter().map(|p| p[k]).collect::<Vec<f32>>();
+    let mut channels = vec![("R", colour(0)), ("G", colour(1)), ("B", colour(2)), ("A", colour(3))];
+    for (name, layer) in
+        [("ftle.mean", &film.ftle_mean), ("trust.traced", &film.traced), ("variance", &film.variance), ("samples.count", &film.samples)]
+    {
+        match layer.len() {
+            0 => {}
+            n if n == pixels => channels.push((name, layer.clone())),
+            n => return Err(format!("layer {name} has {n} entries for {pixels} pixels")),
+        }
+    }
+    let mut attributes = LayerAttributes { software_name: Some(Text::from("ridgewatch")), ..Default::default() };
+    if let Some(record) = record {
+        let json = serde_json::to_string(record).map_err(|e| e.to_string())?;
+        attributes.comments = Some(Text::from("linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples"));
+        let frame = i32::try_from(record.frame).unwrap_or(i32::MAX);
+        attributes.other.insert(Text::from("ridgewatch.frame"), AttributeValue::I32(frame));
+        attributes.other.insert(Text::from("ridgewatch.time"), AttributeValue::F64(record.time));
+        attributes.other.insert(Text::from("ridgewatch.record"), AttributeValue::Text(Text::from(json.as_str())));
+    }
+    let list = channels.into_iter().map(|(name, values)| AnyChannel::new(name, FlatSamples::F32(values))).collect();
+    let encoding = Encoding { compression: Compression::ZIP16, blocks: Blocks::ScanLines, line_order: LineOrder::Increasing };
+    let image = Image::from_layer(Layer::new((film.width, film.height), attributes, encoding, AnyChannels::sort(list)));
+    let mut bytes = Cursor::new(Vec::new());
+    // One thread: the other cores belong to the renderer and the solver.
+    image.write().non_parallel().to_buffered(&mut bytes).map_err(|e| e.to_string())?;
+    Ok(bytes.into_inner())
+}
+
+/// Writes the film; nothing half-written appears under `path`.
+pub fn write_exr(path: &Path, film: &Film, record: Option<&FrameRecord>) -> std::result::Result<(), PublishError> {
+    let problem = |problem: String| PublishError::Exr { path: path.to_owned(), problem };
+    let bytes = encode_exr(film, record).map_err(problem)?;
+    write_whole(path, &bytes).map_err(|e| problem(e.to_string()))
+}
+
+/// Reads an EXR into a film: the first part that has R, G and B. Alpha is 1 where there is none; layers that the file lacks
+/// stay empty, and channels of other names are ignored.
+pub fn read_exr(path: &Path) -> std::result::Result<Film, PublishError> {
+    let problem = |problem: String| PublishError::Exr { path: path.to_owned(), problem };
+    let bytes = std::fs::read(path).map_err(|e| problem(format!("cannot be read: {e}")))?;
+    decode_exr(&bytes).map_err(problem)
+}
+
+/// Reads an EXR file in memory; see [`read_exr`].
+pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
+    let damaged = |e: exr::error::Error| format!("not a readable EXR file: {e}");
+    let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(damaged)?;
+    for header in &meta.headers {
+        let samples = header.layer_size.area().saturating_mul(header.channels.list.len());
+        if samples > MOST_SAMPLES {
+            return Err(format!("its header claims {samples} samples; at most {MOST_SAMPLES} are accepted"));
+        }
+    }
+    let image = read()
+        .no_deep_data()
+        .largest_resolution_level()
+        .all_channels()
+        .all_layers()
+        .all_attributes()
+        .non_parallel()
+        .from_buffered(Cursor::new(bytes))
+        .map_err(damaged)?;
+    let layer = image
+        .layer_data
+        .iter()
+        .find(|layer| ["R", "G", "B"].iter().all(|name| channel(layer, name).is_some()))
+        .ok_or_else(|| format!("no part has channels R, G and B; found {}", names(&image.layer_data)))?;
+    let (width, height) = (layer.size.width(), layer.size.height());
+    let pixels = width * height;
+    let values = |name: &str| channel(layer, name).map(|c| c.sample_data.values_as_f32().collect::<Vec<f32>>());
+    let full = |name: &str| {
+        let values = values(name).unwrap_or_else(|| vec![1.0; pixels]);
+        if values.len() == pixels { Ok(values) } else { Err(format!("channel {name} is subsampled; one value a pixel is accepted")) }
+    };
+    let (red, green, blue, alpha) = (full("R")?, full("G")?, full("B")?, full("A")?);
+    let layer_of = |name: &str| values(name).filter(|v| v.len() == pixels).unwrap_or_default();
+    Ok(Film {
+        width,
+        height,
+        rgba: (0..pixels).map(|i| [red[i], green[i], blue[i], alpha[i]]).collect(),
+        ftle_mean: layer_of("ftle.mean"),
+        traced: layer_of("trust.traced"),
+        variance: layer_of("variance"),
+        samples: layer_of("samples.count"),
+    })
+}
+
+type Part = Layer<AnyChannels<FlatSamples>>;
+
+fn channel<'a>(layer: &'a Part, name: &str) -> Option<&'a AnyChannel<FlatSamples>> {
+    layer.channel_data.list.iter().find(|c| c.name == name)
+}
+
+fn names(layers: &[Part]) -> String {
+    let names: Vec<String> = layers.iter().flat_map(|l| l.channel_data.list.iter().map(|c| c.name.to_string())).take(32).collect();
+    if names.is_empty() { "no channel".to_owned() } else { names.join(", ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn film() -> Film {
+        let pixels = 7 * 3;
+        let layer = |scale: f32| (0..pixels).map(|i| i as f32 * scale).collect::<Vec<f32>>();
+        let mut ftle_mean = layer(0.1);
+        ftle_mean[4] = f32::NAN;
+        Film {
+            width: 7,
+            height: 3,
+            rgba: (0..pixels).map(|i| [i as f32, 12.5 * i as f32, -0.25, 0.5]).collect(),
+            ftle_mean,
+            traced: layer(0.01),
+            variance: layer(1e-6),
+            samples: vec![16.0; pixels],
+        }
+    }
+
+    fn bits(values: &[f32]) -> Vec<u32> {
+        values.iter().map(|v| v.to_bits()).collect()
+    }
+
+    #[test]
+    fn comes_back_bit_for_bit() {
+        let film = film();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.exr");
+        write_exr(&path, &film, Some(&FrameRecord { frame: 3, time: 1.5, ..Default::default() })).unwrap();
+        let back = read_exr(&path).unwrap();
+        assert_eq!((back.width, back.height, &back.rgba), (7, 3, &film.rgba));
+        // Through the bits, since NaN marks pixels without a collision.
+        assert_eq!(bits(&back.ftle_mean), bits(&film.ftle_mean));
+        assert_eq!((&back.traced, &back.variance, &back.samples), (&film.traced, &film.variance, &film.samples));
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file stays");
+    }
+
+    #[test]
+    fn channels_are_sorted_in_one_part_and_the_record_rides_along() {
+        let record = FrameRecord { frame: 3, time: 1.5, ..Default::default() };
+        let bytes = encode_exr(&film(), Some(&record)).unwrap();
+        let meta = MetaData::read_from_buffered(Cursor::new(&bytes), true).unwrap();
+        assert_eq!(meta.headers.len(), 1);
+        let names: Vec<String> = meta.headers[0].channels.list.iter().map(|c| c.name.to_string()).collect();
+        assert_eq!(names, ["A", "B", "G", "R", "ftle.mean", "samples.count", "trust.traced", "variance"]);
+        let other = &meta.headers[0].own_attributes.other;
+        assert_eq!(other.get(&Text::from("ridgewatch.time")), Some(&AttributeValue::F64(1.5)));
+        let AttributeValue::Text(json) = &other[&Text::from("ridgewatch.record")] else { panic!("text") };
+        assert_eq!(serde_json::from_str::<FrameRecord>(&json.to_string()).unwrap(), record);
+    }
+
+    #[test]
+    fn plain_half_float_rgb_from_elsewhere_is_read() {
+        let list = ["B", "G", "R"]
+            .into_iter()
+            .enumerate()
+            .map(|(k, name)| AnyChannel::new(name, FlatSamples::F16(vec![f16::from_f32(k as f32); 4])))
+            .collect();
+        let layer = Layer::new((2, 2), LayerAttributes::default(), Encoding::FAST_LOSSLESS, AnyChannels::sort(list));
+        let mut bytes = Cursor::new(Vec::new());
+        Image::from_layer(layer).write().to_buffered(&mut bytes).unwrap();
+        let film = decode_exr(bytes.get_ref()).unwrap();
+        assert_eq!(film.rgba, [[2.0, 1.0, 0.0, 1.0]; 4]);
+        assert!(film.variance.is_empty());
+    }
+
+    #[test]
+    fn damage_is_an_error_never_a_panic() {
+        let bytes = encode_exr(&film(), None).unwrap();
+        for end in 0..bytes.len() {
+            assert!(decode_exr(&bytes[..end]).is_err(), "cut at {end}");
+        }
+        for at in 0..bytes.len() {
+            let mut damaged = bytes.clone();
+            damaged[at] ^= 0x55;
+            // Some damage only changes a value; none may panic.
+            let _ = decode_exr(&damaged);
+        }
+        assert!(read_exr(Path::new("does/not/exist.exr")).unwrap_err().to_string().contains("does/not/exist.exr"));
+    }
+
+    #[test]
+    fn a_picture_without_colour_names_what_it_has() {
+        let list = std::iter::once(AnyChannel::new("depth", FlatSamples::F32(vec![0.0; 4]))).collect();
+        let layer = Layer::new((2, 2), LayerAttributes::default(), Encoding::FAST_LOSSLESS, AnyChannels::sort(list));
+        let mut bytes = Cursor::new(Vec::new());
+        Image::from_layer(layer).write().to_buffered(&mut bytes).unwrap();
+        assert!(decode_exr(bytes.get_ref()).unwrap_err().contains("depth"));
+    }
+
+    #[test]
+    fn a_layer_of_the_wrong_length_is_refused() {
+        let film = Film { variance: vec![0.0; 5], ..film() };
+        assert!(encode_exr(&film, None).unwrap_err().contains("variance"));
+    }
+}

@@ -1,0 +1,298 @@
+//! The thread that writes the run folder, behind a short queue.
+
+use super::{FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
+use crate::engine::{Frame, FrameRecord};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+/// Frames with pictures that may wait for the disk.
+const PICTURES_WAITING: usize = 4;
+/// Records that may wait for it.
+const RECORDS_WAITING: usize = 1024;
+/// Longest that the cycle waits for a place in the queue, and the end of the run for the last frame: a disk that hangs longer loses.
+const DISK_LIMIT: Duration = Duration::from_secs(60);
+
+/// Writes frames behind the cycle's back.
+#[derive(Debug)]
+pub(super) struct FileWriter {
+    shared: Arc<Shared>,
+    /// None once finished.
+    thread: Option<JoinHandle<RunFolder>>,
+    when_full: WhenFull,
+    limit: Duration,
+}
+
+impl Drop for FileWriter {
+    /// Left without [`FileWriter::finish`], after an error elsewhere: the thread writes what waits and ends; nobody waits for it.
+    fn drop(&mut self) {
+        self.shared.lock().closed = true;
+        self.shared.changed.notify_all();
+    }
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct State {
+    queue: VecDeque<Job>,
+    /// Frames with pictures in `queue`.
+    pictures: usize,
+    /// A job is being written.
+    busy: bool,
+    closed: bool,
+    statistics: FileStatistics,
+}
+
+#[derive(Debug)]
+enum Job {
+    Whole(Frame),
+    /// Its pictures were dropped.
+    Record(Arc<FrameRecord>),
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl FileWriter {
+    pub(super) fn start(folder: RunFolder, settings: PublishSettings) -> Result<Self, PublishError> {
+        Self::start_with_limit(folder, settings, DISK_LIMIT)
+    }
+
+    fn start_with_limit(folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
+        let shared = Arc::new(Shared::default());
+        let (theirs, when_full) = (Arc::clone(&shared), settings.when_full);
+        let name = "ridgewatch-files";
+        let thread = std::thread::Builder::new()
+            .name(name.to_owned())
+            .spawn(move || write_all(&theirs, folder, &settings))
+            .map_err(|source| PublishError::Thread { name, source })?;
+        Ok(Self { shared, thread: Some(thread), when_full, limit })
+    }
+
+    /// Hands a frame over. With [`WhenFull::Wait`] it waits for a place in the queue, a minute at most.
+    pub(super) fn frame(&self, frame: Frame) {
+        let mut state = self.shared.lock();
+        if self.when_full == WhenFull::Wait {
+            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.pictures >= PICTURES_WAITING);
+            state = waited.unwrap_or_else(PoisonError::into_inner).0;
+        }
+        if state.pictures >= PICTURES_WAITING {
+            state.drop_oldest_pictures();
+        }
+        if state.queue.len() >= RECORDS_WAITING {
+            // Only records wait in front, since their pictures were dropped long before.
+            state.queue.pop_front();
+            state.statistics.records_lost += 1;
+        }
+        state.queue.push_back(Job::Whole(frame));
+        state.pictures += 1;
+        self.shared.changed.notify_all();
+    }
+
+    /// Waits for the last frame, a minute at most, and says what happened. The folder comes back unless the disk hangs.
+    pub(super) fn finish(mut self) -> (Option<RunFolder>, FileStatistics) {
+        let deadline = Instant::now() + self.limit;
+        let mut state = self.shared.lock();
+        state.closed = true;
+        self.shared.changed.notify_all();
+        while !state.queue.is_empty() || state.busy {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                let mut statistics = state.statistics;
+                statistics.unfinished = (state.pictures + usize::from(state.busy)) as u64;
+                tracing::error!("the disk did not take the last {} frames within {:?}", statistics.unfinished, self.limit);
+                return (None, statistics);
+            }
+            state = self.shared.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        drop(state);
+        let folder = self.thread.take().and_then(|thread| thread.join().ok());
+        let mut statistics = self.shared.lock().statistics;
+        statistics.bytes_kept = folder.as_ref().map_or(0, RunFolder::kept_bytes);
+        (folder, statistics)
+    }
+}
+
+impl State {
+    fn drop_oldest_pictures(&mut self) {
+        let oldest = self.queue.iter_mut().find(|job| matches!(job, Job::Whole(_)));
+        if let Some(job) = oldest {
+            if let Job::Whole(frame) = job {
+                *job = Job::Record(Arc::clone(&frame.record));
+            }
+            self.pictures -= 1;
+            self.statistics.pictures_dropped += 1;
+            if self.statistics.pictures_dropped == 1 {
+                tracing::warn!("the disk is slower than the frames: pictures are dropped from here on (counted in the summary)");
+            }
+        }
+    }
+}
+
+fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings) -> RunFolder {
+    // A series of refusals is announced once.
+    let mut refused = false;
+    loop {
+        let mut state = shared.lock();
+        state.busy = false;
+        shared.changed.notify_all();
+        let job = loop {
+            if let Some(job) = state.queue.pop_front() {
+                break job;
+            }
+            if state.closed {
+                return folder;
+            }
+            state = shared.changed.wait(state).unwrap_or_else(PoisonError::into_inner);
+        };
+        state.busy = true;
+        if matches!(job, Job::Whole(_)) {
+            state.pictures -= 1;
+        }
+        // A place is free.
+        shared.changed.notify_all();
+        drop(state);
+
+        let record = match &job {
+            Job::Whole(frame) => &frame.record,
+            Job::Record(record) => record,
+        };
+        let appended = folder.append_record(record);
+        let pictured = match &job {
+            Job::Whole(frame) if settings.exr || settings.preview => Some(folder.write_pictures(frame, settings)),
+            _ => None,
+        };
+
+        let mut state = shared.lock();
+        let statistics = &mut state.statistics;
+        let mut trouble = None;
+        match appended {
+            Ok(()) => statistics.records_written += 1,
+            Err(error) => {
+                statistics.records_lost += 1;
+                trouble = Some(error);
+            }
+        }
+        match pictured {
+            Some(Ok(written)) => {
+                statistics.pictures_written += 1;
+                statistics.bytes_written += written.bytes;
+                statistics.pictures_removed += written.removed;
+            }
+            Some(Err(error)) => {
+                statistics.pictures_failed += 1;
+                trouble = Some(error);
+            }
+            None => {}
+        }
+        drop(state);
+        match trouble {
+            Some(error) if !refused => {
+                refused = true;
+                let path = folder.path().display();
+                tracing::warn!("{path}: frame {} could not be written: {error}; the run goes on and counts such frames", record.frame);
+            }
+            Some(_) => {}
+            None if refused => {
+                refused = false;
+                tracing::info!("{}: frames are written again from {} on", folder.path().display(), record.frame);
+            }
+            None => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::Film;
+
+    fn frame(number: u64, edge: usize) -> Frame {
+        let film = Film { width: edge, height: edge, rgba: vec![[0.5; 4]; edge * edge], ..Default::default() };
+        let record = FrameRecord { frame: number, ..Default::default() };
+        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
+    }
+
+    fn recorded(folder: &std::path::Path) -> Vec<u64> {
+        let text = std::fs::read_to_string(folder.join("records.jsonl")).unwrap();
+        text.lines().map(|l| serde_json::from_str::<FrameRecord>(l).unwrap().frame).collect()
+    }
+
+    fn run(when_full: WhenFull, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
+        let folder = tempfile::tempdir().unwrap();
+        let settings = PublishSettings { when_full, ..Default::default() };
+        let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), settings).unwrap();
+        for n in 0..frames {
+            writer.frame(frame(n, edge));
+        }
+        let (_, statistics) = writer.finish();
+        (statistics, recorded(folder.path()))
+    }
+
+    #[test]
+    fn waiting_loses_nothing() {
+        let (statistics, records) = run(WhenFull::Wait, 40, 64);
+        assert_eq!((statistics.pictures_written, statistics.records_written), (40, 40));
+        assert_eq!(records, (0..40).collect::<Vec<u64>>());
+    }
+
+    #[test]
+    fn dropping_loses_pictures_but_no_record() {
+        // Frames of a megapixel come far faster than they can be compressed.
+        let (statistics, records) = run(WhenFull::Drop, 30, 1024);
+        assert!(statistics.pictures_dropped >= 20, "{statistics:?}");
+        assert_eq!(statistics.pictures_written + statistics.pictures_dropped, 30);
+        assert_eq!(records, (0..30).collect::<Vec<u64>>(), "every record, in order");
+    }
+
+    #[test]
+    fn a_disk_that_refuses_is_counted_and_the_run_goes_on() {
+        let folder = tempfile::tempdir().unwrap();
+        let frames = folder.path().join("frames");
+        let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), PublishSettings::default()).unwrap();
+        let settled = |n: u64| {
+            writer.frame(frame(n, 8));
+            let mut state = writer.shared.lock();
+            while state.statistics.records_written <= n {
+                state = writer.shared.changed.wait_timeout(state, Duration::from_secs(10)).unwrap().0;
+            }
+        };
+        settled(0);
+        std::fs::rename(&frames, folder.path().join("away")).unwrap();
+        settled(1);
+        settled(2);
+        std::fs::create_dir(&frames).unwrap();
+        settled(3);
+        let (back, statistics) = writer.finish();
+        assert_eq!((statistics.pictures_written, statistics.pictures_failed, statistics.records_written), (2, 2, 4));
+        assert!(back.is_some() && frames.join("frame_000003.exr").exists());
+    }
+
+    #[test]
+    fn a_disk_that_hangs_costs_the_limit_and_no_more() {
+        let folder = tempfile::tempdir().unwrap();
+        let limit = Duration::from_millis(200);
+        let run = RunFolder::create(folder.path(), false).unwrap();
+        let writer = FileWriter::start_with_limit(run, PublishSettings::default(), limit).unwrap();
+        // Opening a pipe that nobody reads hangs like a disk that went away.
+        let pipe = folder.path().join("frames/.frame_000000.exr.part");
+        assert!(std::process::Command::new("mkfifo").arg(pipe).status().unwrap().success());
+        let started = Instant::now();
+        for n in 0..2 {
+            writer.frame(frame(n, 8));
+        }
+        let (back, statistics) = writer.finish();
+        assert!(back.is_none() && statistics.unfinished == 2, "{statistics:?}");
+        // The limit and what a busy machine adds to a wake-up.
+        assert!(started.elapsed() < limit + Duration::from_secs(2));
+    }
+}

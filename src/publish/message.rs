@@ -1,0 +1,55 @@
+//! What a published message says: topics, header, payload.
+
+use super::{Payload, encode_exr, jpeg, png, preview};
+use crate::engine::{Frame, FrameRecord};
+use serde::{Deserialize, Serialize};
+
+/// First part of a message with a picture.
+pub const FRAME_TOPIC: &str = "frame";
+/// First part of a message with a record alone.
+pub const RECORD_TOPIC: &str = "record";
+/// Version of the messages; grows when a client would have to change.
+pub const PROTOCOL: u32 = 1;
+
+/// Second part of a `frame` message, as JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FrameHeader {
+    /// [`PROTOCOL`].
+    pub protocol: u32,
+    /// Frame number in this run, from 0. Gaps are frames that were superseded.
+    pub frame: u64,
+    /// `jpeg`, `png`, `exr` or `raw`.
+    pub encoding: Payload,
+    /// Rows, columns and channels of the decoded picture.
+    pub shape: [usize; 3],
+    /// Type of the decoded channels: `uint8` (jpeg, png) or `float32` (exr, raw; raw is little-endian).
+    pub dtype: String,
+    /// Length of the payload, in bytes.
+    pub payload_bytes: usize,
+    /// `[contrast, brightness, gamma]` that 8-bit pictures were mapped with, and that others should be.
+    pub tone_map: [f64; 3],
+    /// Everything that is known of the frame.
+    pub record: FrameRecord,
+}
+
+/// The picture in the wanted form, with its header as JSON.
+pub fn encode_frame(frame: &Frame, payload: Payload) -> Result<(Vec<u8>, Vec<u8>), String> {
+    let film = &frame.film;
+    let (bytes, channels, dtype) = match payload {
+        Payload::Jpeg => (jpeg(film, frame.tone_map).map_err(|e| e.to_string())?, 3, "uint8"),
+        Payload::Png => (png(film, frame.tone_map).map_err(|e| e.to_string())?, 3, "uint8"),
+        Payload::Exr => (encode_exr(film, Some(&frame.record))?, 4, "float32"),
+        Payload::Raw => (preview::raw(film), 4, "float32"),
+    };
+    let header = FrameHeader {
+        protocol: PROTOCOL,
+        frame: frame.record.frame,
+        encoding: payload,
+        shape: [film.height, film.width, channels],
+        dtype: dtype.to_owned(),
+        payload_bytes: bytes.len(),
+        tone_map: frame.tone_map,
+        record: FrameRecord::clone(&frame.record),
+    };
+    Ok((serde_json::to_vec(&header).map_err(|e| e.to_string())?, bytes))
+}

@@ -1,0 +1,285 @@
+//! The run folder: `frames/frame_000000.exr` and `.png`, `records.jsonl`, `summary.json`.
+
+use super::{PublishError, PublishSettings, encode_exr, png};
+use crate::engine::{Frame, FrameRecord};
+use std::collections::VecDeque;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+
+/// Folder of the pictures, in the run folder.
+const FRAMES: &str = "frames";
+/// Records, one JSON object a line.
+const RECORDS: &str = "records.jsonl";
+/// Written at the end.
+const SUMMARY: &str = "summary.json";
+
+/// Writes a whole file beside its place and renames it, so that nothing half-written has its final name.
+pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no file name"))?;
+    let mut hidden = std::ffi::OsString::from(".");
+    hidden.push(name);
+    hidden.push(".part");
+    let part = path.with_file_name(hidden);
+    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
+    if written.is_err() {
+        // It may not exist; what matters is already in `written`.
+        let _ = fs::remove_file(&part);
+    }
+    written
+}
+
+/// A folder that this run alone writes.
+#[derive(Debug)]
+pub struct RunFolder {
+    path: PathBuf,
+    records: File,
+    /// Length of `records.jsonl` up to its last complete line.
+    complete: u64,
+    /// Pictures that are there, oldest first.
+    kept: VecDeque<Kept>,
+    kept_bytes: u64,
+}
+
+#[derive(Debug)]
+struct Kept {
+    files: Vec<PathBuf>,
+    bytes: u64,
+}
+
+/// What writing a frame's pictures did.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub struct Written {
+    /// Bytes of its pictures.
+    pub bytes: u64,
+    /// Older frames whose pictures were deleted for it.
+    pub removed: u64,
+}
+
+impl RunFolder {
+    /// Makes the folder ready and proves that it can be written, before any work starts. A folder that already holds a run is
+    /// refused, unless `overwrite`: then the files that a run writes are removed, and no others.
+    pub fn create(path: &Path, overwrite: bool) -> Result<Self, PublishError> {
+        let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
+        let frames = path.join(FRAMES);
+        fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
+        for old in run_files(path).map_err(|e| refuse(path, e))? {
+            if !overwrite {
+                let found = old.strip_prefix(path).unwrap_or(&old).display().to_string();
+                return Err(PublishError::Occupied { path: path.to_owned(), found });
+            }
+            fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
+        }
+        let probe = frames.join(".probe");
+        fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)).map_err(|e| refuse(&frames, e))?;
+        let file = path.join(RECORDS);
+        // `create_new`: of two runs that start at once in one folder, one is told.
+        let records = OpenOptions::new().append(true).create_new(true).open(&file).map_err(|e| refuse(&file, e))?;
+        Ok(Self { path: path.to_owned(), records, complete: 0, kept: VecDeque::new(), kept_bytes: 0 })
+    }
+
+    /// The folder.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Bytes of the pictures that are there.
+    pub fn kept_bytes(&self) -> u64 {
+        self.kept_bytes
+    }
+
+    /// Appends one line to `records.jsonl`. After an error the file still ends with a complete line.
+    pub fn append_record(&mut self, record: &FrameRecord) -> io::Result<()> {
+        let mut line = serde_json::to_vec(record)?;
+        line.push(b'\n');
+        self.trim()?;
+        match self.records.write_all(&line) {
+            Ok(()) => {
+                self.complete += line.len() as u64;
+                Ok(())
+            }
+            Err(error) => {
+                // If this fails as well, the next append tries again before it writes.
+                let _ = self.trim();
+                Err(error)
+            }
+        }
+    }
+
+    /// Cuts off what a failed append left behind.
+    fn trim(&mut self) -> io::Result<()> {
+        if self.records.metadata()?.len() > self.complete { self.records.set_len(self.complete) } else { Ok(()) }
+    }
+
+    /// Writes the frame's pictures as the settings say, then deletes those of the oldest frames beyond `keep` and `keep_bytes`.
+    /// On an error none of this frame's pictures stays.
+    pub fn write_pictures(&mut self, frame: &Frame, settings: &PublishSettings) -> io::Result<Written> {
+        let name = format!("frame_{:06}", frame.record.frame);
+        let mut new = Kept { files: Vec::new(), bytes: 0 };
+        let outcome = (|| {
+            if settings.exr {
+                let bytes = encode_exr(&frame.film, Some(&frame.record)).map_err(io::Error::other)?;
+                self.write_picture(&mut new, &format!("{name}.exr"), &bytes)?;
+            }
+            if settings.preview {
+                let bytes = png(&frame.film, frame.tone_map).map_err(io::Error::other)?;
+                self.write_picture(&mut new, &format!("{name}.png"), &bytes)?;
+            }
+            Ok(())
+        })();
+        if let Err(error) = outcome {
+            remove(&new);
+            return Err(error);
+        }
+        let bytes = new.bytes;
+        self.kept_bytes += bytes;
+        self.kept.push_back(new);
+        Ok(Written { bytes, removed: self.make_room(settings) })
+    }
+
+    fn write_picture(&self, new: &mut Kept, name: &str, bytes: &[u8]) -> io::Result<()> {
+        let path = self.path.join(FRAMES).join(name);
+        write_whole(&path, bytes)?;
+        new.bytes += bytes.len() as u64;
+        new.files.push(path);
+        Ok(())
+    }
+
+    /// Deletes the oldest frames' pictures until both caps hold; the newest frame always stays.
+    fn make_room(&mut self, settings: &PublishSettings) -> u64 {
+        let (most, most_bytes) = (settings.keep.unwrap_or(usize::MAX), settings.keep_bytes.unwrap_or(u64::MAX));
+        let mut removed = 0;
+        while self.kept.len() > 1 && (self.kept.len() > most || self.kept_bytes > most_bytes) {
+            let Some(oldest) = self.kept.pop_front() else { break };
+            remove(&oldest);
+            self.kept_bytes -= oldest.bytes;
+            removed += 1;
+        }
+        removed
+    }
+
+    /// Writes `summary.json`.
+    pub fn write_summary(&self, summary: &super::Summary) -> Result<(), PublishError> {
+        let path = self.path.join(SUMMARY);
+        let written = serde_json::to_vec_pretty(summary).map_err(io::Error::from).and_then(|json| write_whole(&path, &json));
+        written.map_err(|source| PublishError::Folder { path, source })
+    }
+}
+
+/// Removes a frame's pictures. A file that somebody else removed before is no trouble; any other is worth a word.
+fn remove(kept: &Kept) {
+    for file in &kept.files {
+        match fs::remove_file(file) {
+            Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                tracing::warn!("{}: cannot be removed: {error}", file.display());
+            }
+            _ => {}
+        }
+    }
+}
+
+/// Files that a run writes, as far as they are there.
+fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
+    let mut files: Vec<PathBuf> = [RECORDS, SUMMARY, ".summary.json.part"].iter().map(|f| path.join(f)).filter(|f| f.exists()).collect();
+    for entry in fs::read_dir(path.join(FRAMES))? {
+        let entry = entry?;
+        if entry.file_name().to_str().is_some_and(is_picture) {
+            files.push(entry.path());
+        }
+    }
+    Ok(files)
+}
+
+/// Whether a run gives a picture this name, finished or in the making.
+fn is_picture(name: &str) -> bool {
+    let name = name.strip_prefix('.').and_then(|n| n.strip_suffix(".part")).unwrap_or(name);
+    let number = name.strip_prefix("frame_").and_then(|n| n.strip_suffix(".exr").or_else(|| n.strip_suffix(".png")));
+    number.is_some_and(|n| n.len() >= 6 && n.bytes().all(|b| b.is_ascii_digit()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::Film;
+    use std::sync::Arc;
+
+    fn frame(number: u64) -> Frame {
+        let film = Film { width: 4, height: 2, rgba: vec![[number as f32, 0.5, 0.25, 1.0]; 8], ..Default::default() };
+        let record = FrameRecord { frame: number, ..Default::default() };
+        Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
+    }
+
+    fn names(folder: &Path) -> Vec<String> {
+        let mut names: Vec<String> =
+            fs::read_dir(folder.join(FRAMES)).unwrap().map(|e| e.unwrap().file_name().into_string().unwrap()).collect();
+        names.sort();
+        names
+    }
+
+    #[test]
+    fn keeps_the_newest_by_number_and_by_bytes() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        let two = PublishSettings { keep: Some(2), preview: false, ..Default::default() };
+        let removed: Vec<u64> = (0..4).map(|n| run.write_pictures(&frame(n), &two).unwrap().removed).collect();
+        assert_eq!(removed, [0, 0, 1, 1]);
+        assert_eq!(names(folder.path()), ["frame_000002.exr", "frame_000003.exr"]);
+
+        let one_byte = PublishSettings { keep_bytes: Some(1), ..Default::default() };
+        let written = run.write_pictures(&frame(4), &one_byte).unwrap();
+        assert_eq!(written.removed, 2);
+        assert_eq!(names(folder.path()), ["frame_000004.exr", "frame_000004.png"], "the newest stays though it is over the cap");
+        assert_eq!(run.kept_bytes(), written.bytes);
+    }
+
+    #[test]
+    fn an_older_run_is_refused_and_overwritten_only_on_demand() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        run.append_record(&frame(0).record).unwrap();
+        run.write_pictures(&frame(0), &PublishSettings::default()).unwrap();
+        for foreign in ["notes.txt", "frames/frame_best.png", "frames/frame_000000.tif"] {
+            fs::write(folder.path().join(foreign), "mine").unwrap();
+        }
+        let refused = RunFolder::create(folder.path(), false).unwrap_err().to_string();
+        assert!(refused.contains("--overwrite") && refused.contains("records.jsonl"), "{refused}");
+
+        fs::write(folder.path().join("frames/.frame_000007.exr.part"), "half").unwrap();
+        let run = RunFolder::create(folder.path(), true).unwrap();
+        assert_eq!(fs::read(folder.path().join(RECORDS)).unwrap(), b"");
+        assert_eq!(names(run.path()), ["frame_000000.tif", "frame_best.png"]);
+        assert!(folder.path().join("notes.txt").exists());
+    }
+
+    #[test]
+    fn a_folder_that_cannot_be_written_is_refused_at_once() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("taken");
+        fs::write(&file, "a file").unwrap();
+        let error = RunFolder::create(&file.join("run"), false).unwrap_err();
+        assert!(matches!(error, PublishError::Folder { .. }) && error.to_string().contains("taken"), "{error}");
+    }
+
+    #[test]
+    fn a_torn_line_is_cut_off_before_the_next() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        run.append_record(&frame(0).record).unwrap();
+        run.records.write_all(b"{\"frame\":1,\"ti").unwrap();
+        run.append_record(&frame(2).record).unwrap();
+        let text = fs::read_to_string(folder.path().join(RECORDS)).unwrap();
+        let frames: Vec<u64> = text.lines().map(|l| serde_json::from_str::<FrameRecord>(l).unwrap().frame).collect();
+        assert_eq!(frames, [0, 2]);
+    }
+
+    #[test]
+    fn a_failed_picture_leaves_nothing_under_its_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        // The PNG cannot take its place, since a folder is there: the EXR written before it must go again.
+        fs::create_dir_all(folder.path().join("frames/frame_000000.png/x")).unwrap();
+        assert!(run.write_pictures(&frame(0), &PublishSettings::default()).is_err());
+        assert_eq!(names(folder.path()), ["frame_000000.png"]);
+        assert_eq!(run.kept_bytes(), 0);
+    }
+}

@@ -1,0 +1,138 @@
+//! `[publish]` of a scene file.
+
+use super::PublishError;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
+
+/// Where frames go unless told otherwise: this machine only.
+pub const DEFAULT_ENDPOINT: &str = "tcp://127.0.0.1:5577";
+
+/// Form of the published picture.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Payload {
+    /// Tone-mapped, 8 bits a channel, lossy.
+    Jpeg,
+    /// Tone-mapped, 8 bits a channel, lossless.
+    Png,
+    /// The whole film with its layers, as in the run folder.
+    Exr,
+    /// Linear R, G, B, A as little-endian f32, rows from the top.
+    Raw,
+}
+
+impl Payload {
+    /// Name in the header's `encoding`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Payload::Jpeg => "jpeg",
+            Payload::Png => "png",
+            Payload::Exr => "exr",
+            Payload::Raw => "raw",
+        }
+    }
+}
+
+/// What happens to a frame when the disk is slower than the cycle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WhenFull {
+    /// The cycle waits for the disk (replay: nothing is lost), for a minute at most.
+    Wait,
+    /// The oldest waiting picture is dropped and counted (live: the cycle never waits). Its record is still written.
+    Drop,
+}
+
+/// `[publish]` of a scene file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct PublishSettings {
+    /// ZeroMQ endpoint, `tcp://HOST:PORT`; None (in a file: `"none"`) opens no socket. Port 0 takes a free one.
+    #[serde(deserialize_with = "endpoint_or_none", serialize_with = "none_as_word")]
+    pub endpoint: Option<String>,
+    /// Form of the published picture.
+    pub payload: Payload,
+    /// Pictures that may be on their way to subscribers at once.
+    pub frames_in_flight: usize,
+    /// Seconds after which a subscriber that still holds a picture is cut off.
+    pub stall_seconds: f64,
+    /// Newest frames whose pictures stay in the run folder; None keeps all.
+    pub keep: Option<usize>,
+    /// Bytes that the pictures in the run folder may take; None sets no cap. The newest frame always stays.
+    pub keep_bytes: Option<u64>,
+    /// Whether a PNG of each frame is written.
+    pub preview: bool,
+    /// Whether an EXR of each frame is written.
+    pub exr: bool,
+    /// What happens when the disk is slower than the cycle.
+    pub when_full: WhenFull,
+}
+
+impl Default for PublishSettings {
+    fn default() -> Self {
+        Self {
+            endpoint: Some(DEFAULT_ENDPOINT.to_owned()),
+            payload: Payload::Jpeg,
+            frames_in_flight: 3,
+            stall_seconds: 2.0,
+            keep: None,
+            keep_bytes: None,
+            preview: true,
+            exr: true,
+            when_full: WhenFull::Wait,
+        }
+    }
+}
+
+impl PublishSettings {
+    /// Checks ranges that the types do not.
+    pub fn check(&self) -> Result<(), PublishError> {
+        let setting = |key, found: String, accepted| Err(PublishError::Setting { key, found, accepted });
+        if !(1..=64).contains(&self.frames_in_flight) {
+            return setting("frames_in_flight", self.frames_in_flight.to_string(), "1 to 64");
+        }
+        if !(0.1..=3600.0).contains(&self.stall_seconds) {
+            return setting("stall_seconds", self.stall_seconds.to_string(), "0.1 to 3600");
+        }
+        if self.keep == Some(0) {
+            return setting("keep", "0".to_owned(), "at least 1, or no key to keep all frames");
+        }
+        Ok(())
+    }
+}
+
+/// TOML has no null, so that `"none"` (or an empty string) says it.
+fn endpoint_or_none<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
+    Ok(Option::<String>::deserialize(deserializer)?.filter(|s| !s.is_empty() && s != "none"))
+}
+
+fn none_as_word<S: Serializer>(endpoint: &Option<String>, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(endpoint.as_deref().unwrap_or("none"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reads_what_it_writes_and_knows_none() {
+        let settings = PublishSettings { endpoint: None, payload: Payload::Raw, keep: Some(3), ..Default::default() };
+        let text = toml::to_string(&settings).unwrap();
+        assert!(text.contains("endpoint = \"none\""), "{text}");
+        assert_eq!(toml::from_str::<PublishSettings>(&text).unwrap(), settings);
+        assert_eq!(toml::from_str::<PublishSettings>("").unwrap(), PublishSettings::default());
+        assert!(toml::from_str::<PublishSettings>("endpiont = 'none'").is_err());
+    }
+
+    #[test]
+    fn ranges_are_checked() {
+        let bad = [
+            PublishSettings { frames_in_flight: 0, ..Default::default() },
+            PublishSettings { stall_seconds: f64::NAN, ..Default::default() },
+            PublishSettings { keep: Some(0), ..Default::default() },
+        ];
+        for (settings, key) in bad.iter().zip(["frames_in_flight", "stall_seconds", "keep"]) {
+            assert!(settings.check().unwrap_err().to_string().contains(key));
+        }
+        PublishSettings::default().check().unwrap();
+    }
+}

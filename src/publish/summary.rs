@@ -1,0 +1,119 @@
+//! What `summary.json` says at the end of a run.
+
+use super::PublishStatistics;
+use crate::engine::FrameRecord;
+use serde::{Deserialize, Serialize};
+
+/// `summary.json`.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct Summary {
+    /// Frames that the cycle finished.
+    pub frames: u64,
+    /// Sums over the frames' records.
+    pub totals: Totals,
+    /// What became of them on disk; none without a run folder.
+    pub files: Option<FileStatistics>,
+    /// What became of them on the socket; none without one.
+    pub published: Option<PublishStatistics>,
+    /// Wall-clock seconds from start to finish.
+    pub seconds: f64,
+    /// Largest resident memory of the process, in bytes (VmHWM), where the system tells it.
+    pub peak_memory_bytes: Option<u64>,
+    /// What the caller added.
+    pub run: serde_json::Map<String, serde_json::Value>,
+}
+
+/// Sums over the records of all frames.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct Totals {
+    /// Log-stretch queries that the renderer made.
+    pub queries: u64,
+    /// Of them, answered by RK4.
+    pub traced: u64,
+    /// `traced / queries`; 0 without queries.
+    pub traced_share: f64,
+    /// Audit points traced.
+    pub audited: u64,
+    /// Queries whose extinction exceeded the majorant in force.
+    pub majorant_exceeded: u64,
+    /// Frames whose estimated residual exceeded the tolerance.
+    pub over_tolerance_frames: u64,
+    /// Optimizer steps.
+    pub training_steps: u64,
+    /// Times the weights were rolled back.
+    pub rollbacks: u64,
+    /// Warnings in the records.
+    pub warnings: u64,
+}
+
+impl Totals {
+    /// Adds one frame.
+    pub fn add(&mut self, record: &FrameRecord) {
+        self.queries += record.queries;
+        self.traced += record.traced;
+        self.traced_share = if self.queries == 0 { 0.0 } else { self.traced as f64 / self.queries as f64 };
+        self.audited += record.audited;
+        self.majorant_exceeded += record.majorant_exceeded;
+        self.over_tolerance_frames += u64::from(record.over_tolerance.is_some());
+        if let Some(training) = &record.training {
+            self.training_steps += training.steps;
+            self.rollbacks += training.rollbacks;
+        }
+        self.warnings += record.warnings.len() as u64;
+    }
+}
+
+/// What became of the frames on disk. `frames = pictures_written + pictures_dropped + pictures_failed + unfinished` when pictures
+/// are written at all.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+pub struct FileStatistics {
+    /// Lines in `records.jsonl`.
+    pub records_written: u64,
+    /// Records that the disk refused or that found the queue full.
+    pub records_lost: u64,
+    /// Frames whose pictures were written.
+    pub pictures_written: u64,
+    /// Frames whose pictures were dropped because the disk was slower than the cycle.
+    pub pictures_dropped: u64,
+    /// Frames whose pictures the disk refused (full, for instance).
+    pub pictures_failed: u64,
+    /// Frames whose pictures were deleted later, by `keep` or `keep_bytes`.
+    pub pictures_removed: u64,
+    /// Bytes of pictures written.
+    pub bytes_written: u64,
+    /// Bytes of pictures that are still there.
+    pub bytes_kept: u64,
+    /// Frames still unwritten when the run gave up waiting for the disk.
+    pub unfinished: u64,
+}
+
+/// Largest resident memory of this process so far, in bytes: VmHWM of `/proc/self/status`. None where there is no such file.
+pub fn peak_memory_bytes() -> Option<u64> {
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
+    let kibibytes: u64 = line.split_whitespace().next()?.parse().ok()?;
+    Some(kibibytes * 1024)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn peak_memory_grows_with_what_is_touched() {
+        let Some(before) = peak_memory_bytes() else { return };
+        let block = vec![1u8; 64 << 20];
+        let sum: u64 = block.iter().step_by(4096).map(|&b| u64::from(b)).sum();
+        assert_eq!(sum, (64 << 20) / 4096);
+        // Other tests run beside this one, so that only a lower bound is certain.
+        assert!(before > 0 && peak_memory_bytes().unwrap() >= 64 << 20);
+    }
+
+    #[test]
+    fn totals_add_up() {
+        let mut totals = Totals::default();
+        totals.add(&FrameRecord { queries: 100, traced: 100, over_tolerance: Some(0.01), ..Default::default() });
+        totals.add(&FrameRecord { queries: 300, traced: 0, warnings: vec!["odd".into()], ..Default::default() });
+        assert_eq!((totals.queries, totals.traced_share, totals.over_tolerance_frames, totals.warnings), (400, 0.25, 1, 1));
+    }
+}

@@ -1,0 +1,165 @@
+//! Frames through a real socket.
+
+#![allow(clippy::unwrap_used)]
+
+use ridgewatch::engine::{Frame, FrameRecord};
+use ridgewatch::publish::{
+    FRAME_TOPIC, FrameHeader, Output, Payload, PublishError, PublishSettings, Publisher, RECORD_TOPIC, RunFolder, Summary, decode_exr,
+};
+use ridgewatch::render::Film;
+use std::sync::Arc;
+use std::time::Duration;
+use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};
+
+/// Far longer than anything here takes on a busy machine: a test that hangs should fail, not hang.
+const LIMIT: Duration = Duration::from_secs(20);
+
+fn frame(number: u64) -> Frame {
+    let rgba = (0..24 * 16).map(|i| [i as f32 / 384.0, number as f32 / 1000.0, 0.5, 1.0]).collect();
+    let film = Film { width: 24, height: 16, rgba, ..Default::default() };
+    let record = FrameRecord { frame: number, time: 0.5 * number as f64, warnings: vec!["odd".into()], ..Default::default() };
+    Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
+}
+
+fn settings(payload: Payload) -> PublishSettings {
+    PublishSettings { payload, endpoint: Some("tcp://127.0.0.1:0".into()), ..Default::default() }
+}
+
+async fn subscribe(endpoint: &str, topics: &[&str]) -> SubSocket {
+    let mut socket = SubSocket::new();
+    socket.connect(endpoint).await.unwrap();
+    for topic in topics {
+        socket.subscribe(topic).await.unwrap();
+    }
+    socket
+}
+
+async fn receive(socket: &mut SubSocket) -> ZmqMessage {
+    tokio::time::timeout(LIMIT, socket.recv()).await.expect("a message in time").unwrap()
+}
+
+/// Sends frames until the subscription has taken hold, and returns the first message with its frame number.
+async fn first_message(publisher: &Publisher, socket: &mut SubSocket) -> (u64, ZmqMessage) {
+    for number in 0..1000 {
+        publisher.frame(frame(number));
+        if let Ok(message) = tokio::time::timeout(Duration::from_millis(50), socket.recv()).await {
+            return (number, message.unwrap());
+        }
+    }
+    panic!("no message came");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_encoding_arrives_and_decodes() {
+    for payload in [Payload::Jpeg, Payload::Png, Payload::Exr, Payload::Raw] {
+        let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(payload)).unwrap();
+        let mut socket = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
+        let (_, message) = first_message(&publisher, &mut socket).await;
+        assert_eq!(message.len(), 3);
+        assert_eq!(message.get(0).unwrap(), FRAME_TOPIC.as_bytes());
+        let header: FrameHeader = serde_json::from_slice(message.get(1).unwrap()).unwrap();
+        let body = message.get(2).unwrap();
+        let sent = frame(header.frame);
+        assert_eq!((header.encoding, header.payload_bytes), (payload, body.len()));
+        assert_eq!(header.record, *sent.record);
+        let film = &sent.film;
+        match payload {
+            Payload::Jpeg | Payload::Png => {
+                let picture = image::load_from_memory(body).unwrap().to_rgb8();
+                assert_eq!((header.shape, header.dtype.as_str()), ([16, 24, 3], "uint8"));
+                assert_eq!(picture.dimensions(), (24, 16));
+                if payload == Payload::Png {
+                    assert_eq!(picture.into_raw(), film.tone_mapped(header.tone_map));
+                }
+            }
+            Payload::Exr => assert_eq!(decode_exr(body).unwrap().rgba, film.rgba),
+            Payload::Raw => {
+                assert_eq!((header.shape, header.dtype.as_str()), ([16, 24, 4], "float32"));
+                let floats: Vec<f32> = body.chunks_exact(4).map(|b| f32::from_le_bytes(b.try_into().unwrap())).collect();
+                assert_eq!(floats, film.rgba.as_flattened());
+            }
+        }
+        let statistics = publisher.finish(Duration::from_millis(500));
+        assert_eq!(statistics.frames, statistics.sent + statistics.superseded + statistics.unheard, "{statistics:?}");
+        assert_eq!(statistics.subscribers, 1);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_record_arrives_though_pictures_are_superseded() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Png)).unwrap();
+    let mut socket = subscribe(publisher.endpoint(), &[RECORD_TOPIC]).await;
+    let (first, message) = first_message(&publisher, &mut socket).await;
+    assert_eq!((message.len(), message.get(0).unwrap().as_ref()), (2, RECORD_TOPIC.as_bytes()));
+    // A burst: far faster than pictures can be encoded.
+    for number in first + 1..first + 100 {
+        publisher.frame(frame(number));
+    }
+    for number in first + 1..first + 100 {
+        let message = receive(&mut socket).await;
+        let record: FrameRecord = serde_json::from_slice(message.get(1).unwrap()).unwrap();
+        assert_eq!(record.frame, number);
+    }
+    let statistics = publisher.finish(Duration::from_millis(500));
+    assert!(statistics.superseded > 0 && statistics.records_dropped == 0, "{statistics:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn finishing_flushes_the_last_frame() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Png)).unwrap();
+    let mut socket = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
+    first_message(&publisher, &mut socket).await;
+    publisher.frame(frame(5000));
+    tokio::task::spawn_blocking(move || publisher.finish(Duration::from_millis(500))).await.unwrap();
+    loop {
+        let message = receive(&mut socket).await;
+        let header: FrameHeader = serde_json::from_slice(message.get(1).unwrap()).unwrap();
+        if header.frame == 5000 {
+            break;
+        }
+    }
+}
+
+#[test]
+fn a_port_in_use_is_said_at_start() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
+    let taken = PublishSettings { endpoint: Some(publisher.endpoint().to_owned()), ..Default::default() };
+    let error = Output::start(&taken, None).unwrap_err();
+    assert!(matches!(error, PublishError::PortInUse { .. }));
+    assert!(error.to_string().contains(publisher.endpoint()) && error.to_string().contains("in use"), "{error}");
+}
+
+#[test]
+fn without_subscribers_nothing_is_encoded_and_nothing_waits() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Exr)).unwrap();
+    for number in 0..100 {
+        publisher.frame(frame(number));
+    }
+    let statistics = publisher.finish(Duration::from_millis(500));
+    assert_eq!((statistics.frames, statistics.sent, statistics.peak_held_bytes), (100, 0, 0));
+    assert_eq!(statistics.unheard + statistics.superseded, 100);
+}
+
+#[test]
+fn a_whole_run_leaves_its_folder_and_its_summary() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("run");
+    let settings = PublishSettings { keep: Some(3), ..settings(Payload::Jpeg) };
+    let mut output = Output::start(&settings, Some(RunFolder::create(&path, false).unwrap())).unwrap();
+    assert!(output.endpoint().unwrap().starts_with("tcp://127.0.0.1:"));
+    for number in 0..10 {
+        output.frame(frame(number));
+    }
+    let mut extra = serde_json::Map::new();
+    extra.insert("scene".into(), "double_gyre".into());
+    let summary = output.finish(extra);
+    let files = summary.files.unwrap();
+    assert_eq!((summary.frames, files.records_written, files.pictures_written, files.pictures_removed), (10, 10, 10, 7));
+    assert_eq!(summary.totals.warnings, 10);
+    let written: Summary = serde_json::from_slice(&std::fs::read(path.join("summary.json")).unwrap()).unwrap();
+    assert_eq!(written, summary);
+    assert_eq!(written.run["scene"], "double_gyre");
+    let text = std::fs::read_to_string(path.join("records.jsonl")).unwrap();
+    assert_eq!(text.lines().count(), 10);
+    assert!(path.join("frames/frame_000009.exr").exists() && !path.join("frames/frame_000006.png").exists());
+}

@@ -1,0 +1,188 @@
+//! A subscriber that stalls, beside a healthy one: memory stays bounded and the healthy one goes on.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch::engine::{Frame, FrameRecord};
+use ridgewatch::publish::{FRAME_TOPIC, FrameHeader, Payload, PublishSettings, PublishStatistics, Publisher, peak_memory_bytes};
+use ridgewatch::render::Film;
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+use zeromq::{Socket, SocketRecv, SubSocket};
+
+/// 1024 x 512 pixels of four f32: the 8 MB of a large raw frame.
+const FRAME_BYTES: u64 = 1024 * 512 * 16;
+/// Frames that may be in flight.
+const CAP: usize = 3;
+
+fn frame(number: u64, film: &Arc<Film>) -> Frame {
+    let record = FrameRecord { frame: number, ..Default::default() };
+    Frame { record: Arc::new(record), film: Arc::clone(film), tone_map: [1.0, 0.5, 1.0] }
+}
+
+fn film() -> Arc<Film> {
+    Arc::new(Film { width: 1024, height: 512, rgba: vec![[0.25, 0.5, 0.75, 1.0]; 1024 * 512], ..Default::default() })
+}
+
+fn publisher() -> Publisher {
+    let settings = PublishSettings { payload: Payload::Raw, frames_in_flight: CAP, ..Default::default() };
+    Publisher::start("tcp://127.0.0.1:0", &settings).unwrap()
+}
+
+/// Hands over ten frames a second for so long; hands over the statistics of each second.
+fn publish(publisher: &Publisher, seconds: u64) {
+    let film = film();
+    let start = Instant::now();
+    for number in 0..seconds * 10 {
+        let before = Instant::now();
+        publisher.frame(frame(number, &film));
+        // Handing over replaces a pointer: a millisecond would already be a wait. A busy machine may suspend this thread.
+        assert!(before.elapsed() < Duration::from_millis(200), "the cycle waited {:?}", before.elapsed());
+        std::thread::sleep((start + Duration::from_millis(100 * (number + 1))).saturating_duration_since(Instant::now()));
+    }
+}
+
+/// A subscriber that shakes hands (ZMTP 3.0, RFC 23), subscribes to everything and never reads again.
+fn stalled(endpoint: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(endpoint.strip_prefix("tcp://").unwrap()).unwrap();
+    stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+    let mut greeting = [0u8; 64];
+    greeting[0] = 0xff;
+    greeting[9] = 0x7f;
+    greeting[10] = 3;
+    greeting[12..16].copy_from_slice(b"NULL");
+    stream.write_all(&greeting).unwrap();
+    stream.read_exact(&mut greeting).unwrap();
+    let mut ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB".to_vec();
+    ready.splice(0..0, [0x04, ready.len() as u8]);
+    stream.write_all(&ready).unwrap();
+    let mut head = [0u8; 2];
+    stream.read_exact(&mut head).unwrap();
+    stream.read_exact(&mut vec![0u8; usize::from(head[1])]).unwrap();
+    // An empty subscription: all topics.
+    stream.write_all(&[0x00, 0x01, 0x01]).unwrap();
+    stream
+}
+
+/// Frame numbers and times at which a healthy subscriber got them.
+async fn listen(endpoint: String, until: tokio::sync::watch::Receiver<bool>) -> Vec<(Instant, u64)> {
+    let mut socket = SubSocket::new();
+    socket.connect(&endpoint).await.unwrap();
+    socket.subscribe(FRAME_TOPIC).await.unwrap();
+    let mut arrivals = Vec::new();
+    while !*until.borrow() {
+        match tokio::time::timeout(Duration::from_millis(100), socket.recv()).await {
+            Ok(Ok(message)) => {
+                let header: FrameHeader = serde_json::from_slice(message.get(1).unwrap()).unwrap();
+                assert_eq!(message.get(2).unwrap().len() as u64, FRAME_BYTES);
+                arrivals.push((Instant::now(), header.frame));
+            }
+            // A message torn by the cut-off, or none just now; the socket reconnects by itself.
+            Ok(Err(_)) => tokio::time::sleep(Duration::from_millis(10)).await,
+            Err(_) => {}
+        }
+    }
+    arrivals
+}
+
+fn beside_a_healthy_one(seconds: u64) -> (PublishStatistics, Duration, usize) {
+    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
+    let publisher = publisher();
+    let (stop, stopped) = tokio::sync::watch::channel(false);
+    let healthy = runtime.spawn(listen(publisher.endpoint().to_owned(), stopped));
+    std::thread::sleep(Duration::from_millis(500));
+    let stalled = stalled(publisher.endpoint());
+    publish(&publisher, seconds);
+    let end = Instant::now();
+    stop.send(true).unwrap();
+    let arrivals = runtime.block_on(healthy).unwrap();
+    drop(stalled);
+    let times: Vec<Instant> = arrivals.iter().map(|a| a.0).chain([end]).collect();
+    let gap = times.windows(2).map(|w| w[1].saturating_duration_since(w[0])).max().unwrap();
+    (publisher.finish(Duration::from_millis(500)), gap, arrivals.len())
+}
+
+fn check(statistics: &PublishStatistics, gap: Duration, arrivals: usize, seconds: u64) {
+    println!("{statistics:?}\nlargest gap {gap:?}, {arrivals} frames arrived, peak memory {:?} MiB", peak_memory_bytes().map(|b| b >> 20));
+    assert!(statistics.cut_offs >= 1, "the stalled one was cut off: {statistics:?}");
+    // 2 s until the cut-off, 0.1 s until the healthy one reconnects, 0.1 s until the next frame; the rest is a busy machine.
+    assert!(gap < Duration::from_secs(3), "the healthy one waited {gap:?}");
+    // The cap, and a kilobyte a record that is on its way beside them.
+    let bound = CAP as u64 * FRAME_BYTES + 256 * 1024;
+    assert!(statistics.peak_held_bytes <= bound, "{} bytes held", statistics.peak_held_bytes);
+    // Two seconds and a half lost to the cut-off, and every second frame may be superseded on a busy machine.
+    assert!(arrivals as u64 >= (seconds - 4) * 5, "{arrivals} frames in {seconds} s");
+}
+
+#[test]
+fn a_stalled_subscriber_is_cut_off_and_the_healthy_one_goes_on() {
+    let (statistics, gap, arrivals) = beside_a_healthy_one(9);
+    check(&statistics, gap, arrivals, 9);
+}
+
+#[test]
+#[ignore = "takes a minute"]
+fn a_minute_of_stall() {
+    let (statistics, gap, arrivals) = beside_a_healthy_one(60);
+    check(&statistics, gap, arrivals, 60);
+}
+
+/// A child that is continued and killed when the test ends, however it ends.
+struct Subscriber(Child);
+
+impl Subscriber {
+    fn start(python: &str, endpoint: &str) -> Self {
+        let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/subscriber.py");
+        Self(Command::new(python).args([script, endpoint]).stdout(Stdio::piped()).spawn().unwrap())
+    }
+
+    fn signal(&self, name: &str) {
+        assert!(Command::new("kill").args([name, &self.0.id().to_string()]).status().unwrap().success());
+    }
+}
+
+impl Drop for Subscriber {
+    fn drop(&mut self) {
+        self.signal("-CONT");
+        self.0.kill().unwrap();
+        self.0.wait().unwrap();
+    }
+}
+
+/// The realistic stall: a libzmq subscriber whose process is stopped for a minute, then wakes.
+#[test]
+#[ignore = "takes a minute and needs a Python with pyzmq, named by PYTHON"]
+fn a_minute_of_stopped_pyzmq() {
+    let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let publisher = publisher();
+    let mut healthy = Subscriber::start(&python, publisher.endpoint());
+    let lines = BufReader::new(healthy.0.stdout.take().unwrap());
+    let arrivals = std::thread::spawn(move || {
+        lines.lines().map_while(Result::ok).filter(|l| l.starts_with("frame")).map(|_| Instant::now()).collect::<Vec<Instant>>()
+    });
+    let mut sleeper = Subscriber::start(&python, publisher.endpoint());
+    let mut sleeper_lines = BufReader::new(sleeper.0.stdout.take().unwrap()).lines();
+    // Both have got frames before one is stopped.
+    publish(&publisher, 3);
+    assert!(sleeper_lines.next().unwrap().unwrap().starts_with("frame"));
+    sleeper.signal("-STOP");
+    publish(&publisher, 60);
+    let end = Instant::now();
+    println!("peak memory {:?} MiB", peak_memory_bytes().map(|b| b >> 20));
+    sleeper.signal("-CONT");
+    publish(&publisher, 5);
+    let woke = std::thread::spawn(move || sleeper_lines.map_while(Result::ok).count());
+    publish(&publisher, 1);
+    drop(sleeper);
+    drop(healthy);
+    let statistics = publisher.finish(Duration::from_millis(500));
+    let times: Vec<Instant> = arrivals.join().unwrap().into_iter().take_while(|t| *t < end).collect();
+    let gap = times.windows(2).map(|w| w[1] - w[0]).max().unwrap();
+    let woke = woke.join().unwrap();
+    println!("the stopped one printed {woke} lines after its first");
+    check(&statistics, gap, times.len(), 60);
+    // 30 frames before it was stopped at most; more shows that it came back by itself.
+    assert!(woke > 45, "the stopped one came back: {woke} lines");
+}
