@@ -3,7 +3,7 @@
 use super::{Common, Usage, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::engine::{self, Event, Frame, RunOptions, Setup};
-use ridgewatch::publish::{write_exr, write_preview};
+use ridgewatch::publish::write_exr;
 use ridgewatch::render::Method;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -72,11 +72,9 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {
-        write_exr(&options.out, &frame)?;
-        write_preview(&options.out.with_extension("png"), &frame)?;
-    } else {
-        write_preview(&options.out, &frame)?;
+        write_exr(&options.out, &frame.film, Some(&*frame.record))?;
     }
+    ridgewatch::publish::write_png(&options.out.with_extension("png"), &frame.film, frame.tone_map)?;
     if common.json {
         return print_json(&*frame.record);
     }

@@ -4,7 +4,7 @@ use super::{Common, Usage, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
-use ridgewatch::publish::{Output, OutputOptions};
+use ridgewatch::publish::{Output, RunFolder};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -63,7 +63,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
     let setup = Setup::new(scene)?;
     let scene = setup.scene.clone();
-    let output = Output::start(&scene.publish, OutputOptions { folder: Some(options.out.clone()), overwrite: options.overwrite }).await?;
+    let mut output = Output::start(&scene.publish, Some(RunFolder::create(&options.out, options.overwrite)?))?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }
@@ -76,33 +76,24 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         ..RunOptions::default()
     };
     // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.
-    let sender = output.sender();
-    let worker = {
-        let stop = stop.clone();
-        tokio::task::spawn_blocking(move || {
-            let mut bar = messages::progress(None);
-            let mut last: Option<Arc<FrameRecord>> = None;
-            let result = engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &sender), &stop);
-            bar.finish_and_clear();
-            (result, last)
-        })
-    };
-    let (result, last) = worker.await.context("the cycle stopped unexpectedly")?;
+    let worker = tokio::task::spawn_blocking(move || {
+        let mut bar = messages::progress(None);
+        let mut last: Option<Arc<FrameRecord>> = None;
+        let result = engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
+        bar.finish_and_clear();
+        // Whatever happened, the frames made so far and their records are completed.
+        let mut run = serde_json::Map::new();
+        run.insert("title".into(), scene.title.into());
+        run.insert("seed".into(), scene.seed.into());
+        match &result {
+            Ok(report) => run.extend(run_json(report)),
+            Err(error) => drop(run.insert("failed".into(), error.to_string().into())),
+        }
+        (result, last, output.finish(run))
+    });
+    let (result, last, summary) = worker.await.context("the cycle stopped unexpectedly")?;
     signals.abort();
-    // Whatever happened, the frames made so far and their records are completed first.
-    let report = result.as_ref().ok().cloned();
-    let mut extra = serde_json::Map::new();
-    extra.insert("title".into(), scene.title.clone().into());
-    extra.insert("seed".into(), scene.seed.into());
-    if let Some(report) = &report {
-        extra.insert("run".into(), run_json(report));
-    }
-    if let Err(error) = &result {
-        extra.insert("failed".into(), error.to_string().into());
-    }
-    let summary = output.finish(extra).await;
     let report = result?;
-    let summary = summary?;
     if common.json {
         return print_json(&summary);
     }
@@ -124,7 +115,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     Ok(())
 }
 
-fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<FrameRecord>>, sender: &ridgewatch::publish::FrameSender) {
+fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<FrameRecord>>, output: &mut Output) {
     match event {
         Event::Begin { frames, notes } => {
             *bar = messages::progress(frames);
@@ -139,7 +130,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
             }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
             *last = Some(frame.record.clone());
-            sender.send(frame);
+            output.frame(frame);
             bar.inc(1);
         }
     }
@@ -164,8 +155,8 @@ pub(super) fn line(record: &FrameRecord) -> String {
     text + &format!(", {:.2} s", record.seconds.total)
 }
 
-fn run_json(report: &RunReport) -> serde_json::Value {
-    serde_json::json!({
+fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
+    let serde_json::Value::Object(map) = serde_json::json!({
         "frames": report.frames,
         "slides": report.slides,
         "interrupted": report.interrupted,
@@ -174,7 +165,8 @@ fn run_json(report: &RunReport) -> serde_json::Value {
         "integration_steps": report.integration_steps,
         "surrogate_bytes": report.surrogate_bytes,
         "window_bytes_peak": report.window_bytes,
-    })
+    }) else { unreachable!("an object literal") };
+    map
 }
 
 /// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process.

@@ -2,19 +2,24 @@
 
 use super::answers::push_sample;
 use crate::flow::{Extras, Traced, Tracer};
-use crate::render::{TransferFunction, rng::Counter};
+use crate::render::Transfer;
+use crate::render::rng::{philox, unit};
 use crate::surrogate::{Samples, Surrogate};
 use crate::trust::{Gate, Residual, TrustedError};
 
+/// Dimension that no path reaches.
+const AUDIT_DIMENSION: u32 = u32::MAX;
+
 /// Stratified uniform points in the unit cube: `per_cell` in each of `cells`, jittered.
 pub fn stratified_points(cells: [usize; 3], per_cell: usize, seed: u64, stream: u64) -> Vec<[f32; 3]> {
-    let counter = Counter::new(seed, stream);
+    let key = [seed as u32, (seed >> 32) as u32];
     let mut points = Vec::with_capacity(cells.iter().product::<usize>() * per_cell);
     for cell in 0..cells.iter().product::<usize>() {
         let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
         for _ in 0..per_cell {
-            let n = points.len() as u32;
-            points.push(std::array::from_fn(|k| (index[k] as f32 + counter.uniform(n, k as u32)) / cells[k] as f32));
+            // The last word keeps these draws apart from every pixel's.
+            let words = philox([points.len() as u32, stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION], key);
+            points.push(std::array::from_fn(|k| (index[k] as f32 + unit(words[k])) / cells[k] as f32));
         }
     }
     points
@@ -50,7 +55,7 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
 }
 
 /// Residuals of `surrogate` on traced samples that it has not seen. `tau` turns log-stretch into FTLE for the ramp.
-pub fn residuals(surrogate: &dyn Surrogate, samples: &Samples, transfer: &TransferFunction, tau: f64) -> Vec<Residual> {
+pub fn residuals(surrogate: &dyn Surrogate, samples: &Samples, transfer: &Transfer, tau: f64) -> Vec<Residual> {
     let mut predicted = vec![0.0; samples.len()];
     surrogate.predict(&samples.points, &mut predicted);
     let ramp = |s: f32| transfer.ramp(s / tau as f32);

@@ -10,7 +10,7 @@ use super::setup::Setup;
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::TrainingSettings;
 use crate::flow::{Tracer, cpu_tracer};
-use crate::render::{Method, Renderer, Scene, TransferFunction, TransferSettings};
+use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, TrustMap};
 use std::path::PathBuf;
@@ -96,13 +96,24 @@ struct Cycle<'a> {
     options: &'a RunOptions,
     threads: Threads,
     renderer: Renderer,
-    transfer: TransferFunction,
     trust: TrustMap,
     ring: SampleRing,
     live: Option<Box<dyn Surrogate>>,
     frame: u64,
+    /// Frames that were no warm-up.
+    pictures: u64,
     report: RunReport,
 }
+
+/// Where a frame stands in the run.
+#[derive(Clone, Copy)]
+struct Place {
+    first_of_slide: bool,
+    warmup: bool,
+}
+
+/// Number of the first warm-up picture, far beyond all others.
+const WARMUP_PICTURES: u64 = 1 << 40;
 
 /// Runs the whole scene. `sink` gets every event; `stop` ends the run after the current frame.
 pub fn run(mut setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
@@ -118,11 +129,12 @@ pub fn run(mut setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) 
     loop {
         let extra = if slide.index == 0 { setup.scene.time.warmup_frames } else { 0 };
         for number in 0..setup.scene.time.frames_per_slide + extra {
+            let place = Place { first_of_slide: number == 0, warmup: number < extra };
             if stop.load(Ordering::Relaxed) {
                 cycle.report.interrupted = true;
                 return cycle.finish();
             }
-            let frame = cycle.frame(&*tracer, &mut slide, number == 0, sink)?;
+            let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
             sink(Event::Frame(frame));
         }
         if stop.load(Ordering::Relaxed) {
@@ -142,8 +154,7 @@ pub fn run(mut setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) 
 impl<'a> Cycle<'a> {
     fn new(setup: &'a Setup, options: &'a RunOptions, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
         let scene = &setup.scene;
-        let (transfer_settings, transfer) = settle_transfer(setup, tracer, first.time)?;
-        let renderer = Renderer::new(render_scene(setup, transfer_settings), &setup.domain, setup.map.tau)?;
+        let renderer = Renderer::new(settled_scene(setup, tracer, first.time)?, &setup.domain, setup.map.tau)?;
         let method = scene.render.method;
         let mut live = if method == Method::Reference {
             None
@@ -159,11 +170,11 @@ impl<'a> Cycle<'a> {
             options,
             threads: Threads::new(options.threads, scene.training.share, learns)?,
             renderer,
-            transfer,
             trust: TrustMap::new(&scene.trust, &setup.domain),
             ring: SampleRing::new(scene.training.ring, scene.seed),
             live,
             frame: 0,
+            pictures: 0,
             report: RunReport { integration_steps: tracer.steps(), ..RunReport::default() },
         })
     }
@@ -182,7 +193,7 @@ impl<'a> Cycle<'a> {
         self.renderer.window_slid();
     }
 
-    fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, first_of_slide: bool, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
+    fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, place: Place, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
         let start = Instant::now();
         let scene = &self.setup.scene;
         let method = scene.render.method;
@@ -195,6 +206,10 @@ impl<'a> Cycle<'a> {
         let front: Option<Arc<dyn Surrogate>> = self.live.as_ref().map(|live| live.freeze());
         let per_cell = scene.trust.audit_per_cell;
         let cells = self.trust.shape();
+        let samples_per_pixel = self.options.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
+        // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
+        // the warm-up was.
+        let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
         let (mut learned, mut work) = (None, None);
         {
@@ -209,7 +224,7 @@ impl<'a> Cycle<'a> {
                         None => Trainer::After(live, ring),
                     }
                 });
-                let mut render = || {
+                let mut render = || -> Result<Rendered, EngineError> {
                     let mut answers =
                         Answers::new(tracer, front.as_deref(), &gate, scene.trust.trace_budget, if front.is_some() { scene.training.ring } else { 0 })
                             .with_flow_map(flow_map);
@@ -220,7 +235,7 @@ impl<'a> Cycle<'a> {
                         }
                     };
                     let walk = Instant::now();
-                    let (film, stats) = renderer.render(frame, &mut answers, scene.render.samples, Some(&report), &AtomicBool::new(false));
+                    let (film, stats) = renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
@@ -230,8 +245,8 @@ impl<'a> Cycle<'a> {
                     });
                     let unit = audit::stratified_points(cells, per_cell, seed, 2 * frame);
                     let audit = audit::trace(tracer, &unit, flow_map);
-                    let residuals = front.as_deref().map(|front| audit::residuals(front, &audit.samples, &self.transfer, tracer.tau()));
-                    Rendered { film, stats, tally, samples, audit, residuals, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() }
+                    let residuals = front.as_deref().map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
+                    Ok(Rendered { film, stats, tally, samples, audit, residuals, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() })
                 };
                 work = Some(threads.render.install(&mut render));
                 rendered.store(true, Ordering::Release);
@@ -242,8 +257,9 @@ impl<'a> Cycle<'a> {
                 };
             });
         }
-        let Some(work) = work else { return Err(EngineError::EndedEarly) };
+        let work = work.ok_or(EngineError::EndedEarly)??;
         let auditing = Instant::now();
+        let transfer = self.renderer.transfer();
         let mut record = FrameRecord {
             frame: self.frame,
             slide: slide.index,
@@ -261,7 +277,7 @@ impl<'a> Cycle<'a> {
             },
             surrogate: front.as_ref().map(|s| s.name().to_owned()),
             size: [work.film.width, work.film.height],
-            samples_per_pixel: scene.render.samples,
+            samples_per_pixel,
             queries: work.tally.queries,
             traced: work.tally.traced,
             traced_share: work.tally.traced as f64 / work.tally.queries.max(1) as f64,
@@ -285,17 +301,17 @@ impl<'a> Cycle<'a> {
                 let unit = audit::stratified_points(cells, per_cell, scene.seed, 2 * self.frame + 1);
                 record.verified = self.threads.render.install(|| {
                     let fresh = audit::trace(tracer, &unit, false);
-                    audit::trusted_error(&audit::residuals(front, &fresh.samples, &self.transfer, tracer.tau()), &gate)
+                    audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &gate)
                 });
             }
             let mut residuals = audited.clone();
             let stride = work.samples.len().div_ceil(RENDER_RESIDUALS).max(1);
             let some = every(&work.samples, stride);
-            residuals.extend(self.threads.render.install(|| audit::residuals(front, &some, &self.transfer, tracer.tau())));
+            residuals.extend(self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau())));
             self.trust.observe(&residuals);
-            if first_of_slide && slide.index > 0 {
+            if place.first_of_slide && slide.index > 0 {
                 // Old labels stay only where the new window's traces say that they still hold.
-                self.threads.render.install(|| self.ring.revalidate(tracer, scene.trust.tolerance, &self.transfer));
+                self.threads.render.install(|| self.ring.revalidate(tracer, scene.trust.tolerance, transfer));
             }
             self.ring.push(&work.audit.samples);
             self.ring.push(&work.samples);
@@ -322,6 +338,7 @@ impl<'a> Cycle<'a> {
         self.report.waited += record.seconds.waiting;
         self.report.slides = slide.index + 1;
         self.frame += 1;
+        self.pictures += u64::from(!place.warmup);
         Ok(Frame { record: Arc::new(record), film: Arc::new(work.film), tone_map: scene.render.tone_map })
     }
 
@@ -390,32 +407,22 @@ fn every(samples: &Samples, stride: usize) -> Samples {
     }
 }
 
-/// The transfer function of the run: as given, or scaled to the FTLE of the first slide and kept for the whole run, so that
-/// colours compare.
-fn settle_transfer(setup: &Setup, tracer: &dyn Tracer, time: f64) -> Result<(TransferSettings, TransferFunction), EngineError> {
-    let mut settings = setup.scene.transfer.clone().unwrap_or_else(TransferSettings::published_colours);
-    if settings.low.is_none() || settings.high.is_none() {
+/// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
+/// for the whole run, so that colours compare.
+fn settled_scene(setup: &Setup, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
+    let file = &setup.scene;
+    let mut scene =
+        Scene::assemble(&setup.domain, file.camera.clone(), file.light.clone(), file.transfer.clone(), file.render.clone(), file.seed);
+    if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if setup.domain.dimensions == 3 { 16 } else { 1 };
-        let unit = audit::stratified_points([PROBES, PROBES, z], 1, setup.scene.seed, u64::MAX);
-        let mut ftle: Vec<f32> =
-            audit::trace(tracer, &unit, false).samples.log_stretch.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
+        let unit = audit::stratified_points([PROBES, PROBES, z], 1, file.seed, u64::MAX);
+        let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
+        let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {
             return Err(EngineError::AllMissing { points: unit.len(), time });
         }
-        settings.scale_to(&mut ftle);
+        scene.transfer = scene.transfer.scaled_to(&ftle);
     }
-    let transfer = TransferFunction::new(&settings, &setup.domain)?;
-    Ok((settings, transfer))
-}
-
-fn render_scene(setup: &Setup, transfer: TransferSettings) -> Scene {
-    let scene = &setup.scene;
-    Scene {
-        camera: scene.camera.clone().unwrap_or_else(|| crate::render::CameraSettings::overview(&setup.domain)),
-        light: scene.light.clone().unwrap_or_else(|| crate::render::LightSettings::overview(&setup.domain)),
-        transfer,
-        settings: scene.render.clone(),
-        seed: scene.seed,
-    }
+    Ok(scene)
 }
