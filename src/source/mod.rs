@@ -1,3 +1,140 @@
-//! Where snapshots come from: closed forms sampled on a grid, NetCDF files.
+//! Where snapshots come from: NetCDF files, or memory (closed forms sampled on a grid).
 //!
 //! In: settings and files. Out: snapshots in time order, read ahead by one I/O thread. Calls `field`.
+//!
+//! [`NetCdfArchive`] and [`MemorySource`] are [`SnapshotSource`]s; [`read_ahead`] puts one on its thread; [`inspect`] tells what
+//! would be read and why.
+
+mod archive;
+mod axes;
+mod cf;
+mod classic;
+mod container;
+mod conversion;
+mod error;
+mod files;
+mod inspect;
+mod layout;
+mod memory;
+mod netcdf4;
+mod reader;
+mod settings;
+
+pub use archive::NetCdfArchive;
+pub use error::SourceError;
+pub use inspect::{AxisReport, Inspection, MissingReport, ResolutionReport, TimeReport, VariableReport, inspect};
+pub use memory::MemorySource;
+pub use reader::{DEFAULT_READ_AHEAD, ReadAhead, read_ahead};
+pub use settings::{Metric, NetCdfSettings, VelocityUnit};
+
+use crate::field::{Grid, Snapshot};
+use serde::Serialize;
+use std::sync::Arc;
+
+/// Snapshots by index, in ascending time, all on one grid.
+pub trait SnapshotSource: Send {
+    /// The grid.
+    fn grid(&self) -> &Arc<Grid>;
+
+    /// Times of the snapshots, strictly ascending: seconds (since 1970-01-01 where there is a calendar), or snapshots counted from
+    /// 0 in the index metric.
+    fn times(&self) -> &[f64];
+
+    /// Reads one snapshot.
+    ///
+    /// # Errors
+    /// An index that is not there; a file that went away, changed or is damaged.
+    fn read(&mut self, index: usize) -> Result<Snapshot, SourceError>;
+
+    /// A time as a date (`2002-01-01T00:00:00Z`); none without a calendar.
+    fn date(&self, time: f64) -> Option<String>;
+
+    /// What it is, in words.
+    fn describe(&self) -> SourceDescription;
+
+    /// |tau| where none is given: half the span of the archive, at least two intervals.
+    ///
+    /// # Errors
+    /// Fewer than three snapshots.
+    fn default_tau(&self) -> Result<f64, SourceError> {
+        let times = self.times();
+        let (span, interval) = (span(times), median_interval(times));
+        let tau = (span / 2.0).max(2.0 * interval);
+        if times.len() < 3 {
+            return Err(SourceError::TooShort { tau, needed: 3, found: times.len(), interval, span });
+        }
+        // Uneven steps: two median intervals may be longer than the archive.
+        Ok(tau.min(span))
+    }
+
+    /// Whether the snapshots cover an integration over `tau`.
+    ///
+    /// # Errors
+    /// They do not: the error says how many are needed and how many there are. Or `tau` is not a positive number.
+    fn check_tau(&self, tau: f64) -> Result<(), SourceError> {
+        let times = self.times();
+        if !(tau.is_finite() && tau > 0.0) {
+            return Err(SourceError::Setting { key: "tau", found: tau.to_string(), accepted: "a positive duration".into() });
+        }
+        let (span, interval) = (span(times), median_interval(times));
+        // The window's slack.
+        if times.len() >= 2 && span >= tau * (1.0 - 1e-9) {
+            return Ok(());
+        }
+        let needed = if interval > 0.0 { (tau / interval * (1.0 - 1e-9)).ceil() as usize + 1 } else { 2 };
+        Err(SourceError::TooShort { tau, needed: needed.max(times.len() + 1), found: times.len(), interval, span })
+    }
+}
+
+/// What a source is, in words, for logs and summaries.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct SourceDescription {
+    /// Format and number of files, or what the memory holds.
+    pub kind: String,
+    /// Components and why they were chosen.
+    pub variables: Vec<String>,
+    /// Metric in force.
+    pub metric: Metric,
+    /// Unit of [`SnapshotSource::times`].
+    pub time_unit: String,
+    /// Time variable.
+    pub time_variable: Option<String>,
+    /// Its `units`.
+    pub time_units_in_file: Option<String>,
+    /// Calendar of the dates.
+    pub calendar: Option<String>,
+    /// Choices, conversions, gaps in time.
+    pub notes: Vec<String>,
+}
+
+/// An interval that is longer than the others.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct TimeGap {
+    /// Time of the snapshot before it.
+    pub after: f64,
+    /// Time of the snapshot behind it.
+    pub before: f64,
+    /// Snapshots that would fit in at the median interval.
+    pub missing: usize,
+}
+
+/// Intervals of more than one and a half times the median.
+pub fn time_gaps(times: &[f64]) -> Vec<TimeGap> {
+    let median = median_interval(times);
+    let gap = |w: &[f64]| {
+        let steps = (w[1] - w[0]) / median;
+        (steps > 1.5).then(|| TimeGap { after: w[0], before: w[1], missing: (steps.round() as usize).saturating_sub(1) })
+    };
+    if median > 0.0 { times.windows(2).filter_map(gap).collect() } else { Vec::new() }
+}
+
+fn span(times: &[f64]) -> f64 {
+    times.last().zip(times.first()).map_or(0.0, |(last, first)| last - first)
+}
+
+/// Median of the intervals; 0 with fewer than two times.
+fn median_interval(times: &[f64]) -> f64 {
+    let mut intervals: Vec<f64> = times.windows(2).map(|w| w[1] - w[0]).collect();
+    intervals.sort_by(f64::total_cmp);
+    intervals.get(intervals.len() / 2).copied().unwrap_or(0.0)
+}

@@ -1,0 +1,412 @@
+//! Many NetCDF files as one sequence of snapshots.
+
+use super::axes::{AxisPlan, runs};
+use super::cf::calendar::Calendar;
+use super::cf::coordinate::Kind;
+use super::container::Container;
+use super::conversion::Conversion;
+use super::files::expand;
+use super::layout::{ComponentPlan, Layout, Role, plan};
+use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
+use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A file of the archive; closed until it is read.
+struct ArchiveFile {
+    path: PathBuf,
+    components: Vec<ComponentPlan>,
+}
+
+/// Velocity in NetCDF files with CF conventions. Opening reads headers, coordinates and times; velocities are read one snapshot
+/// at a time. One file is open at any moment.
+pub struct NetCdfArchive {
+    files: Vec<ArchiveFile>,
+    /// File and time entry of each snapshot, in time order.
+    places: Vec<(usize, usize)>,
+    seconds: Vec<f64>,
+    times: Vec<f64>,
+    calendar: Option<Calendar>,
+    axes: Vec<AxisPlan>,
+    grid: Arc<Grid>,
+    conversion: Option<Conversion>,
+    metric: Metric,
+    in_cells: bool,
+    description: SourceDescription,
+    open: Option<(usize, Container)>,
+}
+
+impl NetCdfArchive {
+    /// Opens files, folders (their `*.nc`) and patterns; where there are none, those of the settings. Snapshots are sorted by time.
+    ///
+    /// # Errors
+    /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
+    /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each names the file.
+    pub fn open(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<Self, SourceError> {
+        check(settings)?;
+        let paths = expand(if paths.is_empty() { &settings.files } else { paths })?;
+        let mut first: Option<(Layout, &'static str)> = None;
+        let mut entries: Vec<(f64, usize, usize)> = Vec::new();
+        let mut files = Vec::with_capacity(paths.len());
+        let mut last_open = None;
+        for path in paths {
+            let container = Container::open(&path)?;
+            let layout = plan(&container, settings)?;
+            let index = files.len();
+            entries.extend(layout.time.seconds.iter().enumerate().map(|(i, &s)| (s, index, i)));
+            files.push(ArchiveFile { path, components: layout.components.clone() });
+            match &first {
+                Some((reference, _)) => {
+                    if let Some(what) = difference(reference, &layout) {
+                        return Err(SourceError::Mixed { first: files[0].path.clone(), second: files[index].path.clone(), what });
+                    }
+                }
+                None => first = Some((layout, container.format.name())),
+            }
+            last_open = Some((index, container));
+        }
+        let Some((layout, format)) = first else { return Err(SourceError::NoFiles) };
+        entries.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let calendar = layout.time.calendar;
+        check_duplicates(&entries, &files, calendar)?;
+        let seconds: Vec<f64> = entries.iter().map(|e| e.0).collect();
+        let times = match layout.metric {
+            Metric::Index => (0..seconds.len()).map(|i| i as f64).collect(),
+            Metric::Sphere | Metric::Cartesian => seconds.clone(),
+        };
+        let path = &files[0].path;
+        let conversion = match (layout.metric, settings.velocity_unit) {
+            (Metric::Index, VelocityUnit::Si) => Some(Conversion::to_cells(&layout.axes)),
+            (Metric::Cartesian, VelocityUnit::Si) if is_sphere(&layout.axes) => Some(Conversion::to_degrees(&layout.axes)),
+            _ => None,
+        };
+        let grid = Arc::new(build_grid(path, &layout, settings)?);
+        let description = describe(&layout, format, files.len(), &seconds);
+        Ok(Self {
+            places: entries.iter().map(|e| (e.1, e.2)).collect(),
+            seconds,
+            times,
+            calendar,
+            axes: layout.axes,
+            grid,
+            conversion,
+            metric: layout.metric,
+            in_cells: settings.velocity_unit == VelocityUnit::Cells,
+            description,
+            open: last_open,
+            files,
+        })
+    }
+
+    /// The files, in the order of their names in the arguments.
+    pub fn files(&self) -> impl ExactSizeIterator<Item = &Path> {
+        self.files.iter().map(|f| f.path.as_path())
+    }
+
+    /// Seconds since 1970-01-01 in the archive's calendar (or since the simulation's start), one a snapshot, ascending. Equal to
+    /// [`SnapshotSource::times`] but in the index metric.
+    pub fn seconds(&self) -> &[f64] {
+        &self.seconds
+    }
+
+    /// Metric in force.
+    pub fn metric(&self) -> Metric {
+        self.metric
+    }
+
+    /// Intervals of more than one and a half times the median.
+    pub fn gaps(&self) -> Vec<TimeGap> {
+        time_gaps(&self.times)
+    }
+
+    /// Units of the axes in the files, before the index metric replaced them, with direction: for reports.
+    pub(super) fn axis_plans(&self) -> &[AxisPlan] {
+        &self.axes
+    }
+
+    /// Variable, component and reason of what is read.
+    pub(super) fn chosen(&self) -> impl Iterator<Item = (&str, &'static str, &str)> {
+        self.files[0].components.iter().zip(["u", "v", "w"]).map(|(c, role)| (c.name.as_str(), role, c.why.as_str()))
+    }
+
+    /// Measures one snapshot's velocities in SI and in cells per interval.
+    pub(super) fn displacement(&mut self, index: usize) -> Result<Displacement, SourceError> {
+        let Some(&(file, entry)) = self.places.get(index) else {
+            return Err(SourceError::NoSuchSnapshot { index, count: self.places.len() });
+        };
+        let count = self.files[file].components.len();
+        let raw = (0..count).map(|which| self.component(file, entry, which)).collect::<Result<Vec<_>, _>>()?;
+        let mut cells = raw.clone();
+        if !self.in_cells {
+            Conversion::to_cells(&self.axes).apply(&mut cells, self.grid.shape(), self.interval(index));
+        }
+        let mut sum = Displacement::default();
+        for i in 0..self.grid.nodes() {
+            if raw.iter().any(|c| !c[i].is_finite()) {
+                sum.missing += 1;
+                continue;
+            }
+            sum.known += 1;
+            for (total, component) in sum.squared_velocity.iter_mut().zip(&raw) {
+                *total += f64::from(component[i]).powi(2);
+            }
+            let squared = cells.iter().map(|c| f64::from(c[i]).powi(2)).sum::<f64>();
+            sum.squared_cells += squared;
+            sum.greatest_cells = sum.greatest_cells.max(squared.sqrt());
+        }
+        Ok(sum)
+    }
+
+    /// Seconds that snapshot `index` stands for: half the way to its neighbours on both sides.
+    fn interval(&self, index: usize) -> f64 {
+        let last = self.seconds.len() - 1;
+        let (low, high) = (index.saturating_sub(1), (index + 1).min(last));
+        if high > low { (self.seconds[high] - self.seconds[low]) / (high - low) as f64 } else { 1.0 }
+    }
+
+    /// Makes the file of a snapshot the open one.
+    fn container(&mut self, file: usize) -> Result<&Container, SourceError> {
+        if self.open.as_ref().is_none_or(|o| o.0 != file) {
+            // Closed before the next is opened.
+            self.open = None;
+            let path = &self.files[file].path;
+            let container = Container::open(path)?;
+            for component in &self.files[file].components {
+                let found = container.header.find(&component.name).map(|v| &container.header.variables[v]);
+                if found.is_none_or(|v| container.header.shape(v) != component.shape) {
+                    let what = "it changed since the archive was opened".into();
+                    return Err(SourceError::Read { path: path.clone(), variable: component.name.clone(), what });
+                }
+            }
+            self.open = Some((file, container));
+        }
+        match &self.open {
+            Some((_, container)) => Ok(container),
+            None => Err(SourceError::NoFiles),
+        }
+    }
+
+    /// One component in SI (or as it is, in cells), x fastest; missing values are NaN.
+    fn component(&mut self, file: usize, entry: usize, which: usize) -> Result<Vec<f32>, SourceError> {
+        self.container(file)?;
+        let Some((_, container)) = &self.open else { return Err(SourceError::NoFiles) };
+        read_component(container, &self.files[file].components[which], &self.axes, self.grid.shape(), entry)
+    }
+}
+
+impl SnapshotSource for NetCdfArchive {
+    fn grid(&self) -> &Arc<Grid> {
+        &self.grid
+    }
+
+    fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    fn read(&mut self, index: usize) -> Result<Snapshot, SourceError> {
+        let Some(&(file, entry)) = self.places.get(index) else {
+            return Err(SourceError::NoSuchSnapshot { index, count: self.places.len() });
+        };
+        let mut components = Vec::with_capacity(3);
+        for which in 0..self.files[file].components.len() {
+            components.push(self.component(file, entry, which)?);
+        }
+        if let Some(conversion) = &self.conversion {
+            let interval = if self.metric == Metric::Index { self.interval(index) } else { 1.0 };
+            conversion.apply(&mut components, self.grid.shape(), interval);
+        }
+        let w: &[f32] = components.get(2).map_or(&[], Vec::as_slice);
+        Ok(Snapshot::from_components(self.times[index], self.grid.clone(), &components[0], &components[1], w))
+    }
+
+    fn date(&self, time: f64) -> Option<String> {
+        let calendar = self.calendar?;
+        if self.metric != Metric::Index {
+            return calendar.iso(time);
+        }
+        if !(time >= 0.0 && time <= (self.seconds.len() - 1) as f64) {
+            return None;
+        }
+        let (low, high) = (time.floor() as usize, time.ceil() as usize);
+        calendar.iso(self.seconds[low] + (self.seconds[high] - self.seconds[low]) * time.fract())
+    }
+
+    fn describe(&self) -> SourceDescription {
+        self.description.clone()
+    }
+}
+
+/// Sums over the nodes of one or more snapshots.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Displacement {
+    pub(super) known: usize,
+    pub(super) missing: usize,
+    pub(super) squared_velocity: [f64; 3],
+    pub(super) squared_cells: f64,
+    pub(super) greatest_cells: f64,
+}
+
+impl Displacement {
+    pub(super) fn add(&mut self, other: &Self) {
+        self.known += other.known;
+        self.missing += other.missing;
+        self.squared_velocity.iter_mut().zip(other.squared_velocity).for_each(|(a, b)| *a += b);
+        self.squared_cells += other.squared_cells;
+        self.greatest_cells = self.greatest_cells.max(other.greatest_cells);
+    }
+}
+
+/// Reads one time of one component onto the grid.
+fn read_component(
+    file: &Container,
+    component: &ComponentPlan,
+    axes: &[AxisPlan],
+    [nx, ny, nz]: [usize; 3],
+    entry: usize,
+) -> Result<Vec<f32>, SourceError> {
+    let gone = || SourceError::Read { path: file.path.clone(), variable: component.name.clone(), what: "it is gone".into() };
+    let variable = file.header.find(&component.name).ok_or_else(gone)?;
+    let mut values = vec![f32::NAN; nx * ny * nz];
+    let runs_of = |k: usize| axes.get(k).map_or_else(|| runs(&[0]), |a| runs(&a.order));
+    let (runs_x, runs_y, runs_z) = (runs_of(0), runs_of(1), runs_of(2));
+    for run_z in &runs_z {
+        for run_y in &runs_y {
+            for run_x in &runs_x {
+                let block = [run_x, run_y, run_z];
+                let (start, count): (Vec<usize>, Vec<usize>) = component
+                    .roles
+                    .iter()
+                    .map(|role| match *role {
+                        Role::Time => (entry, 1),
+                        Role::Fixed(index) => (index, 1),
+                        Role::Axis(k) => (block[k].start, block[k].nodes.len()),
+                    })
+                    .unzip();
+                let raw = file.read(variable, &start, &count)?;
+                // Distance in `raw` between neighbours along each axis of the grid.
+                let (mut strides, mut stride) = ([0usize; 3], 1);
+                for (role, n) in component.roles.iter().zip(&count).rev() {
+                    if let Role::Axis(k) = *role {
+                        strides[k] = stride;
+                    }
+                    stride *= n;
+                }
+                let at = |k: usize, i: usize| if block[k].reversed { block[k].nodes.len() - 1 - i } else { i } * strides[k];
+                for z in 0..run_z.nodes.len() {
+                    for y in 0..run_y.nodes.len() {
+                        let from = at(2, z) + at(1, y);
+                        let to = ((run_z.nodes.start + z) * ny + run_y.nodes.start + y) * nx + run_x.nodes.start;
+                        for x in 0..run_x.nodes.len() {
+                            values[to + x] = (component.packing.unpack(raw[from + at(0, x)]) * component.factor) as f32;
+                        }
+                    }
+                }
+            }
+        }
+    }
+    Ok(values)
+}
+
+fn is_sphere(axes: &[AxisPlan]) -> bool {
+    axes[0].kind == Kind::Longitude && axes[1].kind == Kind::Latitude
+}
+
+/// Settings that are wrong whatever the files are.
+fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
+    let fault = |key, found: String, accepted: &str| Err(SourceError::Setting { key, found, accepted: accepted.into() });
+    if let Some(region) = settings.region
+        && !(region.iter().all(|v| v.is_finite()) && region[2] < region[3] && region[0] != region[1])
+    {
+        return fault("region", format!("{region:?}"), "[x0, x1, y0, y1] with y0 < y1 and x0 < x1 (longitudes may pass the seam)");
+    }
+    if let Some(slab) = settings.slab
+        && !(slab[0].is_finite() && slab[1].is_finite() && slab[0] < slab[1])
+    {
+        return fault("slab", format!("{slab:?}"), "[lower, upper] with lower < upper");
+    }
+    if settings.level.is_some_and(|l| !l.is_finite()) {
+        return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
+    }
+    Ok(())
+}
+
+/// First difference between two files that matters.
+fn difference(a: &Layout, b: &Layout) -> Option<String> {
+    let names = |l: &Layout| l.components.iter().map(|c| format!("`{}`", c.name)).collect::<Vec<_>>().join(", ");
+    if names(a) != names(b) {
+        return Some(format!("their velocities are {} and {}", names(a), names(b)));
+    }
+    if a.axes.len() != b.axes.len() {
+        return Some(format!("they have {} and {} axes", a.axes.len(), b.axes.len()));
+    }
+    for (x, y) in a.axes.iter().zip(&b.axes) {
+        if x == y {
+            continue;
+        }
+        let (one, two) = (&x.axis, &y.axis);
+        let show = |a: &Axis| format!("`{}` of {} nodes from {} to {} {}", a.name(), a.len(), a.first(), a.last(), a.units());
+        let detail = match one.coordinates().iter().zip(two.coordinates()).position(|(p, q)| p != q) {
+            Some(i) if one.len() == two.len() => format!(", first at node {i}: {} and {}", one.coordinates()[i], two.coordinates()[i]),
+            _ => String::new(),
+        };
+        return Some(format!("their axes are {} and {}{detail}", show(one), show(two)));
+    }
+    let calendar = |l: &Layout| l.time.calendar.map_or("none", Calendar::name);
+    (calendar(a) != calendar(b)).then(|| format!("their calendars are {} and {}", calendar(a), calendar(b)))
+}
+
+fn check_duplicates(entries: &[(f64, usize, usize)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {
+    let (Some(first), Some(last)) = (entries.first(), entries.last()) else { return Ok(()) };
+    // Times written in different units may differ in their last digits.
+    let slack = (last.0 - first.0) * 1e-9;
+    match entries.windows(2).find(|w| w[1].0 - w[0].0 <= slack) {
+        None => Ok(()),
+        Some(pair) => Err(SourceError::DuplicateTime {
+            time: calendar.and_then(|c| c.iso(pair[0].0)).unwrap_or_else(|| format!("time {}", pair[0].0)),
+            first: files[pair[0].1].path.clone(),
+            second: files[pair[1].1].path.clone(),
+        }),
+    }
+}
+
+fn build_grid(path: &Path, layout: &Layout, settings: &NetCdfSettings) -> Result<Grid, SourceError> {
+    let index_axis = |plan: &AxisPlan| {
+        let n = plan.axis.len();
+        let axis = Axis::uniform(plan.axis.name(), "cells", 0.0, (n - 1) as f64, n);
+        let axis = axis.map_err(|fault| SourceError::Axis { path: path.into(), fault })?;
+        Ok(if plan.axis.period().is_some() { axis.with_period(n as f64) } else { axis })
+    };
+    let axes: Vec<Axis> = match layout.metric {
+        Metric::Index => layout.axes.iter().map(index_axis).collect::<Result<_, SourceError>>()?,
+        Metric::Sphere | Metric::Cartesian => layout.axes.iter().map(|p| p.axis.clone()).collect(),
+    };
+    let edge = axes[..2].iter().map(|a| a.last() - a.first()).fold(0.0, f64::max);
+    let [low, high] = settings.slab.unwrap_or([0.0, edge / 10.0]);
+    let geometry = if layout.metric == Metric::Sphere { Geometry::Sphere { radius: EARTH_RADIUS } } else { Geometry::Cartesian };
+    Ok(Grid { axes, geometry, slab: (low, high) })
+}
+
+fn describe(layout: &Layout, format: &str, files: usize, seconds: &[f64]) -> SourceDescription {
+    let variables = layout.components.iter().zip(["u", "v", "w"]).map(|(c, k)| format!("{k} = `{}`: {}", c.name, c.why)).collect();
+    let mut notes = layout.notes.clone();
+    for gap in time_gaps(seconds) {
+        let show = |s: f64| layout.time.calendar.and_then(|c| c.iso(s)).unwrap_or_else(|| s.to_string());
+        notes.push(format!(
+            "gap in time between {} and {}: about {} snapshot(s) are missing",
+            show(gap.after),
+            show(gap.before),
+            gap.missing
+        ));
+    }
+    SourceDescription {
+        kind: format!("{format}, {files} file(s)"),
+        variables,
+        metric: layout.metric,
+        time_unit: if layout.metric == Metric::Index { "snapshots".into() } else { "s".into() },
+        time_variable: Some(layout.time.variable.clone()),
+        time_units_in_file: Some(layout.time.units.clone()),
+        calendar: layout.time.calendar.map(|c| c.name().to_owned()),
+        notes,
+    }
+}

@@ -1,0 +1,125 @@
+//! Packed and missing values: `scale_factor`, `add_offset`, `_FillValue`, `missing_value`, `valid_range`, `_Unsigned`.
+
+use crate::source::container::{Attribute, NumberType, Variable};
+
+/// How raw numbers become values; missing ones become NaN.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::source) struct Packing {
+    scale: f64,
+    offset: f64,
+    missing: Vec<f64>,
+    /// Least and greatest valid raw number.
+    valid: (f64, f64),
+    /// Added to negative raw numbers (signed storage of unsigned numbers); 0 otherwise.
+    wrap: f64,
+}
+
+impl Packing {
+    pub(in crate::source) fn of(variable: &Variable) -> Self {
+        let number = |name: &str| variable.numbers(name).first().copied();
+        let scale = number("scale_factor").filter(|s| s.is_finite()).unwrap_or(1.0);
+        let offset = number("add_offset").filter(|s| s.is_finite()).unwrap_or(0.0);
+        let unsigned = variable.text("_Unsigned").is_some_and(|t| t.eq_ignore_ascii_case("true"));
+        let wrap = match variable.number {
+            NumberType::I8 if unsigned => 256.0,
+            NumberType::I16 if unsigned => 65_536.0,
+            NumberType::I32 if unsigned => 4_294_967_296.0,
+            _ => 0.0,
+        };
+        let raw = |v: f64| if v < 0.0 { v + wrap } else { v };
+        let mut missing: Vec<f64> = variable.numbers("missing_value").iter().copied().map(raw).collect();
+        match number("_FillValue") {
+            Some(fill) => missing.push(raw(fill)),
+            None => missing.extend(default_fill(variable.number).map(raw)),
+        }
+        // Limits count in packed numbers, unless they are of the unpacked type (NetCDF User's Guide, appendix A).
+        let limit = |name: &str, k: usize| {
+            let Some(Attribute::Numbers(of, values)) = variable.attribute(name) else { return None };
+            let value = *values.get(k)?;
+            let unpacked = of.is_float() && !variable.number.is_float() && scale != 0.0;
+            value.is_finite().then_some(if unpacked { (value - offset) / scale } else { raw(value) })
+        };
+        let low = limit("valid_range", 0).or_else(|| limit("valid_min", 0));
+        let high = limit("valid_range", 1).or_else(|| limit("valid_max", 0));
+        let (mut low, mut high) = (low.unwrap_or(f64::NEG_INFINITY), high.unwrap_or(f64::INFINITY));
+        if low > high {
+            // A negative scale turns unpacked limits round.
+            (low, high) = (high, low);
+        }
+        Self { scale, offset, missing, valid: (low, high), wrap }
+    }
+
+    /// The value, or NaN where it is missing.
+    pub(in crate::source) fn unpack(&self, raw: f64) -> f64 {
+        let raw = if raw < 0.0 { raw + self.wrap } else { raw };
+        // NaN is inside no range.
+        let valid = raw >= self.valid.0 && raw <= self.valid.1;
+        if !valid || self.missing.contains(&raw) { f64::NAN } else { raw * self.scale + self.offset }
+    }
+}
+
+/// What the library writes where nothing was written. Bytes have none: all their values are in use.
+fn default_fill(number: NumberType) -> Option<f64> {
+    match number {
+        NumberType::I16 => Some(-32_767.0),
+        NumberType::U16 => Some(65_535.0),
+        NumberType::I32 => Some(-2_147_483_647.0),
+        NumberType::U32 => Some(4_294_967_295.0),
+        NumberType::I64 => Some(-9_223_372_036_854_775_806.0),
+        NumberType::U64 => Some(18_446_744_073_709_551_614.0),
+        NumberType::F32 => Some(f64::from(9.969_21e36_f32)),
+        NumberType::F64 => Some(9.969_209_968_386_869e36),
+        NumberType::I8 | NumberType::U8 | NumberType::Other => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn packed(number: NumberType, attributes: &[(&str, NumberType, &[f64])]) -> Packing {
+        let attributes = attributes.iter().map(|(n, t, v)| (n.to_string(), Attribute::Numbers(*t, v.to_vec()))).collect();
+        Packing::of(&Variable { name: "u".into(), number, dimensions: vec![], attributes })
+    }
+
+    #[test]
+    fn integers_are_unpacked_and_fill_values_are_missing() {
+        let (short, double) = (NumberType::I16, NumberType::F64);
+        let packing = packed(
+            short,
+            &[
+                ("scale_factor", double, &[0.5]),
+                ("add_offset", double, &[10.0]),
+                ("_FillValue", short, &[-32_768.0]),
+                ("missing_value", short, &[-1.0, -2.0]),
+                ("valid_range", short, &[-100.0, 100.0]),
+            ],
+        );
+        assert_eq!(packing.unpack(4.0), 12.0);
+        assert_eq!(packing.unpack(100.0), 60.0);
+        for raw in [-32_768.0, -1.0, -2.0, 101.0, -101.0, f64::NAN] {
+            assert!(packing.unpack(raw).is_nan(), "{raw}");
+        }
+        // Limits in unpacked numbers: 5 to 15 is -10 to 10 packed.
+        let packing =
+            packed(short, &[("scale_factor", double, &[-0.5]), ("add_offset", double, &[10.0]), ("valid_range", double, &[5.0, 15.0])]);
+        assert_eq!((packing.unpack(10.0), packing.unpack(-10.0)), (5.0, 15.0));
+        assert!(packing.unpack(11.0).is_nan() && packing.unpack(-32_767.0).is_nan(), "the default fill value too");
+    }
+
+    #[test]
+    fn signed_storage_of_unsigned_bytes() {
+        let variable = Variable {
+            name: "u".into(),
+            number: NumberType::I8,
+            dimensions: vec![],
+            attributes: vec![
+                ("_Unsigned".into(), Attribute::Text("true".into())),
+                ("_FillValue".into(), Attribute::Numbers(NumberType::I8, vec![-1.0])),
+            ],
+        };
+        let packing = Packing::of(&variable);
+        assert_eq!(packing.unpack(-56.0), 200.0);
+        assert!(packing.unpack(-1.0).is_nan());
+    }
+}

@@ -1,0 +1,238 @@
+//! One opened file: its header as plain data, and values on request. The formats meet here.
+
+use super::SourceError;
+use super::classic::ClassicStore;
+use super::netcdf4::NetCdf4Store;
+use std::fs::File;
+use std::io::{Read, Seek, SeekFrom};
+use std::path::{Path, PathBuf};
+
+/// External type of a variable or attribute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum NumberType {
+    I8,
+    U8,
+    I16,
+    U16,
+    I32,
+    U32,
+    I64,
+    U64,
+    F32,
+    F64,
+    /// Text and types that hold no numbers.
+    Other,
+}
+
+impl NumberType {
+    pub(crate) fn is_float(self) -> bool {
+        matches!(self, Self::F32 | Self::F64)
+    }
+
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::I8 => "int8",
+            Self::U8 => "uint8",
+            Self::I16 => "int16",
+            Self::U16 => "uint16",
+            Self::I32 => "int32",
+            Self::U32 => "uint32",
+            Self::I64 => "int64",
+            Self::U64 => "uint64",
+            Self::F32 => "float32",
+            Self::F64 => "float64",
+            Self::Other => "text",
+        }
+    }
+}
+
+/// Value of an attribute.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) enum Attribute {
+    Text(String),
+    Numbers(NumberType, Vec<f64>),
+}
+
+/// A named extent.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct Dimension {
+    pub(crate) name: String,
+    pub(crate) len: usize,
+}
+
+/// A variable's header.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Variable {
+    pub(crate) name: String,
+    pub(crate) number: NumberType,
+    /// Indices into [`Header::dimensions`], slowest first.
+    pub(crate) dimensions: Vec<usize>,
+    pub(crate) attributes: Vec<(String, Attribute)>,
+}
+
+impl Variable {
+    /// Attribute of this name, whatever its case.
+    pub(crate) fn attribute(&self, name: &str) -> Option<&Attribute> {
+        self.attributes.iter().find(|(n, _)| n.eq_ignore_ascii_case(name)).map(|(_, a)| a)
+    }
+
+    /// Text attribute, trimmed.
+    pub(crate) fn text(&self, name: &str) -> Option<&str> {
+        match self.attribute(name) {
+            Some(Attribute::Text(text)) => Some(text.trim()),
+            _ => None,
+        }
+    }
+
+    /// Numbers of an attribute (none when it is text or absent).
+    pub(crate) fn numbers(&self, name: &str) -> &[f64] {
+        match self.attribute(name) {
+            Some(Attribute::Numbers(_, values)) => values,
+            _ => &[],
+        }
+    }
+
+    /// `units`, or `unit` as some products write it.
+    pub(crate) fn units(&self) -> Option<&str> {
+        self.text("units").or_else(|| self.text("unit"))
+    }
+}
+
+/// All that a file says about itself.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(crate) struct Header {
+    pub(crate) dimensions: Vec<Dimension>,
+    pub(crate) variables: Vec<Variable>,
+}
+
+impl Header {
+    pub(crate) fn find(&self, name: &str) -> Option<usize> {
+        self.variables.iter().position(|v| v.name == name)
+    }
+
+    pub(crate) fn shape(&self, variable: &Variable) -> Vec<usize> {
+        variable.dimensions.iter().map(|&d| self.dimensions[d].len).collect()
+    }
+
+    /// `time, lat, lon`.
+    pub(crate) fn dimension_names(&self, variable: &Variable) -> String {
+        variable.dimensions.iter().map(|&d| self.dimensions[d].name.as_str()).collect::<Vec<_>>().join(", ")
+    }
+}
+
+/// File formats that are told apart.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Format {
+    /// NetCDF classic: version 1, 2 (64-bit offset) or 5 (64-bit data).
+    Classic(u8),
+    /// NetCDF-4, or HDF5 that may or may not have its structure.
+    Hdf5,
+}
+
+impl Format {
+    pub(crate) fn name(self) -> &'static str {
+        match self {
+            Self::Classic(1) => "NetCDF classic",
+            Self::Classic(2) => "NetCDF 64-bit offset",
+            Self::Classic(_) => "NetCDF 64-bit data",
+            Self::Hdf5 => "NetCDF-4",
+        }
+    }
+}
+
+enum Store {
+    Classic(ClassicStore),
+    NetCdf4(NetCdf4Store),
+}
+
+/// An open file.
+pub(crate) struct Container {
+    pub(crate) path: PathBuf,
+    pub(crate) format: Format,
+    pub(crate) header: Header,
+    store: Store,
+}
+
+impl Container {
+    /// Opens a file and reads its header, nothing else.
+    pub(crate) fn open(path: &Path) -> Result<Self, SourceError> {
+        let failed = |cause| SourceError::Open { path: path.to_path_buf(), cause };
+        let mut file = File::open(path).map_err(failed)?;
+        let length = file.metadata().map_err(failed)?.len();
+        let format = sniff(&mut file, length).map_err(failed)?.map_err(|found| SourceError::NotNetCdf { path: path.into(), found })?;
+        let (header, store) = match format {
+            Format::Classic(version) => {
+                let (header, store) = ClassicStore::open(path, file, length, version)?;
+                (header, Store::Classic(store))
+            }
+            Format::Hdf5 => {
+                let (header, store) = NetCdf4Store::open(path)?;
+                (header, Store::NetCdf4(store))
+            }
+        };
+        Ok(Self { path: path.to_path_buf(), format, header, store })
+    }
+
+    /// Raw values of a hyperslab as `f64` (no unpacking), in the file's order, slowest dimension first.
+    pub(crate) fn read(&self, variable: usize, start: &[usize], count: &[usize]) -> Result<Vec<f64>, SourceError> {
+        let header = &self.header.variables[variable];
+        let failed = |what: String| SourceError::Read { path: self.path.clone(), variable: header.name.clone(), what };
+        if header.number == NumberType::Other {
+            return Err(failed("it holds no numbers".into()));
+        }
+        let shape = self.header.shape(header);
+        let inside = start.len() == shape.len() && count.len() == shape.len();
+        if !inside || (0..shape.len()).any(|k| start[k].checked_add(count[k]).is_none_or(|end| end > shape[k])) {
+            return Err(failed(format!("{count:?} values from {start:?} were asked for, but its shape is {shape:?}")));
+        }
+        let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
+        let mut values: Vec<f64> = Vec::new();
+        values.try_reserve_exact(total).map_err(|_| failed(format!("no memory for {total} values")))?;
+        if total > 0 {
+            match &self.store {
+                Store::Classic(store) => store.read(variable, &shape, start, count, &mut values).map_err(|e| failed(e.to_string()))?,
+                Store::NetCdf4(store) => store.read(&header.name, start, count, total, &mut values).map_err(failed)?,
+            }
+        }
+        Ok(values)
+    }
+
+    /// All values of a variable.
+    pub(crate) fn read_all(&self, variable: usize) -> Result<Vec<f64>, SourceError> {
+        let shape = self.header.shape(&self.header.variables[variable]);
+        self.read(variable, &vec![0; shape.len()], &shape)
+    }
+}
+
+/// Tells the format by the first bytes; the inner error says what else the file seems to be.
+fn sniff(file: &mut File, length: u64) -> std::io::Result<Result<Format, String>> {
+    const HDF5: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
+    let mut head = [0u8; 8];
+    let got = length.min(8) as usize;
+    file.read_exact(&mut head[..got])?;
+    file.seek(SeekFrom::Start(0))?;
+    if let [b'C', b'D', b'F', version @ (1 | 2 | 5), ..] = head
+        && got >= 4
+    {
+        return Ok(Ok(Format::Classic(version)));
+    }
+    // The signature of HDF5 may follow a user block of 512 bytes times a power of two.
+    let mut at = 0u64;
+    while at + 8 <= length && at <= 1 << 20 {
+        let mut signature = [0u8; 8];
+        file.seek(SeekFrom::Start(at))?;
+        file.read_exact(&mut signature)?;
+        if signature == HDF5 {
+            return Ok(Ok(Format::Hdf5));
+        }
+        at = if at == 0 { 512 } else { at * 2 };
+    }
+    Ok(Err(match head {
+        _ if got == 0 => "it is empty".into(),
+        [b'G', b'R', b'I', b'B', ..] => "it is GRIB: convert it, for example with `cdo -f nc copy`".into(),
+        [0x1f, 0x8b, ..] => "it is compressed with gzip: unpack it first".into(),
+        [b'P', b'K', 3, 4, ..] => "it is a zip archive: unpack it first".into(),
+        [b'C', b'D', b'F', version, ..] => format!("its version {version} is unknown"),
+        _ => format!("it starts with {:?}", String::from_utf8_lossy(&head[..got])),
+    }))
+}

@@ -1,0 +1,60 @@
+//! Files, folders and patterns as a list of files.
+
+use super::SourceError;
+use std::path::{Path, PathBuf};
+
+/// Endings of files that are taken from a folder.
+const ENDINGS: [&str; 4] = ["nc", "nc4", "cdf", "netcdf"];
+
+/// Expands folders and patterns, in name order; a file that is named twice counts once.
+pub(super) fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
+    if paths.is_empty() {
+        return Err(SourceError::NoFiles);
+    }
+    let mut files: Vec<PathBuf> = Vec::new();
+    for path in paths {
+        let text = path.to_string_lossy();
+        if path.is_dir() {
+            files.extend(folder(path)?);
+        } else if !path.exists() && text.contains(['*', '?', '[']) {
+            files.extend(pattern(&text)?);
+        } else {
+            files.push(path.clone());
+        }
+    }
+    let mut seen = std::collections::HashSet::new();
+    files.retain(|f| seen.insert(f.canonicalize().unwrap_or_else(|_| f.clone())));
+    Ok(files)
+}
+
+fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
+    let failed = |cause| SourceError::Open { path: path.into(), cause };
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(failed)? {
+        let file = entry.map_err(failed)?.path();
+        let ending = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
+        if file.is_file() && ENDINGS.iter().any(|e| e.eq_ignore_ascii_case(ending)) {
+            files.push(file);
+        }
+    }
+    if files.is_empty() {
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc").display().to_string() });
+    }
+    files.sort();
+    Ok(files)
+}
+
+fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
+    let found = glob::glob(text).map_err(|e| SourceError::NoMatch { pattern: format!("{text} ({e})") })?;
+    let mut files = Vec::new();
+    for file in found {
+        let file = file.map_err(|e| SourceError::Open { path: e.path().into(), cause: e.into() })?;
+        if file.is_file() {
+            files.push(file);
+        }
+    }
+    if files.is_empty() {
+        return Err(SourceError::NoMatch { pattern: text.into() });
+    }
+    Ok(files)
+}

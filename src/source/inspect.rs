@@ -1,0 +1,338 @@
+//! What would be read from an archive, and why.
+
+use super::archive::{Displacement, NetCdfArchive};
+use super::axes::Quantity;
+use super::cf::velocity;
+use super::container::{Container, Header};
+use super::files::expand;
+use super::settings::NetCdfSettings;
+use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
+use serde::Serialize;
+use std::fmt;
+use std::path::PathBuf;
+
+/// Snapshots that are read to measure displacements and missing values.
+const SAMPLED: usize = 5;
+
+/// Everything that `ridgewatch inspect` shows.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Inspection {
+    /// The first file.
+    pub file: PathBuf,
+    /// Number of files.
+    pub files: usize,
+    /// Format of the first file.
+    pub format: String,
+    /// All variables of the first file.
+    pub variables: Vec<VariableReport>,
+    /// Why it cannot be read as an archive; what follows is empty then.
+    pub problem: Option<String>,
+    /// What would be read.
+    pub source: Option<SourceDescription>,
+    /// Axes of the grid.
+    pub axes: Vec<AxisReport>,
+    /// Times.
+    pub time: Option<TimeReport>,
+    /// Missing values.
+    pub missing: Option<MissingReport>,
+    /// Whether the snapshots are close enough in time.
+    pub resolution: Option<ResolutionReport>,
+}
+
+/// A variable and its part.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct VariableReport {
+    /// Name.
+    pub name: String,
+    /// External type, e.g. `int16`.
+    pub number: String,
+    /// Dimensions, slowest first, with their lengths.
+    pub dimensions: Vec<(String, usize)>,
+    /// Units as they stand in the file.
+    pub units: Option<String>,
+    /// `u`, `v`, `w`, `x`, `y`, `z`, `time`, or none.
+    pub role: Option<String>,
+    /// Why it has this part, or what it lacks.
+    pub why: String,
+}
+
+/// An axis.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct AxisReport {
+    /// Name in the file.
+    pub name: String,
+    /// Units (after conversion to degrees, metres or pascal).
+    pub units: String,
+    /// Nodes read.
+    pub nodes: usize,
+    /// First coordinate, ascending.
+    pub first: f64,
+    /// Last coordinate.
+    pub last: f64,
+    /// Least distance between neighbours.
+    pub least_spacing: f64,
+    /// Greatest distance between neighbours.
+    pub greatest_spacing: f64,
+    /// Whether the file runs the other way.
+    pub descending_in_file: bool,
+    /// Length after which it repeats.
+    pub period: Option<f64>,
+}
+
+/// Times of the archive.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TimeReport {
+    /// Number of snapshots.
+    pub snapshots: usize,
+    /// First time, as a date where there is a calendar.
+    pub first: String,
+    /// Last time.
+    pub last: String,
+    /// Median interval, in `unit`.
+    pub interval: f64,
+    /// Unit of times.
+    pub unit: String,
+    /// Intervals longer than one and a half times the median.
+    pub gaps: Vec<TimeGap>,
+    /// |tau| that the memory is stated for: the one asked for, or the default.
+    pub tau: Option<f64>,
+    /// Snapshots that a window of this tau holds.
+    pub window_snapshots: Option<usize>,
+    /// Its memory in bytes.
+    pub window_bytes: Option<usize>,
+    /// Why tau does not fit the archive.
+    pub tau_problem: Option<String>,
+}
+
+/// Missing values, measured on a few snapshots.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct MissingReport {
+    /// Snapshots that were read.
+    pub sampled: usize,
+    /// Share of nodes without a velocity, in [0, 1].
+    pub share: f64,
+}
+
+/// Displacement between two snapshots, measured on a few of them.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ResolutionReport {
+    /// Root mean square of the displacement in one interval, in cells.
+    pub rms_cells: f64,
+    /// Greatest displacement in one interval, in cells.
+    pub max_cells: f64,
+    /// Root mean square of each component in SI.
+    pub rms_velocity: Vec<f64>,
+    /// A warning where a particle crosses many cells between two snapshots.
+    pub warning: Option<String>,
+}
+
+/// Looks at an archive. What keeps it from being read becomes [`Inspection::problem`], as long as the first file's header can be read.
+///
+/// # Errors
+/// No file, or a first file that is missing, damaged or of another format.
+pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
+    let files = expand(if paths.is_empty() { &settings.files } else { paths })?;
+    let Some(file) = files.first() else { return Err(SourceError::NoFiles) };
+    let first = Container::open(file)?;
+    let mut inspection = Inspection {
+        file: file.clone(),
+        files: files.len(),
+        format: first.format.name().into(),
+        variables: variables(&first.header),
+        problem: None,
+        source: None,
+        axes: Vec::new(),
+        time: None,
+        missing: None,
+        resolution: None,
+    };
+    match NetCdfArchive::open(&files, settings) {
+        Ok(archive) => inspection.fill(archive, tau)?,
+        Err(error) => inspection.problem = Some(error.to_string()),
+    }
+    Ok(inspection)
+}
+
+fn variables(header: &Header) -> Vec<VariableReport> {
+    let report = |i: usize| {
+        let variable = &header.variables[i];
+        VariableReport {
+            name: variable.name.clone(),
+            number: variable.number.name().into(),
+            dimensions: variable.dimensions.iter().map(|&d| (header.dimensions[d].name.clone(), header.dimensions[d].len)).collect(),
+            units: variable.units().map(str::to_owned),
+            role: None,
+            why: match velocity::judge(header, i) {
+                Ok(candidate) => format!("may be {}, but another was chosen: {}", candidate.component.name(), candidate.why),
+                Err(lacks) => lacks,
+            },
+        }
+    };
+    (0..header.variables.len()).map(report).collect()
+}
+
+impl Inspection {
+    fn fill(&mut self, mut archive: NetCdfArchive, tau: Option<f64>) -> Result<(), SourceError> {
+        let description = archive.describe();
+        let mut give = |name: &str, role: &str, why: String| {
+            if let Some(variable) = self.variables.iter_mut().find(|v| v.name == name) {
+                (variable.role, variable.why) = (Some(role.into()), why);
+            }
+        };
+        for (name, role, why) in archive.chosen() {
+            give(name, role, why.to_owned());
+        }
+        if let Some(time) = &description.time_variable {
+            give(time, "time", format!("times, in `{}`", description.time_units_in_file.as_deref().unwrap_or_default()));
+        }
+        for (plan, role) in archive.axis_plans().iter().zip(["x", "y", "z"]) {
+            give(plan.axis.name(), role, format!("coordinates of {role}"));
+            let steps: Vec<f64> = plan.axis.coordinates().windows(2).map(|w| w[1] - w[0]).collect();
+            self.axes.push(AxisReport {
+                name: plan.axis.name().into(),
+                units: if plan.quantity == Quantity::None { "no unit".into() } else { plan.axis.units().into() },
+                nodes: plan.axis.len(),
+                first: plan.axis.coordinates()[0],
+                last: plan.axis.coordinates()[plan.axis.len() - 1],
+                least_spacing: steps.iter().copied().fold(f64::INFINITY, f64::min),
+                greatest_spacing: steps.iter().copied().fold(0.0, f64::max),
+                descending_in_file: plan.descending,
+                period: plan.axis.period(),
+            });
+        }
+        self.time = Some(times(&archive, &description, tau));
+        let count = archive.times().len();
+        let sampled = count.min(SAMPLED);
+        let mut sum = Displacement::default();
+        for k in 0..sampled {
+            // Evenly over the archive, ends included.
+            sum.add(&archive.displacement(if sampled > 1 { k * (count - 1) / (sampled - 1) } else { 0 })?);
+        }
+        self.missing = Some(MissingReport { sampled, share: sum.missing as f64 / (sum.missing + sum.known).max(1) as f64 });
+        if sum.known > 0 && count > 1 {
+            let mean = |s: f64| (s / sum.known as f64).sqrt();
+            let rms_cells = mean(sum.squared_cells);
+            self.resolution = Some(ResolutionReport {
+                rms_cells,
+                max_cells: sum.greatest_cells,
+                rms_velocity: sum.squared_velocity.iter().take(archive.grid().dimensions()).map(|&s| mean(s)).collect(),
+                warning: (rms_cells > 4.0).then(|| {
+                    format!("particles cross {rms_cells:.1} cells between snapshots (root mean square): too coarse in time for linear interpolation")
+                }),
+            });
+        }
+        self.source = Some(description);
+        Ok(())
+    }
+}
+
+fn times(archive: &NetCdfArchive, description: &SourceDescription, tau: Option<f64>) -> TimeReport {
+    let times = archive.times();
+    let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
+    let interval = median_interval(times);
+    let tau = tau.map_or_else(|| archive.default_tau(), |t| archive.check_tau(t).map(|()| t));
+    // The window keeps what covers tau: the snapshots inside, and one to interpolate from.
+    let held = |tau: f64| if interval > 0.0 { ((tau / interval - 1e-9).ceil() as usize + 1).min(times.len()) } else { times.len() };
+    let snapshots = tau.as_ref().ok().map(|&t| held(t));
+    TimeReport {
+        snapshots: times.len(),
+        first: show(times[0]),
+        last: show(times[0] + span(times)),
+        interval,
+        unit: description.time_unit.clone(),
+        gaps: archive.gaps(),
+        window_snapshots: snapshots,
+        window_bytes: snapshots.map(|s| s * archive.grid().nodes() * size_of::<[f32; 4]>()),
+        tau_problem: tau.as_ref().err().map(ToString::to_string),
+        tau: tau.ok(),
+    }
+}
+
+impl fmt::Display for Inspection {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let more = if self.files > 1 { format!(" and {} more", self.files - 1) } else { String::new() };
+        writeln!(f, "{}{more} ({})", self.file.display(), self.format)?;
+        writeln!(f, "\nvariables")?;
+        let width = self.variables.iter().map(|v| v.name.chars().count()).max().unwrap_or(0);
+        let part = |v: &&VariableReport| v.role.is_none();
+        for v in self.variables.iter().filter(|v| !part(v)).chain(self.variables.iter().filter(part)) {
+            let dims: Vec<String> = v.dimensions.iter().map(|(n, l)| format!("{n} {l}")).collect();
+            let role = v.role.as_deref().unwrap_or("-");
+            writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
+        }
+        if let Some(problem) = &self.problem {
+            return writeln!(f, "\ncannot be read as an archive:\n{problem}");
+        }
+        if let Some(source) = &self.source {
+            writeln!(f, "\nmetric {}", format!("{:?}", source.metric).to_lowercase())?;
+        }
+        writeln!(f, "\naxes")?;
+        for (axis, role) in self.axes.iter().zip(["x", "y", "z"]) {
+            write!(f, "  {role} `{}`: {} nodes from {} to {} {}", axis.name, axis.nodes, Short(axis.first), Short(axis.last), axis.units)?;
+            if axis.greatest_spacing - axis.least_spacing <= 1e-5 * axis.greatest_spacing {
+                write!(f, ", every {}", Short(axis.greatest_spacing))?;
+            } else {
+                write!(f, ", spacing {} to {}", Short(axis.least_spacing), Short(axis.greatest_spacing))?;
+            }
+            let period = axis.period.map(|p| format!(", periodic with {p}")).unwrap_or_default();
+            writeln!(f, "{}{period}", if axis.descending_in_file { ", descending in the file" } else { "" })?;
+        }
+        if let Some(t) = &self.time {
+            writeln!(f, "\ntime\n  {} snapshots from {} to {}, every {} {}", t.snapshots, t.first, t.last, Short(t.interval), t.unit)?;
+            let calendar = self.source.as_ref().and_then(|s| s.calendar.as_deref()).unwrap_or("none");
+            writeln!(f, "  calendar {calendar}, {} gap(s)", t.gaps.len())?;
+            if let (Some(tau), Some(held), Some(bytes)) = (t.tau, t.window_snapshots, t.window_bytes) {
+                writeln!(f, "  tau {} {}: a window of {held} snapshots, {:.1} MiB", Short(tau), t.unit, bytes as f64 / f64::from(1 << 20))?;
+            }
+            if let Some(problem) = &t.tau_problem {
+                writeln!(f, "  {problem}")?;
+            }
+        }
+        if let Some(m) = &self.missing {
+            writeln!(f, "\nvelocity (measured on {} snapshots)\n  missing {:.1} %", m.sampled, 100.0 * m.share)?;
+        }
+        if let Some(r) = &self.resolution {
+            let rms: Vec<String> = r.rms_velocity.iter().map(|v| Short(*v).to_string()).collect();
+            writeln!(f, "  root mean square of the components {}", rms.join(", "))?;
+            writeln!(f, "  displacement in one interval: {:.2} cells (root mean square), {:.2} at most", r.rms_cells, r.max_cells)?;
+            if let Some(warning) = &r.warning {
+                writeln!(f, "  {warning}")?;
+            }
+        }
+        let notes = self.source.as_ref().map_or(&[][..], |s| &s.notes);
+        if !notes.is_empty() {
+            writeln!(f, "\nnotes")?;
+        }
+        notes.iter().try_for_each(|note| writeln!(f, "  {note}"))
+    }
+}
+
+/// A number with six significant digits at most.
+struct Short(f64);
+
+impl fmt::Display for Short {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let v = self.0;
+        if v == 0.0 || (1e-3..1e7).contains(&v.abs()) {
+            let digits = if v == 0.0 { 0 } else { (5 - v.abs().log10().floor() as i32).max(0) as usize };
+            let text = format!("{v:.digits$}");
+            f.write_str(if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text })
+        } else {
+            write!(f, "{v:.4e}")
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Short;
+
+    #[test]
+    fn numbers_are_short() {
+        for (value, text) in
+            [(0.0, "0"), (0.25, "0.25"), (86_400.0, "86400"), (-40.125, "-40.125"), (1.0 / 3.0, "0.333333"), (2.5e-7, "2.5000e-7")]
+        {
+            assert_eq!(Short(value).to_string(), text);
+        }
+    }
+}

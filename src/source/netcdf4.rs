@@ -1,0 +1,117 @@
+//! NetCDF-4 through libnetcdf.
+
+use super::SourceError;
+use super::container::{Attribute, Dimension, Header, NumberType, Variable};
+use netcdf::AttributeValue;
+use netcdf::types::{FloatType, IntType, NcVariableType};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+
+/// An open NetCDF-4 file.
+pub(super) struct NetCdf4Store {
+    file: netcdf::File,
+}
+
+impl NetCdf4Store {
+    pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
+        let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
+        // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
+        let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
+            let file = netcdf::open(path)?;
+            let header = read_header(&file)?;
+            Ok((header, file))
+        }));
+        let (header, file) = match opened {
+            Ok(Ok(pair)) => pair,
+            Ok(Err(error)) => return Err(damaged(error.to_string())),
+            Err(_) => return Err(damaged("its header holds names or types that are not understood".into())),
+        };
+        // libnetcdf invents dimensions for HDF5 files that have none.
+        let invented = |d: &Dimension| d.name.starts_with("phony_dim_");
+        if header.variables.is_empty() || header.dimensions.iter().all(invented) {
+            return Err(SourceError::Hdf5 { path: path.into() });
+        }
+        Ok((header, Self { file }))
+    }
+
+    pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], total: usize, out: &mut Vec<f64>) -> Result<(), String> {
+        let read = catch_unwind(AssertUnwindSafe(|| {
+            let variable = self.file.variable(name).ok_or("it is gone")?;
+            out.resize(total, 0.0);
+            if count.is_empty() {
+                out[0] = variable.get_value::<f64, _>(..).map_err(|e| e.to_string())?;
+                return Ok(());
+            }
+            variable.get_values_into(out, (start, count)).map_err(|e| e.to_string())
+        }));
+        read.unwrap_or_else(|_| Err("the NetCDF library failed".into()))
+    }
+}
+
+fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
+    let mut header = Header::default();
+    for variable in file.variables() {
+        let mut dimensions = Vec::new();
+        for dimension in variable.dimensions() {
+            let found = Dimension { name: dimension.name(), len: dimension.len() };
+            let index = header.dimensions.iter().position(|d| *d == found).unwrap_or_else(|| {
+                header.dimensions.push(found);
+                header.dimensions.len() - 1
+            });
+            dimensions.push(index);
+        }
+        let mut attributes = Vec::new();
+        for attribute in variable.attributes() {
+            // An attribute of a user-defined type says nothing that is needed here.
+            if let Ok(value) = attribute.value() {
+                attributes.push((attribute.name().to_owned(), convert(value)));
+            }
+        }
+        let number = match variable.vartype() {
+            NcVariableType::Int(IntType::I8) => NumberType::I8,
+            NcVariableType::Int(IntType::U8) => NumberType::U8,
+            NcVariableType::Int(IntType::I16) => NumberType::I16,
+            NcVariableType::Int(IntType::U16) => NumberType::U16,
+            NcVariableType::Int(IntType::I32) => NumberType::I32,
+            NcVariableType::Int(IntType::U32) => NumberType::U32,
+            NcVariableType::Int(IntType::I64) => NumberType::I64,
+            NcVariableType::Int(IntType::U64) => NumberType::U64,
+            NcVariableType::Float(FloatType::F32) => NumberType::F32,
+            NcVariableType::Float(FloatType::F64) => NumberType::F64,
+            _ => NumberType::Other,
+        };
+        header.variables.push(Variable { name: variable.name(), number, dimensions, attributes });
+    }
+    Ok(header)
+}
+
+fn convert(value: AttributeValue) -> Attribute {
+    use AttributeValue as A;
+    fn list<T: Copy>(number: NumberType, values: &[T], to: impl Fn(T) -> f64) -> Attribute {
+        Attribute::Numbers(number, values.iter().map(|&v| to(v)).collect())
+    }
+    match value {
+        A::Str(text) => Attribute::Text(text),
+        A::Strs(texts) => Attribute::Text(texts.join(" ")),
+        A::Uchar(v) => list(NumberType::U8, &[v], f64::from),
+        A::Uchars(v) => list(NumberType::U8, &v, f64::from),
+        A::Schar(v) => list(NumberType::I8, &[v], f64::from),
+        A::Schars(v) => list(NumberType::I8, &v, f64::from),
+        A::Ushort(v) => list(NumberType::U16, &[v], f64::from),
+        A::Ushorts(v) => list(NumberType::U16, &v, f64::from),
+        A::Short(v) => list(NumberType::I16, &[v], f64::from),
+        A::Shorts(v) => list(NumberType::I16, &v, f64::from),
+        A::Uint(v) => list(NumberType::U32, &[v], f64::from),
+        A::Uints(v) => list(NumberType::U32, &v, f64::from),
+        A::Int(v) => list(NumberType::I32, &[v], f64::from),
+        A::Ints(v) => list(NumberType::I32, &v, f64::from),
+        A::Ulonglong(v) => list(NumberType::U64, &[v], |v| v as f64),
+        A::Ulonglongs(v) => list(NumberType::U64, &v, |v| v as f64),
+        A::Longlong(v) => list(NumberType::I64, &[v], |v| v as f64),
+        A::Longlongs(v) => list(NumberType::I64, &v, |v| v as f64),
+        A::Float(v) => list(NumberType::F32, &[v], f64::from),
+        A::Floats(v) => list(NumberType::F32, &v, f64::from),
+        A::Double(v) => list(NumberType::F64, &[v], |v| v),
+        A::Doubles(v) => list(NumberType::F64, &v, |v| v),
+    }
+}

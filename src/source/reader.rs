@@ -1,0 +1,158 @@
+//! The I/O thread: reads ahead into a bounded channel.
+
+use super::{SnapshotSource, SourceError};
+use crate::field::Snapshot;
+use std::ops::Range;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::time::{Duration, Instant};
+
+/// Snapshots that wait in the channel unless asked otherwise.
+pub const DEFAULT_READ_AHEAD: usize = 2;
+
+/// Snapshots in time order, read ahead by a thread of their own. Dropping it ends the thread after the read in progress.
+pub struct ReadAhead {
+    receiver: Receiver<Result<Arc<Snapshot>, SourceError>>,
+    given: usize,
+    count: usize,
+    waited: Duration,
+    reading_nanoseconds: Arc<AtomicU64>,
+    /// Why the thread could not start; handed out once.
+    failed: Option<SourceError>,
+    ended: bool,
+}
+
+/// Starts reading snapshots `range` (clipped to those there are) on a thread named `ridgewatch-io`. At most `capacity`
+/// snapshots (at least one) wait; one more is in the thread's hands. A snapshot that cannot be read gives an error in its place, and
+/// reading goes on with the next.
+pub fn read_ahead(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capacity: usize) -> ReadAhead {
+    let range = range.start..range.end.min(source.times().len());
+    let count = range.len();
+    let (sender, receiver) = sync_channel(capacity.max(1));
+    let reading_nanoseconds = Arc::new(AtomicU64::new(0));
+    let clock = reading_nanoseconds.clone();
+    let work = move || {
+        for index in range {
+            let begin = Instant::now();
+            let read = source.read(index).map(Arc::new);
+            clock.fetch_add(begin.elapsed().as_nanos() as u64, Ordering::Relaxed);
+            // The receiver is gone: nobody wants the rest.
+            if sender.send(read).is_err() {
+                return;
+            }
+        }
+    };
+    let failed = std::thread::Builder::new().name("ridgewatch-io".into()).spawn(work).err().map(|e| SourceError::ReaderStopped {
+        index: 0,
+        count,
+        what: format!("it could not start: {e}"),
+    });
+    ReadAhead { receiver, given: 0, count, waited: Duration::ZERO, reading_nanoseconds, failed, ended: false }
+}
+
+impl ReadAhead {
+    /// Time that [`Iterator::next`] spent waiting for input so far.
+    pub fn waited(&self) -> Duration {
+        self.waited
+    }
+
+    /// Time that the thread spent reading so far.
+    pub fn reading(&self) -> Duration {
+        Duration::from_nanos(self.reading_nanoseconds.load(Ordering::Relaxed))
+    }
+
+    /// Snapshots still to come.
+    pub fn remaining(&self) -> usize {
+        if self.ended { 0 } else { self.count - self.given }
+    }
+}
+
+impl Iterator for ReadAhead {
+    type Item = Result<Arc<Snapshot>, SourceError>;
+
+    /// The next snapshot; waits until it is read.
+    fn next(&mut self) -> Option<Self::Item> {
+        if self.remaining() == 0 {
+            return None;
+        }
+        if let Some(error) = self.failed.take() {
+            self.ended = true;
+            return Some(Err(error));
+        }
+        let begin = Instant::now();
+        let received = self.receiver.recv();
+        self.waited += begin.elapsed();
+        match received {
+            Ok(snapshot) => {
+                self.given += 1;
+                Some(snapshot)
+            }
+            Err(_) => {
+                self.ended = true;
+                Some(Err(SourceError::ReaderStopped { index: self.given, count: self.count, what: "it panicked".into() }))
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Axis, Geometry, Grid};
+    use crate::source::MemorySource;
+    use std::sync::atomic::AtomicUsize;
+
+    fn source(count: usize, made: Arc<AtomicUsize>, panic_at: usize) -> Box<dyn SnapshotSource> {
+        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 2).unwrap();
+        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+        let on = grid.clone();
+        let make = move |i: usize, time: f64| {
+            assert!(i != panic_at, "wanted by the test");
+            made.fetch_add(1, Ordering::SeqCst);
+            Snapshot::from_components(time, on.clone(), &[i as f32; 4], &[0.0; 4], &[])
+        };
+        Box::new(MemorySource::new("test", grid, (0..count).map(|i| i as f64).collect(), make).unwrap())
+    }
+
+    /// Waits until `made` is `count` or a second went by, then a little longer to see whether more come.
+    fn settled(made: &AtomicUsize, count: usize) -> usize {
+        let begin = Instant::now();
+        while made.load(Ordering::SeqCst) < count && begin.elapsed() < Duration::from_secs(1) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(30));
+        made.load(Ordering::SeqCst)
+    }
+
+    #[test]
+    fn all_come_in_order() {
+        let mut reader = read_ahead(source(20, Arc::default(), 99), 5..30, 2);
+        assert_eq!(reader.remaining(), 15);
+        let times: Vec<f64> = reader.by_ref().map(|s| s.unwrap().time).collect();
+        assert_eq!(times, (5..20).map(f64::from).collect::<Vec<_>>());
+        assert!(reader.next().is_none() && reader.reading() > Duration::ZERO);
+    }
+
+    #[test]
+    fn memory_is_bounded_and_dropping_ends_the_thread() {
+        let made = Arc::new(AtomicUsize::new(0));
+        let mut reader = read_ahead(source(1000, made.clone(), 9999), 0..1000, 3);
+        reader.next().unwrap().unwrap();
+        // One taken, three waiting, one in hand.
+        assert_eq!(settled(&made, 5), 5);
+        drop(reader);
+        assert_eq!(settled(&made, 5), 5);
+        // The closure holds the other count until the thread ends.
+        assert_eq!(Arc::strong_count(&made), 1, "the thread is gone");
+    }
+
+    #[test]
+    fn a_panicking_source_is_an_error() {
+        let mut reader = read_ahead(source(5, Arc::default(), 2), 0..5, 1);
+        assert!(reader.next().unwrap().is_ok() && reader.next().unwrap().is_ok());
+        let message = reader.next().unwrap().unwrap_err().to_string();
+        assert!(message.contains("before snapshot 2 of 5"), "{message}");
+        assert!(reader.next().is_none());
+    }
+}
