@@ -31,7 +31,7 @@ fn publisher() -> Publisher {
     Publisher::start("tcp://127.0.0.1:0", &settings).unwrap()
 }
 
-/// Hands over ten frames a second for so long; hands over the statistics of each second.
+/// Hands over ten frames a second for so long.
 fn publish(publisher: &Publisher, seconds: u64) {
     let film = film();
     let start = Instant::now();
@@ -133,9 +133,26 @@ fn a_minute_of_stall() {
 struct Subscriber(Child);
 
 impl Subscriber {
-    fn start(python: &str, endpoint: &str) -> Self {
+    fn start(endpoint: &str) -> Self {
         let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/subscriber.py");
-        Self(Command::new(python).args([script, endpoint]).stdout(Stdio::piped()).spawn().unwrap())
+        Self(Command::new(python()).args([script, endpoint]).stdout(Stdio::piped()).spawn().unwrap())
+    }
+
+    /// Subscribes and never asks for a message. libzmq goes on in the background, and reconnects after every cut-off.
+    fn start_hung(endpoint: &str) -> Self {
+        let script = "import sys, time, zmq\n\
+            socket = zmq.Context().socket(zmq.SUB)\n\
+            socket.setsockopt(zmq.RCVHWM, 2)\n\
+            socket.connect(sys.argv[1])\n\
+            socket.subscribe(b'')\n\
+            time.sleep(3600)\n";
+        Self(Command::new(python()).args(["-c", script, endpoint]).spawn().unwrap())
+    }
+
+    /// Times at which it got frames, until it ends.
+    fn arrivals(&mut self) -> std::thread::JoinHandle<Vec<Instant>> {
+        let lines = BufReader::new(self.0.stdout.take().unwrap()).lines();
+        std::thread::spawn(move || lines.map_while(Result::ok).filter(|l| l.starts_with("frame")).map(|_| Instant::now()).collect())
     }
 
     fn signal(&self, name: &str) {
@@ -151,18 +168,19 @@ impl Drop for Subscriber {
     }
 }
 
+/// Interpreter with pyzmq.
+fn python() -> String {
+    std::env::var("PYTHON").unwrap_or_else(|_| "python3".to_owned())
+}
+
 /// The realistic stall: a libzmq subscriber whose process is stopped for a minute, then wakes.
 #[test]
 #[ignore = "takes a minute and needs a Python with pyzmq, named by PYTHON"]
 fn a_minute_of_stopped_pyzmq() {
-    let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let publisher = publisher();
-    let mut healthy = Subscriber::start(&python, publisher.endpoint());
-    let lines = BufReader::new(healthy.0.stdout.take().unwrap());
-    let arrivals = std::thread::spawn(move || {
-        lines.lines().map_while(Result::ok).filter(|l| l.starts_with("frame")).map(|_| Instant::now()).collect::<Vec<Instant>>()
-    });
-    let mut sleeper = Subscriber::start(&python, publisher.endpoint());
+    let mut healthy = Subscriber::start(publisher.endpoint());
+    let arrivals = healthy.arrivals();
+    let mut sleeper = Subscriber::start(publisher.endpoint());
     let mut sleeper_lines = BufReader::new(sleeper.0.stdout.take().unwrap()).lines();
     // Both have got frames before one is stopped.
     publish(&publisher, 3);
@@ -185,4 +203,30 @@ fn a_minute_of_stopped_pyzmq() {
     check(&statistics, gap, times.len(), 60);
     // 30 frames before it was stopped at most; more shows that it came back by itself.
     assert!(woke > 45, "the stopped one came back: {woke} lines");
+}
+
+/// An application that hangs while its libzmq keeps reconnecting: cut off again and again, the worst that one client can do.
+#[test]
+#[ignore = "takes a minute and needs a Python with pyzmq, named by PYTHON"]
+fn a_minute_of_hung_application() {
+    let publisher = publisher();
+    let mut healthy = Subscriber::start(publisher.endpoint());
+    let arrivals = healthy.arrivals();
+    publish(&publisher, 3);
+    let hung = Subscriber::start_hung(publisher.endpoint());
+    let start = Instant::now();
+    publish(&publisher, 60);
+    let end = Instant::now();
+    drop((hung, healthy));
+    let statistics = publisher.finish(Duration::from_millis(500));
+    let times: Vec<Instant> = arrivals.join().unwrap().into_iter().filter(|t| (start..end).contains(t)).collect();
+    let gap = times.windows(2).map(|w| w[1] - w[0]).max().unwrap();
+    println!(
+        "{statistics:?}\nlargest gap {gap:?}, {} frames arrived, peak memory {:?} MiB",
+        times.len(),
+        peak_memory_bytes().map(|b| b >> 20)
+    );
+    assert!(statistics.cut_offs > 2, "it stalled again and again: {statistics:?}");
+    assert!(gap < Duration::from_secs(3), "the healthy one waited {gap:?}");
+    assert!(statistics.peak_held_bytes <= CAP as u64 * FRAME_BYTES + 256 * 1024, "{} bytes held", statistics.peak_held_bytes);
 }

@@ -109,7 +109,7 @@ pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
 type Part = Layer<AnyChannels<FlatSamples>>;
 
 fn channel<'a>(layer: &'a Part, name: &str) -> Option<&'a AnyChannel<FlatSamples>> {
-    layer.channel_data.list.iter().find(|c| c.name == name)
+    layer.channel_data.list.iter().find(|c| c.name == *name)
 }
 
 fn names(layers: &[Part]) -> String {

@@ -1,0 +1,84 @@
+//! A disk that fills up during a run.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch::engine::{Frame, FrameRecord};
+use ridgewatch::publish::{Output, PublishSettings, RunFolder, read_exr};
+use ridgewatch::render::Film;
+use std::path::Path;
+use std::process::Command;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+/// A file system of one megabyte that is gone when the test ends.
+struct SmallDisk(tempfile::TempDir);
+
+impl SmallDisk {
+    fn mount() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let mounted = Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m", "tmpfs"]).arg(folder.path()).status().unwrap();
+        assert!(mounted.success(), "mounting needs root");
+        Self(folder)
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("-l").arg(self.0.path()).status();
+    }
+}
+
+/// 128 x 128 pixels of noise: 256 KiB that do not compress.
+fn noise(number: u64) -> Frame {
+    let mut state = number.wrapping_mul(0x9e37_79b9_7f4a_7c15) | 1;
+    let mut next = || {
+        // xorshift64*: any bits that do not compress will do.
+        state ^= state >> 12;
+        state ^= state << 25;
+        state ^= state >> 27;
+        (state.wrapping_mul(0x2545_f491_4f6c_dd1d) >> 40) as f32
+    };
+    let rgba = (0..128 * 128).map(|_| [next(), next(), next(), next()]).collect();
+    let film = Film { width: 128, height: 128, rgba, ..Default::default() };
+    let record = FrameRecord { frame: number, warnings: vec!["x".repeat(2000)], ..Default::default() };
+    Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
+}
+
+fn wait_for(path: &Path) {
+    let start = Instant::now();
+    while !path.exists() {
+        assert!(start.elapsed() < Duration::from_secs(20), "{} was not written", path.display());
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn a_full_disk_is_counted_and_the_run_goes_on() {
+    let disk = SmallDisk::mount();
+    let run = disk.0.path().join("run");
+    let ballast = disk.0.path().join("ballast");
+    std::fs::write(&ballast, vec![1u8; 600 << 10]).unwrap();
+    let settings = PublishSettings { endpoint: None, preview: false, ..Default::default() };
+    let mut output = Output::start(&settings, Some(RunFolder::create(&run, false).unwrap())).unwrap();
+    // One fits beside the ballast, nineteen do not.
+    for number in 0..20 {
+        output.frame(noise(number));
+    }
+    // The queue holds four: when the hand-over of the last returns, most have been tried; give the rest their turn.
+    std::thread::sleep(Duration::from_millis(500));
+    std::fs::remove_file(&ballast).unwrap();
+    output.frame(noise(20));
+    wait_for(&run.join("frames/frame_000020.exr"));
+    let summary = output.finish(serde_json::Map::new());
+    println!("{:?}", summary.files);
+    let files = summary.files.unwrap();
+    assert_eq!((summary.frames, files.pictures_written, files.pictures_failed), (21, 2, 19));
+    let text = std::fs::read_to_string(run.join("records.jsonl")).unwrap();
+    assert!(text.ends_with('\n'));
+    let records: Vec<FrameRecord> = text.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    assert_eq!(records.len() as u64, files.records_written);
+    assert_eq!(std::fs::read_dir(run.join("frames")).unwrap().count(), 2, "nothing half-written stays");
+    assert_eq!(read_exr(&run.join("frames/frame_000020.exr")).unwrap(), *noise(20).film);
+    assert!(run.join("summary.json").exists());
+}
