@@ -2,11 +2,13 @@
 //!
 //! The rooms, and the one way of the arrows (a room calls only those to its left):
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`], the command line.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`], the command line. [`config`] puts the
+//! settings of all rooms together.
 //!
 //! One cycle: take the newest snapshots, slide the window, render with the weights of the previous cycle, test every traced
 //! sample against the surrogate (this feeds the trust map), then train on it.
 
+pub mod config;
 pub mod engine;
 pub mod field;
 pub mod flow;

@@ -62,7 +62,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
     let setup = Setup::new(scene)?;
-    let scene = setup.scene.clone();
+    let scene = setup.plan.scene.clone();
     let mut output = Output::start(&scene.publish, Some(RunFolder::create(&options.out, options.overwrite)?))?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));

@@ -6,10 +6,10 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::Slide;
-use super::setup::Setup;
+use super::setup::{Plan, Setup};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::TrainingSettings;
-use crate::flow::{Tracer, cpu_tracer};
+use crate::flow::{FlowMap, VelocitySource, Steps, Tracer, cpu_tracer};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, TrustMap};
@@ -92,7 +92,7 @@ impl Threads {
 
 /// The state that goes from frame to frame.
 struct Cycle<'a> {
-    setup: &'a Setup,
+    plan: &'a Plan,
     options: &'a RunOptions,
     threads: Threads,
     renderer: Renderer,
@@ -116,71 +116,60 @@ struct Place {
 const WARMUP_PICTURES: u64 = 1 << 40;
 
 /// Runs the whole scene. `sink` gets every event; `stop` ends the run after the current frame.
-pub fn run(mut setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
-    let time = &setup.scene.time;
-    let frames = setup.slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
-    sink(Event::Begin { frames, notes: std::mem::take(&mut setup.notes) });
-    let first = setup.feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
-    let feed = std::mem::replace(&mut setup.feed, super::feed::Feed::ended());
-    let mut feed = feed;
-    let mut tracer = cpu_tracer(first.velocity.clone(), &setup.map, first.time)?;
-    let mut cycle = Cycle::new(&setup, options, &*tracer, &first)?;
-    let mut slide = first;
+pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
+    let Setup { plan, mut feed, slides, notes } = setup;
+    let time = &plan.scene.time;
+    let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    sink(Event::Begin { frames, notes });
+    let mut slide = feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
+    let mut tracer = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+    // The number of steps is settled once, on the first slide, so that frames compare.
+    let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
+    let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
     loop {
-        let extra = if slide.index == 0 { setup.scene.time.warmup_frames } else { 0 };
-        for number in 0..setup.scene.time.frames_per_slide + extra {
-            let place = Place { first_of_slide: number == 0, warmup: number < extra };
+        let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
+        for number in 0..warmups + time.frames_per_slide {
+            let place = Place { first_of_slide: number == 0, warmup: number < warmups };
+            let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
+            sink(Event::Frame(frame));
             if stop.load(Ordering::Relaxed) {
                 cycle.report.interrupted = true;
                 return cycle.finish();
             }
-            let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
-            sink(Event::Frame(frame));
-        }
-        if stop.load(Ordering::Relaxed) {
-            cycle.report.interrupted = true;
-            return cycle.finish();
         }
         let Some(next) = feed.next_slide()? else { return cycle.finish() };
         slide = next;
-        // The number of steps is settled once, on the first slide, so that frames compare.
-        let mut map = setup.map.clone();
-        map.steps = crate::flow::Steps::Fixed(tracer.steps());
         tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
         cycle.slid(&*tracer);
     }
 }
 
 impl<'a> Cycle<'a> {
-    fn new(setup: &'a Setup, options: &'a RunOptions, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
-        let scene = &setup.scene;
-        let renderer = Renderer::new(settled_scene(setup, tracer, first.time)?, &setup.domain, setup.map.tau)?;
+    fn new(plan: &'a Plan, options: &'a RunOptions, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
+        let scene = &plan.scene;
+        let renderer = Renderer::new(settled_scene(plan, tracer, first.time)?, &plan.domain, plan.map.tau)?;
         let method = scene.render.method;
         let mut live = if method == Method::Reference {
             None
         } else {
-            Some(crate::surrogate::build(&scene.surrogate, &scene.network, &setup.domain, scene.seed, tracer)?)
+            Some(crate::surrogate::build(&scene.surrogate, &scene.network, &plan.domain, scene.seed, tracer)?)
         };
         if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live) {
             surrogate.load(path)?;
         }
         let learns = live.as_ref().is_some_and(|s| s.learns());
         Ok(Self {
-            setup,
+            plan,
             options,
             threads: Threads::new(options.threads, scene.training.share, learns)?,
             renderer,
-            trust: TrustMap::new(&scene.trust, &setup.domain),
+            trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring, scene.seed),
             live,
             frame: 0,
             pictures: 0,
             report: RunReport { integration_steps: tracer.steps(), ..RunReport::default() },
         })
-    }
-
-    fn wants_flow_map(&self) -> bool {
-        self.setup.scene.network.target == Target::FlowMap && self.setup.scene.surrogate.kind != Kind::Table
     }
 
     /// The window moved: tables are traced anew, weights carry over, labels are old, trust must be earned again.
@@ -195,7 +184,7 @@ impl<'a> Cycle<'a> {
 
     fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, place: Place, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
         let start = Instant::now();
-        let scene = &self.setup.scene;
+        let scene = &self.plan.scene;
         let method = scene.render.method;
         let gate = match method {
             Method::Gated => self.trust.gate(),
@@ -266,7 +255,7 @@ impl<'a> Cycle<'a> {
             time: slide.time,
             date: slide.date.clone(),
             tau: tracer.tau(),
-            direction: match self.setup.map.direction {
+            direction: match self.plan.map.direction {
                 crate::flow::Direction::Forward => "forward".into(),
                 crate::flow::Direction::Backward => "backward".into(),
             },
@@ -334,6 +323,9 @@ impl<'a> Cycle<'a> {
             train: train_seconds,
             total: start.elapsed().as_secs_f64(),
         };
+        if let VelocitySource::Window(window) = &slide.velocity {
+            self.report.window_bytes = self.report.window_bytes.max(window.bytes());
+        }
         self.report.frames += 1;
         self.report.waited += record.seconds.waiting;
         self.report.slides = slide.index + 1;
@@ -409,13 +401,13 @@ fn every(samples: &Samples, stride: usize) -> Samples {
 
 /// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
 /// for the whole run, so that colours compare.
-fn settled_scene(setup: &Setup, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
-    let file = &setup.scene;
+fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
+    let file = &plan.scene;
     let mut scene =
-        Scene::assemble(&setup.domain, file.camera.clone(), file.light.clone(), file.transfer.clone(), file.render.clone(), file.seed);
+        Scene::assemble(&plan.domain, file.camera.clone(), file.light.clone(), file.transfer.clone(), file.render.clone(), file.seed);
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
-        let z = if setup.domain.dimensions == 3 { 16 } else { 1 };
+        let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
         let unit = audit::stratified_points([PROBES, PROBES, z], 1, file.seed, u64::MAX);
         let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
         let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();

@@ -30,20 +30,9 @@ pub enum EngineError {
     /// "30 days" where time has no seconds.
     #[error("time.tau has a unit, but the source's time is not in seconds (with the index metric it counts snapshots): give a plain number")]
     TauUnit,
-    /// The archive is shorter than tau.
-    #[error(
-        "the archive is too short: tau = {tau} needs at least {needed} snapshots, {found} are there (they span {span}); give a shorter time.tau or more files"
-    )]
-    TooFewSnapshots {
-        /// |tau|.
-        tau: f64,
-        /// From the first to the last time.
-        span: f64,
-        /// Snapshots that tau needs at the archive's spacing.
-        needed: usize,
-        /// Snapshots there.
-        found: usize,
-    },
+    /// A synthetic grid.
+    #[error(transparent)]
+    Axis(#[from] crate::field::AxisFault),
     /// The source gave fewer snapshots than its times promised.
     #[error("the source ended before its window was full")]
     EndedEarly,

@@ -2,10 +2,22 @@
 //!
 //! In: a scene. Out: frames with their records. Calls every room but `publish`.
 
+mod answers;
+mod audit;
+mod cycle;
+mod error;
+mod feed;
 mod record;
+mod setup;
 
 pub use crate::trust::TrustedError;
+pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
+pub use answers::{Answers, Tally};
+pub use cycle::{Event, RunOptions, RunReport, run};
+pub use error::EngineError;
+pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};
+pub use setup::Setup;
 
 /// A finished frame on its way out.
 #[derive(Debug, Clone)]

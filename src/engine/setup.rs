@@ -7,13 +7,20 @@ use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Steps};
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
-pub struct Setup {
+#[derive(Debug, Clone)]
+pub struct Plan {
     /// The file.
     pub scene: SceneFile,
     /// The flow map, but for its start time.
     pub map: FlowMap,
     /// Where seeds lie.
     pub domain: Domain,
+}
+
+/// A plan and its opened source.
+pub struct Setup {
+    /// What is to be done.
+    pub plan: Plan,
     /// The slides of the window.
     pub feed: Feed,
     /// Slides to come, where known.
@@ -32,14 +39,14 @@ impl Setup {
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
         let tau = match (&scene.time.tau, &snapshots) {
             (Some(tau), source) => {
-                if tau.has_unit() && source.as_ref().is_some_and(|s| !s.time_in_seconds()) {
+                if tau.has_unit() && source.as_ref().is_some_and(|s| s.describe().time_unit != "s") {
                     return Err(EngineError::TauUnit);
                 }
                 tau.value().ok_or(EngineError::TauUnit)?
             }
             (None, Some(source)) => {
-                let tau = default_tau(source.times())?;
-                notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", if source.time_in_seconds() { "seconds" } else { "snapshots" }));
+                let tau = source.default_tau()?;
+                notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
                 tau
             }
             (None, None) => return Err(EngineError::TauUnit),
@@ -71,17 +78,6 @@ impl Setup {
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let feed = Feed::open(&scene, snapshots, tau, direction)?;
         let slides = feed.expected_slides(times.as_deref(), tau);
-        Ok(Self { scene, map, domain, feed, slides, notes })
+        Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
     }
-}
-
-/// Half of the span, at least two intervals.
-fn default_tau(times: &[f64]) -> Result<f64, EngineError> {
-    if times.len() < 3 {
-        return Err(EngineError::TooFewSnapshots { tau: f64::NAN, span: 0.0, needed: 3, found: times.len() });
-    }
-    let span = times[times.len() - 1] - times[0];
-    // A whole number of snapshots, so that no window is held for a fraction of an interval.
-    let half = times.iter().rev().find(|t| *t - times[0] <= span / 2.0 + span * 1e-9).copied().unwrap_or(times[2]);
-    Ok((half - times[0]).max(times[2] - times[0]))
 }
