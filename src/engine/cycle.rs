@@ -9,7 +9,7 @@ use super::feed::Slide;
 use super::setup::{Plan, Setup};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::TrainingSettings;
-use crate::flow::{FlowMap, VelocitySource, Steps, Tracer, cpu_tracer};
+use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, TrustMap};
@@ -108,7 +108,6 @@ struct Cycle<'a> {
 /// Where a frame stands in the run.
 #[derive(Clone, Copy)]
 struct Place {
-    first_of_slide: bool,
     warmup: bool,
 }
 
@@ -129,7 +128,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     loop {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
-            let place = Place { first_of_slide: number == 0, warmup: number < warmups };
+            let place = Place { warmup: number < warmups };
             let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
             sink(Event::Frame(frame));
             if stop.load(Ordering::Relaxed) {
@@ -164,7 +163,7 @@ impl<'a> Cycle<'a> {
             threads: Threads::new(options.threads, scene.training.share, learns)?,
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
-            ring: SampleRing::new(scene.training.ring, scene.seed),
+            ring: SampleRing::new(scene.training.ring),
             live,
             frame: 0,
             pictures: 0,
@@ -172,14 +171,31 @@ impl<'a> Cycle<'a> {
         })
     }
 
-    /// The window moved: tables are traced anew, weights carry over, labels are old, trust must be earned again.
+    /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold, trust must be earned
+    /// again.
     fn slid(&mut self, tracer: &dyn Tracer) {
         if let Some(live) = &mut self.live {
             self.threads.render.install(|| live.window_slid(tracer));
             self.trust.window_slid();
             self.ring.mark_stale();
+            let holding = self.threads.render.install(|| self.share_of_labels_that_hold(tracer));
+            self.ring.revalidate(holding);
         }
         self.renderer.window_slid();
+    }
+
+    /// Traces some of the old labels anew: the share whose ramp is within the tolerance of what the label says.
+    fn share_of_labels_that_hold(&self, tracer: &dyn Tracer) -> f64 {
+        const PROBES: usize = 2048;
+        let stale = self.ring.stale();
+        let chosen = self.ring.probe(PROBES, self.plan.scene.seed, self.frame);
+        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| tracer.domain().from_unit(stale.points[i])).collect();
+        let mut traced = Traced::default();
+        tracer.trace(&points, Extras::default(), &mut traced);
+        let ramp = |s: f32| self.renderer.transfer().ramp(s / tracer.tau() as f32);
+        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(stale.log_stretch[i])).abs()) <= self.plan.scene.trust.tolerance;
+        let held = chosen.iter().zip(&traced.log_stretch).filter(|pair| holds(*pair)).count();
+        held as f64 / chosen.len().max(1) as f64
     }
 
     fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, place: Place, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
@@ -298,10 +314,6 @@ impl<'a> Cycle<'a> {
             let some = every(&work.samples, stride);
             residuals.extend(self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau())));
             self.trust.observe(&residuals);
-            if place.first_of_slide && slide.index > 0 {
-                // Old labels stay only where the new window's traces say that they still hold.
-                self.threads.render.install(|| self.ring.revalidate(tracer, scene.trust.tolerance, transfer));
-            }
             self.ring.push(&work.audit.samples);
             self.ring.push(&work.samples);
         }

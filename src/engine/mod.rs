@@ -17,7 +17,7 @@ pub use cycle::{Event, RunOptions, RunReport, run};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};
-pub use setup::Setup;
+pub use setup::{Plan, Setup};
 
 /// A finished frame on its way out.
 #[derive(Debug, Clone)]

@@ -1,0 +1,315 @@
+//! `ridgewatch ftle`: the field on a grid, and how right it is.
+
+use super::{Common, Usage, messages, on_threads, print_json, print_text, scene};
+use anyhow::{Context, Result, bail};
+use ridgewatch::engine::{Plan, Setup, Slide};
+use ridgewatch::field::analytic::Analytic;
+use ridgewatch::flow::{Boundary, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// Options of `ftle`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), or data files and globs.
+    #[arg(required = true, value_name = "CONFIG | FILES")]
+    paths: Vec<PathBuf>,
+    /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions.
+    #[arg(long, default_value = "201x101", value_parser = grid)]
+    grid: Grid,
+    /// Which slide of the window, from 0.
+    #[arg(long, default_value_t = 0, value_name = "N")]
+    slide: u64,
+    /// Holds the field against its closed form where there is one, else against Dormand-Prince integration in f64 of the same field.
+    #[arg(long)]
+    check: bool,
+    /// Prints the error against the same truth for 5, 10, 20 ... 160 steps (in f64), and the order that it shows.
+    #[arg(long)]
+    convergence: bool,
+    /// NetCDF file; without it nothing is written.
+    #[arg(long, short)]
+    out: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Grid([usize; 3]);
+
+fn grid(text: &str) -> Result<Grid, String> {
+    const ACCEPTED: &str = "accepted: NXxNY or NXxNYxNZ with numbers from 2 to 16384";
+    let numbers: Vec<usize> = text.split(['x', 'X']).map(|n| n.trim().parse().map_err(|_| ACCEPTED.to_owned())).collect::<Result<_, _>>()?;
+    if !numbers.iter().all(|n| (2..=16_384).contains(n)) {
+        return Err(ACCEPTED.into());
+    }
+    match numbers[..] {
+        [x, y] => Ok(Grid([x, y, 1])),
+        [x, y, z] => Ok(Grid([x, y, z])),
+        _ => Err(ACCEPTED.into()),
+    }
+}
+
+#[derive(Serialize)]
+struct Report {
+    time: f64,
+    date: Option<String>,
+    tau: f64,
+    grid: [usize; 3],
+    integrator: Integrator,
+    precision: Precision,
+    steps: usize,
+    minimum: f64,
+    mean: f64,
+    maximum: f64,
+    missing_seeds: usize,
+    stopped_early_share: f64,
+    seconds: f64,
+    samples_per_second: f64,
+    check: Option<Check>,
+    convergence: Option<Convergence>,
+    file: Option<PathBuf>,
+}
+
+#[derive(Serialize)]
+struct Check {
+    truth: &'static str,
+    rms: f64,
+    maximum: f64,
+    maximum_relative: Option<f64>,
+    psnr: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct Convergence {
+    truth: &'static str,
+    steps: Vec<usize>,
+    rms: Vec<f64>,
+    order: Vec<f64>,
+}
+
+/// Computes, checks and writes.
+pub fn run(common: &Common, options: &Options) -> Result<()> {
+    let Setup { plan, mut feed, notes, .. } = Setup::new(scene(common, &options.paths)?)?;
+    notes.iter().for_each(messages::note);
+    if let Some(out) = &options.out {
+        super::render::check_folder(out)?;
+    }
+    let mut slide = None;
+    for _ in 0..=options.slide {
+        slide = feed.next_slide()?;
+        if slide.is_none() {
+            bail!(Usage(format!("--slide {}: the source has fewer slides", options.slide)));
+        }
+    }
+    let slide = slide.context("the source gave no slide")?;
+    let report = on_threads(common, || compute(&plan, &slide, options))??;
+    if common.json { print_json(&report) } else { Ok(print_report(&report)) }
+}
+
+fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
+    let tracer = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+    let mut grid = options.grid.0;
+    match (plan.domain.dimensions, grid[2]) {
+        (2, 1) => {}
+        (2, n) => bail!(Usage(format!("--grid has {n} seeds along z, but the flow does not vary along z; accepted: NXxNY"))),
+        (_, 1) => {
+            // A grid given for two axes: as many along z as its spacing along x asks for.
+            let extent = plan.domain.extent();
+            grid[2] = (((grid[0] - 1) as f64 * extent[2] / extent[0]).round() as usize + 1).max(2);
+        }
+        _ => {}
+    }
+    let seeds = seeds(&*tracer, grid);
+    let begun = std::time::Instant::now();
+    let extras = Extras { precise: true, ..Extras::default() };
+    let mut traced = Traced::default();
+    tracer.trace(&seeds, extras, &mut traced);
+    let seconds = begun.elapsed().as_secs_f64();
+    let tau = tracer.tau();
+    let ftle: Vec<f64> = (0..seeds.len()).map(|i| if traced.lived[i] > 0.0 { traced.precise[i] / tau } else { f64::NAN }).collect();
+    let known: Vec<f64> = ftle.iter().copied().filter(|f| !f.is_nan()).collect();
+    let check = if options.check { Some(check(plan, slide, &seeds, &ftle)?) } else { None };
+    let convergence = if options.convergence { Some(convergence(plan, slide, &seeds)?) } else { None };
+    if let Some(out) = &options.out {
+        write(out, plan, slide, &*tracer, grid, &ftle, &traced.lived).with_context(|| format!("cannot write {}", out.display()))?;
+    }
+    Ok(Report {
+        time: slide.time,
+        date: slide.date.clone(),
+        tau,
+        grid,
+        integrator: plan.map.integrator,
+        precision: plan.map.precision,
+        steps: tracer.steps(),
+        minimum: known.iter().copied().fold(f64::INFINITY, f64::min),
+        mean: known.iter().sum::<f64>() / known.len().max(1) as f64,
+        maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
+        missing_seeds: seeds.len() - known.len(),
+        stopped_early_share: traced.lived.iter().filter(|l| **l > 0.0 && **l < 1.0).count() as f64 / seeds.len() as f64,
+        seconds,
+        samples_per_second: seeds.len() as f64 / seconds,
+        check,
+        convergence,
+        file: options.out.clone(),
+    })
+}
+
+fn seeds(tracer: &dyn Tracer, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
+    let at = |i: usize, n: usize| if n > 1 { i as f32 / (n - 1) as f32 } else { 0.5 };
+    (0..nx * ny * nz).map(|i| tracer.domain().from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
+}
+
+/// FTLE of a closed form that is the same everywhere; none where there is no such form.
+fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
+    let tau = plan.map.tau;
+    match velocity {
+        VelocitySource::Analytic(flow, _) if plan.map.boundary == Boundary::Unbounded => match *flow {
+            Analytic::Saddle { rate } => Some(rate.abs()),
+            Analytic::Rotation { .. } => Some(0.0),
+            Analytic::Shear { rate } => {
+                let g = (rate * tau).abs();
+                Some((1.0 + g * g / 2.0 + g * (1.0 + g * g / 4.0).sqrt()).ln() / (2.0 * tau))
+            }
+            _ => None,
+        },
+        _ => None,
+    }
+}
+
+/// FTLE at the seeds that is taken for the truth.
+fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str, Vec<f64>)> {
+    if let Some(value) = closed_form(plan, &slide.velocity) {
+        return Ok(("closed form", vec![value; seeds.len()]));
+    }
+    let map = FlowMap { integrator: Integrator::DormandPrince, precision: Precision::F64, ..plan.map.clone() };
+    Ok(("Dormand-Prince, f64", ftle(&map, slide, seeds)?))
+}
+
+fn ftle(map: &FlowMap, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Vec<f64>> {
+    let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
+    let mut traced = Traced::default();
+    tracer.trace(seeds, Extras { precise: true, ..Extras::default() }, &mut traced);
+    Ok(traced.precise.iter().map(|s| s / map.tau).collect())
+}
+
+fn check(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]], ftle: &[f64]) -> Result<Check> {
+    let (name, truth) = truth(plan, slide, seeds)?;
+    let (rms, maximum) = difference(ftle, &truth);
+    let peak = truth.iter().copied().filter(|f| f.is_finite()).fold(0.0, f64::max);
+    let relative = ftle.iter().zip(&truth).filter(|(a, _)| !a.is_nan()).map(|(a, b)| (a - b).abs() / b.abs()).fold(0.0, f64::max);
+    Ok(Check {
+        truth: name,
+        rms,
+        maximum,
+        maximum_relative: relative.is_finite().then_some(relative),
+        psnr: (rms > 0.0 && peak > 0.0).then(|| 20.0 * (peak / rms).log10()),
+    })
+}
+
+/// Root mean square and maximum over seeds that have a value.
+fn difference(a: &[f64], b: &[f64]) -> (f64, f64) {
+    let (mut square, mut maximum, mut count) = (0.0, 0.0f64, 0usize);
+    for (a, b) in a.iter().zip(b).filter(|(a, _)| !a.is_nan()) {
+        square += (a - b).powi(2);
+        maximum = maximum.max((a - b).abs());
+        count += 1;
+    }
+    ((square / count.max(1) as f64).sqrt(), maximum)
+}
+
+fn convergence(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Convergence> {
+    let (name, truth) = truth(plan, slide, seeds)?;
+    let steps: Vec<usize> = (0..6).map(|k| 5 << k).collect();
+    let mut rms = Vec::new();
+    for &n in &steps {
+        let map = FlowMap { integrator: Integrator::Tangent, precision: Precision::F64, steps: Steps::Fixed(n), ..plan.map.clone() };
+        rms.push(difference(&ftle(&map, slide, seeds)?, &truth).0);
+    }
+    let order = rms.windows(2).map(|pair| (pair[0] / pair[1]).log2()).collect();
+    Ok(Convergence { truth: name, steps, rms, order })
+}
+
+/// Writes under a temporary name first: nothing half-written is left under the final one.
+fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usize; 3], ftle: &[f64], lived: &[f32]) -> Result<()> {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    let temporary = tempfile::Builder::new().prefix(".ridgewatch-").suffix(".nc").tempfile_in(folder)?.into_temp_path();
+    {
+        let mut file = netcdf::create(&temporary)?;
+        let axes = &["x", "y", "z"][..plan.domain.dimensions];
+        for (k, name) in axes.iter().enumerate() {
+            file.add_dimension(name, grid[k])?;
+        }
+        for (k, name) in axes.iter().enumerate() {
+            let mut variable = file.add_variable::<f64>(name, &[name])?;
+            let step = plan.domain.extent()[k] / (grid[k] - 1) as f64;
+            let values: Vec<f64> = (0..grid[k]).map(|i| plan.domain.min[k] + step * i as f64).collect();
+            variable.put_values(&values, ..)?;
+            let (long_name, units) = axis_words(&slide.velocity, k);
+            variable.put_attribute("long_name", long_name)?;
+            variable.put_attribute("units", units)?;
+        }
+        let dimensions: Vec<&str> = axes.iter().rev().copied().collect();
+        let seconds = slide.date.is_some();
+        {
+            let mut variable = file.add_variable::<f64>("ftle", &dimensions)?;
+            variable.set_fill_value(f64::NAN)?;
+            variable.put_values(ftle, ..)?;
+            variable.put_attribute("long_name", "finite-time Lyapunov exponent")?;
+            variable.put_attribute("units", if seconds { "s-1" } else { "1" })?;
+        }
+        let mut variable = file.add_variable::<f32>("lived", &dimensions)?;
+        variable.put_values(lived, ..)?;
+        variable.put_attribute("long_name", "share of tau that the particle lived")?;
+        variable.put_attribute("units", "1")?;
+        file.add_attribute("title", plan.scene.title.as_str())?;
+        file.add_attribute("source", concat!("ridgewatch ", env!("CARGO_PKG_VERSION")))?;
+        file.add_attribute("seed_time", slide.time)?;
+        if let Some(date) = &slide.date {
+            file.add_attribute("seed_date", date.as_str())?;
+        }
+        file.add_attribute("tau", tracer.tau())?;
+        file.add_attribute("direction", plan.map.direction.name())?;
+        file.add_attribute("integrator", format!("{:?}, {:?}, {} steps", plan.map.integrator, plan.map.precision, tracer.steps()))?;
+    }
+    temporary.persist(out)?;
+    Ok(())
+}
+
+/// Name and unit of an axis, as its source has them.
+fn axis_words(velocity: &VelocitySource, axis: usize) -> (&str, &str) {
+    let known = match velocity {
+        VelocitySource::Window(window) => window.grid().and_then(|g| g.axes.get(axis)).map(|a| (a.name(), a.units())),
+        VelocitySource::Analytic(..) => None,
+    };
+    known.unwrap_or((["x", "y", "z"][axis], "1"))
+}
+
+fn print_report(report: &Report) {
+    let [nx, ny, nz] = report.grid;
+    let when = report.date.clone().unwrap_or_else(|| format!("t0 = {}", report.time));
+    print_text(format_args!(
+        "{when}, tau = {}: {:?} {:?}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
+        report.tau, report.integrator, report.precision, report.steps, report.seconds, report.samples_per_second
+    ));
+    print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
+    if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {
+        print_text(format_args!(
+            "{} seeds without velocity; {:.2} % of the particles stopped early",
+            report.missing_seeds,
+            100.0 * report.stopped_early_share
+        ));
+    }
+    if let Some(check) = &report.check {
+        let relative = check.maximum_relative.map_or_else(String::new, |r| format!(", relative {r:.3e}"));
+        let psnr = check.psnr.map_or_else(String::new, |p| format!(", PSNR {p:.1} dB"));
+        print_text(format_args!("against {}: rms {:.3e}, maximum {:.3e}{relative}{psnr}", check.truth, check.rms, check.maximum));
+    }
+    if let Some(c) = &report.convergence {
+        print_text(format_args!("against {}, f64:", c.truth));
+        for (k, (steps, rms)) in c.steps.iter().zip(&c.rms).enumerate() {
+            let order = if k > 0 { format!("   order {:.2}", c.order[k - 1]) } else { String::new() };
+            print_text(format_args!("  {steps:>4} steps   rms {rms:.3e}{order}"));
+        }
+    }
+    if let Some(file) = &report.file {
+        print_text(format_args!("written to {}", file.display()));
+    }
+}
