@@ -1,6 +1,34 @@
 //! The network: encoding, MLP in burn, loss; stock path, fused autodiff operation and `train_steps(k)`.
+//!
+//! burn owns the parameters ([`Network`]) and Adam's moments ([`Model`]). The fused kernels (`tile`, `dense`, `encode`, `adam`) read and write the
+//! same buffers: a tile of about a hundred samples goes through encoding, layers, loss and back while it lies in the first two cache
+//! levels; then each level of the hash grid collects its gradient and takes its Adam step as one task.
 
 use serde::{Deserialize, Serialize};
+
+mod adam;
+mod architecture;
+mod dense;
+mod encode;
+mod lanes;
+mod model;
+mod module;
+mod objective;
+mod operation;
+mod predictor;
+mod tile;
+mod train;
+
+pub use architecture::{Architecture, Layer, Level};
+pub use model::Model;
+pub use module::Network;
+#[cfg(test)]
+pub(crate) use module::uniform;
+pub(crate) use module::mix;
+pub use objective::{Objective, Scale, signed_exp, signed_log};
+pub use operation::FusedNetwork;
+pub(crate) use predictor::Predictor;
+pub use train::{Average, Fused, Pick, Step, autodiff_gradient, operation_step, stock_step};
 
 /// How a position is shown to the MLP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -64,6 +92,12 @@ pub struct NetworkSettings {
     pub learning_rate: Option<f32>,
     /// Samples an optimizer step.
     pub batch: usize,
+    /// Whether shorter axes of the domain get fewer cells, so that cells are about as wide as high.
+    pub follow_aspect: bool,
+    /// Weight of the flow map's derivatives in the loss (target `flow_map`); 0 trains on arrivals alone.
+    pub jacobian_weight: f32,
+    /// Share of the steps so far over which the weights used for prediction are averaged; 0 predicts with the latest weights.
+    pub averaging: f32,
 }
 
 impl Default for NetworkSettings {
@@ -83,6 +117,9 @@ impl Default for NetworkSettings {
             mean_penalty: 1.0,
             learning_rate: None,
             batch: 1 << 14,
+            follow_aspect: true,
+            jacobian_weight: 0.1,
+            averaging: 0.1,
         }
     }
 }

@@ -1,0 +1,47 @@
+//! Adam (Kingma and Ba 2015) on slices, with burn's arithmetic: same order, same f32 rounding up to fused multiply-adds.
+
+/// Decay of the first moment.
+pub(super) const BETA_1: f32 = 0.9;
+/// Decay of the second moment.
+pub(super) const BETA_2: f32 = 0.999;
+
+/// The factors of one step.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Adam {
+    rate: f32,
+    epsilon: f32,
+    correction: f32,
+}
+
+impl Adam {
+    /// The factors of step number `time`, counted from 1.
+    pub(super) fn at(time: usize, rate: f64, epsilon: f32) -> Self {
+        // 1 - 0.999^t is 1 in f32 long before i32 runs out.
+        let time = time.min(1 << 30) as i32;
+        let second = (1.0 - BETA_2.powi(time)).sqrt();
+        Self { rate: rate as f32, epsilon: epsilon * second, correction: second / (1.0 - BETA_1.powi(time)) }
+    }
+
+    /// Updates parameters and moments, and zeroes the gradient. `average`, where given, moves the mean of the parameters by its share.
+    pub(super) fn step(
+        self,
+        parameters: &mut [f32],
+        gradient: &mut [f32],
+        first: &mut [f32],
+        second: &mut [f32],
+        average: Option<(&mut [f32], f32)>,
+    ) {
+        let Self { rate, epsilon, correction } = self;
+        for (((p, g), m), v) in parameters.iter_mut().zip(gradient.iter_mut()).zip(first).zip(second) {
+            *m = *m * BETA_1 + *g * (1.0 - BETA_1);
+            *v = *v * BETA_2 + *g * *g * (1.0 - BETA_2);
+            *p -= *m * correction / (v.sqrt() + epsilon) * rate;
+            *g = 0.0;
+        }
+        if let Some((average, share)) = average {
+            for (a, &p) in average.iter_mut().zip(parameters.iter()) {
+                *a += (p - *a) * share;
+            }
+        }
+    }
+}

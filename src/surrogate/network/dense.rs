@@ -1,0 +1,227 @@
+//! Fully connected layers on a tile of rows: Y = X W + b, its gradient for X, and its gradient for W.
+//!
+//! All three are register-blocked products of a broadcast scalar and a row of [`PANEL`] weights: six rows by two vectors, so that
+//! twelve accumulators hide the latency of the multiply-adds (two a cycle on Zen 3). Rows are samples, so no activation is ever
+//! transposed; weights are packed into panels once a step, which costs little beside a batch of thousands.
+//!
+//! Rows come in groups of `primal` rows: the first group are values, the further ones tangents (derivatives along one input axis). A
+//! tangent has no bias and takes the ReLU mask of its value, because the network is linear between the kinks.
+
+use super::architecture::{Layer, PANEL, padded};
+use super::lanes::{Aligned, load, store};
+use wide::f32x8;
+
+/// Rows computed at once. Tiles have a multiple of it in each group.
+pub(super) const BLOCK: usize = 6;
+
+/// A layer's weights in panels: `[panel][input][PANEL]`, then the padded biases; and the transpose `[panel][output][PANEL]` for the way back.
+pub(super) struct Packed {
+    pub(super) inputs: usize,
+    pub(super) outputs: usize,
+    pub(super) forward: Aligned,
+    pub(super) backward: Aligned,
+}
+
+/// Length of a layer's packed weights and biases (and of their packed gradient).
+pub(super) fn packed_len(layer: &Layer) -> usize {
+    (layer.inputs + 1) * padded(layer.outputs)
+}
+
+/// Calls `place(packed index, flat index)` for every parameter of the layer.
+pub(super) fn for_each_parameter(layer: &Layer, mut place: impl FnMut(usize, usize)) {
+    for input in 0..layer.inputs {
+        for output in 0..layer.outputs {
+            place((output / PANEL * layer.inputs + input) * PANEL + output % PANEL, layer.weights + input * layer.outputs + output);
+        }
+    }
+    let biases = layer.inputs * padded(layer.outputs);
+    for output in 0..layer.outputs {
+        place(biases + output, layer.biases + output);
+    }
+}
+
+impl Packed {
+    /// Room for a layer; `transposed` when the gradient for its input will be asked for.
+    pub(super) fn new(layer: &Layer, transposed: bool) -> Self {
+        let backward = if transposed { padded(layer.inputs) * layer.outputs } else { 0 };
+        Self { inputs: layer.inputs, outputs: layer.outputs, forward: Aligned::zeros(packed_len(layer)), backward: Aligned::zeros(backward) }
+    }
+
+    /// Copies the layer's parameters out of the flat vector.
+    pub(super) fn fill(&mut self, layer: &Layer, flat: &[f32]) {
+        let forward = &mut self.forward[..];
+        for_each_parameter(layer, |to, from| forward[to] = flat[from]);
+        if !self.backward.is_empty() {
+            for input in 0..layer.inputs {
+                let row = &flat[layer.weights + input * layer.outputs..][..layer.outputs];
+                for (output, &weight) in row.iter().enumerate() {
+                    self.backward[(input / PANEL * layer.outputs + output) * PANEL + input % PANEL] = weight;
+                }
+            }
+        }
+    }
+}
+
+/// `init + X[M rows] * panel`, over `depth` inputs.
+///
+/// # Safety
+/// `x` points to M rows of at least `depth` values, `stride` apart; `panel` to `depth * PANEL` values.
+#[inline(always)]
+unsafe fn product<const M: usize>(x: *const f32, stride: usize, depth: usize, panel: *const f32, init: [f32x8; 2]) -> [[f32x8; 2]; M] {
+    let mut sums = [init; M];
+    for k in 0..depth {
+        // SAFETY: k < depth, so both reads lie inside what the caller promised.
+        unsafe {
+            let low = load(panel.add(k * PANEL));
+            let high = load(panel.add(k * PANEL + 8));
+            for (m, sum) in sums.iter_mut().enumerate() {
+                let value = f32x8::splat(*x.add(m * stride + k));
+                sum[0] = value.mul_add(low, sum[0]);
+                sum[1] = value.mul_add(high, sum[1]);
+            }
+        }
+    }
+    sums
+}
+
+/// Y = relu(X W + b) on `rows` rows; tangent rows: (X W) where the value row's Y is above 0. `rows` and `primal` are multiples of [`BLOCK`].
+pub(super) fn forward(layer: &Packed, x: &[f32], x_stride: usize, y: &mut [f32], y_stride: usize, rows: usize, primal: usize) {
+    let (depth, wide) = (layer.inputs, padded(layer.outputs));
+    assert!(rows % BLOCK == 0 && primal % BLOCK == 0 && x_stride >= depth && y_stride >= wide);
+    assert!(rows == 0 || (x.len() >= rows * x_stride && y.len() >= rows * y_stride));
+    let biases = depth * wide;
+    let zero = f32x8::splat(0.0);
+    for panel in 0..wide / PANEL {
+        let column = panel * PANEL;
+        for row in (0..rows).step_by(BLOCK) {
+            // SAFETY: the asserts above bound x and y; `forward` holds (depth + 1) * wide values; row - row % primal is a row before this one.
+            unsafe {
+                let weights = layer.forward.as_ptr().add(column * depth);
+                let bias = layer.forward.as_ptr().add(biases + column);
+                let init = if row < primal { [load(bias), load(bias.add(8))] } else { [zero; 2] };
+                let sums = product::<BLOCK>(x.as_ptr().add(row * x_stride), x_stride, depth, weights, init);
+                for (m, sum) in sums.into_iter().enumerate() {
+                    let out = y.as_mut_ptr().add((row + m) * y_stride + column);
+                    let value = y.as_ptr().add(((row + m) % primal) * y_stride + column);
+                    for (half, sum) in sum.into_iter().enumerate() {
+                        // `max(0, sum)` in this order lets NaN through, so that a diverged network is seen and not painted black.
+                        let passed =
+                            if row < primal { zero.fast_max(sum) } else { load(value.add(8 * half)).simd_gt(zero) & sum };
+                        store(out.add(8 * half), passed);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// dX = dZ W^T, kept only where `active` (the value rows of X itself) is above 0; no mask for an encoded input.
+pub(super) fn input_gradient(
+    layer: &Packed,
+    dz: &[f32],
+    dz_stride: usize,
+    dx: &mut [f32],
+    dx_stride: usize,
+    active: Option<&[f32]>,
+    rows: usize,
+    primal: usize,
+) {
+    let (depth, wide) = (layer.outputs, padded(layer.inputs));
+    assert!(rows % BLOCK == 0 && primal % BLOCK == 0 && dz_stride >= depth && dx_stride >= wide);
+    assert!(dz.len() >= rows * dz_stride && dx.len() >= rows * dx_stride && layer.backward.len() == depth * wide);
+    assert!(active.is_none_or(|a| a.len() >= primal * dx_stride));
+    let zero = f32x8::splat(0.0);
+    for panel in 0..wide / PANEL {
+        let column = panel * PANEL;
+        for row in (0..rows).step_by(BLOCK) {
+            // SAFETY: the asserts above bound every buffer.
+            unsafe {
+                let weights = layer.backward.as_ptr().add(column * depth);
+                let sums = product::<BLOCK>(dz.as_ptr().add(row * dz_stride), dz_stride, depth, weights, [zero; 2]);
+                for (m, sum) in sums.into_iter().enumerate() {
+                    let out = dx.as_mut_ptr().add((row + m) * dx_stride + column);
+                    for (half, sum) in sum.into_iter().enumerate() {
+                        let kept = match active {
+                            Some(a) => {
+                                let value = load(a.as_ptr().add(((row + m) % primal) * dx_stride + column + 8 * half));
+                                value.simd_gt(zero) & sum
+                            }
+                            None => sum,
+                        };
+                        store(out.add(8 * half), kept);
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// Adds X^T dZ (and the column sums of the value rows of dZ) to the packed gradient.
+pub(super) fn weight_gradient(
+    inputs: usize,
+    outputs: usize,
+    x: &[f32],
+    x_stride: usize,
+    dz: &[f32],
+    dz_stride: usize,
+    gradient: &mut [f32],
+    rows: usize,
+    primal: usize,
+) {
+    let wide = padded(outputs);
+    assert!(x_stride >= inputs && dz_stride >= wide && gradient.len() == (inputs + 1) * wide);
+    assert!(x.len() >= rows * x_stride && dz.len() >= rows * dz_stride && primal <= rows);
+    for panel in 0..wide / PANEL {
+        let column = panel * PANEL;
+        let mut input = 0;
+        while input < inputs {
+            let take = (inputs - input).min(BLOCK);
+            // SAFETY: input + take <= inputs <= x_stride and column + PANEL <= wide <= dz_stride; the asserts above bound the buffers.
+            unsafe {
+                let x = x.as_ptr().add(input);
+                let dz = dz.as_ptr().add(column);
+                let sum = gradient.as_mut_ptr().add(column * inputs + input * PANEL);
+                match take {
+                    6 => outer::<6>(x, x_stride, dz, dz_stride, rows, sum),
+                    5 => outer::<5>(x, x_stride, dz, dz_stride, rows, sum),
+                    4 => outer::<4>(x, x_stride, dz, dz_stride, rows, sum),
+                    3 => outer::<3>(x, x_stride, dz, dz_stride, rows, sum),
+                    2 => outer::<2>(x, x_stride, dz, dz_stride, rows, sum),
+                    _ => outer::<1>(x, x_stride, dz, dz_stride, rows, sum),
+                }
+            }
+            input += take;
+        }
+        let biases = inputs * wide + column;
+        for row in 0..primal {
+            for lane in 0..PANEL {
+                gradient[biases + lane] += dz[row * dz_stride + column + lane];
+            }
+        }
+    }
+}
+
+/// sum[m][PANEL] += over rows of x[row][m] * dz[row][PANEL].
+///
+/// # Safety
+/// `x` and `dz` point to `rows` rows of M and PANEL values; `sum` to M * PANEL writable values.
+#[inline(always)]
+unsafe fn outer<const M: usize>(x: *const f32, x_stride: usize, dz: *const f32, dz_stride: usize, rows: usize, sum: *mut f32) {
+    // SAFETY: all indices stay inside what the caller promised.
+    unsafe {
+        let mut sums: [[f32x8; 2]; M] = std::array::from_fn(|m| [load(sum.add(m * PANEL)), load(sum.add(m * PANEL + 8))]);
+        for row in 0..rows {
+            let low = load(dz.add(row * dz_stride));
+            let high = load(dz.add(row * dz_stride + 8));
+            for (m, sum) in sums.iter_mut().enumerate() {
+                let value = f32x8::splat(*x.add(row * x_stride + m));
+                sum[0] = value.mul_add(low, sum[0]);
+                sum[1] = value.mul_add(high, sum[1]);
+            }
+        }
+        for (m, values) in sums.into_iter().enumerate() {
+            store(sum.add(m * PANEL), values[0]);
+            store(sum.add(m * PANEL + 8), values[1]);
+        }
+    }
+}

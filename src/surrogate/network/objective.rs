@@ -1,0 +1,217 @@
+//! What the outputs mean, and what training minimises.
+
+use super::{Loss, NetworkSettings, Target, architecture::Architecture, tile::OUT};
+use crate::surrogate::Samples;
+use serde::{Deserialize, Serialize};
+
+/// Outputs are trained as (value - mean) / deviation, so that rates mean the same on every scene. Per output.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Scale {
+    /// Subtracted.
+    pub mean: [f32; 3],
+    /// Divided by.
+    pub deviation: [f32; 3],
+}
+
+impl Default for Scale {
+    fn default() -> Self {
+        Self { mean: [0.0; 3], deviation: [1.0; 3] }
+    }
+}
+
+/// Target, loss and scale.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Objective {
+    /// What the outputs are.
+    pub target: Target,
+    /// Loss on them.
+    pub loss: Loss,
+    /// Weight of the penalty on the difference of the batch means.
+    pub mean_penalty: f32,
+    /// Weight of the flow map's derivatives beside its values; 0: not trained on.
+    pub jacobian_weight: f32,
+    /// |tau|, the ratio of log-stretch and FTLE.
+    pub tau: f32,
+    /// Edge lengths of the domain along the active axes.
+    pub extent: [f32; 3],
+    /// Standardisation.
+    pub scale: Scale,
+}
+
+/// sign(y) ln(1 + |y|): a logarithm that divergent data (FTLE below -1) do not break.
+pub fn signed_log(y: f32) -> f32 {
+    y.abs().ln_1p().copysign(y)
+}
+
+/// The inverse of [`signed_log`].
+pub fn signed_exp(y: f32) -> f32 {
+    y.abs().exp_m1().copysign(y)
+}
+
+impl Objective {
+    /// From the settings; `extent` along x, y, z.
+    pub fn new(settings: &NetworkSettings, shape: &Architecture, extent: [f64; 3], tau: f64) -> Self {
+        let mut active = [1.0; 3];
+        for (slot, &axis) in shape.axes.iter().enumerate() {
+            active[slot] = extent[axis] as f32;
+        }
+        Self {
+            target: settings.target,
+            loss: settings.loss,
+            mean_penalty: settings.mean_penalty,
+            jacobian_weight: if settings.target == Target::FlowMap { settings.jacobian_weight } else { 0.0 },
+            tau: tau as f32,
+            extent: active,
+            scale: Scale::default(),
+        }
+    }
+
+    /// Whether derivatives along the axes are trained on.
+    pub fn derivatives(&self) -> bool {
+        self.jacobian_weight > 0.0
+    }
+
+    /// Whether sample `index` can be trained on: everything it is asked for is there and finite.
+    pub fn usable(&self, samples: &Samples, index: usize) -> bool {
+        let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
+        finite(&samples.points[index])
+            && match self.target {
+                Target::Ftle => samples.log_stretch.get(index).is_some_and(|s| s.is_finite()),
+                Target::FlowMap => {
+                    samples.arrival.get(index).is_some_and(|a| finite(a))
+                        && (!self.derivatives() || samples.jacobian.get(index).is_some_and(|j| finite(j)))
+                }
+            }
+    }
+
+    /// The values that the outputs of sample `index` stand for, before standardisation.
+    fn raw(&self, shape: &Architecture, samples: &Samples, index: usize) -> [f32; 3] {
+        let mut values = [0.0; 3];
+        match (self.target, self.loss) {
+            (Target::Ftle, Loss::MeanSquare) => values[0] = samples.log_stretch[index],
+            (Target::Ftle, Loss::Published) => values[0] = signed_log(samples.log_stretch[index] / self.tau),
+            (Target::FlowMap, _) => {
+                for (slot, &axis) in shape.axes.iter().enumerate() {
+                    values[slot] = samples.arrival[index][axis] - samples.points[index][axis];
+                }
+            }
+        }
+        values
+    }
+
+    /// Sets mean and deviation from the first `4096` usable samples. The published loss has a scale of its own and keeps it; `centred` leaves the
+    /// mean at 0, so that an output of 0 stays 0.
+    pub fn standardise(&mut self, shape: &Architecture, samples: &Samples, centred: bool) {
+        if self.target == Target::Ftle && self.loss == Loss::Published {
+            return;
+        }
+        let (mut sum, mut square, mut count) = ([0.0_f64; 3], [0.0_f64; 3], 0_u32);
+        let stride = (samples.len() / 4096).max(1);
+        for index in (0..samples.len()).step_by(stride).filter(|&i| self.usable(samples, i)) {
+            for (output, value) in self.raw(shape, samples, index).into_iter().enumerate() {
+                sum[output] += f64::from(value);
+                square[output] += f64::from(value).powi(2);
+            }
+            count += 1;
+        }
+        if count == 0 {
+            return;
+        }
+        for output in 0..shape.outputs() {
+            let mean = if centred { 0.0 } else { sum[output] / f64::from(count) };
+            let deviation = (square[output] / f64::from(count) - mean * mean).max(0.0).sqrt();
+            self.scale.mean[output] = mean as f32;
+            // A constant field has nothing to be scaled by.
+            self.scale.deviation[output] = if deviation > 1e-6 { deviation as f32 } else { 1.0 };
+        }
+    }
+
+    /// Targets of one sample: outputs, then (when trained on) their derivatives along each axis. Length [`OUT`] a group.
+    pub(super) fn targets(&self, shape: &Architecture, samples: &Samples, index: usize, group: usize) -> [f32; OUT] {
+        let mut targets = [0.0; OUT];
+        if group == 0 {
+            let raw = self.raw(shape, samples, index);
+            for output in 0..shape.outputs() {
+                targets[output] = (raw[output] - self.scale.mean[output]) / self.scale.deviation[output];
+            }
+        } else {
+            let along = shape.axes[group - 1];
+            for (output, &axis) in shape.axes.iter().enumerate() {
+                let identity = if axis == along { 1.0 } else { 0.0 };
+                targets[output] = (samples.jacobian[index][3 * axis + along] - identity) / self.scale.deviation[output];
+            }
+        }
+        targets
+    }
+
+    /// Weight of the squares of a group of outputs in the loss, for a batch of `count`.
+    pub(super) fn weight(&self, shape: &Architecture, group: usize, count: usize) -> f32 {
+        let share = if group == 0 { 1.0 } else { self.jacobian_weight / shape.dimensions() as f32 };
+        share / (count * shape.outputs()) as f32
+    }
+
+    /// Log-stretch from the outputs of the `ftle` target.
+    pub(super) fn log_stretch(&self, output: f32) -> f32 {
+        match self.loss {
+            Loss::MeanSquare => output * self.scale.deviation[0] + self.scale.mean[0],
+            Loss::Published => self.tau * signed_exp(output),
+        }
+    }
+
+    /// Log-stretch from the derivatives of the `flow_map` target: ln sigma_max of d arrival / d point in domain coordinates.
+    /// `derivative(along, output)` is the network's.
+    pub(super) fn log_stretch_of_map(&self, dimensions: usize, derivative: impl Fn(usize, usize) -> f32) -> f32 {
+        let mut jacobian = [[0.0_f64; 3]; 3];
+        for row in 0..dimensions {
+            for along in 0..dimensions {
+                let unit = derivative(along, row) * self.scale.deviation[row] + if row == along { 1.0 } else { 0.0 };
+                jacobian[row][along] = f64::from(unit * self.extent[row] / self.extent[along]);
+            }
+        }
+        (0.5 * largest_eigenvalue(cauchy_green(jacobian)).max(f64::MIN_POSITIVE).ln()) as f32
+    }
+}
+
+fn cauchy_green(j: [[f64; 3]; 3]) -> [[f64; 3]; 3] {
+    std::array::from_fn(|a| std::array::from_fn(|b| (0..3).map(|k| j[k][a] * j[k][b]).sum()))
+}
+
+/// Largest eigenvalue of a symmetric positive 3x3 matrix, by the trigonometric solution of the characteristic equation.
+fn largest_eigenvalue(c: [[f64; 3]; 3]) -> f64 {
+    let mean = (c[0][0] + c[1][1] + c[2][2]) / 3.0;
+    let off = c[0][1].powi(2) + c[0][2].powi(2) + c[1][2].powi(2);
+    let spread = (((c[0][0] - mean).powi(2) + (c[1][1] - mean).powi(2) + (c[2][2] - mean).powi(2) + 2.0 * off) / 6.0).sqrt();
+    if spread <= f64::EPSILON * mean {
+        return mean;
+    }
+    let b: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|k| (c[i][k] - if i == k { mean } else { 0.0 }) / spread));
+    let determinant = b[0][0] * (b[1][1] * b[2][2] - b[1][2] * b[2][1]) - b[0][1] * (b[1][0] * b[2][2] - b[1][2] * b[2][0])
+        + b[0][2] * (b[1][0] * b[2][1] - b[1][1] * b[2][0]);
+    mean + 2.0 * spread * ((determinant / 2.0).clamp(-1.0, 1.0).acos() / 3.0).cos()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_signed_logarithm_is_odd_and_has_an_inverse() {
+        for y in [-3.0_f32, -0.5, 0.0, 1e-3, 7.0] {
+            assert!((signed_exp(signed_log(y)) - y).abs() <= 4.0 * f32::EPSILON * y.abs().max(1.0));
+            assert_eq!(signed_log(-y), -signed_log(y));
+        }
+    }
+
+    #[test]
+    fn the_largest_eigenvalue_equals_the_library_s() {
+        for seed in 0..200_u64 {
+            let j: [[f64; 3]; 3] =
+                std::array::from_fn(|i| std::array::from_fn(|k| f64::from(super::super::module::uniform(seed, (3 * i + k) as u64)) - 0.5));
+            let c = cauchy_green(j);
+            let library = nalgebra::Matrix3::from_fn(|i, k| c[i][k]).symmetric_eigenvalues().max();
+            // The cosine loses half the digits where two eigenvalues meet.
+            assert!((largest_eigenvalue(c) - library).abs() < 1e-9 * library.max(1.0), "{seed}");
+        }
+        assert_eq!(largest_eigenvalue([[2.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 2.0]]), 2.0);
+    }
+}

@@ -1,0 +1,204 @@
+//! Encoding and MLP as one differentiable burn operation, for any burn training code on the CPU.
+//!
+//! ```
+//! use burn::backend::{Autodiff, Flex};
+//! use burn::tensor::Tensor;
+//! use ridgewatch::surrogate::network::{Architecture, FusedNetwork, Network, NetworkSettings};
+//! use std::sync::Arc;
+//!
+//! type B = Autodiff<Flex>;
+//! let settings = NetworkSettings { levels: 4, log2_table: 8, width: 16, ..NetworkSettings::default() };
+//! let shape = Arc::new(Architecture::new(&settings, &[0, 1], [2.0, 1.0, 1.0]).unwrap());
+//! let network = Network::<B>::new(&shape, 0, false, &Default::default());
+//! let points = Tensor::<B, 2>::from_floats([[0.1, 0.2], [0.7, 0.4]], &Default::default());
+//! let gradients = network.forward_fused(&shape, points).powi_scalar(2).mean().backward();
+//! assert!(network.layers.grad(&gradients).is_some());
+//! ```
+
+use super::architecture::Architecture;
+use super::encode::Corners;
+use super::module::Network;
+use super::tile::{self, Batch, OUT, Weights};
+use burn::backend::autodiff::{
+    Autodiff,
+    checkpoint::{base::Checkpointer, strategy::CheckpointStrategy},
+    grads::Gradients,
+    ops::{Backward, Ops, OpsKind},
+};
+use burn::backend::{Flex, flex::FlexTensor};
+use burn::tensor::{Tensor, TensorData, TensorMetadata, TensorPrimitive, backend::Backend, ops::FloatTensor};
+use std::sync::Arc;
+
+/// A backend with the fused network.
+pub trait FusedNetwork: Backend {
+    /// Outputs `[samples, outputs]` at `points` `[samples, axes]`. `tables` is `[entries, features]` (any one value for the frequency
+    /// encoding), `layers` the flat vector. The points get no gradient: they are data.
+    fn network(
+        points: FloatTensor<Self>,
+        tables: FloatTensor<Self>,
+        layers: FloatTensor<Self>,
+        shape: &Arc<Architecture>,
+    ) -> FloatTensor<Self>;
+
+    /// Gradients for `tables` and `layers`, from the gradient for the outputs. The forward pass is repeated rather than kept: its activations would
+    /// be hundreds of bytes a sample.
+    fn network_backward(
+        points: FloatTensor<Self>,
+        tables: FloatTensor<Self>,
+        layers: FloatTensor<Self>,
+        gradient: FloatTensor<Self>,
+        shape: &Arc<Architecture>,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>);
+}
+
+impl<B: FusedNetwork> Network<B> {
+    /// [`Network::forward`] as one operation.
+    pub fn forward_fused(&self, shape: &Arc<Architecture>, points: Tensor<B, 2>) -> Tensor<B, 2> {
+        let device = points.device();
+        let tables = self.tables.as_ref().map_or_else(|| Tensor::zeros([1, 1], &device), |tables| tables.val());
+        let float = |primitive: TensorPrimitive<B>| primitive.tensor();
+        let outputs = B::network(
+            float(points.into_primitive()),
+            float(tables.into_primitive()),
+            float(self.layers.val().into_primitive()),
+            shape,
+        );
+        Tensor::from_primitive(TensorPrimitive::Float(outputs))
+    }
+}
+
+/// The values of a tensor, in order.
+fn values(tensor: &FlexTensor) -> std::borrow::Cow<'_, [f32]> {
+    match tensor.as_slice::<f32>() {
+        Some(values) => values.into(),
+        None => tensor.to_contiguous().storage::<f32>().to_vec().into(),
+    }
+}
+
+fn unpack(points: &[f32], shape: &Architecture) -> Vec<[f32; 3]> {
+    points
+        .chunks_exact(shape.dimensions())
+        .map(|row| {
+            let mut point = [0.0; 3];
+            for (&axis, &value) in shape.axes.iter().zip(row) {
+                point[axis] = value;
+            }
+            point
+        })
+        .collect()
+}
+
+fn tables_of<'a>(tables: &'a [f32], shape: &Architecture) -> &'a [f32] {
+    if shape.levels.is_empty() { &[] } else { tables }
+}
+
+impl FusedNetwork for Flex {
+    fn network(points: FlexTensor, tables: FlexTensor, layers: FlexTensor, shape: &Arc<Architecture>) -> FlexTensor {
+        let (points, tables, layers) = (values(&points), values(&tables), values(&layers));
+        let points = unpack(&points, shape);
+        let weights = Weights::new(shape, &layers, false);
+        let width = shape.outputs();
+        let mut out = vec![0.0; points.len() * width];
+        tile::predict(shape, &weights, tables_of(&tables, shape), &points, false, width, &mut out, |points, scratch, out| {
+            for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out.chunks_exact_mut(width)).take(points.len()) {
+                out.copy_from_slice(&row[..width]);
+            }
+        });
+        FlexTensor::from_data(TensorData::new(out, [points.len(), width]))
+    }
+
+    fn network_backward(
+        points: FlexTensor,
+        tables: FlexTensor,
+        layers: FlexTensor,
+        gradient: FlexTensor,
+        shape: &Arc<Architecture>,
+    ) -> (FlexTensor, FlexTensor) {
+        let (table_shape, layer_shape) = (tables.shape(), layers.shape());
+        let (points, tables, layers, gradient) = (values(&points), values(&tables), values(&layers), values(&gradient));
+        let points = unpack(&points, shape);
+        let weights = Weights::new(shape, &layers, true);
+        let width = shape.outputs();
+        let mut batch = Batch::new(shape, points.len(), false);
+        let given = |first: usize, count: usize, _: usize, _: &[f32], out: &mut [f32]| {
+            for (row, gradient) in out.chunks_exact_mut(OUT).zip(gradient[first * width..].chunks_exact(width)).take(count) {
+                row[..width].copy_from_slice(gradient);
+            }
+            0.0
+        };
+        batch.accumulate(shape, &weights, tables_of(&tables, shape), points.len(), |sample| points[sample], given);
+        let mut d_layers = vec![0.0; layers.len()];
+        batch.layer_gradient(shape, &mut d_layers);
+        let mut d_tables = vec![0.0; tables.len()];
+        let mut corners = Corners::new(1024);
+        for (number, level) in shape.levels.iter().enumerate() {
+            let table = &mut d_tables[level.offset * shape.features..][..level.entries * shape.features];
+            batch.table_gradient(shape, number, level, &mut corners, table);
+        }
+        (
+            FlexTensor::from_data(TensorData::new(d_tables, table_shape)),
+            FlexTensor::from_data(TensorData::new(d_layers, layer_shape)),
+        )
+    }
+}
+
+/// What the way back needs.
+#[derive(Debug, Clone)]
+struct Inputs<P> {
+    points: P,
+    tables: P,
+    layers: P,
+    shape: Arc<Architecture>,
+}
+
+#[derive(Debug)]
+struct NetworkBackward;
+
+impl<B: FusedNetwork> Backward<B, 2> for NetworkBackward {
+    type State = Inputs<FloatTensor<B>>;
+
+    fn backward(self, ops: Ops<Self::State, 2>, gradients: &mut Gradients, _: &mut Checkpointer) {
+        let [tables, layers] = ops.parents;
+        let gradient = gradients.consume::<B>(&ops.node);
+        let Inputs { points, tables: table_values, layers: layer_values, shape } = ops.state;
+        let (d_tables, d_layers) = B::network_backward(points, table_values, layer_values, gradient, &shape);
+        if let Some(node) = tables {
+            gradients.register::<B>(node.id, d_tables);
+        }
+        if let Some(node) = layers {
+            gradients.register::<B>(node.id, d_layers);
+        }
+    }
+}
+
+impl<B: FusedNetwork, C: CheckpointStrategy> FusedNetwork for Autodiff<B, C> {
+    fn network(
+        points: FloatTensor<Self>,
+        tables: FloatTensor<Self>,
+        layers: FloatTensor<Self>,
+        shape: &Arc<Architecture>,
+    ) -> FloatTensor<Self> {
+        let outputs = B::network(points.primitive.clone(), tables.primitive.clone(), layers.primitive.clone(), shape);
+        match NetworkBackward.prepare::<C>([tables.node.clone(), layers.node.clone()]).compute_bound().stateful() {
+            OpsKind::Tracked(preparation) => {
+                let state =
+                    Inputs { points: points.primitive, tables: tables.primitive, layers: layers.primitive, shape: Arc::clone(shape) };
+                preparation.finish(state, outputs)
+            }
+            OpsKind::UnTracked(preparation) => preparation.finish(outputs),
+        }
+    }
+
+    fn network_backward(
+        points: FloatTensor<Self>,
+        tables: FloatTensor<Self>,
+        layers: FloatTensor<Self>,
+        gradient: FloatTensor<Self>,
+        shape: &Arc<Architecture>,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>) {
+        // Gradients of gradients are not defined here: the results are constants.
+        let (tables, layers) = B::network_backward(points.primitive, tables.primitive, layers.primitive, gradient.primitive, shape);
+        let constant = |primitive| Tensor::<Self, 1>::from_inner(Tensor::from_primitive(TensorPrimitive::Float(primitive)));
+        (constant(tables).into_primitive().tensor(), constant(layers).into_primitive().tensor())
+    }
+}

@@ -1,0 +1,240 @@
+//! The bounded memory of traced samples: newest wins, and labels of a window that has slid on are set aside until a re-test says that
+//! they still hold.
+
+use super::Samples;
+use super::network::mix;
+
+/// Share of re-traced labels that must still hold for the stale ones to be used again. A label error in one sample of twenty, at the
+/// tolerance of the test, adds less to the loss than the tolerance itself.
+pub const KEEP_STALE: f64 = 0.95;
+
+/// Newest samples, at most `capacity`, those set aside included.
+#[derive(Debug, Clone)]
+pub struct SampleRing {
+    capacity: usize,
+    /// Labels of the present window. Circular once full.
+    fresh: Samples,
+    /// Where the next fresh sample goes once full.
+    next: usize,
+    /// Labels of an earlier window.
+    stale: Samples,
+    pushed: u64,
+    dropped_stale: u64,
+}
+
+impl SampleRing {
+    /// An empty ring of at least one sample.
+    pub fn new(capacity: usize) -> Self {
+        let empty = Samples::default();
+        Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, dropped_stale: 0 }
+    }
+
+    /// Most samples held.
+    pub fn capacity(&self) -> usize {
+        self.capacity
+    }
+
+    /// Samples that may be trained on, in no particular order.
+    pub fn samples(&self) -> &Samples {
+        &self.fresh
+    }
+
+    /// Number of samples that may be trained on.
+    pub fn len(&self) -> usize {
+        self.fresh.len()
+    }
+
+    /// Whether nothing may be trained on.
+    pub fn is_empty(&self) -> bool {
+        self.fresh.is_empty()
+    }
+
+    /// Samples set aside since the window slid.
+    pub fn stale(&self) -> &Samples {
+        &self.stale
+    }
+
+    /// Samples ever pushed.
+    pub fn pushed(&self) -> u64 {
+        self.pushed
+    }
+
+    /// Stale samples dropped because their labels no longer held.
+    pub fn dropped_stale(&self) -> u64 {
+        self.dropped_stale
+    }
+
+    /// Takes samples in; stale ones make room first, then the oldest fresh ones. Arrivals and Jacobians are kept when every sample has them; a
+    /// push without them, or with them for the first time, starts the ring anew, since half of a flow map cannot be trained on.
+    pub fn push(&mut self, samples: &Samples) {
+        if samples.is_empty() {
+            return;
+        }
+        if !self.fresh.is_empty() && shape(&self.fresh) != shape(samples) {
+            self.fresh = Samples::default();
+            self.next = 0;
+        }
+        self.pushed += samples.len() as u64;
+        let first = samples.len().saturating_sub(self.capacity);
+        for index in first..samples.len() {
+            if self.fresh.len() < self.capacity {
+                append(&mut self.fresh, samples, index);
+            } else {
+                overwrite(&mut self.fresh, self.next, samples, index);
+                self.next = (self.next + 1) % self.capacity;
+            }
+        }
+        let room = self.capacity - self.fresh.len();
+        self.stale.points.truncate(room);
+        self.stale.log_stretch.truncate(room);
+        self.stale.arrival.truncate(room);
+        self.stale.jacobian.truncate(room);
+    }
+
+    /// The window slid: all labels are set aside. What had been set aside before is dropped.
+    pub fn mark_stale(&mut self) {
+        self.dropped_stale += self.stale.len() as u64;
+        self.stale = std::mem::take(&mut self.fresh);
+        self.next = 0;
+    }
+
+    /// Numbers of up to `count` stale samples to trace anew, drawn with repetition by seed and counter.
+    pub fn probe(&self, count: usize, seed: u64, counter: u64) -> Vec<usize> {
+        if self.stale.is_empty() {
+            return Vec::new();
+        }
+        (0..count.min(self.stale.len())).map(|i| draw(seed, counter + i as u64, self.stale.len())).collect()
+    }
+
+    /// Tells which share of the probed labels still holds: from [`KEEP_STALE`] on the stale samples may be trained on again (as many as fit),
+    /// below it they are dropped. Returns whether they were kept.
+    pub fn revalidate(&mut self, share_holding: f64) -> bool {
+        let stale = std::mem::take(&mut self.stale);
+        let same = self.fresh.is_empty() || shape(&self.fresh) == shape(&stale);
+        let keep = share_holding >= KEEP_STALE && same && !stale.is_empty();
+        if !keep {
+            self.dropped_stale += stale.len() as u64;
+            return false;
+        }
+        let room = (self.capacity - self.fresh.len()).min(stale.len());
+        for index in 0..room {
+            append(&mut self.fresh, &stale, index);
+        }
+        self.dropped_stale += (stale.len() - room) as u64;
+        true
+    }
+
+    /// `count` fresh samples drawn with repetition: a function of the ring's contents, the seed and the counter only.
+    pub fn batch(&self, count: usize, seed: u64, counter: u64) -> Samples {
+        let mut batch = Samples::default();
+        if self.fresh.is_empty() {
+            return batch;
+        }
+        for i in 0..count {
+            append(&mut batch, &self.fresh, draw(seed, counter + i as u64, self.fresh.len()));
+        }
+        batch
+    }
+}
+
+fn draw(seed: u64, counter: u64, count: usize) -> usize {
+    ((u128::from(mix(seed, counter)) * count as u128) >> 64) as usize
+}
+
+fn shape(samples: &Samples) -> [bool; 2] {
+    [samples.arrival.len() == samples.len(), samples.jacobian.len() == samples.len()]
+}
+
+fn append(to: &mut Samples, from: &Samples, index: usize) {
+    to.points.push(from.points[index]);
+    to.log_stretch.push(from.log_stretch.get(index).copied().unwrap_or(f32::NAN));
+    to.arrival.extend(from.arrival.get(index));
+    to.jacobian.extend(from.jacobian.get(index));
+}
+
+fn overwrite(to: &mut Samples, at: usize, from: &Samples, index: usize) {
+    to.points[at] = from.points[index];
+    to.log_stretch[at] = from.log_stretch.get(index).copied().unwrap_or(f32::NAN);
+    if let (Some(to), Some(&from)) = (to.arrival.get_mut(at), from.arrival.get(index)) {
+        *to = from;
+    }
+    if let (Some(to), Some(&from)) = (to.jacobian.get_mut(at), from.jacobian.get(index)) {
+        *to = from;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbered(range: std::ops::Range<u32>) -> Samples {
+        Samples {
+            points: range.clone().map(|i| [i as f32, 0.0, 0.0]).collect(),
+            log_stretch: range.map(|i| i as f32).collect(),
+            ..Samples::default()
+        }
+    }
+
+    fn labels(samples: &Samples) -> Vec<u32> {
+        let mut labels: Vec<u32> = samples.log_stretch.iter().map(|&s| s as u32).collect();
+        labels.sort_unstable();
+        labels
+    }
+
+    #[test]
+    fn the_newest_stay() {
+        let mut ring = SampleRing::new(10);
+        ring.push(&numbered(0..7));
+        ring.push(&numbered(7..13));
+        assert_eq!(labels(ring.samples()), (3..13).collect::<Vec<_>>());
+        ring.push(&numbered(100..125));
+        assert_eq!(labels(ring.samples()), (115..125).collect::<Vec<_>>());
+        assert_eq!((ring.len(), ring.pushed()), (10, 38));
+        assert!(ring.samples().points.iter().zip(&ring.samples().log_stretch).all(|(p, s)| p[0] == *s));
+    }
+
+    #[test]
+    fn stale_labels_are_not_drawn_until_they_are_shown_to_hold() {
+        let mut ring = SampleRing::new(10);
+        ring.push(&numbered(0..8));
+        ring.mark_stale();
+        assert!(ring.is_empty() && ring.batch(4, 1, 0).is_empty());
+        ring.push(&numbered(50..55));
+        // Room for ten: five fresh ones push three of the eight stale ones out.
+        assert_eq!((ring.len(), ring.stale().len()), (5, 5));
+        assert!(labels(&ring.batch(64, 1, 0)).iter().all(|&l| l >= 50));
+        assert_eq!(ring.probe(100, 1, 0).len(), 5);
+        let mut dropped = ring.clone();
+        assert!(!dropped.revalidate(0.94));
+        assert_eq!((dropped.len(), dropped.dropped_stale()), (5, 5));
+        assert!(ring.revalidate(0.96));
+        assert_eq!(ring.len(), 10);
+    }
+
+    #[test]
+    fn batches_are_a_function_of_seed_and_counter() {
+        let mut ring = SampleRing::new(1000);
+        ring.push(&numbered(0..1000));
+        let (a, b, c) = (ring.batch(300, 7, 40), ring.batch(300, 7, 40), ring.batch(300, 7, 340));
+        assert_eq!(a.log_stretch, b.log_stretch);
+        assert_ne!(a.log_stretch, c.log_stretch);
+        assert_eq!(ring.batch(100, 7, 140).log_stretch, a.log_stretch[100..200]);
+        let mean = ring.batch(100_000, 7, 0).log_stretch.iter().sum::<f32>() / 1e5;
+        // The mean of 1e5 uniform draws from 0..999 has a deviation of 0.91; five of them.
+        assert!((mean - 499.5).abs() < 4.6, "{mean}");
+    }
+
+    #[test]
+    fn flow_map_labels_travel_along() {
+        let mut ring = SampleRing::new(4);
+        let mut samples = numbered(0..6);
+        samples.arrival = (0..6).map(|i| [i as f32; 3]).collect();
+        samples.jacobian = (0..6).map(|i| [i as f32; 9]).collect();
+        ring.push(&samples);
+        ring.push(&samples);
+        let held = ring.samples();
+        assert!((0..4).all(|i| held.arrival[i][1] == held.log_stretch[i] && held.jacobian[i][8] == held.log_stretch[i]));
+        ring.push(&numbered(6..8));
+        assert_eq!((ring.len(), ring.samples().arrival.len()), (2, 0));
+    }
+}

@@ -1,0 +1,223 @@
+//! The log-stretch traced at the nodes of a regular grid over the unit domain, interpolated multilinearly.
+
+use super::checkpoint::{Checkpoint, Entry};
+use super::{CheckpointError, Learned, Samples, Surrogate};
+use crate::flow::{Extras, Traced, Tracer};
+use rayon::prelude::*;
+use std::path::Path;
+use wide::{f32x8, i32x8};
+
+/// Seeds traced at once while a table is built: bounds the memory beside the table itself.
+const TRACE_AT_ONCE: usize = 1 << 20;
+
+/// Node i of n along an axis lies at unit coordinate i / (n - 1). Two-dimensional tables have one node along z.
+#[derive(Debug, Clone)]
+pub struct Table {
+    nodes: [usize; 3],
+    dimensions: usize,
+    /// x fastest.
+    values: Vec<f32>,
+    not_finite: usize,
+}
+
+impl Table {
+    /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
+    pub fn trace(tracer: &dyn Tracer, nodes: [usize; 3]) -> Self {
+        let dimensions = tracer.domain().dimensions.clamp(2, 3);
+        let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
+        let mut table = Self { nodes, dimensions, values: vec![0.0; nodes.iter().product()], not_finite: 0 };
+        table.retrace(tracer);
+        table
+    }
+
+    /// Traces every node anew, after the window has slid.
+    pub fn retrace(&mut self, tracer: &dyn Tracer) {
+        let (nodes, dimensions) = (self.nodes, self.dimensions);
+        let unit = |index: usize| -> [f32; 3] {
+            let node = [index % nodes[0], index / nodes[0] % nodes[1], index / (nodes[0] * nodes[1])];
+            // The slab's middle stands for an axis that the flow does not depend on.
+            std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 })
+        };
+        let mut traced = Traced::default();
+        self.not_finite = 0;
+        for (part, values) in self.values.chunks_mut(TRACE_AT_ONCE).enumerate() {
+            let first = part * TRACE_AT_ONCE;
+            let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| tracer.domain().from_unit(unit(first + i))).collect();
+            tracer.trace(&seeds, Extras::default(), &mut traced);
+            for (value, &traced) in values.iter_mut().zip(&traced.log_stretch) {
+                // A node without a value would spread over all cells around it; no stretch is the value of a particle that never moved.
+                *value = if traced.is_finite() { traced } else { 0.0 };
+                self.not_finite += usize::from(!traced.is_finite());
+            }
+        }
+    }
+
+    /// Nodes along x, y, z.
+    pub fn nodes(&self) -> [usize; 3] {
+        self.nodes
+    }
+
+    /// Values at the nodes, x fastest.
+    pub fn values(&self) -> &[f32] {
+        &self.values
+    }
+
+    /// Nodes whose trace was not finite; they hold 0.
+    pub fn not_finite(&self) -> usize {
+        self.not_finite
+    }
+
+    /// Interpolates at eight points.
+    fn lookup<const D: usize>(&self, points: &[[f32; 3]; 8]) -> [f32; 8] {
+        let (zero, one) = (f32x8::splat(0.0), f32x8::splat(1.0));
+        let mut base = i32x8::splat(0);
+        let mut fraction = [zero; D];
+        let mut stride = [0_usize; D];
+        let mut step = 1;
+        for axis in 0..D {
+            let cells = (self.nodes[axis] - 1) as i32;
+            let x = f32x8::from(std::array::from_fn(|lane| points[lane][axis]));
+            let position = x.fast_max(zero).fast_min(one) * f32x8::splat(cells as f32);
+            let cell = position.fast_trunc_int().max(i32x8::splat(0)).min(i32x8::splat(cells - 1));
+            fraction[axis] = position - f32x8::from_i32x8(cell);
+            base += cell * i32x8::splat(step as i32);
+            stride[axis] = step;
+            step *= self.nodes[axis];
+        }
+        let base = base.to_array();
+        let corner = |offset: usize| f32x8::from(std::array::from_fn(|lane| self.values[base[lane] as usize + offset]));
+        let along = |low: f32x8, high: f32x8, axis: usize| (high - low).mul_add(fraction[axis], low);
+        let plane = |offset: usize| {
+            let low = along(corner(offset), corner(offset + stride[0]), 0);
+            along(low, along(corner(offset + stride[1]), corner(offset + stride[1] + stride[0]), 0), 1)
+        };
+        let value = if D == 2 { plane(0) } else { along(plane(0), plane(stride[D - 1]), D - 1) };
+        value.to_array()
+    }
+
+    fn predict_chunk(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        for (points, out) in points.chunks(8).zip(out.chunks_mut(8)) {
+            let mut eight = [[0.0; 3]; 8];
+            eight[..points.len()].copy_from_slice(points);
+            let values = if self.dimensions == 2 { self.lookup::<2>(&eight) } else { self.lookup::<3>(&eight) };
+            out.copy_from_slice(&values[..out.len()]);
+        }
+    }
+
+    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
+        checkpoint.note("table.nodes", format!("{:?}", self.nodes));
+        checkpoint.note("table.not_finite", self.not_finite.to_string());
+        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], &self.values));
+    }
+
+    pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
+        checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
+        let values = checkpoint.values("table.values", self.values.len())?;
+        let not_finite = checkpoint.number("table.not_finite")?;
+        Ok(Self { values, not_finite, ..self.clone() })
+    }
+}
+
+impl Surrogate for Table {
+    fn name(&self) -> &'static str {
+        "table"
+    }
+
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        assert_eq!(points.len(), out.len(), "one value a point");
+        points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(points, out));
+    }
+
+    fn learns(&self) -> bool {
+        false
+    }
+
+    fn learn(&mut self, _: &Samples, _: f64, _: u64) -> Learned {
+        Learned::default()
+    }
+
+    fn window_slid(&mut self, tracer: &dyn Tracer) {
+        self.retrace(tracer);
+    }
+
+    fn bytes(&self) -> usize {
+        self.values.len() * size_of::<f32>()
+    }
+
+    fn save(&self, path: &Path) -> Result<(), CheckpointError> {
+        let mut checkpoint = Checkpoint::new("table");
+        self.entries(&mut checkpoint);
+        checkpoint.write(path)
+    }
+
+    fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
+        let checkpoint = Checkpoint::read(path, "table")?;
+        *self = self.restored(&checkpoint)?;
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Domain;
+
+    /// Log-stretch 1 + 2x + 3y + 4z in unit coordinates, NaN left of `hole`.
+    struct Plane(Domain, f32);
+
+    impl Tracer for Plane {
+        fn domain(&self) -> &Domain {
+            &self.0
+        }
+        fn tau(&self) -> f64 {
+            1.0
+        }
+        fn steps(&self) -> usize {
+            1
+        }
+        fn trace(&self, seeds: &[[f32; 3]], _: Extras, out: &mut Traced) {
+            let value = |p: [f32; 3]| if p[0] < self.1 { f32::NAN } else { 1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2] };
+            out.log_stretch = seeds.iter().map(|&s| value(self.0.to_unit(s))).collect();
+        }
+    }
+
+    fn points(count: u64) -> Vec<[f32; 3]> {
+        let random = |i| super::super::network::uniform(5, i);
+        (0..count).map(|i| [random(3 * i), random(3 * i + 1), random(3 * i + 2)]).collect()
+    }
+
+    #[test]
+    fn a_linear_field_is_exact_in_three_dimensions() {
+        let tracer = Plane(Domain::cuboid([-1.0, 0.0, 2.0], [3.0, 1.0, 5.0]), -1.0);
+        let table = Table::trace(&tracer, [5, 3, 4]);
+        let mut points = points(1003);
+        points.push([1.0; 3]);
+        points.push([0.0; 3]);
+        let mut out = vec![0.0; points.len()];
+        table.predict(&points, &mut out);
+        for (p, value) in points.iter().zip(out) {
+            // A few roundings of values up to 10.
+            assert!((value - (1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2])).abs() < 1e-5, "{p:?} {value}");
+        }
+        assert_eq!(table.bytes(), 5 * 3 * 4 * 4);
+    }
+
+    #[test]
+    fn the_slab_axis_is_ignored_and_points_outside_are_clamped() {
+        let tracer = Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0);
+        let table = Table::trace(&tracer, [3, 3, 77]);
+        assert_eq!(table.nodes(), [3, 3, 1]);
+        let mut out = [0.0; 4];
+        table.predict(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]], &mut out);
+        // The tracer sees the slab's middle: z = 0.5 adds 2. NaN is clamped like a point below the domain.
+        assert_eq!(out, [4.75, 4.75, 5.0, 3.0]);
+    }
+
+    #[test]
+    fn nodes_without_a_value_are_counted() {
+        let tracer = Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), 0.5);
+        let table = Table::trace(&tracer, [5, 2, 1]);
+        assert_eq!(table.not_finite(), 4);
+        assert!(table.values().iter().all(|v| v.is_finite()));
+    }
+}

@@ -1,0 +1,105 @@
+//! A scalar Runge-Kutta tracer of the double gyre with its tangent flow, in f64: slow, short, and independent of the program's own.
+#![allow(dead_code)]
+
+use rayon::prelude::*;
+use ridgewatch::field::Domain;
+use ridgewatch::flow::{Extras, Traced, Tracer};
+use std::f64::consts::PI;
+
+/// A = 0.1, eps = 0.25, omega = 2 pi / 10, forward from `start` over `tau`.
+pub struct DoubleGyre {
+    pub domain: Domain,
+    pub start: f64,
+    pub tau: f64,
+    pub steps: usize,
+}
+
+impl DoubleGyre {
+    pub fn new(start: f64, tau: f64, steps: usize) -> Self {
+        Self { domain: Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0)), start, tau, steps }
+    }
+}
+
+/// d/dt of (x, y, J row-major).
+fn rate(t: f64, s: &[f64; 6]) -> [f64; 6] {
+    let (a, eps, omega) = (0.1, 0.25, 2.0 * PI / 10.0);
+    let (p, q) = (eps * (omega * t).sin(), 1.0 - 2.0 * eps * (omega * t).sin());
+    let (x, y) = (s[0], s[1]);
+    let (f, df, ddf) = (p * x * x + q * x, 2.0 * p * x + q, 2.0 * p);
+    let (sf, cf) = (PI * f).sin_cos();
+    let (sy, cy) = (PI * y).sin_cos();
+    let u = -PI * a * sf * cy;
+    let v = PI * a * cf * sy * df;
+    let (ux, uy) = (-PI * PI * a * cf * df * cy, PI * PI * a * sf * sy);
+    let (vx, vy) = (PI * a * sy * (-PI * sf * df * df + cf * ddf), PI * PI * a * cf * cy * df);
+    [u, v, ux * s[2] + uy * s[4], ux * s[3] + uy * s[5], vx * s[2] + vy * s[4], vx * s[3] + vy * s[5]]
+}
+
+fn advect(start: f64, tau: f64, steps: usize, point: [f32; 3]) -> [f64; 6] {
+    let mut s = [f64::from(point[0]), f64::from(point[1]), 1.0, 0.0, 0.0, 1.0];
+    let h = tau / steps as f64;
+    let along = |s: &[f64; 6], k: &[f64; 6], h: f64| -> [f64; 6] { std::array::from_fn(|i| s[i] + h * k[i]) };
+    for step in 0..steps {
+        let t = start + h * step as f64;
+        let a = rate(t, &s);
+        let b = rate(t + h / 2.0, &along(&s, &a, h / 2.0));
+        let c = rate(t + h / 2.0, &along(&s, &b, h / 2.0));
+        let d = rate(t + h, &along(&s, &c, h));
+        s = std::array::from_fn(|i| s[i] + h / 6.0 * (a[i] + 2.0 * b[i] + 2.0 * c[i] + d[i]));
+    }
+    s
+}
+
+impl Tracer for DoubleGyre {
+    fn domain(&self) -> &Domain {
+        &self.domain
+    }
+    fn tau(&self) -> f64 {
+        self.tau
+    }
+    fn steps(&self) -> usize {
+        self.steps
+    }
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+        let states: Vec<[f64; 6]> = seeds.par_iter().map(|&p| advect(self.start, self.tau, self.steps, p)).collect();
+        out.log_stretch = states
+            .iter()
+            .map(|s| {
+                let (a, b, c) = (s[2] * s[2] + s[4] * s[4], s[2] * s[3] + s[4] * s[5], s[3] * s[3] + s[5] * s[5]);
+                let largest = (a + c) / 2.0 + (((a - c) / 2.0).powi(2) + b * b).sqrt();
+                (0.5 * largest.ln()) as f32
+            })
+            .collect();
+        out.lived = vec![1.0; seeds.len()];
+        out.arrival = if extras.arrival { states.iter().zip(seeds).map(|(s, p)| [s[0] as f32, s[1] as f32, p[2]]).collect() } else { Vec::new() };
+        let matrix = |s: &[f64; 6]| [s[2] as f32, s[3] as f32, 0.0, s[4] as f32, s[5] as f32, 0.0, 0.0, 0.0, 1.0];
+        out.jacobian = if extras.jacobian { states.iter().map(matrix).collect() } else { Vec::new() };
+    }
+}
+
+/// Uniform points of the unit domain, from a seed.
+pub fn uniform_points(seed: u64, count: usize) -> Vec<[f32; 3]> {
+    let mut state = seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) | 1;
+    let mut random = || {
+        state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (state >> 40) as f32 / (1_u64 << 24) as f32
+    };
+    (0..count).map(|_| std::array::from_fn(|_| random())).collect()
+}
+
+/// Traced samples at unit points, flow-map labels included, in unit coordinates.
+pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> ridgewatch::surrogate::Samples {
+    let domain = tracer.domain();
+    let seeds: Vec<[f32; 3]> = points.iter().map(|&p| domain.from_unit(p)).collect();
+    let mut out = Traced::default();
+    tracer.trace(&seeds, Extras { arrival: flow_map, jacobian: flow_map }, &mut out);
+    let extent = domain.extent();
+    let unit = |p: &[f32; 3]| std::array::from_fn(|k| ((f64::from(p[k]) - domain.min[k]) / extent[k]) as f32);
+    let scaled = |j: &[f32; 9]| std::array::from_fn(|i| j[i] * (extent[i % 3] / extent[i / 3]) as f32);
+    ridgewatch::surrogate::Samples {
+        points,
+        log_stretch: out.log_stretch,
+        arrival: out.arrival.iter().map(unit).collect(),
+        jacobian: out.jacobian.iter().map(scaled).collect(),
+    }
+}
