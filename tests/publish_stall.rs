@@ -138,14 +138,14 @@ impl Subscriber {
         Self(Command::new(python()).args([script, endpoint]).stdout(Stdio::piped()).spawn().unwrap())
     }
 
-    /// Subscribes and never asks for a message. libzmq goes on in the background, and reconnects after every cut-off.
-    fn start_hung(endpoint: &str) -> Self {
+    /// Subscribes and asks for a message every one and a half seconds, so that it falls behind for ever.
+    fn start_slow(endpoint: &str) -> Self {
         let script = "import sys, time, zmq\n\
             socket = zmq.Context().socket(zmq.SUB)\n\
             socket.setsockopt(zmq.RCVHWM, 2)\n\
             socket.connect(sys.argv[1])\n\
             socket.subscribe(b'')\n\
-            time.sleep(3600)\n";
+            while True: socket.recv_multipart(); time.sleep(1.5)\n";
         Self(Command::new(python()).args(["-c", script, endpoint]).spawn().unwrap())
     }
 
@@ -205,19 +205,20 @@ fn a_minute_of_stopped_pyzmq() {
     assert!(woke > 45, "the stopped one came back: {woke} lines");
 }
 
-/// An application that hangs while its libzmq keeps reconnecting: cut off again and again, the worst that one client can do.
+/// An application that is too slow for its frames and comes back after every cut-off: the worst that one client can do. (One that hangs
+/// altogether is cut off once: libzmq notices the closed connection only when the application reads again.)
 #[test]
 #[ignore = "takes a minute and needs a Python with pyzmq, named by PYTHON"]
-fn a_minute_of_hung_application() {
+fn a_minute_of_slow_application() {
     let publisher = publisher();
     let mut healthy = Subscriber::start(publisher.endpoint());
     let arrivals = healthy.arrivals();
     publish(&publisher, 3);
-    let hung = Subscriber::start_hung(publisher.endpoint());
+    let slow = Subscriber::start_slow(publisher.endpoint());
     let start = Instant::now();
     publish(&publisher, 60);
     let end = Instant::now();
-    drop((hung, healthy));
+    drop((slow, healthy));
     let statistics = publisher.finish(Duration::from_millis(500));
     let times: Vec<Instant> = arrivals.join().unwrap().into_iter().filter(|t| (start..end).contains(t)).collect();
     let gap = times.windows(2).map(|w| w[1] - w[0]).max().unwrap();
@@ -226,7 +227,7 @@ fn a_minute_of_hung_application() {
         times.len(),
         peak_memory_bytes().map(|b| b >> 20)
     );
-    assert!(statistics.cut_offs > 2, "it stalled again and again: {statistics:?}");
+    assert!(statistics.cut_offs > 2, "it fell behind again and again: {statistics:?}");
     assert!(gap < Duration::from_secs(3), "the healthy one waited {gap:?}");
     assert!(statistics.peak_held_bytes <= CAP as u64 * FRAME_BYTES + 256 * 1024, "{} bytes held", statistics.peak_held_bytes);
 }
