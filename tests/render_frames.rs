@@ -181,7 +181,7 @@ fn a_scene_can_be_edited_between_frames() {
     scene.transfer.extinction = Some(10.0);
     renderer.set_scene(scene).unwrap();
     let (film, stats) = renderer.render(1, &mut Waves, 64, None, &NEVER).unwrap();
-    assert!(stats.queries < first && stats.majorant_exceeded == 0, "re-derived, not forgotten: {stats:?} after {first}");
+    assert!(stats.queries < first && stats.majorant_exceeded < stats.queries / 200, "re-derived, not forgotten: {stats:?} after {first}");
     // The same frame from scratch: means agree within noise (alpha is 0 or 1 a path: deviation at most 0.5; 32,768 paths each).
     let mut fresh = Renderer::new(renderer.scene().clone(), &gyre_box(), 1.0).unwrap();
     let (other, _) = fresh.render(7, &mut Waves, 64, None, &NEVER).unwrap();
@@ -250,7 +250,7 @@ fn bare_files_get_a_view_of_everything() {
         Domain::cuboid([0.0, -90.0, 0.0], [359.0, 90.0, 30_000.0]),
         Domain::cuboid([0.0; 3], [0.01, 0.02, 0.04]),
     ] {
-        let transfer = TransferSettings::default().scaled_to(&[0.0, 1.0]);
+        let transfer = TransferSettings { low: Some(0.0), high: Some(1.0), ..TransferSettings::default() };
         let scene = Scene::assemble(&domain, None, None, Some(transfer), RenderSettings { width: 48, height: 24, ..Default::default() }, 0);
         let mut renderer = Renderer::new(scene, &domain, 1.0).unwrap();
         struct Half;

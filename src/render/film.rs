@@ -19,7 +19,8 @@ pub struct Film {
     pub variance: Vec<f32>,
     /// Samples in the pixel.
     pub samples: Vec<f32>,
-    /// Share of paths that left without scattering after meeting missing values (land). Their colour is `render.missing`.
+    /// Share of paths that left without scattering and saw missing values (land) at a point drawn uniformly along their way through
+    /// the box. Their colour is `render.missing`; for a map seen from above it is 1 on land and 0 elsewhere.
     pub missing: Vec<f32>,
     /// Log-stretch queries made for the pixel.
     pub queries: Vec<f32>,
@@ -88,7 +89,7 @@ pub(super) struct PathSample {
     pub(super) scattered: f32,
     /// `scattered` times the FTLE there.
     pub(super) ftle: f32,
-    /// Weight of the path, if it left after meeting missing values; else 0.
+    /// Weight of the path, if it left and saw missing values; else 0.
     pub(super) missing: f32,
     pub(super) queries: u32,
     pub(super) traced: u32,

@@ -18,8 +18,8 @@ const MARGIN: f32 = 1.1;
 const SLID_MARGIN: f32 = 1.25;
 /// What a sample of the window before counts against one of this window.
 const SLID_WEIGHT: f32 = 0.25;
-/// Optical depth that a cell with missing values keeps across the box's shortest edge: 1 - exp(-6) of the rays through land see it.
-const MISSING_DEPTH: f32 = 6.0;
+/// Samples from which on a cell without a missing one is taken to hold none.
+const KNOWN_PRESENT: f32 = 16.0;
 
 /// What was seen in one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,6 +65,7 @@ fn from_ordered(image: u32) -> f32 {
 pub struct MajorantGrid {
     cells: [usize; 3],
     majorants: Vec<f32>,
+    may_miss: Vec<bool>,
     watch: Vec<Watch>,
     current: Vec<Seen>,
     previous: Vec<Seen>,
@@ -77,18 +78,19 @@ impl MajorantGrid {
         Self {
             cells,
             majorants: vec![transfer.extinction_max(); count],
+            may_miss: vec![true; count],
             watch: std::iter::repeat_with(Watch::default).take(count).collect(),
             current: vec![NOTHING; count],
             previous: vec![NOTHING; count],
         }
     }
 
-    /// Cells of about equal edges: 96 along the longest edge in two dimensions (one along z), 40 in three.
+    /// Cells of about equal edges: 96 along the longest edge in two dimensions (one along z), 32 in three.
     pub(super) fn default_cells(domain: &Domain, scale: [f64; 3]) -> [usize; 3] {
         let edges: [f64; 3] = std::array::from_fn(|k| domain.extent()[k] * scale[k]);
         let seen = &edges[..domain.dimensions];
         let longest = seen.iter().copied().fold(0.0, f64::max);
-        let most = if domain.dimensions == 2 { 96.0 } else { 40.0 };
+        let most = if domain.dimensions == 2 { 96.0 } else { 32.0 };
         std::array::from_fn(|k| if k < domain.dimensions { (most * edges[k] / longest).ceil().clamp(1.0, most) as usize } else { 1 })
     }
 
@@ -100,6 +102,19 @@ impl MajorantGrid {
     /// The majorants in force, per unit of length.
     pub fn majorants(&self) -> &[f32] {
         &self.majorants
+    }
+
+    /// Whether a cell may hold missing values: some were seen, or too little was.
+    #[inline]
+    pub(super) fn may_miss(&self, cell: usize) -> bool {
+        self.may_miss[cell]
+    }
+
+    /// Index of the cell at grid coordinates.
+    #[inline]
+    pub(super) fn cell_at(&self, point: [f32; 3]) -> usize {
+        let [x, y, z] = std::array::from_fn(|k| (point[k] as usize).min(self.cells[k] - 1));
+        (z * self.cells[1] + y) * self.cells[0] + x
     }
 
     /// Plants majorants.
@@ -131,19 +146,19 @@ impl MajorantGrid {
     }
 
     /// Puts what the frames so far have seen into force.
-    pub(super) fn commit(&mut self, transfer: &Transfer, shortest_edge: f64) {
+    pub(super) fn commit(&mut self, transfer: &Transfer) {
         for (watch, current) in self.watch.iter_mut().zip(&mut self.current) {
             let watch = std::mem::take(watch);
             let image = watch.highest.into_inner();
             let highest = if image == 0 { f32::NEG_INFINITY } else { from_ordered(image) };
             *current = current.join(Seen { count: watch.count.into_inner(), highest, missing: watch.missing.into_inner() });
         }
-        self.derive(transfer, shortest_edge);
+        self.derive(transfer);
     }
 
     /// The window has moved: what was seen counts for less, and may have moved into a neighbouring cell.
-    pub(super) fn slide(&mut self, transfer: &Transfer, shortest_edge: f64) {
-        self.commit(transfer, shortest_edge);
+    pub(super) fn slide(&mut self, transfer: &Transfer) {
+        self.commit(transfer);
         let [nx, ny, nz] = self.cells;
         let around = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
         for z in 0..nz {
@@ -159,21 +174,20 @@ impl MajorantGrid {
             }
         }
         self.current.fill(NOTHING);
-        self.derive(transfer, shortest_edge);
+        self.derive(transfer);
     }
 
     /// Derives the majorants from what was seen.
-    pub(super) fn derive(&mut self, transfer: &Transfer, shortest_edge: f64) {
+    pub(super) fn derive(&mut self, transfer: &Transfer) {
         let largest = transfer.extinction_max();
-        let missing_floor = (MISSING_DEPTH / shortest_edge as f32).min(largest);
         // An empty interval has an empty ramp.
         let ramp = |highest: f32| if highest == f32::NEG_INFINITY { 0.0 } else { transfer.ramp(highest) };
-        for ((majorant, current), previous) in self.majorants.iter_mut().zip(&self.current).zip(&self.previous) {
+        for (i, (current, previous)) in self.current.iter().zip(&self.previous).enumerate() {
             let count = current.count as f32 + SLID_WEIGHT * previous.count as f32;
             let seen = (MARGIN * ramp(current.highest)).max(SLID_MARGIN * ramp(previous.highest));
             // With count 0 the bound is the largest extinction.
-            let bound = largest * (seen + FLOOR + UNSEEN / count).min(1.0);
-            *majorant = if current.missing | previous.missing { bound.max(missing_floor) } else { bound };
+            self.majorants[i] = largest * (seen + FLOOR + UNSEEN / count).min(1.0);
+            self.may_miss[i] = current.missing | previous.missing || count < KNOWN_PRESENT;
         }
     }
 }
@@ -205,12 +219,12 @@ mod tests {
         assert_eq!(grid.majorants(), [100.0, 100.0]);
         (0..800).for_each(|_| grid.observe(0, 0.2));
         assert_eq!(grid.majorants()[0], 100.0, "a frame's own samples change nothing in it");
-        grid.commit(&transfer, 1.0);
+        grid.commit(&transfer);
         // 1.1 * 0.2 seen + 0.02 floor + 8/800 unseen, times 100; f32 rounding.
         assert!((grid.majorants()[0] - 25.0).abs() < 1e-3);
         assert_eq!(grid.majorants()[1], 100.0, "nothing seen, nothing known");
         grid.observe(0, 0.7);
-        grid.commit(&transfer, 1.0);
+        grid.commit(&transfer);
         assert!(grid.majorants()[0] > 77.0, "a value above its majorant raises it");
     }
 
@@ -218,8 +232,8 @@ mod tests {
     fn another_transfer_function_re_derives() {
         let mut grid = MajorantGrid::new([1, 1, 1], &transfer(100.0));
         (0..8000).for_each(|_| grid.observe(0, 0.5));
-        grid.commit(&transfer(100.0), 1.0);
-        grid.derive(&transfer(10.0), 1.0);
+        grid.commit(&transfer(100.0));
+        grid.derive(&transfer(10.0));
         // 1.1 * 0.5 + 0.02 + 8/8000 of 10; f32 rounding.
         assert!((grid.majorants()[0] - 5.71).abs() < 1e-4);
     }
@@ -231,28 +245,33 @@ mod tests {
         for cell in 0..4 {
             (0..8000).for_each(|_| grid.observe(cell, if cell == 0 { 0.5 } else { 0.0 }));
         }
-        grid.commit(&transfer, 1.0);
+        grid.commit(&transfer);
         let before = grid.majorants().to_vec();
-        grid.slide(&transfer, 1.0);
+        grid.slide(&transfer);
         assert!(grid.majorants()[1] > 60.0, "the ridge may have moved over: {:?}", grid.majorants());
         assert!((0..4).all(|k| grid.majorants()[k] > before[k]));
         assert!(grid.majorants()[3] < 10.0, "two cells away it has not");
-        grid.slide(&transfer, 1.0);
+        grid.slide(&transfer);
         assert_eq!(grid.majorants(), [100.0; 4], "a window in which nothing was seen proves nothing");
     }
 
     #[test]
-    fn land_stays_visible() {
+    fn land_is_remembered_and_empty() {
         let transfer = transfer(100.0);
-        let mut grid = MajorantGrid::new([1, 1, 1], &transfer);
-        (0..100_000).for_each(|_| grid.observe_missing(0));
-        grid.commit(&transfer, 0.25);
-        assert_eq!(grid.majorants()[0], 24.0, "optical depth 6 over an edge of 0.25");
+        let mut grid = MajorantGrid::new([2, 1, 1], &transfer);
+        assert!(grid.may_miss(0) && grid.may_miss(1), "nothing seen, nothing known");
+        (0..8000).for_each(|_| grid.observe_missing(0));
+        (0..8000).for_each(|_| grid.observe(1, -1.0));
+        grid.commit(&transfer);
+        // Floor 0.02 + 8/8000 of 100; f32 rounding.
+        assert!((grid.majorants()[0] - 2.1).abs() < 1e-4);
+        assert!(grid.may_miss(0) && !grid.may_miss(1));
+        assert_eq!((grid.cell_at([0.9, 0.5, 0.5]), grid.cell_at([2.0, 1.0, 1.0])), (0, 1), "the far walls belong to the last cells");
     }
 
     #[test]
     fn maps_need_one_cell_in_z() {
         assert_eq!(MajorantGrid::default_cells(&Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), [1.0; 3]), [96, 48, 1]);
-        assert_eq!(MajorantGrid::default_cells(&Domain::cuboid([0.0; 3], [4.0, 2.0, 1.0]), [1.0; 3]), [40, 20, 10]);
+        assert_eq!(MajorantGrid::default_cells(&Domain::cuboid([0.0; 3], [4.0, 2.0, 1.0]), [1.0; 3]), [32, 16, 8]);
     }
 }

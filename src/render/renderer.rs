@@ -113,7 +113,7 @@ impl Renderer {
         next.last_frame = self.last_frame;
         if next.space.cells() == self.space.cells() {
             std::mem::swap(&mut next.majorants, &mut self.majorants);
-            next.majorants.commit(&next.transfer, next.scene.shortest_edge(&next.domain));
+            next.majorants.commit(&next.transfer);
         }
         *self = next;
         Ok(())
@@ -121,7 +121,7 @@ impl Renderer {
 
     /// To be called when the window slides: majorants loosen, since the field has changed.
     pub fn window_slid(&mut self) {
-        self.majorants.slide(&self.transfer, self.scene.shortest_edge(&self.domain));
+        self.majorants.slide(&self.transfer);
     }
 
     /// Renders samples 0 to `samples` of every pixel. The film depends on scene, frame number, answers and majorants (what earlier
@@ -154,7 +154,7 @@ impl Renderer {
             return Err(RenderError::Samples { first: samples.start, end: samples.end, limit: LIMIT });
         }
         if self.last_frame.is_some_and(|last| last != frame) {
-            self.majorants.commit(&self.transfer, self.scene.shortest_edge(&self.domain));
+            self.majorants.commit(&self.transfer);
         }
         self.last_frame = Some(frame);
 

@@ -100,7 +100,7 @@ pub struct RenderSettings {
     pub samples: usize,
     /// Background colour, linear.
     pub background: [f64; 3],
-    /// Colour, linear, of camera paths that leave after meeting missing values: land, as opposed to background.
+    /// Colour, linear, of camera paths that leave and saw missing values: land, as opposed to background.
     pub missing: [f64; 3],
     /// Majorant cells along x, y, z; None: chosen from the domain.
     pub majorant_cells: Option<[usize; 3]>,

@@ -37,6 +37,8 @@ enum Stage {
     Camera,
     /// From there to the light.
     Shadow,
+    /// Past the box without a collision: one point of the way through it tells land from background.
+    Probe,
 }
 
 /// What becomes of a flight.
@@ -67,7 +69,6 @@ pub(super) struct Flight {
     sample: u32,
     dimension: u32,
     stage: Stage,
-    met_missing: bool,
     /// What the path adds at full transmittance.
     path: PathSample,
     /// Where its lane keeps the result.
@@ -96,12 +97,11 @@ impl Flight {
             sample,
             dimension: 1,
             stage: Stage::Camera,
-            met_missing: false,
             path: PathSample::default(),
             slot,
         };
         let Some((enter, leave)) = scene.space.intersect(origin, direction) else {
-            let outcome = flight.leave(scene);
+            let outcome = flight.see(scene.background, 0.0);
             return (flight, outcome);
         };
         flight.origin = scene.space.grid_point(std::array::from_fn(|k| origin[k] + enter * direction[k]));
@@ -130,20 +130,31 @@ impl Flight {
                 (self.t, self.cell, self.majorant) = (hit.t, hit.cell, hit.majorant);
                 Outcome::Pending
             }
-            None => self.leave(scene),
+            None => self.leave(scene, unit(words[3])),
         }
     }
 
-    /// The path has left the box (or reached the light).
-    fn leave(&mut self, scene: &FrameScene) -> Outcome {
-        match self.stage {
-            Stage::Camera => {
-                let behind = if self.met_missing { scene.missing } else { scene.background };
-                self.path.radiance = behind.map(|c| c * self.weight);
-                self.path.missing = if self.met_missing { self.weight } else { 0.0 };
-            }
-            Stage::Shadow => self.path.radiance = self.path.radiance.map(|c| c * self.weight),
+    /// The walk has come to its end. A camera flight probes a point drawn uniformly along its way through the box: a choice that
+    /// does not depend on majorants, so that neither does the picture. Cells known to hold no missing value need no query.
+    fn leave(&mut self, scene: &FrameScene, place: f32) -> Outcome {
+        if self.stage == Stage::Shadow {
+            self.path.radiance = self.path.radiance.map(|c| c * self.weight);
+            return Outcome::Done(self.path);
         }
+        self.t = place * self.end;
+        let cell = scene.majorants.cell_at(self.point());
+        if !scene.majorants.may_miss(cell) {
+            return self.see(scene.background, 0.0);
+        }
+        self.cell = cell as u32;
+        self.stage = Stage::Probe;
+        Outcome::Pending
+    }
+
+    /// A camera path that did not scatter sees what lies behind.
+    fn see(&mut self, colour: [f32; 3], missing: f32) -> Outcome {
+        self.path.radiance = colour.map(|c| c * self.weight);
+        self.path.missing = missing * self.weight;
         Outcome::Done(self.path)
     }
 
@@ -154,11 +165,13 @@ impl Flight {
         self.path.traced += u32::from(traced);
         if !log_stretch.is_finite() {
             scene.majorants.observe_missing(self.cell as usize);
-            self.met_missing |= self.stage == Stage::Camera;
-            return self.fly(scene);
+            return if self.stage == Stage::Probe { self.see(scene.missing, 1.0) } else { self.fly(scene) };
         }
         let ftle = log_stretch * scene.per_tau;
         scene.majorants.observe(self.cell as usize, ftle);
+        if self.stage == Stage::Probe {
+            return self.see(scene.background, 0.0);
+        }
         let ratio = scene.transfer.extinction(ftle) / self.majorant;
         *exceeded += u64::from(ratio > 1.0);
         match self.stage {
@@ -174,13 +187,13 @@ impl Flight {
                     self.weight *= 1.0 - 2.0 * ratio;
                 }
             }
-            Stage::Shadow => {
+            _ => {
                 self.weight *= 1.0 - ratio;
                 let size = self.weight.abs();
                 if size < ROULETTE {
                     if self.roulette * ROULETTE >= size {
-                        self.weight = 0.0;
-                        return self.leave(scene);
+                        self.path.radiance = [0.0; 3];
+                        return Outcome::Done(self.path);
                     }
                     self.weight = ROULETTE.copysign(self.weight);
                 }
