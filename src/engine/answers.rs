@@ -3,14 +3,14 @@
 use crate::field::Domain;
 use crate::flow::{Extras, Traced, Tracer};
 use crate::render::LogStretch;
-use crate::surrogate::{Samples, Surrogate};
+use crate::surrogate::{Predict, Samples};
 use crate::trust::Gate;
 use std::time::{Duration, Instant};
 
 /// Whom to ask, and what was found out on the way.
 pub struct Answers<'a> {
     tracer: &'a dyn Tracer,
-    surrogate: Option<&'a dyn Surrogate>,
+    surrogate: Option<&'a dyn Predict>,
     gate: &'a Gate,
     /// Time after which even untrusted cells are answered by the surrogate.
     trace_budget: Option<Duration>,
@@ -50,7 +50,7 @@ struct Scratch {
 
 impl<'a> Answers<'a> {
     /// Answers by RK4 alone where `surrogate` is none. At most `keep` traced samples are kept for training.
-    pub fn new(tracer: &'a dyn Tracer, surrogate: Option<&'a dyn Surrogate>, gate: &'a Gate, trace_budget: Option<f64>, keep: usize) -> Self {
+    pub fn new(tracer: &'a dyn Tracer, surrogate: Option<&'a dyn Predict>, gate: &'a Gate, trace_budget: Option<f64>, keep: usize) -> Self {
         Self {
             tracer,
             surrogate,

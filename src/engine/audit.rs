@@ -4,7 +4,7 @@ use super::answers::push_sample;
 use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
-use crate::surrogate::{Samples, Surrogate};
+use crate::surrogate::{Predict, Samples};
 use crate::trust::{Gate, Residual, TrustedError};
 
 /// Dimension that no path reaches.
@@ -55,7 +55,7 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
 }
 
 /// Residuals of `surrogate` on traced samples that it has not seen. `tau` turns log-stretch into FTLE for the ramp.
-pub fn residuals(surrogate: &dyn Surrogate, samples: &Samples, transfer: &Transfer, tau: f64) -> Vec<Residual> {
+pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer, tau: f64) -> Vec<Residual> {
     let mut predicted = vec![0.0; samples.len()];
     surrogate.predict(&samples.points, &mut predicted);
     let ramp = |s: f32| transfer.ramp(s / tau as f32);

@@ -11,7 +11,7 @@ use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::TrainingSettings;
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use crate::render::{Method, Renderer, Scene};
-use crate::surrogate::{Kind, Learned, SampleRing, Samples, Surrogate, network::Target};
+use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, TrustMap};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -208,7 +208,7 @@ impl<'a> Cycle<'a> {
             Method::Surrogate => Gate::uniform(true),
         };
         // Frozen weights: what is rendered with has not seen this frame's samples.
-        let front: Option<Arc<dyn Surrogate>> = self.live.as_ref().map(|live| live.freeze());
+        let front: Option<Arc<dyn Predict>> = self.live.as_ref().map(|live| live.freeze());
         let per_cell = scene.trust.audit_per_cell;
         let cells = self.trust.shape();
         let samples_per_pixel = self.options.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);

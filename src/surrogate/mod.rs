@@ -6,6 +6,7 @@ use crate::field::Domain;
 use crate::flow::Tracer;
 use network::NetworkSettings;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 use trainer::Trainer;
 
 mod checkpoint;
@@ -61,20 +62,26 @@ pub struct Learned {
     pub seconds: f64,
 }
 
-/// A memory of the log-stretch over the domain. Predicts from many threads; learns between frames.
-pub trait Surrogate: Send + Sync {
+/// Something that answers log-stretch queries and does not change: a surrogate, or what one was when it was frozen.
+pub trait Predict: Send + Sync {
     /// `table`, `network` or `residual`.
     fn name(&self) -> &'static str;
     /// Writes the predicted log-stretch at each unit point into `out` (same length). Parallelises over rayon's current pool.
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]);
+    /// Memory of what prediction reads, in bytes.
+    fn bytes(&self) -> usize;
+}
+
+/// A memory of the log-stretch over the domain, which learns between or beside frames.
+pub trait Surrogate: Predict {
+    /// What it would answer now, for good: frames are rendered with it while training goes on.
+    fn freeze(&self) -> Arc<dyn Predict>;
     /// Whether `learn` does anything.
     fn learns(&self) -> bool;
     /// Trains on `samples` for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
     fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned;
     /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over.
     fn window_slid(&mut self, tracer: &dyn Tracer);
-    /// Memory of what prediction reads, in bytes.
-    fn bytes(&self) -> usize;
     /// Writes everything needed to go on (weights, optimizer state, base table) into the file.
     fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError>;
     /// Restores what [`Surrogate::save`] wrote; a checkpoint of another shape is an error and changes nothing.
@@ -193,13 +200,23 @@ struct Network {
     trainer: Trainer,
 }
 
-impl Surrogate for Network {
+impl Predict for Network {
     fn name(&self) -> &'static str {
         "network"
     }
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         self.trainer.predict(points, out);
+    }
+
+    fn bytes(&self) -> usize {
+        self.trainer.bytes()
+    }
+}
+
+impl Surrogate for Network {
+    fn freeze(&self) -> Arc<dyn Predict> {
+        Arc::new(self.trainer.frozen())
     }
 
     fn learns(&self) -> bool {
@@ -212,10 +229,6 @@ impl Surrogate for Network {
 
     fn window_slid(&mut self, _: &dyn Tracer) {
         self.trainer.window_slid();
-    }
-
-    fn bytes(&self) -> usize {
-        self.trainer.bytes()
     }
 
     fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {

@@ -2,10 +2,11 @@
 //! the table.
 
 use super::checkpoint::Checkpoint;
-use super::trainer::Trainer;
-use super::{CheckpointError, Learned, NetworkSettings, Samples, Surrogate, SurrogateError, Table};
+use super::trainer::{FrozenNetwork, Trainer};
+use super::{CheckpointError, Learned, NetworkSettings, Predict, Samples, Surrogate, SurrogateError, Table};
 use crate::flow::Tracer;
 use std::path::Path;
+use std::sync::Arc;
 
 /// Samples on which the network is compared with nothing, after the table below it has changed.
 const COMPARED: usize = 4096;
@@ -63,7 +64,7 @@ impl Residual {
     }
 }
 
-impl Surrogate for Residual {
+impl Predict for Residual {
     fn name(&self) -> &'static str {
         "residual"
     }
@@ -75,6 +76,41 @@ impl Surrogate for Residual {
         for (out, below) in out.iter_mut().zip(below) {
             *out += below;
         }
+    }
+
+    fn bytes(&self) -> usize {
+        self.table.bytes() + self.trainer.bytes()
+    }
+}
+
+/// A residual as it was.
+struct Frozen {
+    table: Table,
+    network: FrozenNetwork,
+}
+
+impl Predict for Frozen {
+    fn name(&self) -> &'static str {
+        "residual"
+    }
+
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        let mut below = vec![0.0; points.len()];
+        self.table.predict(points, &mut below);
+        self.network.predict(points, out);
+        for (out, below) in out.iter_mut().zip(below) {
+            *out += below;
+        }
+    }
+
+    fn bytes(&self) -> usize {
+        self.table.bytes() + self.network.bytes()
+    }
+}
+
+impl Surrogate for Residual {
+    fn freeze(&self) -> Arc<dyn Predict> {
+        Arc::new(Frozen { table: self.table.clone(), network: self.trainer.frozen() })
     }
 
     fn learns(&self) -> bool {
@@ -96,10 +132,6 @@ impl Surrogate for Residual {
         self.table.retrace(tracer);
         self.trainer.window_slid();
         self.slid = true;
-    }
-
-    fn bytes(&self) -> usize {
-        self.table.bytes() + self.trainer.bytes()
     }
 
     fn save(&self, path: &Path) -> Result<(), CheckpointError> {

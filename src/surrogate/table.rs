@@ -1,10 +1,11 @@
 //! The log-stretch traced at the nodes of a regular grid over the unit domain, interpolated multilinearly.
 
 use super::checkpoint::{Checkpoint, Entry};
-use super::{CheckpointError, Learned, Samples, Surrogate};
+use super::{CheckpointError, Learned, Predict, Samples, Surrogate};
 use crate::flow::{Extras, Traced, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
+use std::sync::Arc;
 use wide::{f32x8, i32x8};
 
 /// Seeds traced at once while a table is built: bounds the memory beside the table itself.
@@ -118,7 +119,7 @@ impl Table {
     }
 }
 
-impl Surrogate for Table {
+impl Predict for Table {
     fn name(&self) -> &'static str {
         "table"
     }
@@ -126,6 +127,16 @@ impl Surrogate for Table {
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         assert_eq!(points.len(), out.len(), "one value a point");
         points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(points, out));
+    }
+
+    fn bytes(&self) -> usize {
+        self.values.len() * size_of::<f32>()
+    }
+}
+
+impl Surrogate for Table {
+    fn freeze(&self) -> Arc<dyn Predict> {
+        Arc::new(self.clone())
     }
 
     fn learns(&self) -> bool {
@@ -138,10 +149,6 @@ impl Surrogate for Table {
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.retrace(tracer);
-    }
-
-    fn bytes(&self) -> usize {
-        self.values.len() * size_of::<f32>()
     }
 
     fn save(&self, path: &Path) -> Result<(), CheckpointError> {

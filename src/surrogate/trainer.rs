@@ -7,7 +7,7 @@
 
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::{Architecture, Average, Encoding, Fused, Model, NetworkSettings, Objective, Pick, Predictor, Step};
-use super::{CheckpointError, Learned, Samples, SurrogateError};
+use super::{CheckpointError, Learned, Predict, Samples, SurrogateError};
 use crate::field::Domain;
 use std::time::Instant;
 
@@ -60,6 +60,28 @@ pub(super) struct Trainer {
     fused: Option<Fused>,
 }
 
+/// A network as it was.
+pub(super) struct FrozenNetwork {
+    shape: Architecture,
+    objective: Objective,
+    tables: Vec<f32>,
+    predictor: Predictor,
+}
+
+impl Predict for FrozenNetwork {
+    fn name(&self) -> &'static str {
+        "network"
+    }
+
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        self.predictor.log_stretch(&self.shape, &self.objective, &self.tables, points, out);
+    }
+
+    fn bytes(&self) -> usize {
+        self.shape.parameters() * size_of::<f32>()
+    }
+}
+
 impl Trainer {
     pub(super) fn new(settings: &NetworkSettings, domain: &Domain, tau: f64, seed: u64, centred: bool) -> Result<Self, SurrogateError> {
         let axes: Vec<usize> = (0..domain.dimensions.clamp(1, 3)).collect();
@@ -93,6 +115,16 @@ impl Trainer {
     /// Writes the log-stretch (or the residual's part of it) at each point.
     pub(super) fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         self.predictor.log_stretch(&self.model.shape, &self.objective, &self.average.tables, points, out);
+    }
+
+    /// What predicts now, for good.
+    pub(super) fn frozen(&self) -> FrozenNetwork {
+        FrozenNetwork {
+            shape: self.model.shape.clone(),
+            objective: self.objective.clone(),
+            tables: self.average.tables.clone(),
+            predictor: Predictor::new(&self.model.shape, &self.average.layers),
+        }
     }
 
     /// Parameters that prediction reads, in bytes.
