@@ -119,12 +119,11 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
     }
     let seeds = seeds(&*tracer, grid);
     let begun = std::time::Instant::now();
-    let extras = Extras { precise: true, ..Extras::default() };
     let mut traced = Traced::default();
-    tracer.trace(&seeds, extras, &mut traced);
+    tracer.trace(&seeds, Extras::default(), &mut traced);
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
-    let ftle: Vec<f64> = (0..seeds.len()).map(|i| if traced.lived[i] > 0.0 { traced.precise[i] / tau } else { f64::NAN }).collect();
+    let ftle: Vec<f64> = unrounded(&traced).iter().zip(&traced.lived).map(|(s, lived)| if *lived > 0.0 { s / tau } else { f64::NAN }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| !f.is_nan()).collect();
     let check = if options.check { Some(check(plan, slide, &seeds, &ftle)?) } else { None };
     let convergence = if options.convergence { Some(convergence(plan, slide, &seeds)?) } else { None };
@@ -174,6 +173,11 @@ fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
     }
 }
 
+/// Log-stretch as precise as it was integrated.
+fn unrounded(traced: &Traced) -> Vec<f64> {
+    if traced.log_stretch_f64.is_empty() { traced.log_stretch.iter().map(|s| f64::from(*s)).collect() } else { traced.log_stretch_f64.clone() }
+}
+
 /// FTLE at the seeds that is taken for the truth.
 fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str, Vec<f64>)> {
     if let Some(value) = closed_form(plan, &slide.velocity) {
@@ -186,8 +190,8 @@ fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str
 fn ftle(map: &FlowMap, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Vec<f64>> {
     let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
     let mut traced = Traced::default();
-    tracer.trace(seeds, Extras { precise: true, ..Extras::default() }, &mut traced);
-    Ok(traced.precise.iter().map(|s| s / map.tau).collect())
+    tracer.trace(seeds, Extras::default(), &mut traced);
+    Ok(unrounded(&traced).iter().map(|s| s / map.tau).collect())
 }
 
 fn check(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]], ftle: &[f64]) -> Result<Check> {

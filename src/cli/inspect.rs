@@ -1,7 +1,8 @@
 //! `ridgewatch inspect`.
 
-use super::{Common, print_json, print_text};
+use super::{Common, Usage, print_json, print_text};
 use anyhow::Result;
+use ridgewatch::config::{SceneFile, TimeSpan};
 use std::path::PathBuf;
 
 /// Options of `inspect`.
@@ -10,10 +11,22 @@ pub struct Options {
     /// Data files or globs.
     #[arg(required = true)]
     files: Vec<PathBuf>,
+    /// Integration time that the window's memory is stated for, in seconds or with a unit, e.g. "30 days"; default: half of the span.
+    #[arg(long)]
+    tau: Option<String>,
 }
 
 /// Inspects.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    let inspection = ridgewatch::source::inspect(&options.files)?;
+    let scene = SceneFile::for_archive(options.files.clone(), &common.overrides)?;
+    let tau = match &options.tau {
+        None => None,
+        Some(text) => {
+            let span = text.parse().map_or_else(|_| TimeSpan::Words(text.clone()), TimeSpan::Number);
+            let value = span.value().filter(|v| v.is_finite() && *v > 0.0);
+            Some(value.ok_or_else(|| Usage(format!("--tau {text}: accepted: a number above 0, or words such as \"30 days\"")))?)
+        }
+    };
+    let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)?;
     if common.json { print_json(&inspection) } else { Ok(print_text(inspection)) }
 }

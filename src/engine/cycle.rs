@@ -271,10 +271,7 @@ impl<'a> Cycle<'a> {
             time: slide.time,
             date: slide.date.clone(),
             tau: tracer.tau(),
-            direction: match self.plan.map.direction {
-                crate::flow::Direction::Forward => "forward".into(),
-                crate::flow::Direction::Backward => "backward".into(),
-            },
+            direction: self.plan.map.direction.name().into(),
             method: match method {
                 Method::Reference => "reference".into(),
                 Method::Surrogate => "surrogate".into(),

@@ -4,6 +4,7 @@ use super::grid_flow::GridFlow;
 use super::sphere::SphereFlow;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{Chart, Closed, Velocity};
+use super::voids::Voids;
 use super::{FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
 use crate::field::analytic::{ClosedForm, Form};
 use crate::field::{Domain, Geometry, Window};
@@ -186,6 +187,10 @@ impl<'a> Assembly<'a> {
             boundary: self.map.boundary,
             normalisation: self.map.normalisation,
             order: self.order,
+            voids: match &self.source {
+                VelocitySource::Analytic(..) => Voids::none(),
+                VelocitySource::Window(window) => Voids::at(window, self.from),
+            },
             lanes: PhantomData,
         }
     }

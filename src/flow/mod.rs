@@ -20,6 +20,7 @@ mod steps;
 mod stretch;
 mod tracer;
 mod velocity;
+mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 pub use error::FlowError;
@@ -37,6 +38,14 @@ pub enum Direction {
 }
 
 impl Direction {
+    /// `forward` or `backward`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Direction::Forward => "forward",
+            Direction::Backward => "backward",
+        }
+    }
+
     /// +1 or -1.
     pub fn sign(self) -> f64 {
         match self {
@@ -180,6 +189,8 @@ pub trait Tracer: Send + Sync {
     fn tau(&self) -> f64;
     /// Runge-Kutta steps a path gets.
     fn steps(&self) -> usize;
+    /// Whether a seed lies where the velocity is missing at its start time (land): it has no FTLE.
+    fn is_void(&self, seed: [f32; 3]) -> bool;
     /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
 }

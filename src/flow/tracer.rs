@@ -2,6 +2,7 @@
 
 use super::rk4::{self, MAX_LANES, Paths};
 use super::velocity::{Chart, Velocity};
+use super::voids::Voids;
 use super::{Boundary, Extras, Normalisation, Traced, Tracer, dormand_prince};
 use crate::field::Domain;
 use crate::simd::{Lanes, Mask, Real};
@@ -100,6 +101,8 @@ pub struct CpuTracer<K, V, L, const D: usize, const C: usize> {
     pub normalisation: Normalisation,
     /// Whether batches are sorted.
     pub order: Order,
+    /// Where seeds have no velocity.
+    pub voids: Voids,
     /// Kind of lanes.
     pub lanes: PhantomData<L>,
 }
@@ -200,6 +203,10 @@ where
 
     fn steps(&self) -> usize {
         self.kernel.steps()
+    }
+
+    fn is_void(&self, seed: [f32; 3]) -> bool {
+        self.voids.hold(seed)
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {

@@ -70,4 +70,12 @@ pub enum PublishError {
         /// What is wrong, and what is accepted.
         problem: String,
     },
+    /// A preview that cannot be written.
+    #[error("{path}: {problem}", path = path.display())]
+    Png {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
 }

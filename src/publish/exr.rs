@@ -1,4 +1,4 @@
-//! The film as OpenEXR and back: one part, channels R, G, B, A and the layers `ftle.mean`, `trust.traced`, `variance`, `samples.count`,
+//! The film as OpenEXR and back: one part, channels R, G, B, A and the layers `ftle.mean`, `trust.traced`, `variance`, `samples.count`, `missing.share`, `queries.count`,
 //! all f32, sorted by name, ZIP-compressed without loss.
 
 use super::{PublishError, run_folder::write_whole};
@@ -20,8 +20,15 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     }
     let colour = |k: usize| film.rgba.iter().map(|p| p[k]).collect::<Vec<f32>>();
     let mut channels = vec![("R", colour(0)), ("G", colour(1)), ("B", colour(2)), ("A", colour(3))];
-    for (name, layer) in
-        [("ftle.mean", &film.ftle_mean), ("trust.traced", &film.traced), ("variance", &film.variance), ("samples.count", &film.samples)]
+    let layers = [
+        ("ftle.mean", &film.ftle_mean),
+        ("trust.traced", &film.traced),
+        ("variance", &film.variance),
+        ("samples.count", &film.samples),
+        ("missing.share", &film.missing),
+        ("queries.count", &film.queries),
+    ];
+    for (name, layer) in layers
     {
         match layer.len() {
             0 => {}
@@ -32,7 +39,7 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     let mut attributes = LayerAttributes { software_name: Some(Text::from("ridgewatch")), ..Default::default() };
     if let Some(record) = record {
         let json = serde_json::to_string(record).map_err(|e| e.to_string())?;
-        attributes.comments = Some(Text::from("linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples"));
+        attributes.comments = Some(Text::from("linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples, share missing, queries"));
         let frame = i32::try_from(record.frame).unwrap_or(i32::MAX);
         attributes.other.insert(Text::from("ridgewatch.frame"), AttributeValue::I32(frame));
         attributes.other.insert(Text::from("ridgewatch.time"), AttributeValue::F64(record.time));
@@ -103,6 +110,8 @@ pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
         traced: layer_of("trust.traced"),
         variance: layer_of("variance"),
         samples: layer_of("samples.count"),
+        missing: layer_of("missing.share"),
+        queries: layer_of("queries.count"),
     })
 }
 

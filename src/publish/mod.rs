@@ -21,7 +21,7 @@ pub use error::PublishError;
 pub use exr::{decode_exr, encode_exr, read_exr, write_exr};
 pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
 pub use output::Output;
-pub use preview::{jpeg, png, raw};
+pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};
 pub use settings::{DEFAULT_ENDPOINT, Payload, PublishSettings, WhenFull};
 pub use summary::{FileStatistics, Summary, Totals, peak_memory_bytes};
