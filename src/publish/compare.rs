@@ -44,11 +44,11 @@ pub struct Comparison {
     /// Structural similarity of the tone-mapped luma (Wang et al. 2004: Gaussian window 11x11, deviation 1.5, mean over whole
     /// windows); none when the picture is smaller than the window.
     pub ssim: Option<f64>,
-    /// Mean of (a - b)^2 / (b^2 + 0.01) over the linear colours, b being the reference.
-    pub relative_mse: f64,
-    /// Largest |a - b| of the linear colours.
-    pub max_abs_difference: f64,
-    /// Pixels left out of the two linear figures because a colour is not finite in either picture.
+    /// Mean of (a - b)^2 / (b^2 + 0.01) over the linear colours, b being the reference; none when no pixel is finite.
+    pub relative_mse: Option<f64>,
+    /// Largest |a - b| of the linear colours; none when no pixel is finite.
+    pub max_abs_difference: Option<f64>,
+    /// Pixels left out of the two linear figures because a colour is not finite in one of the pictures.
     pub not_finite: usize,
 }
 
@@ -63,8 +63,9 @@ impl fmt::Display for Comparison {
             Some(ssim) => writeln!(f, "SSIM     {ssim:.4} (tone-mapped luma)")?,
             None => writeln!(f, "SSIM     - (picture smaller than {SSIM_WINDOW} pixels)")?,
         }
-        writeln!(f, "relMSE   {:.4e} (linear)", self.relative_mse)?;
-        write!(f, "max diff {:.4e} (linear)", self.max_abs_difference)?;
+        let linear = |figure: Option<f64>| figure.map_or("-".to_owned(), |figure| format!("{figure:.4e}"));
+        writeln!(f, "relMSE   {} (linear)", linear(self.relative_mse))?;
+        write!(f, "max diff {} (linear)", linear(self.max_abs_difference))?;
         if self.not_finite > 0 {
             write!(f, "\n{} pixels are not finite and were left out of the linear figures", self.not_finite)?;
         }
@@ -106,8 +107,8 @@ pub fn compare_films(a: &Film, b: &Film, tone_map: [f64; 3]) -> Result<Compariso
         height,
         psnr: (squares > 0.0).then(|| 10.0 * (255.0f64.powi(2) * seen_a.len() as f64 / squares).log10()),
         ssim: ssim(&luma(&seen_a), &luma(&seen_b), width, height),
-        relative_mse: if counted == 0 { 0.0 } else { relative / counted as f64 },
-        max_abs_difference: largest,
+        relative_mse: (counted > 0).then(|| relative / counted as f64),
+        max_abs_difference: (counted > 0).then_some(largest),
         not_finite,
     })
 }
@@ -184,7 +185,7 @@ mod tests {
     fn identical_pictures() {
         let a = film(16, 12, |x, y| grey(pattern(x, y)));
         let same = compare_films(&a, &a, PLAIN).unwrap();
-        assert_eq!((same.psnr, same.relative_mse, same.max_abs_difference), (None, 0.0, 0.0));
+        assert_eq!((same.psnr, same.relative_mse, same.max_abs_difference), (None, Some(0.0), Some(0.0)));
         // Sums of products of the same numbers: rounding only.
         assert!((same.ssim.unwrap() - 1.0).abs() < 1e-12);
         assert!(same.to_string().contains("identical"));
@@ -198,8 +199,8 @@ mod tests {
         // 20 log10(255 / 10): ten levels everywhere.
         assert!((report.psnr.unwrap() - 20.0 * 25.5f64.log10()).abs() < 1e-9);
         let (x, y) = (f64::from(110.0f32 / 255.0), f64::from(100.0f32 / 255.0));
-        assert!((report.relative_mse - (x - y).powi(2) / (y * y + 0.01)).abs() < 1e-12);
-        assert!((report.max_abs_difference - (x - y)).abs() < 1e-12);
+        assert!((report.relative_mse.unwrap() - (x - y).powi(2) / (y * y + 0.01)).abs() < 1e-12);
+        assert!((report.max_abs_difference.unwrap() - (x - y)).abs() < 1e-12);
         // Flat pictures: only the luminance term is left.
         let c1 = 2.55f64.powi(2);
         assert!((report.ssim.unwrap() - (2.0 * 110.0 * 100.0 + c1) / (110.0f64.powi(2) + 100.0f64.powi(2) + c1)).abs() < 1e-9);
@@ -228,6 +229,8 @@ mod tests {
         let a = film(4, 4, |x, y| [if x == 0 && y == 0 { f32::NAN } else { 0.5 }, 0.5, 0.5]);
         let b = film(4, 4, |_, _| [0.5; 3]);
         let report = compare_films(&a, &b, PLAIN).unwrap();
-        assert_eq!((report.not_finite, report.relative_mse, report.ssim), (1, 0.0, None));
+        assert_eq!((report.not_finite, report.relative_mse, report.ssim), (1, Some(0.0), None));
+        let nowhere = film(4, 4, |_, _| [f32::NAN; 3]);
+        assert_eq!(compare_films(&nowhere, &b, PLAIN).unwrap().relative_mse, None, "no figure rather than a good one");
     }
 }
