@@ -4,7 +4,7 @@ use super::{Common, Usage, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
-use ridgewatch::publish::{Output, RunFolder};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, RunFolder};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -28,8 +28,8 @@ pub struct Options {
     /// reference, surrogate (neural) or gated; overrides the scene's.
     #[arg(long, value_parser = super::method)]
     method: Option<Method>,
-    /// Publishes frames at this ZeroMQ endpoint, e.g. tcp://127.0.0.1:5577 (port 0: any free one, which is printed).
-    #[arg(long, value_name = "ENDPOINT")]
+    /// Publishes frames at this ZeroMQ endpoint (port 0: any free one, which is printed); without it frames go to files only.
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
     publish: Option<String>,
     /// Checks each frame's stated error on N fresh points afterwards and records that too.
     #[arg(long, value_name = "N", default_value_t = 0)]

@@ -111,6 +111,8 @@ struct Place {
     warmup: bool,
 }
 
+/// Random stream of the first probe, apart from those of audit points.
+const PROBE_STREAM: u64 = 1 << 62;
 /// Number of the first warm-up picture, far beyond all others.
 const WARMUP_PICTURES: u64 = 1 << 40;
 
@@ -125,6 +127,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
     let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
+    cycle.probe(&*tracer);
     loop {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
@@ -180,8 +183,30 @@ impl<'a> Cycle<'a> {
             self.ring.mark_stale();
             let holding = self.threads.render.install(|| self.share_of_labels_that_hold(tracer));
             self.ring.revalidate(holding);
+            self.probe(tracer);
         }
         self.renderer.window_slid();
+    }
+
+    /// Earns trust before the first frame of a slide rather than by tracing all of it: some points a cell are traced and held against
+    /// the surrogate. They decide the gate, so they say nothing about the error that is stated; audit points do.
+    fn probe(&mut self, tracer: &dyn Tracer) {
+        let scene = &self.plan.scene;
+        let Some(live) = self.live.as_ref().filter(|_| scene.render.method == Method::Gated) else { return };
+        let per_cell = scene.trust.min_samples.ceil() as usize;
+        let unit = audit::stratified_points(self.trust.shape(), per_cell, scene.seed, PROBE_STREAM + self.frame);
+        let flow_map = self.wants_flow_map();
+        let (samples, residuals) = self.threads.render.install(|| {
+            let probe = audit::trace(tracer, &unit, flow_map);
+            let residuals = audit::residuals(&*live.freeze(), &probe.samples, self.renderer.transfer(), tracer.tau());
+            (probe.samples, residuals)
+        });
+        self.trust.observe(&residuals);
+        self.ring.push(&samples);
+    }
+
+    fn wants_flow_map(&self) -> bool {
+        self.plan.scene.network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table
     }
 
     /// Traces some of the old labels anew: the share whose ramp is within the tolerance of what the label says.
@@ -216,11 +241,11 @@ impl<'a> Cycle<'a> {
         // the warm-up was.
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
+        let flow_map = self.wants_flow_map();
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
             let (renderer, frame, seed) = (&mut self.renderer, self.frame, scene.seed);
-            let flow_map = scene.network.target == Target::FlowMap && scene.surrogate.kind != Kind::Table;
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);

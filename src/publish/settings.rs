@@ -70,7 +70,7 @@ pub struct PublishSettings {
 impl Default for PublishSettings {
     fn default() -> Self {
         Self {
-            endpoint: Some(DEFAULT_ENDPOINT.to_owned()),
+            endpoint: None,
             payload: Payload::Jpeg,
             frames_in_flight: 3,
             stall_seconds: 2.0,
