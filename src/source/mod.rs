@@ -11,14 +11,17 @@ mod cf;
 mod classic;
 mod container;
 mod conversion;
+mod dimensions;
 mod error;
 mod files;
+mod hyperslab;
 mod inspect;
 mod layout;
 mod memory;
 mod netcdf4;
 mod reader;
 mod settings;
+mod times;
 
 pub use archive::NetCdfArchive;
 pub use error::SourceError;
