@@ -84,7 +84,7 @@ pub trait SnapshotSource: Send {
         if times.len() >= 2 && span >= tau * (1.0 - 1e-9) {
             return Ok(());
         }
-        let needed = if interval > 0.0 { (tau / interval * (1.0 - 1e-9)).ceil() as usize + 1 } else { 2 };
+        let needed = if interval > 0.0 { ((tau / interval * (1.0 - 1e-9)).ceil() as usize).saturating_add(1) } else { 2 };
         Err(SourceError::TooShort { tau, needed: needed.max(times.len() + 1), found: times.len(), interval, span })
     }
 }
