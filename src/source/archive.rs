@@ -1,12 +1,13 @@
 //! Many NetCDF files as one sequence of snapshots.
 
-use super::axes::{AxisPlan, runs};
+use super::axes::AxisPlan;
 use super::cf::calendar::Calendar;
 use super::cf::coordinate::Kind;
 use super::container::Container;
 use super::conversion::Conversion;
 use super::files::expand;
-use super::layout::{ComponentPlan, Layout, Role, plan};
+use super::hyperslab::read_component;
+use super::layout::{ComponentPlan, Layout, difference, plan};
 use super::settings::{Metric, NetCdfSettings, VelocityUnit};
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
 use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -257,57 +258,6 @@ impl Displacement {
     }
 }
 
-/// Reads one time of one component onto the grid.
-fn read_component(
-    file: &Container,
-    component: &ComponentPlan,
-    axes: &[AxisPlan],
-    [nx, ny, nz]: [usize; 3],
-    entry: usize,
-) -> Result<Vec<f32>, SourceError> {
-    let gone = || SourceError::Read { path: file.path.clone(), variable: component.name.clone(), what: "it is gone".into() };
-    let variable = file.header.find(&component.name).ok_or_else(gone)?;
-    let mut values = vec![f32::NAN; nx * ny * nz];
-    let runs_of = |k: usize| axes.get(k).map_or_else(|| runs(&[0]), |a| runs(&a.order));
-    let (runs_x, runs_y, runs_z) = (runs_of(0), runs_of(1), runs_of(2));
-    for run_z in &runs_z {
-        for run_y in &runs_y {
-            for run_x in &runs_x {
-                let block = [run_x, run_y, run_z];
-                let (start, count): (Vec<usize>, Vec<usize>) = component
-                    .roles
-                    .iter()
-                    .map(|role| match *role {
-                        Role::Time => (entry, 1),
-                        Role::Fixed(index) => (index, 1),
-                        Role::Axis(k) => (block[k].start, block[k].nodes.len()),
-                    })
-                    .unzip();
-                let raw = file.read(variable, &start, &count)?;
-                // Distance in `raw` between neighbours along each axis of the grid.
-                let (mut strides, mut stride) = ([0usize; 3], 1);
-                for (role, n) in component.roles.iter().zip(&count).rev() {
-                    if let Role::Axis(k) = *role {
-                        strides[k] = stride;
-                    }
-                    stride *= n;
-                }
-                let at = |k: usize, i: usize| if block[k].reversed { block[k].nodes.len() - 1 - i } else { i } * strides[k];
-                for z in 0..run_z.nodes.len() {
-                    for y in 0..run_y.nodes.len() {
-                        let from = at(2, z) + at(1, y);
-                        let to = ((run_z.nodes.start + z) * ny + run_y.nodes.start + y) * nx + run_x.nodes.start;
-                        for x in 0..run_x.nodes.len() {
-                            values[to + x] = (component.packing.unpack(raw[from + at(0, x)]) * component.factor) as f32;
-                        }
-                    }
-                }
-            }
-        }
-    }
-    Ok(values)
-}
-
 fn is_sphere(axes: &[AxisPlan]) -> bool {
     axes[0].kind == Kind::Longitude && axes[1].kind == Kind::Latitude
 }
@@ -329,31 +279,6 @@ fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
     }
     Ok(())
-}
-
-/// First difference between two files that matters.
-fn difference(a: &Layout, b: &Layout) -> Option<String> {
-    let names = |l: &Layout| l.components.iter().map(|c| format!("`{}`", c.name)).collect::<Vec<_>>().join(", ");
-    if names(a) != names(b) {
-        return Some(format!("their velocities are {} and {}", names(a), names(b)));
-    }
-    if a.axes.len() != b.axes.len() {
-        return Some(format!("they have {} and {} axes", a.axes.len(), b.axes.len()));
-    }
-    for (x, y) in a.axes.iter().zip(&b.axes) {
-        if x == y {
-            continue;
-        }
-        let (one, two) = (&x.axis, &y.axis);
-        let show = |a: &Axis| format!("`{}` of {} nodes from {} to {} {}", a.name(), a.len(), a.first(), a.last(), a.units());
-        let detail = match one.coordinates().iter().zip(two.coordinates()).position(|(p, q)| p != q) {
-            Some(i) if one.len() == two.len() => format!(", first at node {i}: {} and {}", one.coordinates()[i], two.coordinates()[i]),
-            _ => String::new(),
-        };
-        return Some(format!("their axes are {} and {}{detail}", show(one), show(two)));
-    }
-    let calendar = |l: &Layout| l.time.calendar.map_or("none", Calendar::name);
-    (calendar(a) != calendar(b)).then(|| format!("their calendars are {} and {}", calendar(a), calendar(b)))
 }
 
 fn check_duplicates(entries: &[(f64, usize, usize)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {

@@ -49,7 +49,7 @@ impl Coordinates<'_> {
     /// Makes the axis, cropped to `range` when there is one.
     pub(super) fn plan(mut self, range: Option<[f64; 2]>) -> Result<AxisPlan, SourceError> {
         let mut notes = Vec::new();
-        let (quantity, units) = self.to_base_units(&mut notes)?;
+        let (quantity, units) = self.convert_units(&mut notes)?;
         if self.kind == Kind::Longitude {
             unwrap_longitudes(&mut self.values, &mut notes);
         }
@@ -88,7 +88,7 @@ impl Coordinates<'_> {
     }
 
     /// Converts to degrees, metres or pascal.
-    fn to_base_units(&mut self, notes: &mut Vec<String>) -> Result<(Quantity, &'static str), SourceError> {
+    fn convert_units(&mut self, notes: &mut Vec<String>) -> Result<(Quantity, &'static str), SourceError> {
         let text = self.units.unwrap_or_default();
         if matches!(self.kind, Kind::Longitude | Kind::Latitude) {
             if text.to_ascii_lowercase().starts_with("radian") {

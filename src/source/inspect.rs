@@ -232,7 +232,8 @@ fn times(archive: &NetCdfArchive, description: &SourceDescription, tau: Option<f
     let interval = median_interval(times);
     let tau = tau.map_or_else(|| archive.default_tau(), |t| archive.check_tau(t).map(|()| t));
     // The window keeps what covers tau: the snapshots inside, and one to interpolate from.
-    let held = |tau: f64| if interval > 0.0 { ((tau / interval - 1e-9).ceil() as usize + 1).min(times.len()) } else { times.len() };
+    let held =
+        |tau: f64| if interval > 0.0 { ((tau / interval - 1e-9).ceil() as usize).saturating_add(1).min(times.len()) } else { times.len() };
     let snapshots = tau.as_ref().ok().map(|&t| held(t));
     TimeReport {
         snapshots: times.len(),

@@ -2,19 +2,17 @@
 
 use super::SourceError;
 use super::axes::{AxisPlan, Coordinates, Quantity};
-use super::cf::calendar::{CALENDARS, Calendar};
-use super::cf::coordinate::{Kind, classify, classify_name};
+use super::cf::calendar::Calendar;
+use super::cf::coordinate::{Kind, classify};
 use super::cf::packing::Packing;
-use super::cf::time::{TIME_UNITS, TimeUnit};
 use super::cf::units::{Unit, VELOCITY_UNITS};
 use super::cf::velocity::{self, Candidate, Velocity};
-use super::container::{Container, Header, NumberType};
+use super::container::{Container, Header};
+use super::dimensions::Extent;
 use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::times::TimePlan;
 use crate::field::{Axis, AxisFault};
 use std::path::Path;
-
-/// Longest coordinate variable that is read: none is longer, and a damaged header must not fill the memory.
-const LONGEST_AXIS: usize = 1 << 26;
 
 /// What a dimension of a variable is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -39,16 +37,6 @@ pub(super) struct ComponentPlan {
     pub(super) why: String,
 }
 
-/// Times of one file.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct TimePlan {
-    pub(super) variable: String,
-    pub(super) units: String,
-    /// Seconds, strictly ascending.
-    pub(super) seconds: Vec<f64>,
-    pub(super) calendar: Option<Calendar>,
-}
-
 /// Everything.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Layout {
@@ -61,18 +49,11 @@ pub(super) struct Layout {
     /// Choices and conversions, in words.
     pub(super) notes: Vec<String>,
 }
-
-/// A dimension of u on its way to a role.
-struct Extent {
-    dimension: usize,
-    kind: Kind,
-    coordinate: Option<usize>,
-}
-
-struct Planner<'a> {
-    file: &'a Container,
-    settings: &'a NetCdfSettings,
-    notes: Vec<String>,
+/// The planning of one file, step by step.
+pub(super) struct Planner<'a> {
+    pub(super) file: &'a Container,
+    pub(super) settings: &'a NetCdfSettings,
+    pub(super) notes: Vec<String>,
 }
 
 /// Plans how to read a file.
@@ -81,15 +62,15 @@ pub(super) fn plan(file: &Container, settings: &NetCdfSettings) -> Result<Layout
 }
 
 impl Planner<'_> {
-    fn header(&self) -> &Header {
+    pub(super) fn header(&self) -> &Header {
         &self.file.header
     }
 
-    fn path(&self) -> &Path {
+    pub(super) fn path(&self) -> &Path {
         &self.file.path
     }
 
-    fn misfit(&self, variable: usize, what: String) -> SourceError {
+    pub(super) fn misfit(&self, variable: usize, what: String) -> SourceError {
         SourceError::Layout { path: self.path().into(), variable: self.header().variables[variable].name.clone(), what }
     }
 
@@ -148,7 +129,7 @@ impl Planner<'_> {
         self.header().find(name).map(Some).ok_or_else(|| self.not_found(key, name))
     }
 
-    fn not_found(&self, key: &str, name: &str) -> SourceError {
+    pub(super) fn not_found(&self, key: &str, name: &str) -> SourceError {
         let names: Vec<&str> = self.header().variables.iter().map(|v| v.name.as_str()).collect();
         let near = names.iter().map(|n| (strsim::jaro_winkler(n, name), n)).max_by(|a, b| a.0.total_cmp(&b.0));
         SourceError::VariableNotFound {
@@ -189,157 +170,6 @@ impl Planner<'_> {
             self.notes.push(format!("also velocities, but passed over: {} ({})", names.join(", "), velocity::RULE));
         }
         Ok(found)
-    }
-
-    /// Dimension (and coordinate variable) that `x`, `y` or `z` of the settings names.
-    fn named_axis(&self, key: &str, name: &Option<String>) -> Result<Option<(usize, Option<usize>)>, SourceError> {
-        let Some(name) = name else { return Ok(None) };
-        let header = self.header();
-        if let Some(variable) = header.find(name) {
-            return match header.variables[variable].dimensions[..] {
-                [dimension] => Ok(Some((dimension, Some(variable)))),
-                ref dims => {
-                    Err(self.misfit(variable, format!("`{key}` must name a coordinate of one dimension, this one has {}", dims.len())))
-                }
-            };
-        }
-        match header.dimensions.iter().position(|d| d.name == *name) {
-            Some(dimension) => Ok(Some((dimension, None))),
-            None => Err(self.not_found(key, name)),
-        }
-    }
-
-    /// The dimensions of `u` with more than one entry, and horizontal and time ones of any length.
-    fn extents(&mut self, u: usize) -> Result<Vec<Extent>, SourceError> {
-        let s = self.settings;
-        let mut overrides = Vec::new();
-        for (key, name, kind) in [("x", &s.x, Kind::X), ("y", &s.y, Kind::Y), ("z", &s.z, Kind::Level), ("time", &s.time, Kind::Time)] {
-            // A scalar time variable is found later.
-            let scalar = key == "time"
-                && name.as_ref().and_then(|n| self.header().find(n)).is_some_and(|v| self.header().variables[v].dimensions.is_empty());
-            if let Some((dimension, coordinate)) = if scalar { None } else { self.named_axis(key, name)? } {
-                overrides.push((dimension, coordinate, kind));
-            }
-        }
-        let header = self.header();
-        let mut extents = Vec::new();
-        let mut squeezed = Vec::new();
-        for &dimension in &header.variables[u].dimensions {
-            let Dim { kind, coordinate } = match overrides.iter().find(|o| o.0 == dimension) {
-                Some(&(_, coordinate, kind)) => {
-                    let measured = coordinate.map_or(Kind::Unknown, |c| classify(&header.variables[c]));
-                    // The setting says which axis it is, the file whether it is an angle.
-                    let kind = match (kind, measured) {
-                        (Kind::X, Kind::Longitude) => Kind::Longitude,
-                        (Kind::Y, Kind::Latitude) => Kind::Latitude,
-                        _ => kind,
-                    };
-                    Dim { kind, coordinate }
-                }
-                None => self.measure(dimension),
-            };
-            if header.dimensions[dimension].len == 1 && !kind.is_horizontal() && kind != Kind::Time {
-                squeezed.push(header.dimensions[dimension].name.clone());
-                continue;
-            }
-            extents.push(Extent { dimension, kind, coordinate });
-        }
-        if !squeezed.is_empty() {
-            self.notes.push(format!("dimensions of one entry left out: {}", squeezed.join(", ")));
-        }
-        Ok(extents)
-    }
-
-    /// Finds a dimension's coordinate variable and what it measures.
-    fn measure(&self, dimension: usize) -> Dim {
-        let header = self.header();
-        let name = &header.dimensions[dimension].name;
-        let own = |i: &usize| header.variables[*i].dimensions == [dimension] && header.variables[*i].number != NumberType::Other;
-        let candidates: Vec<usize> = (0..header.variables.len()).filter(own).collect();
-        let known = |&i: &usize| classify(&header.variables[i]) != Kind::Unknown;
-        let coordinate = candidates
-            .iter()
-            .copied()
-            .find(|&i| header.variables[i].name == *name)
-            .or_else(|| candidates.iter().copied().find(known))
-            .or_else(|| (candidates.len() == 1).then(|| candidates[0]));
-        let kind = match coordinate.map(|c| classify(&header.variables[c])) {
-            None | Some(Kind::Unknown) => classify_name(name),
-            Some(kind) => kind,
-        };
-        Dim { kind, coordinate }
-    }
-
-    /// Gives dimensions that nothing is known about the place that their order suggests: x last, y before it, then levels.
-    fn name_by_position(&mut self, u: usize, extents: &mut [Extent]) -> Result<(), SourceError> {
-        let has = |extents: &[Extent], kinds: [Kind; 2]| extents.iter().any(|e| kinds.contains(&e.kind));
-        for i in (0..extents.len()).rev() {
-            if extents[i].kind != Kind::Unknown {
-                continue;
-            }
-            let name = self.header().dimensions[extents[i].dimension].name.clone();
-            let (kind, axis) = if !has(extents, [Kind::X, Kind::Longitude]) {
-                (Kind::X, "x")
-            } else if !has(extents, [Kind::Y, Kind::Latitude]) {
-                (Kind::Y, "y")
-            } else if !has(extents, [Kind::Level; 2]) && extents[i].coordinate.is_some() {
-                (Kind::Level, "z")
-            } else {
-                let entries = self.header().dimensions[extents[i].dimension].len;
-                let what = format!(
-                    "dimension `{name}` has {entries} entries, but is neither time nor x, y or level; name the axes with `x`, `y`, `z`, `time`"
-                );
-                return Err(self.misfit(u, what));
-            };
-            extents[i].kind = kind;
-            self.notes.push(format!("dimension `{name}` is taken as {axis} by its position"));
-        }
-        for (kinds, what) in
-            [([Kind::X, Kind::Longitude], "x"), ([Kind::Y, Kind::Latitude], "y"), ([Kind::Level; 2], "z"), ([Kind::Time; 2], "time")]
-        {
-            let found: Vec<&str> =
-                extents.iter().filter(|e| kinds.contains(&e.kind)).map(|e| self.header().dimensions[e.dimension].name.as_str()).collect();
-            let optional = what == "z" || what == "time";
-            if found.len() > 1 || (found.is_empty() && !optional) {
-                let dims = self.header().dimension_names(&self.header().variables[u]);
-                let which = if found.is_empty() { "no dimension".into() } else { found.join(" and ") };
-                return Err(self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with `{what} = \"...\"`")));
-            }
-        }
-        Ok(())
-    }
-
-    /// Dimension and index of the level that the settings pick.
-    fn pick_level(&mut self, extents: &mut [Extent]) -> Result<Option<(usize, usize)>, SourceError> {
-        let Some(wanted) = self.settings.level else { return Ok(None) };
-        let fault = |found: String, accepted: String| SourceError::Setting { key: "level", found: format!("{wanted} ({found})"), accepted };
-        let Some(extent) = extents.iter().find(|e| e.kind == Kind::Level) else {
-            return Err(fault(format!("{} has no level axis", self.path().display()), "leave `level` out".into()));
-        };
-        let Some(coordinate) = extent.coordinate else {
-            return Err(fault("the level axis has no coordinates".into(), "name them with `z`".into()));
-        };
-        let values = self.coordinate_values(coordinate)?;
-        let scale = values.iter().fold(0.0f64, |m, v| m.max(v.abs()));
-        // Four roundings of f32 are the same level.
-        let hit = values.iter().position(|v| (v - wanted).abs() <= 4.0 * f64::from(f32::EPSILON) * scale);
-        let Some(index) = hit else {
-            let units = self.header().variables[coordinate].units().unwrap_or_default();
-            let list = values.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
-            return Err(fault("no such level".into(), format!("levels of {} are {list} {units}", self.path().display())));
-        };
-        self.notes.push(format!("level {wanted} picked (entry {index} of `{}`)", self.header().variables[coordinate].name));
-        Ok(Some((extent.dimension, index)))
-    }
-
-    fn coordinate_values(&self, variable: usize) -> Result<Vec<f64>, SourceError> {
-        let header = &self.header().variables[variable];
-        let count: usize = self.header().shape(header).iter().product();
-        if count > LONGEST_AXIS {
-            return Err(self.misfit(variable, format!("{count} coordinates are too many; accepted are up to {LONGEST_AXIS}")));
-        }
-        let packing = Packing::of(header);
-        Ok(self.file.read_all(variable)?.into_iter().map(|v| packing.unpack(v)).collect())
     }
 
     fn metric(&mut self, extents: &[Extent], three: bool) -> Result<Metric, SourceError> {
@@ -469,57 +299,6 @@ impl Planner<'_> {
             why: candidate.why.clone(),
         })
     }
-
-    fn time(&mut self, extents: &[Extent]) -> Result<TimePlan, SourceError> {
-        let header = self.header();
-        let fault = |what: String| SourceError::Time { path: self.path().into(), what };
-        let dimension = extents.iter().find(|e| e.kind == Kind::Time);
-        let single =
-            |i: &usize| header.shape(&header.variables[*i]).iter().product::<usize>() == 1 && classify(&header.variables[*i]) == Kind::Time;
-        let variable = match (&self.settings.time, dimension) {
-            (Some(name), _) if header.find(name).is_some() => header.find(name),
-            (_, Some(extent)) => extent.coordinate,
-            (_, None) => (0..header.variables.len()).find(single),
-        };
-        let Some(index) = variable else {
-            let times: Vec<&str> = header.variables.iter().filter(|v| classify(v) == Kind::Time).map(|v| v.name.as_str()).collect();
-            let found =
-                if times.is_empty() { "no time variable".into() } else { format!("no numeric time variable, only {}", times.join(", ")) };
-            return Err(fault(format!("{found}; name one with `time = \"...\"`, in {TIME_UNITS}")));
-        };
-        let variable = &header.variables[index];
-        let name = variable.name.clone();
-        let expected = dimension.map_or(1, |e| header.dimensions[e.dimension].len);
-        let units = variable.units().unwrap_or_default().to_owned();
-        let calendar_name = variable.text("calendar").unwrap_or_default();
-        let Some(calendar) = Calendar::parse(calendar_name) else {
-            return Err(fault(format!("calendar `{calendar_name}` of `{name}` is unknown; accepted are {CALENDARS}")));
-        };
-        let Some(unit) = TimeUnit::parse(&units, calendar) else {
-            return Err(fault(format!(
-                "unit `{units}` of `{name}` (calendar {}) is not understood; accepted are {TIME_UNITS}",
-                calendar.name()
-            )));
-        };
-        let seconds: Vec<f64> = self.coordinate_values(index)?.into_iter().map(|v| unit.seconds(v)).collect();
-        if seconds.is_empty() || seconds.len() != expected {
-            return Err(fault(format!("`{name}` holds {} times for {expected} snapshots", seconds.len())));
-        }
-        if let Some(i) = seconds.iter().position(|s| !s.is_finite()) {
-            return Err(fault(format!("entry {i} of `{name}` is missing or not a number")));
-        }
-        if let Some(i) = (1..seconds.len()).find(|&i| seconds[i] <= seconds[i - 1]) {
-            let show = |s: f64| unit.calendar.and_then(|c| c.iso(s)).unwrap_or_else(|| s.to_string());
-            let (before, here) = (show(seconds[i - 1]), show(seconds[i]));
-            return Err(fault(format!("entry {i} of `{name}` is {here}, the one before it {before}; times must ascend")));
-        }
-        Ok(TimePlan { variable: name, units, seconds, calendar: unit.calendar })
-    }
-}
-
-struct Dim {
-    kind: Kind,
-    coordinate: Option<usize>,
 }
 
 /// One line a variable: what it is, or what it lacks.
@@ -533,4 +312,29 @@ pub(super) fn list_candidates(header: &Header) -> String {
         format!("  {} ({}): {verdict}", variable.name, header.dimension_names(variable))
     };
     (0..header.variables.len()).map(line).collect::<Vec<_>>().join("\n")
+}
+
+/// First difference between two files that matters.
+pub(super) fn difference(a: &Layout, b: &Layout) -> Option<String> {
+    let names = |l: &Layout| l.components.iter().map(|c| format!("`{}`", c.name)).collect::<Vec<_>>().join(", ");
+    if names(a) != names(b) {
+        return Some(format!("their velocities are {} and {}", names(a), names(b)));
+    }
+    if a.axes.len() != b.axes.len() {
+        return Some(format!("they have {} and {} axes", a.axes.len(), b.axes.len()));
+    }
+    for (x, y) in a.axes.iter().zip(&b.axes) {
+        if x == y {
+            continue;
+        }
+        let (one, two) = (&x.axis, &y.axis);
+        let show = |a: &Axis| format!("`{}` of {} nodes from {} to {} {}", a.name(), a.len(), a.first(), a.last(), a.units());
+        let detail = match one.coordinates().iter().zip(two.coordinates()).position(|(p, q)| p != q) {
+            Some(i) if one.len() == two.len() => format!(", first at node {i}: {} and {}", one.coordinates()[i], two.coordinates()[i]),
+            _ => String::new(),
+        };
+        return Some(format!("their axes are {} and {}{detail}", show(one), show(two)));
+    }
+    let calendar = |l: &Layout| l.time.calendar.map_or("none", Calendar::name);
+    (calendar(a) != calendar(b)).then(|| format!("their calendars are {} and {}", calendar(a), calendar(b)))
 }

@@ -11,8 +11,10 @@ mod cf;
 mod classic;
 mod container;
 mod conversion;
+mod dimensions;
 mod error;
 mod files;
+mod hyperslab;
 mod inspect;
 mod layout;
 mod libraries;
@@ -20,6 +22,7 @@ mod memory;
 mod netcdf4;
 mod reader;
 mod settings;
+mod times;
 
 pub use archive::NetCdfArchive;
 pub use error::SourceError;
@@ -83,7 +86,7 @@ pub trait SnapshotSource: Send {
         if times.len() >= 2 && span >= tau * (1.0 - 1e-9) {
             return Ok(());
         }
-        let needed = if interval > 0.0 { (tau / interval * (1.0 - 1e-9)).ceil() as usize + 1 } else { 2 };
+        let needed = if interval > 0.0 { ((tau / interval * (1.0 - 1e-9)).ceil() as usize).saturating_add(1) } else { 2 };
         Err(SourceError::TooShort { tau, needed: needed.max(times.len() + 1), found: times.len(), interval, span })
     }
 }

@@ -4,6 +4,7 @@ use super::SourceError;
 use super::container::{Attribute, Dimension, Header, NumberType, Variable};
 use netcdf::AttributeValue;
 use netcdf::types::{FloatType, IntType, NcVariableType};
+use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 
@@ -14,6 +15,7 @@ pub(super) struct NetCdf4Store {
 
 impl NetCdf4Store {
     pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
+        silence();
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
         let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
@@ -35,6 +37,7 @@ impl NetCdf4Store {
     }
 
     pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], total: usize, out: &mut Vec<f64>) -> Result<(), String> {
+        silence();
         let read = catch_unwind(AssertUnwindSafe(|| {
             let variable = self.file.variable(name).ok_or("it is gone")?;
             out.resize(total, 0.0);
@@ -45,6 +48,15 @@ impl NetCdf4Store {
             variable.get_values_into(out, (start, count)).map_err(|e| e.to_string())
         }));
         read.unwrap_or_else(|_| Err("the NetCDF library failed".into()))
+    }
+}
+
+/// libhdf5 prints its error stack on standard error unless told otherwise, once in each thread, even where libnetcdf only asks
+/// whether an attribute is there.
+fn silence() {
+    thread_local!(static SILENCED: Cell<bool> = const { Cell::new(false) });
+    if !SILENCED.replace(true) {
+        hdf5_metno::silence_errors(true);
     }
 }
 

@@ -1,0 +1,379 @@
+//! Archives that must be read, and what must come out.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
+
+mod netcdf_fixture;
+
+use netcdf_fixture::*;
+use ridgewatch::field::{EARTH_RADIUS, Geometry};
+use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, VelocityUnit, inspect, read_ahead};
+use std::path::PathBuf;
+use tempfile::tempdir;
+
+fn open(paths: &[PathBuf]) -> NetCdfArchive {
+    NetCdfArchive::open(paths, &NetCdfSettings::default()).unwrap()
+}
+
+#[test]
+fn every_format_gives_the_same_snapshots() {
+    let dir = tempdir().unwrap();
+    for (name, options) in [("c.nc", CLASSIC), ("o.nc", OFFSET_64), ("d.nc", DATA_64), ("h.nc", NETCDF4)] {
+        let file = plane(options, &[0.0, 1.0, 2.0], "hours since 2000-01-01").write(&dir.path().join(name));
+        let mut archive = open(&[file]);
+        assert_eq!(archive.grid().shape(), [4, 3, 1], "{name}");
+        assert_eq!(archive.grid().geometry, Geometry::Cartesian);
+        assert_eq!(archive.grid().slab, (0.0, 0.4), "a tenth of the longer edge");
+        // 10957 days between 1970 and 2000.
+        assert_eq!(archive.times(), [0.0, 3600.0, 7200.0].map(|s| s + 10_957.0 * 86_400.0));
+        assert_eq!(archive.date(archive.times()[1]).as_deref(), Some("2000-01-01T01:00:00Z"));
+        for t in 0..3 {
+            let expected: Vec<f32> = fill(1, 3, 4, |_, y, x| (100 * t + 10 * y + x) as f64).iter().map(|v| *v as f32).collect();
+            let snapshot = archive.read(t).unwrap();
+            assert_eq!(us(&snapshot), expected, "{name}");
+            assert!(snapshot.nodes.iter().all(|n| n[1] == -n[0] && n[2] == 0.0 && n[3] == 0.0), "{name}");
+        }
+        assert!(archive.read(3).unwrap_err().to_string().contains("there are 3"));
+    }
+}
+
+#[test]
+fn record_dimensions_interleave() {
+    let dir = tempdir().unwrap();
+    // Odd numbers of 2-byte values, so that records are padded; and a single variable of records, which is not.
+    for options in [CLASSIC, DATA_64, NETCDF4] {
+        let values: Vec<i16> = (0..4 * 9).collect();
+        let fixture = Fixture::new(options, &[("time", 0), ("y", 3), ("x", 3)])
+            .axis("x", "m", &[0.0, 1.0, 2.0])
+            .axis("y", "m", &[0.0, 1.0, 2.0])
+            .axis("time", "s", &[0.0, 1.0, 2.0, 3.0])
+            .variable("u", &["time", "y", "x"], Data::I16(values.clone()))
+            .variable("v", &["time", "y", "x"], Data::I16(values));
+        let mut archive = open(&[fixture.write(&dir.path().join("records.nc"))]);
+        let last = archive.read(3).unwrap();
+        assert_eq!(us(&last), (27..36).map(|v| v as f32).collect::<Vec<_>>());
+        assert_eq!(archive.date(1.0), None, "simulation time has no date");
+    }
+}
+
+#[test]
+fn packed_integers_and_fill_values() {
+    let dir = tempdir().unwrap();
+    let fixture = |name: &str, scale: f64| {
+        let packed: Vec<i16> = vec![1, 2, 3, -999, 5, -32_768, 7, 8, 200, 10, 11, 12];
+        let mut fixture = Fixture::new(CLASSIC, &[("time", 1), ("y", 3), ("x", 4)])
+            .axis("x", "km", &[0.0, 1.0, 2.0, 3.0])
+            .axis("y", "km", &[0.0, 1.0, 2.0])
+            .axis("time", "days since 2000-01-01", &[if name == "a.nc" { 0.0 } else { 1.0 }]);
+        for component in ["u", "v"] {
+            fixture = fixture
+                .variable(component, &["time", "y", "x"], Data::I16(packed.clone()))
+                .with("units", "cm s-1")
+                .with("scale_factor", scale)
+                .with("add_offset", 50.0)
+                .with("_FillValue", -32_768i16)
+                .with("missing_value", -999i16)
+                .with("valid_max", 100i16);
+        }
+        fixture.write(&dir.path().join(name))
+    };
+    // Each file has its own packing.
+    let mut archive = open(&[fixture("a.nc", 10.0), fixture("b.nc", 20.0)]);
+    assert_eq!(archive.grid().axes[0].last(), 3000.0, "kilometres become metres");
+    for (index, scale) in [(0, 10.0), (1, 20.0)] {
+        let snapshot = archive.read(index).unwrap();
+        let missing: Vec<usize> = (0..12).filter(|&i| snapshot.nodes[i][3].is_nan()).collect();
+        assert_eq!(missing, [3, 5, 8]);
+        assert_eq!(snapshot.nodes[3][..3], [0.0; 3]);
+        assert_eq!(snapshot.nodes[11][0], ((12.0 * scale + 50.0) * 0.01) as f32);
+    }
+}
+
+#[test]
+fn files_are_ordered_by_time_not_by_name() {
+    let dir = tempdir().unwrap();
+    // Different units and several times in a file, interleaved with another's.
+    plane(CLASSIC, &[3.0, 5.0], "days since 2000-01-01").write(&dir.path().join("a.nc"));
+    plane(CLASSIC, &[0.0], "hours since 2000-01-01").write(&dir.path().join("c.nc"));
+    plane(NETCDF4, &[1.0, 4.0], "days since 2000-01-01").write(&dir.path().join("b.nc"));
+    let archives = [open(&[dir.path().join("*.nc")]), open(&[dir.path().to_path_buf()])];
+    for mut archive in archives {
+        let days: Vec<f64> = archive.times().iter().map(|s| s / 86_400.0 - 10_957.0).collect();
+        assert_eq!(days, [0.0, 1.0, 3.0, 4.0, 5.0]);
+        for (i, day) in days.iter().enumerate() {
+            assert_eq!(archive.read(i).unwrap().nodes[0][0], (100.0 * day) as f32);
+        }
+        let gaps = archive.gaps();
+        assert_eq!(gaps.len(), 1);
+        assert_eq!((gaps[0].missing, gaps[0].after), (1, archive.times()[1]));
+        let said = archive.describe().notes.join("\n");
+        assert!(said.contains("between 2000-01-02T00:00:00Z and 2000-01-04T00:00:00Z"), "{said}");
+    }
+}
+
+#[test]
+fn descending_latitude_and_global_longitude() {
+    let dir = tempdir().unwrap();
+    let (nx, ny) = (12, 5);
+    let longitudes: Vec<f64> = (0..nx).map(|i| i as f64 * 30.0).collect();
+    let latitudes = [60.0, 30.0, 0.0, -30.0, -60.0];
+    let fixture = Fixture::new(CLASSIC, &[("time", 1), ("latitude", ny), ("longitude", nx), ("depth", 1)])
+        .axis("longitude", "degrees_east", &longitudes)
+        .axis("latitude", "degrees_north", &latitudes)
+        .axis("depth", "m", &[0.5])
+        .axis("time", "days since 1900-1-1", &[37_255.0])
+        .variable(
+            "water_u",
+            &["time", "depth", "latitude", "longitude"],
+            f32s(fill(1, ny, nx, |_, y, x| latitudes[y] + longitudes[x] / 1000.0)),
+        )
+        .with("units", "m/s")
+        .variable("water_v", &["time", "depth", "latitude", "longitude"], f32s(fill(1, ny, nx, |_, y, _| -latitudes[y])))
+        .with("units", "m/s");
+    let file = fixture.write(&dir.path().join("ocean.nc"));
+    let mut archive = open(std::slice::from_ref(&file));
+    let grid = archive.grid().clone();
+    assert_eq!(grid.geometry, Geometry::Sphere { radius: EARTH_RADIUS });
+    assert_eq!((grid.dimensions(), grid.axes[0].period(), grid.axes[1].first()), (2, Some(360.0), -60.0));
+    assert_eq!(archive.date(archive.times()[0]).as_deref(), Some("2002-01-01T00:00:00Z"));
+    let snapshot = archive.read(0).unwrap();
+    for i in 0..grid.nodes() {
+        let (lon, lat) = (grid.axes[0].coordinates()[i % nx], grid.axes[1].coordinates()[i / nx]);
+        let [east, north] = east_north(&snapshot, i);
+        // Components of size 60 pass through f32 three times.
+        assert!((east - lat - lon / 1000.0).abs() < 2e-5 && (north + lat).abs() < 2e-5, "node {i}: {east} {north}");
+    }
+    // A region over the seam.
+    let settings = NetCdfSettings { region: Some([-40.0, 40.0, -40.0, 10.0]), ..NetCdfSettings::default() };
+    let mut part = NetCdfArchive::open(&[file], &settings).unwrap();
+    assert_eq!(part.grid().axes[0].coordinates(), [-30.0, 0.0, 30.0]);
+    assert_eq!(part.grid().axes[1].coordinates(), [-30.0, 0.0]);
+    let snapshot = part.read(0).unwrap();
+    for (i, expected) in [-30.0 + 0.33, -30.0, -30.0 + 0.03, 0.33, 0.0, 0.03].into_iter().enumerate() {
+        assert!((east_north(&snapshot, i)[0] - expected).abs() < 2e-5, "node {i}");
+    }
+}
+
+#[test]
+fn dimensions_in_odd_order() {
+    let dir = tempdir().unwrap();
+    // (x, level, time, y): u = 1000 z + 100 t + 10 y + x.
+    let (nx, nz, nt, ny) = (4, 3, 2, 5);
+    let mut values = Vec::new();
+    for x in 0..nx {
+        for z in 0..nz {
+            for t in 0..nt {
+                values.extend((0..ny).map(|y| (1000 * z + 100 * t + 10 * y + x) as f32));
+            }
+        }
+    }
+    for options in [CLASSIC, NETCDF4] {
+        let mut fixture = Fixture::new(options, &[("west_east", nx), ("lev", nz), ("time", nt), ("south_north", ny)])
+            .axis("west_east", "m", &[0.0, 1.0, 2.0, 3.0])
+            .axis("south_north", "m", &[4.0, 3.0, 2.0, 1.0, 0.0])
+            .axis("lev", "hPa", &[1000.0, 500.0, 100.0])
+            .axis("time", "hours since 2000-01-01", &[0.0, 1.0]);
+        for (name, unit) in [("U", "m s**-1"), ("V", "m s**-1"), ("W", "hPa s**-1")] {
+            fixture = fixture.variable(name, &["west_east", "lev", "time", "south_north"], Data::F32(values.clone())).with("units", unit);
+        }
+        let file = fixture.write(&dir.path().join("odd.nc"));
+        let mut archive = open(std::slice::from_ref(&file));
+        assert_eq!(archive.grid().shape(), [nx, ny, nz]);
+        assert_eq!(archive.grid().axes[2].coordinates(), [10_000.0, 50_000.0, 100_000.0]);
+        let snapshot = archive.read(1).unwrap();
+        for (i, node) in snapshot.nodes.iter().enumerate() {
+            // Both y and the levels descend in the file.
+            let (x, y, z) = (i % nx, ny - 1 - i / nx % ny, nz - 1 - i / (nx * ny));
+            let expected = (1000 * z + 100 + 10 * y + x) as f32;
+            assert_eq!(node[..3], [expected, expected, expected * 100.0], "node {i}");
+        }
+        // One level makes it two-dimensional.
+        let settings = NetCdfSettings { level: Some(500.0), ..NetCdfSettings::default() };
+        let mut flat = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+        assert_eq!(flat.grid().dimensions(), 2);
+        assert_eq!(flat.read(0).unwrap().nodes[0][..3], [1040.0, 1040.0, 0.0]);
+        let settings = NetCdfSettings { level: Some(501.0), ..settings };
+        let message = NetCdfArchive::open(&[file], &settings).err().unwrap().to_string();
+        assert!(message.contains("1000, 500, 100 hPa"), "{message}");
+    }
+}
+
+#[test]
+fn index_metric_counts_cells_and_snapshots() {
+    let dir = tempdir().unwrap();
+    let (longitudes, latitudes) = ([0.0, 2.0, 4.0, 6.0], [-90.0, -60.0, 0.0, 60.0]);
+    let constant = |v: f64| f32s(vec![v; 2 * 16]);
+    let fixture = Fixture::new(CLASSIC, &[("time", 2), ("lat", 4), ("lon", 4)])
+        .axis("lon", "degrees_east", &longitudes)
+        .axis("lat", "degrees_north", &latitudes)
+        .axis("time", "hours since 2000-01-01", &[0.0, 6.0])
+        .variable("u", &["time", "lat", "lon"], constant(10.0))
+        .with("units", "m/s")
+        .variable("v", &["time", "lat", "lon"], constant(5.0))
+        .with("units", "m/s");
+    let file = fixture.write(&dir.path().join("index.nc"));
+    let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    assert_eq!(archive.times(), [0.0, 1.0]);
+    assert_eq!(archive.date(0.5).as_deref(), Some("2000-01-01T03:00:00Z"));
+    assert_eq!(archive.grid().axes[1].coordinates(), [0.0, 1.0, 2.0, 3.0]);
+    let snapshot = archive.read(0).unwrap();
+    let degrees = |metres: f64| (metres / EARTH_RADIUS).to_degrees();
+    let hours = 6.0 * 3600.0;
+    // Width of a column: 2 degrees times cos(lat); at the pole that of the circle half a cell away. Heights: 30, 45, 60, 60 degrees.
+    let widths = [75f64, 60.0, 0.0, 60.0].map(|l| 2.0 * l.to_radians().cos());
+    for (y, (width, height)) in widths.into_iter().zip([30.0, 45.0, 60.0, 60.0]).enumerate() {
+        let node = snapshot.nodes[y * 4 + 1];
+        let (u, v) = (degrees(10.0 * hours) / width, degrees(5.0 * hours) / height);
+        // One rounding to f32 before the product and one after.
+        assert!((f64::from(node[0]) / u - 1.0).abs() < 3e-7 && (f64::from(node[1]) / v - 1.0).abs() < 3e-7, "row {y}: {node:?}");
+    }
+    let settings = NetCdfSettings { velocity_unit: VelocityUnit::Cells, ..NetCdfSettings::default() };
+    let mut cells = NetCdfArchive::open(&[file], &settings).unwrap();
+    assert_eq!(cells.read(1).unwrap().nodes[7][..2], [10.0, 5.0]);
+}
+
+#[test]
+fn longitude_latitude_and_levels_fall_to_the_index_metric() {
+    let dir = tempdir().unwrap();
+    let fixture = Fixture::new(NETCDF4, &[("time", 2), ("level", 3), ("lat", 2), ("lon", 4)])
+        .axis("lon", "degrees_east", &[0.0, 90.0, 180.0, 270.0])
+        .axis("lat", "degrees_north", &[10.0, 0.0])
+        .axis("level", "hPa", &[100.0, 500.0, 1000.0])
+        .axis("time", "hours since 2000-01-01", &[0.0, 1.0])
+        .variable("u", &["time", "level", "lat", "lon"], Data::F32(vec![1.0; 48]))
+        .with("standard_name", "eastward_wind")
+        .with("units", "m s-1")
+        .variable("v", &["time", "level", "lat", "lon"], Data::F32(vec![1.0; 48]))
+        .with("standard_name", "northward_wind")
+        .with("units", "m s-1")
+        .variable("w", &["time", "level", "lat", "lon"], Data::F32(vec![2.0; 48]))
+        .with("standard_name", "lagrangian_tendency_of_air_pressure")
+        .with("units", "Pa s-1");
+    let file = fixture.write(&dir.path().join("levels.nc"));
+    let mut archive = open(std::slice::from_ref(&file));
+    assert_eq!((archive.metric(), archive.grid().dimensions()), (Metric::Index, 3));
+    assert_eq!(archive.grid().axes[0].period(), Some(4.0));
+    // 2 Pa/s for an hour, in cells of 400, 450 and 500 hPa.
+    let w: Vec<f32> = archive.read(0).unwrap().nodes.iter().step_by(8).map(|n| n[2]).collect();
+    assert_eq!(w, [7200.0 / 40_000.0, 7200.0 / 45_000.0, 7200.0 / 50_000.0]);
+    let settings = NetCdfSettings { metric: Some(Metric::Sphere), ..NetCdfSettings::default() };
+    let message = NetCdfArchive::open(std::slice::from_ref(&file), &settings).err().unwrap().to_string();
+    assert!(message.contains("level = ..."), "{message}");
+    let settings = NetCdfSettings { level: Some(500.0), ..settings };
+    assert!(matches!(NetCdfArchive::open(&[file], &settings).unwrap().grid().geometry, Geometry::Sphere { .. }));
+}
+
+#[test]
+fn depth_becomes_height() {
+    let dir = tempdir().unwrap();
+    let mut fixture = Fixture::new(CLASSIC, &[("time", 2), ("depth", 3), ("y", 2), ("x", 2)])
+        .axis("x", "m", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .axis("depth", "m", &[0.0, 10.0, 30.0])
+        .with("positive", "down")
+        .axis("time", "s", &[0.0, 1.0]);
+    for name in ["uo", "vo", "wo"] {
+        let values = (0..24).map(|i| (i / 4 % 3) as f32).collect();
+        fixture = fixture.variable(name, &["time", "depth", "y", "x"], Data::F32(values)).with("units", "m/s");
+    }
+    let mut archive = open(&[fixture.write(&dir.path().join("depth.nc"))]);
+    assert_eq!(archive.grid().axes[2].coordinates(), [-30.0, -10.0, 0.0]);
+    let w: Vec<f32> = archive.read(0).unwrap().nodes.iter().step_by(4).map(|n| n[2]).collect();
+    assert_eq!(w, [2.0, 1.0, 0.0], "upward stays upward");
+}
+
+#[test]
+fn settings_outweigh_conventions() {
+    let dir = tempdir().unwrap();
+    let fixture = plane(CLASSIC, &[0.0, 1.0], "hours since 2000-01-01")
+        .variable("fast", &["time", "y", "x"], Data::F32(vec![7.0; 24]))
+        .with("units", "km/h")
+        .variable("runtime", &["time"], Data::F64(vec![10.0, 20.0]))
+        .with("units", "minutes");
+    let file = fixture.write(&dir.path().join("named.nc"));
+    let settings =
+        NetCdfSettings { u: Some("fast".into()), time: Some("runtime".into()), slab: Some([1.0, 2.0]), ..NetCdfSettings::default() };
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    assert_eq!(archive.times(), [600.0, 1200.0]);
+    assert_eq!(archive.grid().slab, (1.0, 2.0));
+    assert_eq!(archive.read(0).unwrap().nodes[0][0], (7.0 / 3.6) as f32);
+    assert!(archive.describe().variables[0].contains("named by the setting"));
+    let settings = NetCdfSettings { u: Some("fats".into()), ..NetCdfSettings::default() };
+    let message = NetCdfArchive::open(&[file], &settings).err().unwrap().to_string();
+    assert!(message.contains("`u = \"fats\"`") && message.contains("is `fast` meant?"), "{message}");
+}
+
+#[test]
+fn settings_are_read_from_toml() {
+    let settings: NetCdfSettings =
+        toml::from_str("files = \"a/*.nc\"\nmetric = \"index\"\nvelocity_unit = \"cells\"\nregion = [0, 1, 2, 3.5]").unwrap();
+    assert_eq!(settings.files, [PathBuf::from("a/*.nc")]);
+    assert_eq!((settings.metric, settings.region), (Some(Metric::Index), Some([0.0, 1.0, 2.0, 3.5])));
+    assert!(toml::from_str::<NetCdfSettings>("colour = 1").unwrap_err().to_string().contains("colour"));
+}
+
+#[test]
+fn read_ahead_delivers_an_archive() {
+    let dir = tempdir().unwrap();
+    for day in 0..6 {
+        plane(CLASSIC, &[f64::from(day)], "days since 2000-01-01").write(&dir.path().join(format!("{}.nc", 9 - day)));
+    }
+    let archive = open(&[dir.path().join("?.nc")]);
+    let reader = read_ahead(Box::new(archive), 1..5, 2);
+    let firsts: Vec<f32> = reader.map(|s| s.unwrap().nodes[0][0]).collect();
+    assert_eq!(firsts, [100.0, 200.0, 300.0, 400.0]);
+}
+
+#[test]
+fn inspection_says_what_and_why() {
+    let dir = tempdir().unwrap();
+    let mut values = fill(4, 3, 4, |_, _, _| 0.5 / 3600.0);
+    values[5] = f64::NAN;
+    let fixture = Fixture::new(CLASSIC, &[("time", 4), ("y", 3), ("x", 4)])
+        .axis("x", "m", &[0.0, 1.0, 2.0, 3.0])
+        .axis("y", "m", &[4.0, 2.0, 0.0])
+        .axis("time", "hours since 2000-01-01", &[0.0, 1.0, 2.0, 3.0])
+        .variable("u", &["time", "y", "x"], Data::F64(values))
+        .with("units", "m/s")
+        .variable("v", &["time", "y", "x"], Data::F64(vec![0.0; 48]))
+        .with("units", "m/s")
+        .variable("sst", &["time", "y", "x"], Data::F64(vec![0.0; 48]))
+        .with("units", "K");
+    let file = fixture.write(&dir.path().join("inspected.nc"));
+    let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), Some(7200.0)).unwrap();
+    let resolution = inspection.resolution.as_ref().unwrap();
+    // u crosses half a cell an hour; stored as f32.
+    assert!((resolution.rms_cells - 0.5).abs() < 1e-6 && (resolution.max_cells - 0.5).abs() < 1e-6);
+    assert_eq!(inspection.missing.as_ref().unwrap().share, 1.0 / 48.0);
+    let time = inspection.time.as_ref().unwrap();
+    assert_eq!((time.window_snapshots, time.window_bytes), (Some(3), Some(3 * 12 * 16)));
+    assert!(inspection.axes[1].descending_in_file);
+    let text = inspection.to_string();
+    for piece in
+        ["u    u", "usual name `u`, unit `m/s`", "unit `K` is no velocity", "descending in the file", "every 3600 s", "missing 2.1 %"]
+    {
+        assert!(text.contains(piece), "{piece} is missing in:\n{text}");
+    }
+    assert!(serde_json::to_string(&inspection).unwrap().contains("\"role\":\"time\""));
+    // A file that is no archive is still shown.
+    let lone = Fixture::new(CLASSIC, &[("y", 2), ("x", 2)]).variable("sst", &["y", "x"], Data::F32(vec![0.0; 4]));
+    let inspection = inspect(&[lone.write(&dir.path().join("lone.nc"))], &NetCdfSettings::default(), None).unwrap();
+    assert!(inspection.problem.unwrap().contains("no velocity found"));
+    assert_eq!(inspection.variables.len(), 1);
+}
+
+#[test]
+fn two_hundred_files_start_at_once() {
+    let dir = tempdir().unwrap();
+    for (kind, options) in [("classic", OFFSET_64), ("netcdf4", NETCDF4)] {
+        for hour in 0..200 {
+            plane(options, &[f64::from(hour)], "hours since 2000-01-01").write(&dir.path().join(format!("{kind}_{hour:03}.nc")));
+        }
+        let begin = std::time::Instant::now();
+        let archive = open(&[dir.path().join(format!("{kind}_*.nc"))]);
+        let took = begin.elapsed();
+        println!("200 {kind} files opened in {took:?}");
+        assert_eq!(archive.times().len(), 200);
+        // Tens to hundreds of milliseconds on two shared cores; a busy machine may take longer, but reading all would not do.
+        assert!(took.as_secs() < 10, "{took:?}");
+    }
+}

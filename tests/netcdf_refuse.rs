@@ -1,0 +1,289 @@
+//! Archives that must be refused, with a message that says which file, what was found and what is accepted.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
+
+mod netcdf_fixture;
+
+use netcdf_fixture::*;
+use ridgewatch::source::{NetCdfArchive, NetCdfSettings, SnapshotSource, SourceError};
+use std::path::{Path, PathBuf};
+use tempfile::tempdir;
+
+fn refused(paths: &[PathBuf]) -> SourceError {
+    refused_with(paths, &NetCdfSettings::default())
+}
+
+fn refused_with(paths: &[PathBuf], settings: &NetCdfSettings) -> SourceError {
+    match NetCdfArchive::open(paths, settings) {
+        Ok(archive) => panic!("{paths:?} was read: {:?}", archive.describe()),
+        Err(error) => error,
+    }
+}
+
+/// Opens one file and checks that the message holds each piece, the file's name among them.
+fn says(file: &Path, pieces: &[&str]) {
+    let message = refused(&[file.to_path_buf()]).to_string();
+    for piece in pieces.iter().chain([&file.file_name().unwrap().to_str().unwrap()]) {
+        assert!(message.contains(piece), "`{piece}` is missing in: {message}");
+    }
+}
+
+const DAYS: &str = "days since 2000-01-01";
+
+#[test]
+fn files_that_are_not_there_or_not_netcdf() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str, bytes: &[u8]| {
+        let path = dir.path().join(name);
+        std::fs::write(&path, bytes).unwrap();
+        path
+    };
+    says(&dir.path().join("absent.nc"), &["cannot be opened", "No such file"]);
+    says(&at("empty.nc", b""), &["it is empty"]);
+    says(&at("text.nc", b"time,lat,lon\n"), &["starts with \"time,lat\"", "NetCDF-4"]);
+    says(&at("wind.grib", b"GRIB\0\0\0\x02"), &["GRIB", "cdo"]);
+    says(&at("wind.nc.gz", &[0x1f, 0x8b, 8, 0, 0, 0, 0, 0, 0]), &["gzip"]);
+    says(&at("cdf9.nc", b"CDF\x09aaaaaaaa"), &["version 9"]);
+    assert!(matches!(refused(&[]), SourceError::NoFiles));
+    assert!(refused(&[dir.path().join("*.nope")]).to_string().contains("*.nope"));
+    let folder = dir.path().join("folder");
+    std::fs::create_dir(&folder).unwrap();
+    assert!(matches!(refused(&[folder]), SourceError::NoMatch { .. }));
+}
+
+#[test]
+fn truncated_files() {
+    let dir = tempdir().unwrap();
+    for (name, options) in [("c.nc", CLASSIC), ("d.nc", DATA_64), ("h.nc", NETCDF4)] {
+        let file = plane(options, &[0.0, 1.0], DAYS).write(&dir.path().join(name));
+        let whole = std::fs::read(&file).unwrap();
+        // libnetcdf reads zeros past the end of a classic file and says nothing.
+        for keep in [whole.len() - 1, whole.len() * 3 / 4, whole.len() / 2, 40, 9] {
+            std::fs::write(&file, &whole[..keep]).unwrap();
+            says(&file, &["truncated"]);
+        }
+    }
+}
+
+#[test]
+fn a_file_that_shrinks_after_opening() {
+    let dir = tempdir().unwrap();
+    let first = plane(CLASSIC, &[0.0], DAYS).write(&dir.path().join("a.nc"));
+    let second = plane(CLASSIC, &[1.0], DAYS).write(&dir.path().join("b.nc"));
+    let mut archive = NetCdfArchive::open(&[first.clone(), second], &NetCdfSettings::default()).unwrap();
+    let whole = std::fs::read(&first).unwrap();
+    std::fs::write(&first, &whole[..whole.len() - 20]).unwrap();
+    assert!(matches!(archive.read(0), Err(SourceError::Truncated { .. })));
+    std::fs::remove_file(&first).unwrap();
+    assert!(matches!(archive.read(0), Err(SourceError::Open { .. })));
+    assert!(archive.read(1).is_ok(), "the other file is as good as before");
+}
+
+#[test]
+fn no_velocity() {
+    let dir = tempdir().unwrap();
+    let file = Fixture::new(CLASSIC, &[("time", 1), ("y", 2), ("x", 2)])
+        .axis("x", "m", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .axis("time", DAYS, &[0.0])
+        .variable("u", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
+        .with("units", "m/s")
+        .variable("sst", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
+        .with("units", "K")
+        .variable("speed", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
+        .with("units", "m/s")
+        .variable("V", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
+        .with("units", "m3/s")
+        .write(&dir.path().join("scalar.nc"));
+    says(
+        &file,
+        &[
+            "no northward or y component",
+            "u (time, y, x): may be u",
+            "sst (time, y, x): unit `K` is no velocity",
+            "speed (time, y, x): unit `m/s`, but neither standard_name, name nor long_name says which component",
+            "V (time, y, x): usual name `V`, but its unit `m3/s` is no velocity",
+        ],
+    );
+}
+
+#[test]
+fn units_and_calendars_that_are_unknown() {
+    let dir = tempdir().unwrap();
+    let wind = |unit: &str| {
+        let mut fixture = Fixture::new(CLASSIC, &[("time", 1), ("y", 2), ("x", 2)])
+            .axis("x", "m", &[0.0, 1.0])
+            .axis("y", "m", &[0.0, 1.0])
+            .axis("time", DAYS, &[0.0]);
+        for (name, standard) in [("a", "eastward_wind"), ("b", "northward_wind")] {
+            fixture =
+                fixture.variable(name, &["time", "y", "x"], Data::F32(vec![0.0; 4])).with("standard_name", standard).with("units", unit);
+        }
+        fixture.write(&dir.path().join("unit.nc"))
+    };
+    says(&wind("furlong/fortnight"), &["`a` has unit `furlong/fortnight`", "accepted are m/s"]);
+    says(&wind("Pa/s"), &["`eastward_wind`, but its unit `Pa/s` is no velocity"]);
+    // Metres a second do not fit a pressure axis.
+    let mut fixture = Fixture::new(CLASSIC, &[("time", 1), ("plev", 2), ("y", 2), ("x", 2)])
+        .axis("x", "m", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .axis("plev", "hPa", &[1000.0, 500.0])
+        .axis("time", DAYS, &[0.0]);
+    for name in ["u", "v", "w"] {
+        fixture = fixture.variable(name, &["time", "plev", "y", "x"], Data::F32(vec![1.0; 8])).with("units", "m/s");
+    }
+    let file = fixture.write(&dir.path().join("mixed_unit.nc"));
+    says(&file, &["`w`", "unit `m/s` does not fit the axis `plev` in `Pa`", "w = \"none\""]);
+    let settings = NetCdfSettings { w: Some("none".into()), ..NetCdfSettings::default() };
+    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][..3], [1.0, 1.0, 0.0]);
+    says(&plane(CLASSIC, &[0.0], "moons since 2000-01-01").write(&dir.path().join("moon.nc")), &["moons since", "seconds|minutes|hours"]);
+    let fixture = Fixture::new(CLASSIC, &[("time", 1), ("y", 2), ("x", 2)])
+        .axis("x", "furlong", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .axis("time", DAYS, &[0.0])
+        .with("calendar", "mayan")
+        .variable("u", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
+        .variable("v", &["time", "y", "x"], Data::F32(vec![0.0; 4]));
+    says(&fixture.write(&dir.path().join("mayan.nc")), &["mayan", "360_day"]);
+    let settings = NetCdfSettings { time: Some("y".into()), ..NetCdfSettings::default() };
+    assert!(refused_with(&[dir.path().join("mayan.nc")], &settings).to_string().contains("mayan.nc"));
+}
+
+#[test]
+fn axes_that_are_none() {
+    let dir = tempdir().unwrap();
+    let with_axes = |x: &[f64], y: &[f64]| {
+        let count = x.len() * y.len();
+        Fixture::new(CLASSIC, &[("time", 1), ("y", y.len()), ("x", x.len())])
+            .axis("x", "m", x)
+            .axis("y", "m", y)
+            .axis("time", DAYS, &[0.0])
+            .variable("u", &["time", "y", "x"], Data::F32(vec![0.0; count]))
+            .variable("v", &["time", "y", "x"], Data::F32(vec![0.0; count]))
+            .write(&dir.path().join("axis.nc"))
+    };
+    says(&with_axes(&[0.0, 1.0, 0.5], &[0.0, 1.0]), &["`x` is not strictly ascending: node 2 is 0.5, the one before it is 1"]);
+    says(&with_axes(&[0.0, 1.0], &[3.0, 2.0, 2.0]), &["`y (descending, read backwards)` is not strictly ascending"]);
+    says(&with_axes(&[0.0, f64::NAN, 2.0], &[0.0, 1.0]), &["`x` is not strictly ascending"]);
+    says(&with_axes(&[0.0], &[0.0, 1.0]), &["axis `x` has 1 node(s); at least 2 are needed"]);
+    // No coordinates; and coordinates of two dimensions.
+    let bare = Fixture::new(CLASSIC, &[("time", 1), ("j", 2), ("i", 3)])
+        .axis("time", DAYS, &[0.0])
+        .variable("u", &["time", "j", "i"], Data::F32(vec![2.0; 6]))
+        .variable("v", &["time", "j", "i"], Data::F32(vec![0.0; 6]))
+        .variable("nav_lon", &["j", "i"], Data::F32(vec![0.0; 6]))
+        .with("units", "degrees_east");
+    let file = bare.write(&dir.path().join("bare.nc"));
+    says(&file, &["dimension `i` has only coordinates of two dimensions (nav_lon)", "velocity_unit = \"cells\""]);
+    let settings: NetCdfSettings = toml::from_str("velocity_unit = \"cells\"").unwrap();
+    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][0], 2.0, "unless cells are meant");
+    // An ensemble.
+    let fixture = Fixture::new(CLASSIC, &[("time", 1), ("member", 5), ("y", 2), ("x", 2)])
+        .axis("x", "m", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .axis("time", DAYS, &[0.0])
+        .variable("u", &["time", "member", "y", "x"], Data::F32(vec![0.0; 20]))
+        .variable("v", &["time", "member", "y", "x"], Data::F32(vec![0.0; 20]));
+    says(&fixture.write(&dir.path().join("ensemble.nc")), &["dimension `member` has 5 entries"]);
+}
+
+#[test]
+fn staggered_components() {
+    let dir = tempdir().unwrap();
+    let fixture = Fixture::new(CLASSIC, &[("time", 1), ("y", 2), ("x", 2), ("x_stag", 3), ("y_stag", 3)])
+        .axis("time", DAYS, &[0.0])
+        .variable("U", &["time", "y", "x_stag"], Data::F32(vec![0.0; 6]))
+        .with("units", "m s-1")
+        .variable("V", &["time", "y_stag", "x"], Data::F32(vec![0.0; 6]))
+        .with("units", "m s-1");
+    says(&fixture.write(&dir.path().join("stag.nc")), &["`U` lies on (time, y, x_stag) but `V` on (time, y_stag, x)", "staggered"]);
+}
+
+#[test]
+fn times_that_repeat_turn_back_or_are_missing() {
+    let dir = tempdir().unwrap();
+    let at = |name: &str, times: &[f64]| plane(CLASSIC, times, DAYS).write(&dir.path().join(name));
+    let message = refused(&[at("a.nc", &[0.0, 1.0]), at("b.nc", &[1.0, 2.0])]).to_string();
+    for piece in ["a.nc", "b.nc", "2000-01-02T00:00:00Z"] {
+        assert!(message.contains(piece), "{message}");
+    }
+    says(&at("back.nc", &[0.0, 2.0, 1.0]), &["entry 2 of `time` is 2000-01-02T00:00:00Z, the one before it 2000-01-03T00:00:00Z"]);
+    says(&at("twice.nc", &[0.0, 0.0]), &["must ascend"]);
+    says(&at("nan.nc", &[0.0, f64::NAN]), &["entry 1 of `time` is missing"]);
+    let file = Fixture::new(CLASSIC, &[("y", 2), ("x", 2)])
+        .axis("x", "m", &[0.0, 1.0])
+        .axis("y", "m", &[0.0, 1.0])
+        .variable("u", &["y", "x"], Data::F32(vec![0.0; 4]))
+        .variable("v", &["y", "x"], Data::F32(vec![0.0; 4]))
+        .write(&dir.path().join("timeless.nc"));
+    says(&file, &["no time variable", "time = \"...\""]);
+    // The same file twice is one file.
+    let once = at("once.nc", &[0.0, 1.0]);
+    assert_eq!(NetCdfArchive::open(&[once.clone(), once], &NetCdfSettings::default()).unwrap().times().len(), 2);
+}
+
+#[test]
+fn mixed_files() {
+    let dir = tempdir().unwrap();
+    let first = plane(CLASSIC, &[0.0], DAYS).write(&dir.path().join("a.nc"));
+    let mixed = |second: Fixture, piece: &str| {
+        let error = refused(&[first.clone(), second.write(&dir.path().join("b.nc"))]);
+        let message = error.to_string();
+        assert!(matches!(error, SourceError::Mixed { .. }), "{message}");
+        for piece in ["a.nc", "b.nc", piece] {
+            assert!(message.contains(piece), "`{piece}` is missing in: {message}");
+        }
+    };
+    let other = |x: &[f64], names: [&str; 2], calendar: &str| {
+        Fixture::new(CLASSIC, &[("time", 1), ("y", 3), ("x", x.len())])
+            .axis("x", "m", x)
+            .axis("y", "m", &[0.0, 2.0, 4.0])
+            .axis("time", DAYS, &[1.0])
+            .with("calendar", calendar)
+            .variable(names[0], &["time", "y", "x"], Data::F32(vec![0.0; 3 * x.len()]))
+            .variable(names[1], &["time", "y", "x"], Data::F32(vec![0.0; 3 * x.len()]))
+    };
+    mixed(other(&[0.0, 1.0, 2.0], ["u", "v"], "standard"), "`x` of 4 nodes from 0 to 3 m and `x` of 3 nodes from 0 to 2 m");
+    mixed(other(&[0.0, 1.0, 2.5, 3.0], ["u", "v"], "standard"), "first at node 2: 2 and 2.5");
+    mixed(other(&[0.0, 1.0, 2.0, 3.0], ["uo", "vo"], "standard"), "`u`, `v` and `uo`, `vo`");
+    mixed(other(&[0.0, 1.0, 2.0, 3.0], ["u", "v"], "360_day"), "standard and 360_day");
+}
+
+#[test]
+fn tau_against_the_archive() {
+    let dir = tempdir().unwrap();
+    let times: Vec<f64> = (0..11).map(f64::from).collect();
+    let file = plane(CLASSIC, &times, DAYS).write(&dir.path().join("long.nc"));
+    let archive = NetCdfArchive::open(&[file], &NetCdfSettings::default()).unwrap();
+    let day = 86_400.0;
+    assert_eq!(archive.default_tau().unwrap(), 5.0 * day);
+    assert!(archive.check_tau(10.0 * day).is_ok());
+    assert!(matches!(archive.check_tau(10.5 * day), Err(SourceError::TooShort { needed: 12, found: 11, .. })));
+    let message = archive.check_tau(30.0 * day).unwrap_err().to_string();
+    assert!(message.contains("needs 31 snapshots") && message.contains("has 11"), "{message}");
+    assert!(archive.check_tau(0.0).is_err() && archive.check_tau(f64::NAN).is_err());
+    let short = plane(CLASSIC, &[0.0, 1.0], DAYS).write(&dir.path().join("short.nc"));
+    let archive = NetCdfArchive::open(&[short], &NetCdfSettings::default()).unwrap();
+    assert!(matches!(archive.default_tau(), Err(SourceError::TooShort { needed: 3, found: 2, .. })));
+}
+
+#[test]
+fn settings_that_do_not_fit() {
+    let dir = tempdir().unwrap();
+    let file = [plane(CLASSIC, &[0.0], DAYS).write(&dir.path().join("plane.nc"))];
+    for (toml, pieces) in [
+        ("metric = \"sphere\"", ["`metric` = sphere", "index and cartesian"]),
+        ("metric = \"cartesian\"\nvelocity_unit = \"cells\"", ["`metric` = cartesian", "index"]),
+        ("level = 3.0", ["`level` = 3", "no level axis"]),
+        ("region = [10.0, 20.0, 0.0, 4.0]", ["0 node(s) of axis `x`", "from 0 to 3"]),
+        ("region = [0.0, 2.0, 4.0, 0.0]", ["`region`", "y0 < y1"]),
+        ("region = [2.0, 0.0, 0.0, 4.0]", ["0 node(s) of axis `x`", "from 0 to 3"]),
+        ("slab = [1.0, 0.0]", ["`slab`", "lower < upper"]),
+        ("x = \"u\"", ["plane.nc", "`x` must name a coordinate of one dimension"]),
+        ("y = \"why\"", ["`y = \"why\"`", "x, y, time, u, v"]),
+    ] {
+        let message = refused_with(&file, &toml::from_str(toml).unwrap()).to_string();
+        for piece in pieces {
+            assert!(message.contains(piece), "{toml}: `{piece}` is missing in: {message}");
+        }
+    }
+}
