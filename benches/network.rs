@@ -7,7 +7,7 @@ use burn::backend::Flex;
 use burn::tensor::{Tensor, TensorData};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Encoding, Fused, FusedNetwork, Model, Network, NetworkSettings, Objective, Pick, Step, operation_step, stock_step,
+    Architecture, Average, Encoding, Fused, Model, Network, NetworkSettings, Objective, Pick, Step, operation_step, stock_step,
 };
 use std::sync::Arc;
 use std::time::Instant;
@@ -66,8 +66,6 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
             Box::new(|| drop(network.forward_fused(&shape, points.clone()).into_data())),
         ],
     );
-    fn check<B: FusedNetwork>() {}
-    check::<Flex>();
     println!(
         "  inference, batch {inference}: stock {:.2} M/s, fused {:.2} M/s, ratio {:.1}",
         inference as f64 / times[0] / 1e6,
@@ -81,8 +79,12 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
     let times = compare(
         rounds.min(5),
         vec![
-            Box::new(|| drop(stock_step(&mut stock, &objective, &samples, training, 1e-3))),
-            Box::new(|| drop(operation_step(&mut operation, &objective, &samples, training, 1e-3))),
+            Box::new(|| {
+                stock_step(&mut stock, &objective, &samples, training, 1e-3);
+            }),
+            Box::new(|| {
+                operation_step(&mut operation, &objective, &samples, training, 1e-3);
+            }),
             Box::new(|| {
                 fused.steps(&mut production, &objective, &mut average, |done, _| {
                     let pick = Pick::Random { seed: 1, counter: done * training as u64, among: None };

@@ -1,4 +1,5 @@
 //! Pictures of media whose radiative transfer is known.
+#![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
 use ridgewatch::field::Domain;
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};

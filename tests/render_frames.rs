@@ -1,4 +1,5 @@
 //! Frames through the front door: the same picture whatever the machine does, merging, stopping, bad scenes, the reference scene.
+#![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
 use rayon::prelude::*;
 use ridgewatch::field::Domain;
@@ -190,6 +191,25 @@ fn a_scene_can_be_edited_between_frames() {
 }
 
 #[test]
+fn values_known_from_elsewhere_tighten_the_first_frame() {
+    let first_frame = |told: bool| {
+        let mut renderer = Renderer::new(waves(32, 16), &gyre_box(), 1.0).unwrap();
+        if told {
+            // A table of 200x100x10 nodes.
+            let points: Vec<[f32; 3]> =
+                (0..200_000).map(|i| [(i % 200) as f32 / 100.0, (i / 200 % 100) as f32 / 100.0, (i / 20_000) as f32 / 10.0]).collect();
+            let (mut log_stretch, mut traced) = (vec![0.0; points.len()], vec![false; points.len()]);
+            Waves.evaluate(&points, &mut log_stretch, &mut traced);
+            renderer.observe(&points, &log_stretch);
+        }
+        renderer.render(0, &mut Waves, 16, None, &NEVER).unwrap().1
+    };
+    let (told, untold) = (first_frame(true), first_frame(false));
+    assert!(told.queries * 3 < untold.queries * 2, "{told:?} against {untold:?}");
+    assert!(told.majorant_exceeded * 200 < told.queries, "{told:?}");
+}
+
+#[test]
 fn tight_and_loose_majorants_draw_the_same_picture() {
     // Late frames of a renderer that has learned against first frames of ones that have not.
     let mut learned = Renderer::new(waves(16, 8), &gyre_box(), 1.0).unwrap();
@@ -225,6 +245,8 @@ fn bad_scenes_name_the_key() {
     };
     assert_eq!(fault(|s| s.settings.width = 0), "`render.width` is 0; accepted: 1 to 16384 pixels");
     assert!(fault(|s| s.settings.height = 20_000).starts_with("`render.height` is 20000"));
+    assert!(fault(|s| (s.settings.width, s.settings.height) = (16_384, 16_384)).contains("pixels in all"));
+    assert!(fault(|s| s.transfer.extinction = Some(1e9)).starts_with("`transfer.extinction`"));
     assert!(fault(|s| s.settings.samples = 0).starts_with("`render.samples` is 0"));
     assert!(fault(|s| s.settings.tone_map[2] = 0.0).starts_with("`render.tone_map`"));
     assert!(fault(|s| s.settings.background[1] = -1.0).starts_with("`render.background`"));

@@ -52,7 +52,7 @@ impl CameraSettings {
             let needed = (dot(offset, right).abs() / across).max(dot(offset, up).abs() / down);
             distance = distance.max(dot(offset, toward_eye) + needed);
         }
-        let eye = std::array::from_fn(|k| centre[k] + 1.02 * distance * toward_eye[k]);
+        let eye = std::array::from_fn(|k| centre[k] + 1.1 * distance * toward_eye[k]);
         Self { eye, look_at: centre, up: [0.0, 0.0, 1.0], field_of_view, orthographic: false }
     }
 }

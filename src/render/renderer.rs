@@ -65,6 +65,10 @@ impl Renderer {
         let camera = Camera::new(&scene.camera, scene.aspect())?;
         let light = Light::new(&scene.light)?;
         let transfer = Transfer::new(&scene.transfer, scene.shortest_edge(domain))?;
+        // Beyond this, f32 cannot tell one tentative collision from the next, and a flight might never end.
+        let depth = f64::from(transfer.extinction_max()) * scene.diagonal(domain);
+        let deep = "at most an optical depth of 100000 over the box's diagonal";
+        require(depth <= 1e5, "transfer.extinction", transfer.extinction_max(), deep)?;
         let cells = scene.settings.majorant_cells.unwrap_or_else(|| MajorantGrid::default_cells(domain, scene.scale));
         let space = SceneBox::new(domain, scene.scale, cells);
         let majorants = MajorantGrid::new(cells, &transfer);
@@ -85,7 +89,7 @@ impl Renderer {
     /// The same with at most this many flights (rounded up to whole lanes of 1024) in a wave, and so points in a batch. The picture
     /// does not depend on it.
     pub fn with_wave_flights(mut self, flights: usize) -> Self {
-        self.wave_flights = flights.clamp(1, 1 << 24);
+        self.wave_flights = flights.clamp(1, 1 << 22);
         self
     }
 
@@ -117,6 +121,15 @@ impl Renderer {
         }
         *self = next;
         Ok(())
+    }
+
+    /// Tells the majorants of log-stretch values known from elsewhere (a traced table, audit points; domain coordinates), from the next
+    /// frame on. A renderer that has seen nothing makes several times the queries in its first frame.
+    pub fn observe(&self, points: &[[f32; 3]], log_stretch: &[f32]) {
+        for (point, &s) in points.iter().zip(log_stretch) {
+            let cell = self.majorants.cell_at(self.space.grid_of_domain(*point));
+            if s.is_finite() { self.majorants.observe(cell, s * self.per_tau) } else { self.majorants.observe_missing(cell) }
+        }
     }
 
     /// To be called when the window slides: majorants loosen, since the field has changed.
@@ -153,7 +166,7 @@ impl Renderer {
         if samples.end > LIMIT || samples.start >= samples.end {
             return Err(RenderError::Samples { first: samples.start, end: samples.end, limit: LIMIT });
         }
-        if self.last_frame.is_some_and(|last| last != frame) {
+        if self.last_frame != Some(frame) {
             self.majorants.commit(&self.transfer);
         }
         self.last_frame = Some(frame);

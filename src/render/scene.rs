@@ -6,6 +6,8 @@ use crate::field::Domain;
 
 /// Largest picture edge, in pixels.
 const MAX_EDGE: usize = 16_384;
+/// Largest number of pixels: a film of them takes 3 GB.
+const MAX_PIXELS: usize = 1 << 26;
 /// Largest number of samples a pixel in one call.
 const MAX_SAMPLES: usize = 1 << 24;
 /// Largest number of majorant cells along one axis.
@@ -66,12 +68,20 @@ impl Scene {
         (0..3).map(|k| extent[k] * self.scale[k]).fold(f64::INFINITY, f64::min)
     }
 
+    /// Diagonal of the box, in scene units.
+    pub(super) fn diagonal(&self, domain: &Domain) -> f64 {
+        let extent = domain.extent();
+        super::space::length(std::array::from_fn(|k| extent[k] * self.scale[k]))
+    }
+
     /// Checks what camera, light and transfer function do not check themselves.
     pub(super) fn check(&self, domain: &Domain) -> Result<(), RenderError> {
         let settings = &self.settings;
         let size = "1 to 16384 pixels";
         require((1..=MAX_EDGE).contains(&settings.width), "render.width", settings.width, size)?;
         require((1..=MAX_EDGE).contains(&settings.height), "render.height", settings.height, size)?;
+        let pixels = settings.width * settings.height;
+        require(pixels <= MAX_PIXELS, "render.width", settings.width, "at most 67108864 pixels in all")?;
         require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;

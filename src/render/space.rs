@@ -85,6 +85,13 @@ impl SceneBox {
         std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32))
     }
 
+    /// Grid coordinates of a domain point, within the grid.
+    pub(super) fn grid_of_domain(&self, point: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| {
+            (((f64::from(point[k]) - self.domain_min[k]) / self.cell_extent[k]) as f32).clamp(0.0, self.cells[k] as f32)
+        })
+    }
+
     /// Cells per scene length along a scene direction.
     #[inline]
     pub(super) fn grid_direction(&self, direction: [f64; 3]) -> [f32; 3] {

@@ -174,11 +174,6 @@ impl<'a> Checkpoint<'a> {
             .ok_or_else(|| self.mismatch(format!("{key} {}", text.unwrap_or("missing")), format!("{key} as a number")))
     }
 
-    /// A note as text.
-    pub(super) fn note_text(&self, key: &str) -> Result<&str, CheckpointError> {
-        self.text(key).ok_or_else(|| self.mismatch(format!("{key} missing"), format!("{key} as text")))
-    }
-
     /// A tensor of `len` values.
     pub(super) fn values(&self, name: &str, len: usize) -> Result<Vec<f32>, CheckpointError> {
         match self.entries.iter().find(|entry| entry.name == name) {

@@ -126,7 +126,7 @@ impl FusedNetwork for Flex {
             }
             0.0
         };
-        batch.accumulate(shape, &weights, tables_of(&tables, shape), points.len(), |sample| points[sample], given);
+        batch.accumulate(shape, &weights, tables_of(&tables, shape), points.len(), |_| {}, |sample| points[sample], given);
         let mut d_layers = vec![0.0; layers.len()];
         batch.layer_gradient(shape, &mut d_layers);
         let mut d_tables = vec![0.0; tables.len()];

@@ -266,7 +266,7 @@ impl Batch {
         Self { chunks, layout, groups, run }
     }
 
-    /// Forward and backward over `count` samples. `loss` sees the first sample's number, the number of samples, the distance of two groups in
+    /// Forward and backward over `count` samples. `announce` is called for every sample one tile before `point` is. `loss` sees the first sample's number, the number of samples, the distance of two groups in
     /// rows, the outputs and the gradient to write (rows of [`OUT`]); it returns the tile's share of the loss. The sum of all shares comes back.
     pub(super) fn accumulate(
         &mut self,
@@ -274,6 +274,7 @@ impl Batch {
         weights: &Weights,
         tables: &[f32],
         count: usize,
+        announce: impl Fn(usize) + Sync,
         point: impl Fn(usize) -> [f32; 3] + Sync,
         loss: impl Fn(usize, usize, usize, &[f32], &mut [f32]) -> f64 + Sync,
     ) -> f64 {
@@ -286,8 +287,12 @@ impl Batch {
             chunk.loss = 0.0;
             chunk.gradient.fill(0.0);
             let scratch = &mut chunk.scratch;
+            let end = begin + chunk.count;
+            (begin..end.min(begin + scratch.samples)).for_each(&announce);
             for first in (0..chunk.count).step_by(scratch.samples) {
                 let take = (chunk.count - first).min(scratch.samples);
+                let next = begin + first + scratch.samples;
+                (next..end.min(next + scratch.samples)).for_each(&announce);
                 scratch.forward(shape, weights, tables, take, |sample| point(begin + first + sample));
                 chunk.loss += loss(begin + first, take, scratch.samples, &scratch.outputs, &mut scratch.d_outputs);
                 scratch.backward(shape, weights, layout, take, &mut chunk.gradient);

@@ -62,6 +62,8 @@ pub struct Fused {
     weights: Weights,
     table_gradient: Aligned,
     layer_gradient: Vec<f32>,
+    /// Numbers of the samples of the present batch.
+    drawn: Vec<u32>,
     size: usize,
 }
 
@@ -89,6 +91,7 @@ impl Fused {
             weights: Weights::new(shape, &model.layers(), true),
             table_gradient: Aligned::zeros(shape.table_entries() * shape.features),
             layer_gradient: vec![0.0; shape.layer_parameters()],
+            drawn: Vec::with_capacity(size),
             size,
         }
     }
@@ -119,7 +122,10 @@ impl Fused {
         self.weights.fill(shape, loan.layers.parameters());
         let tables = loan.tables.as_ref().map_or(&[][..], |tables| tables.parameters());
         let (samples, pick, count) = (step.samples, step.pick, step.count);
-        let index = |position: usize| pick.index(position, samples.len());
+        self.drawn.clear();
+        self.drawn.extend((0..count).map(|position| pick.index(position, samples.len()) as u32));
+        let drawn = &self.drawn[..];
+        let index = |position: usize| drawn[position] as usize;
         let (penalty, slope) = mean_penalty(shape, objective, &self.weights, tables, count, samples, index);
         let outputs = shape.outputs();
         let groups = if objective.derivatives() { 1 + shape.dimensions() } else { 1 };
@@ -142,7 +148,15 @@ impl Fused {
             }
             sum
         };
-        penalty + self.batch.accumulate(shape, &self.weights, tables, count, |position| samples.points[index(position)], loss)
+        // Drawn samples lie anywhere in a pool far larger than the caches: each would be waited for.
+        let announce = |position: usize| {
+            prefetch(&samples.points, index(position));
+            prefetch(&samples.log_stretch, index(position));
+            prefetch(&samples.arrival, index(position));
+            prefetch(&samples.jacobian, index(position));
+        };
+        let point = |position: usize| samples.points[index(position)];
+        penalty + self.batch.accumulate(shape, &self.weights, tables, count, announce, point, loss)
     }
 
     /// Scatters the gradient into the tables, level by level (each level belongs to one task, so nothing is shared), and applies Adam.
@@ -183,6 +197,19 @@ impl Fused {
         };
         rayon::join(update_tables, update_layers);
     }
+}
+
+/// Asks for `values[index]` to be brought into the cache.
+#[inline(always)]
+fn prefetch<T>(values: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(value) = values.get(index) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a prefetch reads nothing and faults on nothing; the address is that of a live value.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (values, index);
 }
 
 /// Cuts `len` values off the front.
