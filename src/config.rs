@@ -94,12 +94,13 @@ impl SceneFile {
     /// A scene for files given by name alone: every default.
     pub fn for_archive(files: Vec<PathBuf>, overrides: &[String]) -> Result<Self, ConfigError> {
         let origin = Path::new("(command line)");
-        let mut scene = Self::parse(origin, "[source]\nkind = \"archive\"\n", &[])?;
+        let text = "[source]\nkind = \"archive\"\n";
+        let mut scene: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(origin, text, &e))?;
         scene.archive.files = files;
         if !overrides.is_empty() {
             scene = Self::overridden(&scene, overrides)?;
-            validate::check(&scene).map_err(|fault| fault.locate(origin, "", overrides))?;
         }
+        validate::check(&scene).map_err(|fault| fault.locate(origin, "", overrides))?;
         Ok(scene)
     }
 

@@ -189,8 +189,11 @@ pub trait Tracer: Send + Sync {
     fn tau(&self) -> f64;
     /// Runge-Kutta steps a path gets.
     fn steps(&self) -> usize;
-    /// Whether a seed lies where the velocity is missing at its start time (land): it has no FTLE.
-    fn is_void(&self, seed: [f32; 3]) -> bool;
+    /// Whether a seed lies where the velocity is missing at its start time (land): it has no FTLE. Closed forms
+    /// have velocity everywhere.
+    fn is_void(&self, _seed: [f32; 3]) -> bool {
+        false
+    }
     /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
 }

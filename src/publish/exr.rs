@@ -143,6 +143,8 @@ mod tests {
             traced: layer(0.01),
             variance: layer(1e-6),
             samples: vec![16.0; pixels],
+            missing: layer(0.02),
+            queries: layer(3.0),
         }
     }
 
@@ -161,6 +163,7 @@ mod tests {
         // Through the bits, since NaN marks pixels without a collision.
         assert_eq!(bits(&back.ftle_mean), bits(&film.ftle_mean));
         assert_eq!((&back.traced, &back.variance, &back.samples), (&film.traced, &film.variance, &film.samples));
+        assert_eq!((&back.missing, &back.queries), (&film.missing, &film.queries));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file stays");
     }
 
@@ -171,7 +174,7 @@ mod tests {
         let meta = MetaData::read_from_buffered(Cursor::new(&bytes), true).unwrap();
         assert_eq!(meta.headers.len(), 1);
         let names: Vec<String> = meta.headers[0].channels.list.iter().map(|c| c.name.to_string()).collect();
-        assert_eq!(names, ["A", "B", "G", "R", "ftle.mean", "samples.count", "trust.traced", "variance"]);
+        assert_eq!(names, ["A", "B", "G", "R", "ftle.mean", "missing.share", "queries.count", "samples.count", "trust.traced", "variance"]);
         let other = &meta.headers[0].own_attributes.other;
         assert_eq!(other.get(&Text::from("ridgewatch.time")), Some(&AttributeValue::F64(1.5)));
         let AttributeValue::Text(json) = &other[&Text::from("ridgewatch.record")] else { panic!("text") };
