@@ -12,6 +12,7 @@ pub mod field;
 pub mod flow;
 pub mod publish;
 pub mod render;
+pub mod simd;
 pub mod source;
 pub mod surrogate;
 pub mod trust;

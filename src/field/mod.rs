@@ -9,6 +9,7 @@ mod snapshot;
 mod window;
 
 pub mod analytic;
+pub mod turbulence;
 
 pub use axis::{Axis, AxisFault};
 pub use domain::Domain;

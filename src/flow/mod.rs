@@ -7,6 +7,25 @@ use crate::field::{Domain, Window, analytic::Analytic};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
+mod assemble;
+mod axis_map;
+mod dormand_prince;
+mod error;
+mod grid_flow;
+mod resolution;
+mod rk4;
+mod sampler;
+mod sphere;
+mod steps;
+mod stretch;
+mod tracer;
+mod velocity;
+
+pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
+pub use error::FlowError;
+pub use resolution::{TimeResolution, time_resolution};
+pub use tracer::Order;
+
 /// Which way particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -143,6 +162,8 @@ pub struct Extras {
 pub struct Traced {
     /// Log-stretch s = ln sigma_max(J), no unit; FTLE = s / |tau| (see [`Normalisation`], which is already applied).
     pub log_stretch: Vec<f32>,
+    /// The same unrounded; filled when the integration is in double precision, otherwise empty.
+    pub log_stretch_f64: Vec<f64>,
     /// Share of |tau| that the particle lived, in [0, 1].
     pub lived: Vec<f32>,
     /// Arrival positions; empty unless asked for.

@@ -1,0 +1,221 @@
+//! From a description of a flow map to the kernel that is compiled for it.
+
+use super::grid_flow::GridFlow;
+use super::sphere::SphereFlow;
+use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
+use super::velocity::{Chart, Closed, Velocity};
+use super::{FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
+use crate::field::analytic::{ClosedForm, Form};
+use crate::field::{Domain, Geometry, Window};
+use crate::simd::{Gather, Lanes};
+use std::marker::PhantomData;
+use wide::{f32x8, f64x4};
+
+/// Makes the CPU's tracer for seeds at time `t0`.
+///
+/// # Errors
+/// A number out of range, a window that does not cover the integration, or a combination that has no meaning; see [`FlowError`].
+pub fn cpu_tracer(source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, FlowError> {
+    tracer_in_order(source, map, t0, Order::Auto)
+}
+
+/// [`cpu_tracer`] with a choice of order, for measurements.
+pub fn tracer_in_order(source: VelocitySource, map: &FlowMap, t0: f64, order: Order) -> Result<Box<dyn Tracer>, FlowError> {
+    Assembly::new(source, map, t0, order)?.build::<f32x8, f64x4>()
+}
+
+/// [`cpu_tracer`] without vectors, one sample at a time, for measurements.
+pub fn scalar_tracer(source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, FlowError> {
+    Assembly::new(source, map, t0, Order::Auto)?.build::<f32, f64>()
+}
+
+/// What all kinds of tracer are made from.
+struct Assembly<'a> {
+    source: VelocitySource,
+    domain: Domain,
+    map: &'a FlowMap,
+    from: f64,
+    to: f64,
+    order: Order,
+}
+
+fn positive(key: &'static str, value: f64) -> Result<(), FlowError> {
+    if value.is_finite() && value > 0.0 {
+        Ok(())
+    } else {
+        Err(FlowError::OutOfRange { key, found: value, accepted: "a finite number above 0" })
+    }
+}
+
+impl<'a> Assembly<'a> {
+    fn new(source: VelocitySource, map: &'a FlowMap, t0: f64, order: Order) -> Result<Self, FlowError> {
+        positive("tau", map.tau)?;
+        match map.steps {
+            Steps::Auto { tolerance } => positive("steps.tolerance", tolerance)?,
+            Steps::Fixed(0) => return Err(FlowError::OutOfRange { key: "steps", found: 0.0, accepted: "1 or more" }),
+            Steps::Fixed(_) => {}
+        }
+        if !t0.is_finite() {
+            return Err(FlowError::OutOfRange { key: "t0", found: t0, accepted: "a finite time" });
+        }
+        let to = t0 + map.direction.sign() * map.tau;
+        let domain = match &source {
+            VelocitySource::Analytic(_, domain) => domain.clone(),
+            VelocitySource::Window(window) => covering(window, t0.min(to), t0.max(to))?,
+        };
+        if map.integrator == Integrator::Differences {
+            positive("gap", map.gap)?;
+            if map.precision == Precision::F32 {
+                let used = 0..domain.dimensions;
+                let coordinate = used.flat_map(|k| [domain.min[k].abs(), domain.max[k].abs()]).fold(0.0, f64::max);
+                let least = coordinate * f64::from(f32::EPSILON);
+                if map.gap < least {
+                    return Err(FlowError::GapVanishes { gap: map.gap, precision: map.precision, coordinate, least });
+                }
+            }
+        }
+        Ok(Self { source, domain, map, from: t0, to, order })
+    }
+
+    fn build<S: Gather<Real = f32>, D: Gather<Real = f64>>(self) -> Result<Box<dyn Tracer>, FlowError> {
+        match &self.source {
+            VelocitySource::Analytic(flow, domain) => {
+                if flow.dimensions() != domain.dimensions {
+                    return Err(FlowError::Dimensions { flow: flow.dimensions(), domain: domain.dimensions });
+                }
+                match flow.form() {
+                    Form::DoubleGyre(form) => self.closed::<_, S, D, 2>(form),
+                    Form::Abc(form) => self.closed::<_, S, D, 3>(form),
+                    Form::Linear(form) => self.closed::<_, S, D, 2>(form),
+                }
+            }
+            VelocitySource::Window(window) => {
+                let window = window.clone();
+                let grid = window.grid().ok_or_else(|| too_short(&window, self.from, self.to))?.clone();
+                let (policy, interpolation) = (self.map.boundary, self.map.interpolation);
+                match (grid.geometry, grid.dimensions()) {
+                    (Geometry::Cartesian, 2) => self.kernel::<_, _, S, D, 2, 2>(
+                        || GridFlow::<f32, 2>::new(&window, &grid, policy, interpolation),
+                        || GridFlow::<f64, 2>::new(&window, &grid, policy, interpolation),
+                    ),
+                    (Geometry::Cartesian, _) => self.kernel::<_, _, S, D, 3, 3>(
+                        || GridFlow::<f32, 3>::new(&window, &grid, policy, interpolation),
+                        || GridFlow::<f64, 3>::new(&window, &grid, policy, interpolation),
+                    ),
+                    (Geometry::Sphere { radius }, 2) => {
+                        positive("radius", radius)?;
+                        self.kernel::<_, _, S, D, 3, 2>(
+                            || SphereFlow::<f32>::new(&window, &grid, radius, policy, interpolation),
+                            || SphereFlow::<f64>::new(&window, &grid, radius, policy, interpolation),
+                        )
+                    }
+                    (Geometry::Sphere { .. }, axes) => Err(FlowError::SphereAxes { axes }),
+                }
+            }
+        }
+    }
+
+    fn closed<F: ClosedForm<N>, S: Lanes<Real = f32>, D: Lanes<Real = f64>, const N: usize>(
+        &self,
+        form: F,
+    ) -> Result<Box<dyn Tracer>, FlowError> {
+        self.kernel::<_, _, S, D, N, N>(
+            || Ok(Closed::<F, f32, N>::new(form, &self.domain, self.map.boundary)),
+            || Ok(Closed::<F, f64, N>::new(form, &self.domain, self.map.boundary)),
+        )
+    }
+
+    /// Picks precision and integrator.
+    fn kernel<V32, V64, S, D, const N: usize, const C: usize>(
+        &self,
+        single: impl FnOnce() -> Result<V32, FlowError>,
+        double: impl Fn() -> Result<V64, FlowError>,
+    ) -> Result<Box<dyn Tracer>, FlowError>
+    where
+        S: Lanes,
+        D: Lanes<Real = f64>,
+        V32: Velocity<S, N, C> + 'static,
+        V64: Velocity<D, N, C> + Velocity<f64, N, C> + 'static,
+    {
+        let (from, to) = (self.from, self.to);
+        if self.map.integrator == Integrator::DormandPrince {
+            let kernel = AdaptiveKernel { from, to, tolerance: dormand_prince::TOLERANCE };
+            return Ok(Box::new(self.tracer::<_, _, f64, N, C>(double()?, kernel)));
+        }
+        let count = match self.map.steps {
+            Steps::Fixed(steps) => steps,
+            Steps::Auto { tolerance } => {
+                // Rounding must not decide, so steps are chosen in double precision.
+                let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
+                let intervals = intervals(Chart::breaks(&tracer.field), from, to);
+                steps::choose(tolerance, intervals, &self.domain, |steps, points, out| {
+                    tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
+                    tracer.trace(points, super::Extras::default(), out);
+                })?
+            }
+        };
+        match self.map.precision {
+            Precision::F32 => Ok(self.fixed::<V32, S, N, C>(single()?, count)),
+            Precision::F64 => Ok(self.fixed::<V64, D, N, C>(double()?, count)),
+        }
+    }
+
+    fn fixed<V, L, const N: usize, const C: usize>(&self, field: V, steps: usize) -> Box<dyn Tracer>
+    where
+        L: Lanes,
+        V: Velocity<L, N, C> + 'static,
+    {
+        let stages = Stages::new::<V, L, N, C>(&field, self.from, self.to, steps);
+        if self.map.integrator == Integrator::Differences {
+            Box::new(self.tracer::<_, _, L, N, C>(field, DifferencesKernel(stages, self.map.gap)))
+        } else {
+            Box::new(self.tracer::<_, _, L, N, C>(field, TangentKernel(stages)))
+        }
+    }
+
+    fn tracer<V, K, L, const N: usize, const C: usize>(&self, field: V, kernel: K) -> CpuTracer<K, V, L, N, C>
+    where
+        L: Lanes,
+        K: Kernel<V, L, N, C>,
+    {
+        CpuTracer {
+            field,
+            kernel,
+            domain: self.domain.clone(),
+            tau: self.map.tau,
+            boundary: self.map.boundary,
+            normalisation: self.map.normalisation,
+            order: self.order,
+            lanes: PhantomData,
+        }
+    }
+}
+
+fn too_short(window: &Window, from: f64, to: f64) -> FlowError {
+    let present = window.snapshots().len();
+    let covered = window.oldest().zip(window.newest());
+    let (from, to) = (from.min(to), from.max(to));
+    let needed = match covered {
+        Some((first, last)) if present > 1 => ((to - from) / ((last - first) / (present - 1) as f64)).ceil() as usize + 1,
+        _ => 2,
+    };
+    FlowError::WindowTooShort { from, to, needed, present, covered }
+}
+
+/// The grid's domain, when the snapshots reach from `from` to `to`.
+fn covering(window: &Window, from: f64, to: f64) -> Result<Domain, FlowError> {
+    let slack = (to - from) * 1e-9;
+    match (window.grid(), window.oldest(), window.newest()) {
+        (Some(grid), Some(first), Some(last)) if window.snapshots().len() > 1 && first <= from + slack && last >= to - slack => {
+            Ok(grid.domain())
+        }
+        _ => Err(too_short(window, from, to)),
+    }
+}
+
+/// Snapshot intervals that the integration touches; 0 for closed forms.
+fn intervals(times: &[f64], from: f64, to: f64) -> usize {
+    let (from, to) = (from.min(to), from.max(to));
+    let slack = (to - from) * 1e-9;
+    times.windows(2).filter(|w| w[1] > from + slack && w[0] < to - slack).count()
+}

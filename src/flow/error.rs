@@ -1,0 +1,84 @@
+//! Why a flow map cannot be traced.
+
+use super::{Boundary, Precision};
+use thiserror::Error;
+
+/// Why no tracer was made.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum FlowError {
+    /// A number of the flow map is out of range.
+    #[error("`{key}` is {found}; accepted: {accepted}")]
+    OutOfRange {
+        /// Its name.
+        key: &'static str,
+        /// What it is.
+        found: f64,
+        /// What is accepted.
+        accepted: &'static str,
+    },
+    /// The snapshots do not reach far enough.
+    #[error(
+        "tracing from {from} to {to} needs about {needed} snapshots that cover this span; there are {present}{}",
+        covered.map_or(String::new(), |(first, last)| format!(", from {first} to {last}"))
+    )]
+    WindowTooShort {
+        /// Earlier end of the integration.
+        from: f64,
+        /// Later end of the integration.
+        to: f64,
+        /// Snapshots needed at the spacing of those present (2 where that is unknown).
+        needed: usize,
+        /// Snapshots present.
+        present: usize,
+        /// First and last time present.
+        covered: Option<(f64, f64)>,
+    },
+    /// Snapshots end where the grid ends.
+    #[error("boundary `{boundary:?}` is for closed-form flows; gridded velocity accepts Stop, Clamp, Periodic or Zero")]
+    NotOnGrids {
+        /// What was asked for.
+        boundary: Boundary,
+    },
+    /// Neighbouring particles would fall on the same number.
+    #[error("`gap` {gap} vanishes in {precision:?} beside coordinates of {coordinate}; at least {least} or F64 is needed")]
+    GapVanishes {
+        /// What was asked for.
+        gap: f64,
+        /// Floating-point type.
+        precision: Precision,
+        /// Largest coordinate of the domain.
+        coordinate: f64,
+        /// Smallest gap that survives.
+        least: f64,
+    },
+    /// The closed form and the box disagree.
+    #[error("the flow varies along {flow} axes, its domain along {domain}")]
+    Dimensions {
+        /// Axes of the flow.
+        flow: usize,
+        /// Axes of the domain.
+        domain: usize,
+    },
+    /// Three-dimensional flow on the sphere.
+    #[error("sphere metric is for two axes (longitude, latitude); the grid has {axes}")]
+    SphereAxes {
+        /// Axes found.
+        axes: usize,
+    },
+    /// Node indices are 32-bit.
+    #[error("the grid has {nodes} nodes; at most {} are accepted", u32::MAX)]
+    GridTooLarge {
+        /// Nodes found.
+        nodes: usize,
+    },
+    /// No number of steps was enough.
+    #[error("{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}")]
+    StepsNotFound {
+        /// Most steps tried.
+        steps: usize,
+        /// Difference reached.
+        reached: f64,
+        /// Difference asked for.
+        tolerance: f64,
+    },
+}

@@ -1,0 +1,104 @@
+//! Whether the snapshots follow one another closely enough.
+
+use super::{FlowError, FlowMap, Extras, Traced, VelocitySource, assemble::cpu_tracer, steps};
+use crate::field::{Geometry, Grid, Snapshot, Window};
+use rayon::prelude::*;
+use std::sync::Arc;
+
+/// How far the flow goes, and how much the FTLE changes, between snapshots.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct TimeResolution {
+    /// Root mean square displacement between snapshots, in cells, over nodes with a known velocity.
+    pub displacement_rms: f64,
+    /// Largest displacement between snapshots, in cells.
+    pub displacement_max: f64,
+    /// Root mean square change of the FTLE (1/time) on a few thousand points when every second snapshot is dropped; none with fewer
+    /// than three snapshots.
+    pub ftle_change: Option<f64>,
+    /// Root mean square of the FTLE (1/time) on the same points, to compare with.
+    pub ftle_rms: f64,
+}
+
+/// Points on which the change is measured.
+const POINTS: usize = 2048;
+/// Degrees from a pole within which a cell's width says nothing.
+const POLAR: f64 = 1.0;
+
+/// Measures a window's time resolution for a flow map.
+///
+/// # Errors
+/// As [`cpu_tracer`].
+pub fn time_resolution(window: &Arc<Window>, map: &FlowMap, t0: f64) -> Result<TimeResolution, FlowError> {
+    let tracer = cpu_tracer(VelocitySource::Window(window.clone()), map, t0)?;
+    let points = steps::points(tracer.domain(), POINTS);
+    let mut all = Traced::default();
+    tracer.trace(&points, Extras::default(), &mut all);
+    let finite: Vec<f64> = all.log_stretch.iter().map(|s| f64::from(*s)).filter(|s| s.is_finite()).collect();
+    let ftle_rms = (finite.iter().map(|s| s * s).sum::<f64>() / finite.len().max(1) as f64).sqrt() / map.tau;
+
+    let count = window.snapshots().len();
+    let mut ftle_change = None;
+    if count > 2 {
+        let mut thinned = Window::new(window.span().max(map.tau));
+        for (index, snapshot) in window.snapshots().enumerate() {
+            // The last one stays, so that the window still covers the integration. They came from a window: none is refused.
+            if index % 2 == 0 || index + 1 == count {
+                let pushed = thinned.push(snapshot.clone());
+                debug_assert!(pushed.is_ok());
+            }
+        }
+        let mut half = Traced::default();
+        cpu_tracer(VelocitySource::Window(Arc::new(thinned)), map, t0)?.trace(&points, Extras::default(), &mut half);
+        ftle_change = Some(steps::difference(&all, &half) / map.tau);
+    }
+
+    let snapshots: Vec<&Arc<Snapshot>> = window.snapshots().collect();
+    let (mut squares, mut nodes, mut largest) = (0.0, 0usize, 0.0f64);
+    for pair in snapshots.windows(2) {
+        let (sum, known, most) = displacements(pair[0], pair[1].time - pair[0].time);
+        (squares, nodes, largest) = (squares + sum, nodes + known, largest.max(most));
+    }
+    Ok(TimeResolution {
+        displacement_rms: (squares / nodes.max(1) as f64).sqrt(),
+        displacement_max: largest.sqrt(),
+        ftle_change,
+        ftle_rms,
+    })
+}
+
+/// Sum of the squared displacements in cells during `interval`, number of known nodes, largest squared displacement.
+fn displacements(snapshot: &Snapshot, interval: f64) -> (f64, usize, f64) {
+    let grid: &Grid = &snapshot.grid;
+    let [nx, ny, _] = grid.shape();
+    let at = |i: usize| [i % nx, i / nx % ny, i / nx / ny];
+    // The smaller of the two cells at a node.
+    let cell = |axis: usize, index: usize| {
+        let c = grid.axes[axis].coordinates();
+        let behind = if index > 0 { c[index] - c[index - 1] } else { f64::INFINITY };
+        let ahead = if index + 1 < c.len() { c[index + 1] - c[index] } else { f64::INFINITY };
+        behind.min(ahead)
+    };
+    snapshot
+        .nodes
+        .par_iter()
+        .enumerate()
+        .filter(|(_, node)| !node[3].is_nan())
+        .filter_map(|(i, node)| {
+            let place = at(i);
+            let v = [0, 1, 2].map(|c| f64::from(node[c]) * interval);
+            match grid.geometry {
+                Geometry::Cartesian => Some((0..grid.dimensions()).map(|k| (v[k] / cell(k, place[k])).powi(2)).sum::<f64>()),
+                Geometry::Sphere { radius } => {
+                    let (longitude, latitude) = (grid.axes[0].coordinates()[place[0]], grid.axes[1].coordinates()[place[1]]);
+                    let (sin_lon, cos_lon) = longitude.to_radians().sin_cos();
+                    let cos_lat = latitude.to_radians().cos();
+                    let east = v[1] * cos_lon - v[0] * sin_lon;
+                    let north_squared = (v.iter().map(|c| c * c).sum::<f64>() - east * east).max(0.0);
+                    let (width, height) = (cell(0, place[0]).to_radians() * radius * cos_lat, cell(1, place[1]).to_radians() * radius);
+                    (latitude.abs() < 90.0 - POLAR).then(|| (east / width).powi(2) + north_squared / (height * height))
+                }
+            }
+        })
+        .map(|square| (square, 1, square))
+        .reduce(|| (0.0, 0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1, a.2.max(b.2)))
+}

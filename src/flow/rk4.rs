@@ -1,0 +1,215 @@
+//! Runge-Kutta of order 4 with fixed steps: path and tangent together, and neighbouring paths for central differences.
+
+use super::stretch::{log_stretch, rescale};
+use super::velocity::Velocity;
+use crate::simd::{Lanes, Mask, Real};
+
+/// Where a batch of particles ended, one a lane.
+pub struct Paths<L: Lanes, const D: usize, const C: usize> {
+    /// ln of the largest singular value.
+    pub log_stretch: L,
+    /// Share of |tau| lived.
+    pub lived: L,
+    /// Which left the domain.
+    pub left: L::Mask,
+    /// Final state.
+    pub state: [L; D],
+    /// Gradient of the flow map between orthonormal bases, times 2^-exponent.
+    pub metric: [[L; C]; C],
+    /// See `metric`.
+    pub exponent: L,
+}
+
+/// Most lanes of a kernel.
+pub const MAX_LANES: usize = 16;
+
+/// Makes lanes of one value a point; the last point fills up.
+#[inline(always)]
+pub fn lanes_of<L: Lanes, const N: usize, P: Copy>(points: &[P], f: impl Fn(P) -> [f64; N]) -> [L; N] {
+    let mut rows = [[0.0; N]; MAX_LANES];
+    for lane in 0..L::LANES {
+        rows[lane] = if lane < points.len() { f(points[lane]) } else { rows[lane - 1] };
+    }
+    std::array::from_fn(|n| L::from_fn(|lane| L::Real::from_f64(rows[lane][n])))
+}
+
+/// a * b + c for every component.
+#[inline(always)]
+fn along<L: Lanes, const D: usize>(h: L, k: &[L; D], x: &[L; D]) -> [L; D] {
+    std::array::from_fn(|i| h.mul_add(k[i], x[i]))
+}
+
+#[inline(always)]
+fn along_tangent<L: Lanes, const C: usize, const D: usize>(h: L, k: &[[L; C]; D], m: &[[L; C]; D]) -> [[L; C]; D] {
+    std::array::from_fn(|i| along(h, &k[i], &m[i]))
+}
+
+/// Which particles go on, and how long the others lived.
+struct Fates<L: Lanes> {
+    alive: L::Mask,
+    left: L::Mask,
+    steps: L,
+}
+
+impl<L: Lanes> Fates<L> {
+    fn new(inside: L::Mask, steps: usize) -> Self {
+        Self { alive: inside, left: !inside, steps: L::select(inside, L::of(steps as f64), L::zero()) }
+    }
+
+    /// Takes a step's verdict; true when all go on.
+    #[inline(always)]
+    fn judge(&mut self, step: usize, inside: L::Mask, known: L::Mask) -> bool {
+        let on = inside & known;
+        if on.all() & self.alive.all() {
+            return true;
+        }
+        let died = self.alive & !on;
+        self.steps = L::select(died, L::of(step as f64), self.steps);
+        self.left = self.left | (died & !inside);
+        self.alive = self.alive & on;
+        false
+    }
+}
+
+/// Integrates path and tangent. `stages` holds the times t0, t0 + h/2, t0 + h, ...: two a step and one more. A step whose end lies
+/// outside, or that meets a missing cell, is not taken: the particle stops with the stretch it has.
+///
+/// The tangent goes through the same four stages as the path, hence it is the exact gradient of the discrete flow map.
+#[inline(never)]
+pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
+    field: &V,
+    stages: &[V::Stage],
+    step: f64,
+    points: &[[f32; 3]],
+) -> Paths<L, D, C> {
+    let steps = stages.len() / 2;
+    let (h, half, sixth, two) = (L::of(step), L::of(step / 2.0), L::of(step / 6.0), L::of(2.0));
+    let mut x: [L; D] = lanes_of(points, |p| field.start(p.map(f64::from)));
+    let mut m: [[L; C]; D] = {
+        let columns: [[L; D]; C] = std::array::from_fn(|c| {
+            lanes_of(points, |p| {
+                let tangent = field.first_tangent(p.map(f64::from));
+                std::array::from_fn(|i| tangent[i][c])
+            })
+        });
+        std::array::from_fn(|i| std::array::from_fn(|c| columns[c][i]))
+    };
+    let mut exponent = L::zero();
+    let mut fates = Fates::<L>::new(field.inside(&x), steps);
+    for n in 0..steps {
+        let (first, middle, last) = (&stages[2 * n], &stages[2 * n + 1], &stages[2 * n + 2]);
+        let (k, g, mark1) = field.tangent(first, &x, &m);
+        let (mut sum, mut sums) = (k, g);
+        let (k, g, mark2) = field.tangent(middle, &along(half, &k, &x), &along_tangent(half, &g, &m));
+        sum = along(two, &k, &sum);
+        sums = along_tangent(two, &g, &sums);
+        let (k, g, mark3) = field.tangent(middle, &along(half, &k, &x), &along_tangent(half, &g, &m));
+        sum = along(two, &k, &sum);
+        sums = along_tangent(two, &g, &sums);
+        let (k, g, mark4) = field.tangent(last, &along(h, &k, &x), &along_tangent(h, &g, &m));
+        let mut end = std::array::from_fn(|i| sixth.mul_add(sum[i] + k[i], x[i]));
+        let mut tangent =
+            std::array::from_fn(|i| std::array::from_fn(|c| sixth.mul_add(sums[i][c] + g[i][c], m[i][c])));
+        field.settle_tangent(&mut end, &mut tangent);
+
+        let known = if V::MARKS { (mark1 + mark2 + (mark3 + mark4)).is_number() } else { L::Mask::splat(true) };
+        if fates.judge(n, field.inside(&end), known) {
+            (x, m) = (end, tangent);
+        } else {
+            if !fates.alive.any() {
+                break;
+            }
+            x = std::array::from_fn(|i| L::select(fates.alive, end[i], x[i]));
+            m = std::array::from_fn(|i| std::array::from_fn(|c| L::select(fates.alive, tangent[i][c], m[i][c])));
+        }
+        rescale(&mut m, &mut exponent);
+    }
+    let metric = field.metric(&x, &m);
+    let log_stretch = exponent.mul_add(L::of(std::f64::consts::LN_2), log_stretch(&metric));
+    Paths { log_stretch, lived: fates.steps * L::of(1.0 / steps as f64), left: fates.left, state: x, metric, exponent }
+}
+
+/// One step of one particle; its end and its mark.
+#[inline(always)]
+fn advance<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
+    field: &V,
+    stages: &[V::Stage],
+    step: [L; 4],
+    x: &[L; D],
+) -> ([L; D], L) {
+    let [h, half, sixth, two] = step;
+    let (k, mark1) = field.velocity(&stages[0], x);
+    let mut sum = k;
+    let (k, mark2) = field.velocity(&stages[1], &along(half, &k, x));
+    sum = along(two, &k, &sum);
+    let (k, mark3) = field.velocity(&stages[1], &along(half, &k, x));
+    sum = along(two, &k, &sum);
+    let (k, mark4) = field.velocity(&stages[2], &along(h, &k, x));
+    let mut end = std::array::from_fn(|i| sixth.mul_add(sum[i] + k[i], x[i]));
+    field.settle(&mut end);
+    (end, mark1 + mark2 + (mark3 + mark4))
+}
+
+/// Integrates two particles an axis, `gap` coordinate units before and behind the seed, and takes central differences. All stop
+/// as soon as one of them does.
+#[inline(never)]
+pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
+    field: &V,
+    stages: &[V::Stage],
+    step: f64,
+    gap: f64,
+    points: &[[f32; 3]],
+) -> Paths<L, D, C> {
+    let steps = stages.len() / 2;
+    let factors = [L::of(step), L::of(step / 2.0), L::of(step / 6.0), L::of(2.0)];
+    let mut pairs: [[[L; D]; 2]; C] = std::array::from_fn(|axis| {
+        [gap, -gap].map(|offset| {
+            lanes_of(points, |p| {
+                let mut p = p.map(f64::from);
+                p[axis] += offset;
+                field.start(p)
+            })
+        })
+    });
+    let all_inside = |pairs: &[[[L; D]; 2]; C]| {
+        pairs.iter().flatten().fold(L::Mask::splat(true), |inside, x| inside & field.inside(x))
+    };
+    let mut fates = Fates::<L>::new(all_inside(&pairs), steps);
+    for n in 0..steps {
+        let mut mark = L::zero();
+        let mut ends = pairs;
+        for end in ends.iter_mut().flatten() {
+            let (there, its_mark) = advance(field, &stages[2 * n..2 * n + 3], factors, end);
+            *end = there;
+            mark += its_mark;
+        }
+        let known = if V::MARKS { mark.is_number() } else { L::Mask::splat(true) };
+        if fates.judge(n, all_inside(&ends), known) {
+            pairs = ends;
+        } else {
+            if !fates.alive.any() {
+                break;
+            }
+            for (x, end) in pairs.iter_mut().flatten().zip(ends.iter().flatten()) {
+                *x = std::array::from_fn(|i| L::select(fates.alive, end[i], x[i]));
+            }
+        }
+    }
+    let [inverse]: [[L; C]; 1] =
+        [lanes_of(points, |p| std::array::from_fn(|axis| 1.0 / field.separation(p.map(f64::from), axis, gap)))];
+    let m: [[L; C]; D] = std::array::from_fn(|i| std::array::from_fn(|c| (pairs[c][0][i] - pairs[c][1][i]) * inverse[c]));
+    let half = L::of(0.5 / C as f64);
+    let mut state = std::array::from_fn(|i| {
+        pairs.iter().flatten().fold(L::zero(), |sum, x| half.mul_add(x[i], sum))
+    });
+    field.settle(&mut state);
+    let metric = field.metric(&state, &m);
+    Paths {
+        log_stretch: log_stretch(&metric),
+        lived: fates.steps * L::of(1.0 / steps as f64),
+        left: fates.left,
+        state,
+        metric,
+        exponent: L::zero(),
+    }
+}

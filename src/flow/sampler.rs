@@ -1,0 +1,379 @@
+//! Velocity between nodes and snapshots: linear in time, linear or cubic in space, with the exact derivative of that interpolant.
+//!
+//! The hot path reads, for each lane, pairs of nodes that are neighbours along x with one load, interpolates them along t, y and z
+//! as one vector, and turns the pairs of all lanes into lanes before the last interpolation, along x.
+//!
+//! Beyond the end of an axis that does not repeat, the velocity is that at the end (so that a stage of a step may look a little past
+//! it), and its derivative across the end is 0.
+//!
+//! Cubic: along each axis a Hermite cubic whose slopes at the nodes are the central differences of their neighbours (Catmull-Rom),
+//! also for uneven nodes; at an end of the axis the difference is one-sided. All nodes that it reads must be known.
+
+use super::axis_map::{AxisMap, Place};
+use super::{Boundary, FlowError, Interpolation};
+use crate::field::{Grid, Snapshot, Window};
+use crate::simd::{Gather, Lanes, NodePair, Real};
+use std::sync::Arc;
+
+/// A window of snapshots that can be asked for velocities. `N` is the number of grid axes.
+#[derive(Debug, Clone)]
+pub struct Sampler<R, const N: usize> {
+    snapshots: Vec<Arc<Snapshot>>,
+    times: Vec<f64>,
+    pub(crate) axes: [AxisMap<R>; N],
+    /// Factors from node velocities to state units per time; the fourth, of the mark, is 1.
+    rate: [f64; 4],
+    row: usize,
+    plane: usize,
+    interpolation: Interpolation,
+    /// Whether some axis has a cell between its last and its first node.
+    seams: bool,
+}
+
+/// Between which snapshots a time lies, with the weights of both.
+#[derive(Debug, Clone)]
+pub struct GridStage<R> {
+    first: usize,
+    /// The time is that of a snapshot: the next one is not read.
+    single: bool,
+    weights: [[R; 4]; 2],
+}
+
+/// Velocity, its derivatives along each axis, and a mark that is NaN where a node read was missing.
+pub struct Sample<L, const N: usize> {
+    pub velocity: [L; 3],
+    /// `slopes[axis][component]`, per state unit.
+    pub slopes: [[L; 3]; N],
+    pub mark: L,
+}
+
+/// A time this close to a snapshot's, in intervals, is that of the snapshot.
+const SAME_TIME: f64 = 1e-9;
+
+impl<R: Real, const N: usize> Sampler<R, N> {
+    /// Prepares a window. `rate` turns node velocities into state units per time.
+    pub fn new(
+        window: &Window,
+        grid: &Grid,
+        policy: Boundary,
+        interpolation: Interpolation,
+        rate: impl Fn(&[AxisMap<R>; N]) -> [f64; 3],
+    ) -> Result<Self, FlowError> {
+        if policy == Boundary::Unbounded {
+            return Err(FlowError::NotOnGrids { boundary: policy });
+        }
+        if u32::try_from(grid.nodes()).is_err() {
+            return Err(FlowError::GridTooLarge { nodes: grid.nodes() });
+        }
+        let snapshots: Vec<_> = window.snapshots().cloned().collect();
+        // Reading nodes without bounds checks relies on this.
+        assert!(snapshots.iter().all(|s| s.nodes.len() == grid.nodes()), "a snapshot has one velocity a node");
+        let axes: [AxisMap<R>; N] = std::array::from_fn(|k| AxisMap::new(&grid.axes[k], policy));
+        let [nx, ny, _] = grid.shape();
+        let [u, v, w] = rate(&axes);
+        Ok(Self {
+            times: snapshots.iter().map(|s| s.time).collect(),
+            snapshots,
+            rate: [u, v, w, 1.0],
+            row: nx,
+            plane: nx * ny,
+            interpolation,
+            seams: axes.iter().any(|a| a.seam),
+            axes,
+        })
+    }
+
+    /// Times of the snapshots.
+    pub fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    /// Snapshots and weights at a time within the window.
+    pub fn stage(&self, time: f64) -> GridStage<R> {
+        let last = self.times.len() - 1;
+        let mut first = self.times.partition_point(|&t| t <= time).clamp(1, last.max(1)) - 1;
+        let mut weight = 0.0;
+        if first < last {
+            weight = ((time - self.times[first]) / (self.times[first + 1] - self.times[first])).clamp(0.0, 1.0);
+            if weight > 1.0 - SAME_TIME {
+                (first, weight) = (first + 1, 0.0);
+            }
+        }
+        let single = weight < SAME_TIME;
+        if single {
+            weight = 0.0;
+        }
+        let weights = [1.0 - weight, weight].map(|w| {
+            let mut weights = self.rate.map(|rate| R::from_f64(rate * w));
+            weights[3] = R::from_f64(w);
+            weights
+        });
+        GridStage { first, single, weights }
+    }
+
+    /// Morton key of a state's cell; cells are joined where there are too many for 32 bits.
+    pub fn sort_key(&self, state: &[f64; N]) -> u32 {
+        let bits = 32 / N as u32;
+        let mut key = 0u32;
+        for k in 0..N {
+            let cells = f64::from(self.axes[k].last_cell) + 1.0;
+            let share = (state[k] / cells).clamp(0.0, 1.0);
+            // One key an axis cell, or fewer where bits run out.
+            let index = (share * cells.min(f64::from(1u32 << bits) - 1.0)) as u32;
+            for bit in 0..bits {
+                key |= (index >> bit & 1) << (bit * N as u32 + k as u32);
+            }
+        }
+        key
+    }
+
+    /// Velocity and mark.
+    #[inline(always)]
+    pub fn value<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> ([L; 3], L) {
+        let places = std::array::from_fn(|k| self.axes[k].locate(x[k]));
+        match self.interpolation {
+            Interpolation::Linear => {
+                let [pair] = self.linear::<L, 1>(stage, &places);
+                (lerp_x(&pair, places[0].fraction), pair[3] + pair[7])
+            }
+            Interpolation::Cubic => {
+                let [pair] = self.cubic::<L, 1>(stage, &places);
+                (std::array::from_fn(|c| pair[c] + pair[c + 4]), pair[3] + pair[7])
+            }
+        }
+    }
+
+    /// Velocity, derivatives and mark.
+    #[inline(always)]
+    pub fn sample<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> Sample<L, N> {
+        let places: [Place<L>; N] = std::array::from_fn(|k| self.axes[k].locate(x[k]));
+        let mut sample = match self.interpolation {
+            Interpolation::Linear => {
+                // The value, and its derivatives along all axes but x.
+                let pairs = self.linear::<L, N>(stage, &places);
+                let fraction = places[0].fraction;
+                let mut slopes = [[L::zero(); 3]; N];
+                slopes[0] = std::array::from_fn(|c| pairs[0][c + 4] - pairs[0][c]);
+                for k in 1..N {
+                    slopes[k] = lerp_x(&pairs[k], fraction);
+                }
+                let velocity = std::array::from_fn(|c| fraction.mul_add(slopes[0][c], pairs[0][c]));
+                Sample { velocity, slopes, mark: pairs[0][3] + pairs[0][7] }
+            }
+            Interpolation::Cubic => {
+                let pairs = self.cubic::<L, 4>(stage, &places);
+                let joined = |k: usize| std::array::from_fn(|c| pairs[k][c] + pairs[k][c + 4]);
+                Sample { velocity: joined(0), slopes: std::array::from_fn(|k| joined(k + 1)), mark: pairs[0][3] + pairs[0][7] }
+            }
+        };
+        if places.iter().any(|p| p.sloped) {
+            for k in 0..N {
+                sample.slopes[k] = sample.slopes[k].map(|s| s * places[k].slope);
+            }
+        }
+        sample
+    }
+
+    /// Node pairs interpolated along t, y and z (`[0]`), and, where K > 1, their derivatives along y and z.
+    #[inline(always)]
+    fn linear<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
+        if self.seams {
+            self.linear_across_seams(stage, places)
+        } else if stage.single {
+            self.linear_inside::<L, K, true>(stage, places)
+        } else {
+            self.linear_inside::<L, K, false>(stage, places)
+        }
+    }
+
+    #[inline(always)]
+    fn linear_inside<L: Gather<Real = R>, const K: usize, const SINGLE: bool>(
+        &self,
+        stage: &GridStage<R>,
+        places: &[Place<L>; N],
+    ) -> [[L; 8]; K] {
+        let first = self.snapshots[stage.first].nodes.as_ptr();
+        let second = if SINGLE { first } else { self.snapshots[stage.first + 1].nodes.as_ptr() };
+        let weights = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
+        let mut flat = places[N - 1].cell;
+        for k in (0..N - 1).rev() {
+            flat = L::flatten(flat, self.axes[k].nodes, places[k].cell);
+        }
+        let (row, plane) = (self.row, self.plane);
+        L::gather(|lane| {
+            let base = L::cell(&flat, lane) as usize;
+            let fetch = |offset: usize| {
+                // SAFETY: each cell index is at most its axis' number of nodes less 2 (`truncate`, `find`; no axis has a seam here), so
+                // that the cell's nodes, and the ones behind them along x, lie within the snapshot, whose length `new` checked.
+                unsafe {
+                    let a = L::Pair::adjacent(first.add(base + offset)) * weights[0];
+                    if SINGLE { a } else { L::Pair::adjacent(second.add(base + offset)).mul_add(weights[1], a) }
+                }
+            };
+            let y = L::Pair::splat(places[1].fraction.lane(lane));
+            if N == 2 {
+                bilinear::<L::Pair, K>(y, [fetch(0), fetch(row)])
+            } else {
+                let z = L::Pair::splat(places[N - 1].fraction.lane(lane));
+                trilinear::<L::Pair, K>(y, z, [fetch(0), fetch(row), fetch(plane), fetch(plane + row)])
+            }
+        })
+    }
+
+    /// The same where a cell's nodes may lie at opposite ends of an axis.
+    #[inline(never)]
+    fn linear_across_seams<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
+        let first = &self.snapshots[stage.first].nodes;
+        let second = if stage.single { first } else { &self.snapshots[stage.first + 1].nodes };
+        let weights = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
+        L::gather(|lane| {
+            let ends: [[usize; 2]; N] = std::array::from_fn(|k| {
+                let cell = L::cell(&places[k].cell, lane);
+                let next = if cell + 1 == self.axes[k].nodes { 0 } else { cell + 1 };
+                [cell as usize, next as usize]
+            });
+            let fetch = |y: usize, z: usize| {
+                let base = ends[1][y] * self.row + if N == 3 { ends[N - 1][z] * self.plane } else { 0 };
+                let (left, right) = (base + ends[0][0], base + ends[0][1]);
+                let a = L::Pair::joined(first[left], first[right]) * weights[0];
+                if stage.single { a } else { L::Pair::joined(second[left], second[right]).mul_add(weights[1], a) }
+            };
+            let y = L::Pair::splat(places[1].fraction.lane(lane));
+            if N == 2 {
+                bilinear::<L::Pair, K>(y, [fetch(0, 0), fetch(1, 0)])
+            } else {
+                let z = L::Pair::splat(places[N - 1].fraction.lane(lane));
+                trilinear::<L::Pair, K>(y, z, [fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)])
+            }
+        })
+    }
+
+    /// Sums over the stencil whose two halves are to be added: the value and, where K > 1, its derivatives along x, y (and z).
+    #[inline(never)]
+    fn cubic<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
+        let first = &self.snapshots[stage.first].nodes;
+        let second = if stage.single { first } else { &self.snapshots[stage.first + 1].nodes };
+        let in_time = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
+        let zero = L::Pair::zero();
+        L::gather(|lane| {
+            let stencils: [Stencil<R>; N] = std::array::from_fn(|k| {
+                Stencil::new(&self.axes[k], L::cell(&places[k].cell, lane), places[k].fraction.lane(lane))
+            });
+            let x = &stencils[0];
+            let spread = |w: &[R; 4], half: usize| L::Pair::spread(w[2 * half], w[2 * half + 1]);
+            let along_x = [spread(&x.weights, 0), spread(&x.weights, 1)];
+            let slope_x = [spread(&x.slopes, 0), spread(&x.slopes, 1)];
+            let mut sums = [zero; K];
+            for iz in 0..if N == 3 { 4 } else { 1 } {
+                let (z_weight, z_slope, z_base) = if N == 3 {
+                    let z = &stencils[N - 1];
+                    (z.weights[iz], z.slopes[iz], z.nodes[iz] * self.plane)
+                } else {
+                    (R::one(), R::zero(), 0)
+                };
+                for iy in 0..4 {
+                    let y = &stencils[1];
+                    let base = z_base + y.nodes[iy] * self.row;
+                    let fetch = |half: usize| {
+                        let (left, right) = (base + x.nodes[2 * half], base + x.nodes[2 * half + 1]);
+                        let a = L::Pair::joined(first[left], first[right]) * in_time[0];
+                        if stage.single { a } else { L::Pair::joined(second[left], second[right]).mul_add(in_time[1], a) }
+                    };
+                    let halves = [fetch(0), fetch(1)];
+                    let row = halves[0].mul_add(along_x[0], halves[1] * along_x[1]);
+                    let weight = L::Pair::splat(y.weights[iy] * z_weight);
+                    sums[0] = row.mul_add(weight, sums[0]);
+                    if K > 1 {
+                        let row_slope = halves[0].mul_add(slope_x[0], halves[1] * slope_x[1]);
+                        sums[1] = row_slope.mul_add(weight, sums[1]);
+                        sums[2] = row.mul_add(L::Pair::splat(y.slopes[iy] * z_weight), sums[2]);
+                        sums[3] = row.mul_add(L::Pair::splat(y.weights[iy] * z_slope), sums[3]);
+                    }
+                }
+            }
+            sums
+        })
+    }
+}
+
+/// The last interpolation, along x.
+#[inline(always)]
+fn lerp_x<L: Lanes>(pair: &[L; 8], fraction: L) -> [L; 3] {
+    std::array::from_fn(|c| fraction.mul_add(pair[c + 4] - pair[c], pair[c]))
+}
+
+/// Value and, where K > 1, derivative along y of two rows.
+#[inline(always)]
+fn bilinear<P: Lanes, const K: usize>(y: P, rows: [P; 2]) -> [P; K] {
+    let slope = rows[1] - rows[0];
+    let mut out = [y.mul_add(slope, rows[0]); K];
+    if K > 1 {
+        out[1] = slope;
+    }
+    out
+}
+
+/// Value and, where K > 1, derivatives along y and z of four rows (y fastest).
+#[inline(always)]
+fn trilinear<P: Lanes, const K: usize>(y: P, z: P, rows: [P; 4]) -> [P; K] {
+    let (near, far) = (rows[1] - rows[0], rows[3] - rows[2]);
+    let start = y.mul_add(near, rows[0]);
+    let slope = y.mul_add(far, rows[2]) - start;
+    let mut out = [z.mul_add(slope, start); K];
+    if K > 2 {
+        out[1] = z.mul_add(far - near, near);
+        out[2] = slope;
+    }
+    out
+}
+
+/// The four nodes that a Hermite cubic reads along one axis.
+struct Stencil<R> {
+    nodes: [usize; 4],
+    weights: [R; 4],
+    /// d weights / d fraction.
+    slopes: [R; 4],
+}
+
+impl<R: Real> Stencil<R> {
+    #[inline(always)]
+    fn new(axis: &AxisMap<R>, cell: u32, fraction: R) -> Self {
+        let f = fraction.to_f64();
+        let wrapped = |index: u32| if index >= axis.nodes { (index - axis.nodes) as usize } else { index as usize };
+        let here = [cell as usize, wrapped(cell + 1)];
+        let [before, after] = axis.reach(cell);
+        // Hermite basis: values at 0 and 1, slopes at 0 and 1.
+        let basis = [(1.0 + 2.0 * f) * (1.0 - f) * (1.0 - f), f * f * (3.0 - 2.0 * f), f * (1.0 - f) * (1.0 - f), f * f * (f - 1.0)];
+        let derivative = [6.0 * f * (f - 1.0), 6.0 * f * (1.0 - f), (1.0 - f) * (1.0 - 3.0 * f), f * (3.0 * f - 2.0)];
+        let combine = |h: [f64; 4]| {
+            let mut w = [0.0, h[0], h[1], 0.0];
+            // Slope at the first node: (next - before) / (1 - before), or next - first.
+            match before {
+                Some(b) => {
+                    w[0] -= h[2] / (1.0 - b);
+                    w[2] += h[2] / (1.0 - b);
+                }
+                None => {
+                    w[1] -= h[2];
+                    w[2] += h[2];
+                }
+            }
+            match after {
+                Some(a) => {
+                    w[1] -= h[3] / a;
+                    w[3] += h[3] / a;
+                }
+                None => {
+                    w[1] -= h[3];
+                    w[2] += h[3];
+                }
+            }
+            w.map(R::from_f64)
+        };
+        let outer = [
+            before.map_or(here[0], |_| if cell == 0 { axis.nodes as usize - 1 } else { cell as usize - 1 }),
+            after.map_or(here[1], |_| wrapped(cell + 2)),
+        ];
+        Self { nodes: [outer[0], here[0], here[1], outer[1]], weights: combine(basis), slopes: combine(derivative) }
+    }
+}

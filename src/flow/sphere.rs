@@ -1,0 +1,193 @@
+//! Gridded flow on the sphere: a unit vector p is carried by velocity / radius, so that a pole is no singularity.
+//!
+//! Node velocities are geocentric Cartesian vectors, interpolated in longitude and latitude and projected onto the tangent plane at
+//! p. The tangent is the exact derivative of that: d longitude = east . dp / cos(latitude), d latitude = north . dp. Singular values
+//! are those between the orthonormal bases (east, north) at seed and arrival, that is, in the metric of the sphere.
+
+use super::sampler::{GridStage, Sampler};
+use super::velocity::{Chart, Velocity, bounds, within};
+use super::{Boundary, FlowError, Interpolation};
+use crate::field::{Grid, Window};
+use crate::simd::{Gather, Lanes, Real};
+
+/// A window on a longitude-latitude grid in degrees.
+#[derive(Debug, Clone)]
+pub struct SphereFlow<R> {
+    sampler: Sampler<R, 2>,
+    bounds: [[R; 2]; 2],
+    /// Longitude in the middle of the axis, degrees.
+    middle: f64,
+    /// State units (grid spacings) in a radian.
+    per_radian: [R; 2],
+    /// State coordinates of `middle` and of the equator.
+    origin: [R; 2],
+    /// Rotation about the axis by -middle, which keeps the branch cut of the longitude opposite to the grid.
+    turn: [R; 2],
+}
+
+impl<R: Real> SphereFlow<R> {
+    /// Prepares a window.
+    pub fn new(window: &Window, grid: &Grid, radius: f64, policy: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
+        let sampler = Sampler::<R, 2>::new(window, grid, policy, interpolation, |_| [1.0 / radius; 3])?;
+        let [longitude, latitude] = &sampler.axes;
+        let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
+        let (sine, cosine) = middle.to_radians().sin_cos();
+        let ends: [[f64; 2]; 2] = [longitude.ends(), latitude.ends()];
+        let end = |i: usize| std::array::from_fn(|k| R::from_f64(ends[k][i]));
+        let real = R::from_f64;
+        Ok(Self {
+            bounds: bounds(policy, end(0), end(1)),
+            middle,
+            per_radian: [real(1f64.to_degrees() / longitude.spacing), real(1f64.to_degrees() / latitude.spacing)],
+            origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
+            turn: [real(cosine), real(sine)],
+            sampler,
+        })
+    }
+}
+
+/// Below this cosine of the latitude, longitude has no meaning: 6e-7 degrees from a pole.
+const AT_POLE: f64 = 1e-8;
+
+/// The direction of a state, and its place on the grid.
+struct Here<L> {
+    /// Unit vector.
+    p: [L; 3],
+    inverse_length: L,
+    cosine: L,
+    /// Longitude and latitude in grid spacings.
+    place: [L; 2],
+}
+
+#[inline(always)]
+fn dot<L: Lanes>(a: &[L; 3], b: &[L; 3]) -> L {
+    a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
+}
+
+impl<R: Real> SphereFlow<R> {
+    #[inline(always)]
+    fn here<L: Gather<Real = R>>(&self, x: &[L; 3]) -> Here<L> {
+        let inverse_length = L::one() / dot(x, x).sqrt();
+        let p = x.map(|c| c * inverse_length);
+        let cosine = p[0].mul_add(p[0], p[1] * p[1]).sqrt();
+        let [c, s] = self.turn.map(L::splat);
+        let (ahead, aside) = (c.mul_add(p[0], s * p[1]), c.mul_add(p[1], -(s * p[0])));
+        // At a pole any longitude will do.
+        let ahead = L::select(L::lt(cosine, L::of(AT_POLE)), L::one(), ahead);
+        let angles = [aside.atan2(ahead), p[2].atan2(cosine)];
+        let place = std::array::from_fn(|k| angles[k].mul_add(L::splat(self.per_radian[k]), L::splat(self.origin[k])));
+        Here { p, inverse_length, cosine: cosine.max(L::of(AT_POLE)), place }
+    }
+
+    /// East and north at a direction.
+    #[inline(always)]
+    fn basis<L: Lanes<Real = R>>(p: &[L; 3], cosine: L) -> [[L; 3]; 2] {
+        let inverse = L::one() / cosine;
+        let at_pole = cosine.le(L::of(AT_POLE));
+        let (c, s) = (L::select(at_pole, L::one(), p[0] * inverse), L::select(at_pole, L::zero(), p[1] * inverse));
+        [[-s, c, L::zero()], [-(p[2] * c), -(p[2] * s), cosine]]
+    }
+}
+
+fn trigonometry(point: [f64; 3]) -> [f64; 4] {
+    let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (point[0].to_radians().sin_cos(), point[1].to_radians().sin_cos());
+    [sin_lon, cos_lon, sin_lat, cos_lat]
+}
+
+impl<R: Real> Chart<3, 2> for SphereFlow<R> {
+    fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
+        Some(self.sampler.sort_key(&std::array::from_fn(|k| self.sampler.axes[k].state(f64::from(point[k])))))
+    }
+    fn start(&self, point: [f64; 3]) -> [f64; 3] {
+        let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
+        [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+    }
+    fn first_tangent(&self, point: [f64; 3]) -> [[f64; 2]; 3] {
+        let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
+        [[-sin_lon, -sin_lat * cos_lon], [cos_lon, -sin_lat * sin_lon], [0.0, cos_lat]]
+    }
+    fn separation(&self, point: [f64; 3], axis: usize, gap: f64) -> f64 {
+        let arc = 2.0 * gap.to_radians();
+        if axis == 0 { arc * point[1].to_radians().cos() } else { arc }
+    }
+    fn arrival(&self, state: &[f64; 3], seed: [f32; 3]) -> [f32; 3] {
+        let latitude = state[2].atan2(state[0].hypot(state[1])).to_degrees();
+        let longitude = state[1].atan2(state[0]).to_degrees();
+        let longitude = longitude + 360.0 * ((self.middle - longitude) / 360.0).round();
+        [longitude as f32, latitude as f32, seed[2]]
+    }
+    fn coordinate_jacobian(&self, seed: [f64; 3], state: &[f64; 3], metric: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
+        let (before, after) = (seed[1].to_radians().cos(), state[0].hypot(state[1]).max(AT_POLE));
+        [[metric[0][0] * before / after, metric[0][1] / after], [metric[1][0] * before, metric[1][1]]]
+    }
+    fn breaks(&self) -> &[f64] {
+        self.sampler.times()
+    }
+}
+
+impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
+    type Stage = GridStage<L::Real>;
+    const MARKS: bool = true;
+
+    fn stage(&self, time: f64) -> Self::Stage {
+        self.sampler.stage(time)
+    }
+    #[inline(always)]
+    fn velocity(&self, stage: &Self::Stage, x: &[L; 3]) -> ([L; 3], L) {
+        let here = self.here(x);
+        let (velocity, mark) = self.sampler.value(stage, &here.place);
+        let radial = dot(&here.p, &velocity);
+        (std::array::from_fn(|i| (-radial).mul_add(here.p[i], velocity[i])), mark)
+    }
+    #[inline(always)]
+    fn tangent(&self, stage: &Self::Stage, x: &[L; 3], m: &[[L; 2]; 3]) -> ([L; 3], [[L; 2]; 3], L) {
+        let here = self.here(x);
+        let sample = self.sampler.sample(stage, &here.place);
+        let p = &here.p;
+        let radial = dot(p, &sample.velocity);
+        let [east, north] = Self::basis(p, here.cosine);
+        let mut product = [[L::zero(); 2]; 3];
+        for c in 0..2 {
+            // Change of direction for a change of the state along the column.
+            let column: [L; 3] = std::array::from_fn(|i| m[i][c]);
+            let outward = dot(p, &column);
+            let change: [L; 3] = std::array::from_fn(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
+            let longitude = dot(&east, &change) / here.cosine * L::splat(self.per_radian[0]);
+            let latitude = dot(&north, &change) * L::splat(self.per_radian[1]);
+            let interpolated: [L; 3] =
+                std::array::from_fn(|i| longitude.mul_add(sample.slopes[0][i], latitude * sample.slopes[1][i]));
+            // Derivative of V - p (p . V).
+            let turned = dot(&change, &sample.velocity) + dot(p, &interpolated);
+            for i in 0..3 {
+                product[i][c] = (-radial).mul_add(change[i], (-turned).mul_add(p[i], interpolated[i]));
+            }
+        }
+        (std::array::from_fn(|i| (-radial).mul_add(p[i], sample.velocity[i])), product, sample.mark)
+    }
+    #[inline(always)]
+    fn inside(&self, x: &[L; 3]) -> L::Mask {
+        within(&self.bounds, &self.here(x).place)
+    }
+    #[inline(always)]
+    fn settle(&self, x: &mut [L; 3]) {
+        let inverse = L::one() / dot(x, x).sqrt();
+        *x = x.map(|c| c * inverse);
+    }
+    #[inline(always)]
+    fn settle_tangent(&self, x: &mut [L; 3], m: &mut [[L; 2]; 3]) {
+        let inverse = L::one() / dot(x, x).sqrt();
+        *x = x.map(|c| c * inverse);
+        for c in 0..2 {
+            let outward = dot(x, &std::array::from_fn(|i| m[i][c]));
+            for i in 0..3 {
+                m[i][c] = (-outward).mul_add(x[i], m[i][c]) * inverse;
+            }
+        }
+    }
+    #[inline(always)]
+    fn metric(&self, x: &[L; 3], m: &[[L; 2]; 3]) -> [[L; 2]; 2] {
+        let cosine = x[0].mul_add(x[0], x[1] * x[1]).sqrt().max(L::of(AT_POLE));
+        let basis = Self::basis(x, cosine);
+        std::array::from_fn(|i| std::array::from_fn(|c| dot(&basis[i], &std::array::from_fn(|k| m[k][c]))))
+    }
+}

@@ -1,0 +1,90 @@
+//! Steps chosen by error, not by habit.
+
+use super::{FlowError, Traced};
+use crate::field::Domain;
+
+/// Points on which a number of steps is judged.
+const POINTS: usize = 2048;
+/// Fewest steps tried on closed forms (on grids: one a snapshot interval, as far as this allows).
+const FEWEST: usize = 4;
+/// Most steps tried.
+const MOST: usize = 16_384;
+/// Points that must have lived the whole span for the judgement to rest on them alone.
+const ENOUGH: usize = 64;
+
+/// Quasi-random points of a domain: the additive recurrence of the generalised golden ratio (Roberts 2018).
+pub fn points(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+    // The real root of x^4 = x + 1.
+    const RATIO: f64 = 1.220_744_084_605_759_5;
+    (0..count)
+        .map(|n| domain.from_unit(std::array::from_fn(|k| (0.5 + (n + 1) as f64 * RATIO.powi(-(k as i32) - 1)).fract() as f32)))
+        .collect()
+}
+
+/// Root mean square difference of two traces, over the points that lived the whole span in both (where such are rare: over all):
+/// a path that stops is cut to whole steps, an error of another kind and order that would hide the integrator's.
+pub fn difference(a: &Traced, b: &Traced) -> f64 {
+    let whole = |i: &usize| a.lived[*i] >= 1.0 && b.lived[*i] >= 1.0;
+    let all = 0..a.lived.len();
+    let lived = all.clone().filter(whole).count();
+    let chosen: Vec<usize> = if lived >= ENOUGH { all.filter(whole).collect() } else { all.collect() };
+    let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
+    let squares: Vec<f64> =
+        chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    if squares.is_empty() { 0.0 } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
+}
+
+/// The fewest steps of a ladder (by halves upwards, from `intervals`) whose log-stretch differs from that of twice as many by at
+/// most `tolerance`, root mean square.
+pub fn choose(
+    tolerance: f64,
+    intervals: usize,
+    domain: &Domain,
+    mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
+) -> Result<usize, FlowError> {
+    let points = points(domain, POINTS);
+    let (mut once, mut twice) = (Traced::default(), Traced::default());
+    let mut steps = if intervals > 0 { intervals } else { FEWEST };
+    let mut reached = f64::INFINITY;
+    while steps <= MOST {
+        trace(steps, &points, &mut once);
+        trace(2 * steps, &points, &mut twice);
+        reached = difference(&once, &twice);
+        if reached <= tolerance {
+            return Ok(steps);
+        }
+        // On a grid a whole number of steps an interval, or of intervals, keeps stages on snapshots.
+        steps = if intervals > 0 { next_on_grid(steps, intervals) } else { (steps * 3).div_ceil(2) };
+    }
+    Err(FlowError::StepsNotFound { steps: MOST, reached, tolerance })
+}
+
+/// The next multiple of `intervals`, at least 1.5 times `steps` when that is large.
+fn next_on_grid(steps: usize, intervals: usize) -> usize {
+    (steps + (steps / 2).max(intervals) / intervals * intervals).next_multiple_of(intervals)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_fill_the_domain() {
+        let domain = Domain::cuboid([-1.0, 0.0, 5.0], [1.0, 1.0, 7.0]);
+        let points = points(&domain, 512);
+        assert!(points.iter().all(|p| domain.contains(*p)));
+        for octant in 0..8 {
+            let inside = |p: &&[f32; 3]| (0..3).all(|k| (domain.to_unit(**p)[k] >= 0.5) == (octant >> k & 1 == 1));
+            let count = points.iter().filter(inside).count();
+            // An even share is 64; random points would be within 15 of it.
+            assert!((56..=72).contains(&count), "{count}");
+        }
+    }
+
+    #[test]
+    fn ladder_on_a_grid() {
+        assert_eq!(next_on_grid(11, 11), 22);
+        assert_eq!(next_on_grid(22, 11), 33);
+        assert_eq!(next_on_grid(44, 11), 66);
+    }
+}
