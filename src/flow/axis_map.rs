@@ -103,11 +103,6 @@ impl<R: Real> AxisMap<R> {
         [before.map(|b| -length(b) / here), after.map(|a| 1.0 + length(a) / here)]
     }
 
-    /// Whether the axis needs a table.
-    pub fn is_uneven(&self) -> bool {
-        self.table.is_some()
-    }
-
     /// Finds each lane's cell. Cells are in range whatever the state is.
     #[inline(always)]
     pub fn locate<L: Gather<Real = R>>(&self, state: L) -> Place<L> {

@@ -83,7 +83,7 @@ fn a_restarted_walk_finds_the_same_place() {
     assert!((whole.t - t).abs() < 1e-4, "{} {t}", whole.t);
 }
 
-fn with_scene<R>(extinction: f64, majorant: f32, test: impl Fn(&FrameScene) -> R) -> R {
+fn with_scene<R>(extinction: f64, majorant: f32, photons: [f64; 3], test: impl Fn(&FrameScene) -> R) -> R {
     let domain = Domain::cuboid([0.0; 3], [1.0; 3]);
     let settings =
         TransferSettings { low: Some(0.0), high: Some(1.0), extinction: Some(extinction), albedo: [vec![1.0], vec![1.0], vec![1.0]] };
@@ -94,7 +94,7 @@ fn with_scene<R>(extinction: f64, majorant: f32, test: impl Fn(&FrameScene) -> R
     majorants.set_for_test(vec![majorant]);
     test(&FrameScene {
         camera: &Camera::new(&camera, 1.0).unwrap(),
-        light: &Light::new(&LightSettings::directional([0.0, 0.0, -1.0], 4.0 * std::f64::consts::PI)).unwrap(),
+        light: &Light::new(&LightSettings::directional(photons, 4.0 * std::f64::consts::PI)).unwrap(),
         transfer: &transfer,
         space: &SceneBox::new(&domain, [1.0; 3], [1, 1, 1]),
         majorants: &majorants,
@@ -131,12 +131,25 @@ fn measure(scene: &FrameScene, paths: u32, value: impl Fn(&PathSample) -> f32) -
 fn extinctions_above_their_majorant_stay_unbiased() {
     // Extinction 2 over a length of 1, light from the camera's side: alpha = 1 - exp(-2), radiance = (1 - exp(-4)) / 2.
     for (majorant, exceeds) in [(4.0, false), (2.0, false), (1.6, true), (1.2, true)] {
-        with_scene(4.0, majorant, |scene| {
+        with_scene(4.0, majorant, [0.0, 0.0, -1.0], |scene| {
             let (alpha, error, exceeded) = measure(scene, 200_000, |path| path.scattered);
             assert!((alpha - (1.0 - (-2.0_f64).exp())).abs() < 4.0 * error, "majorant {majorant}: alpha {alpha} +- {error}");
             let (radiance, error, _) = measure(scene, 200_000, |path| path.radiance[0]);
             assert!((radiance - 0.5 * (1.0 - (-4.0_f64).exp())).abs() < 4.0 * error, "majorant {majorant}: {radiance} +- {error}");
             assert_eq!(exceeded > 0, exceeds, "each is counted");
+        });
+    }
+}
+
+#[test]
+fn thin_transmittance_survives_the_roulette() {
+    // Extinction 6, light from behind: every path of light is as long as the box is deep, radiance = 6 exp(-6), all of it at
+    // transmittances below the roulette's threshold or close to it.
+    for majorant in [9.0, 60.0] {
+        with_scene(12.0, majorant, [0.0, 0.0, 1.0], |scene| {
+            let (radiance, error, _) = measure(scene, 400_000, |path| path.radiance[0]);
+            let expected = 6.0 * (-6.0_f64).exp();
+            assert!(error < 0.05 * expected && (radiance - expected).abs() < 4.0 * error, "majorant {majorant}: {radiance} +- {error}");
         });
     }
 }
