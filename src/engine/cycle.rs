@@ -127,7 +127,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
     let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
-    cycle.probe(&*tracer);
+    cycle.probe(&*tracer, slide.index);
     loop {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
@@ -143,6 +143,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
         slide = next;
         tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
         cycle.slid(&*tracer);
+        cycle.probe(&*tracer, slide.index);
     }
 }
 
@@ -183,26 +184,27 @@ impl<'a> Cycle<'a> {
             self.ring.mark_stale();
             let holding = self.threads.render.install(|| self.share_of_labels_that_hold(tracer));
             self.ring.revalidate(holding);
-            self.probe(tracer);
         }
         self.renderer.window_slid();
     }
 
-    /// Earns trust before the first frame of a slide rather than by tracing all of it: some points a cell are traced and held against
-    /// the surrogate. They decide the gate, so they say nothing about the error that is stated; audit points do.
-    fn probe(&mut self, tracer: &dyn Tracer) {
+    /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and held against the surrogate they earn
+    /// trust without tracing a whole frame. They decide the gate, so they say nothing about the error that is stated; audit points do.
+    fn probe(&mut self, tracer: &dyn Tracer, slide: u64) {
         let scene = &self.plan.scene;
-        let Some(live) = self.live.as_ref().filter(|_| scene.render.method == Method::Gated) else { return };
         let per_cell = scene.trust.min_samples.ceil() as usize;
-        let unit = audit::stratified_points(self.trust.shape(), per_cell, scene.seed, PROBE_STREAM + self.frame);
+        let unit = audit::stratified_points(self.trust.shape(), per_cell, scene.seed, PROBE_STREAM + slide);
         let flow_map = self.wants_flow_map();
-        let (samples, residuals) = self.threads.render.install(|| {
-            let probe = audit::trace(tracer, &unit, flow_map);
-            let residuals = audit::residuals(&*live.freeze(), &probe.samples, self.renderer.transfer(), tracer.tau());
-            (probe.samples, residuals)
-        });
-        self.trust.observe(&residuals);
-        self.ring.push(&samples);
+        let probe = self.threads.render.install(|| audit::trace(tracer, &unit, flow_map));
+        let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
+        self.renderer.observe(&points, &probe.samples.log_stretch);
+        if let Some(live) = &self.live {
+            let front = live.freeze();
+            let residuals =
+                self.threads.render.install(|| audit::residuals(&*front, &probe.samples, self.renderer.transfer(), tracer.tau()));
+            self.trust.observe(&residuals);
+            self.ring.push(&probe.samples);
+        }
     }
 
     fn wants_flow_map(&self) -> bool {
