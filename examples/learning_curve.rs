@@ -8,9 +8,14 @@
 #[path = "../tests/network_support/mod.rs"]
 mod support;
 
-use ridgewatch::flow::Tracer;
+use ridgewatch::field::analytic::Analytic;
+use ridgewatch::field::{Domain, turbulence::Turbulence};
+use ridgewatch::flow::{
+    Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
+};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{Kind, SampleRing, Samples, Surrogate, SurrogateSettings, build};
+use std::sync::Arc;
 use std::time::Instant;
 
 /// PSNR in decibels of the surrogate against traced samples; peak and error in log-stretch, which is FTLE times a constant.
@@ -69,10 +74,31 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         }
     }
     let network: NetworkSettings = settings.try_into()?;
-    let (coarse, fine): (Box<dyn Tracer>, Box<dyn Tracer>) = match scene.as_str() {
-        "gyre" => (Box::new(support::DoubleGyre::new(0.0, 10.0, 40)), Box::new(support::DoubleGyre::new(0.0, 10.0, 200))),
+    let (source, tau, steps) = match scene.as_str() {
+        "gyre" => {
+            let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: std::f64::consts::TAU / 10.0 };
+            (VelocitySource::Analytic(flow, Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0))), 10.0, 50)
+        }
+        "turbulence" => {
+            let shape = [96, 48, 48];
+            let window = Turbulence::easy(shape, 0).window(&Turbulence::grid(shape)?, 12)?;
+            (VelocitySource::Window(Arc::new(window)), 11.0, 22)
+        }
         other => return Err(format!("unknown scene `{other}`; there are gyre and turbulence").into()),
     };
+    let map = |steps, precision| FlowMap {
+        tau,
+        direction: Direction::Forward,
+        integrator: Integrator::Tangent,
+        precision,
+        steps: Steps::Fixed(steps),
+        gap: 1e-6,
+        boundary: Boundary::Clamp,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
+    };
+    let coarse = cpu_tracer(source.clone(), &map(steps, Precision::F32), 0.0)?;
+    let fine = cpu_tracer(source, &map(10 * steps, Precision::F64), 0.0)?;
     let domain = coarse.domain().clone();
     let flow_map = network.target == ridgewatch::surrogate::network::Target::FlowMap;
     let held_out = support::traced(&*fine, support::uniform_points(1, 1 << 16), false);

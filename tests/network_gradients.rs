@@ -197,7 +197,7 @@ fn prepare(case: &Case) -> (Model, Objective, Samples) {
     let shape = Architecture::new(&case.settings, case.axes, extent).unwrap();
     let mut objective = Objective::new(&case.settings, &shape, extent, 2.5);
     let samples = labels(300, 11);
-    objective.standardise(&shape, &samples, false);
+    objective.standardise(&shape, &samples, None);
     let mut model = Model::new(shape, 3, false);
     // A few steps move the tables away from zero, where their gradients would be tiny, and the ReLUs off their starting pattern.
     for _ in 0..20 {
@@ -213,7 +213,7 @@ fn fused_steps(model: &mut Model, objective: &Objective, samples: &Samples, rate
     fused.steps(model, objective, &mut average, |done, loss| {
         losses.extend(loss);
         let rate = *rates.get(done as usize)?;
-        Some(Step { samples, pick: Pick::InOrder, count: samples.len(), rate, average_share: 1.0 })
+        Some(Step { samples, pick: Pick::InOrder, count: samples.len(), rate, average_share: 1.0, lazy: false, base: None })
     });
     losses
 }

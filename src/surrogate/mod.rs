@@ -224,7 +224,7 @@ impl Surrogate for Network {
     }
 
     fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
-        self.trainer.learn(samples, seconds, max_steps)
+        self.trainer.learn(samples, None, seconds, max_steps)
     }
 
     fn window_slid(&mut self, _: &dyn Tracer) {

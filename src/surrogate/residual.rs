@@ -40,24 +40,20 @@ impl Residual {
         &self.table
     }
 
-    /// What the table lacks at the samples.
-    fn lacking(&self, samples: &Samples) -> Samples {
-        let mut below = vec![0.0; samples.len()];
-        self.table.predict(&samples.points, &mut below);
-        let log_stretch = samples.log_stretch.iter().zip(&below).map(|(traced, below)| traced - below).collect();
-        Samples { points: samples.points.clone(), log_stretch, ..Samples::default() }
-    }
-
     /// A residual learned on the previous table may be worse than none; then it starts from 0 again.
-    fn forget_if_worse(&mut self, lacking: &Samples) {
-        let stride = (lacking.len() / COMPARED).max(1);
-        let chosen: Vec<usize> = (0..lacking.len()).step_by(stride).filter(|&i| lacking.log_stretch[i].is_finite()).collect();
-        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| lacking.points[i]).collect();
-        let mut learned = vec![0.0; points.len()];
+    fn forget_if_worse(&mut self, samples: &Samples) {
+        let stride = (samples.len() / COMPARED).max(1);
+        let chosen: Vec<usize> = (0..samples.len()).step_by(stride).filter(|&i| samples.log_stretch[i].is_finite()).collect();
+        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| samples.points[i]).collect();
+        let (mut below, mut learned) = (vec![0.0; points.len()], vec![0.0; points.len()]);
+        self.table.predict(&points, &mut below);
         self.trainer.predict(&points, &mut learned);
-        let square = |value: f32| f64::from(value) * f64::from(value);
-        let with: f64 = chosen.iter().zip(&learned).map(|(&i, &value)| square(lacking.log_stretch[i] - value)).sum();
-        let without: f64 = chosen.iter().map(|&i| square(lacking.log_stretch[i])).sum();
+        let (mut with, mut without) = (0.0, 0.0);
+        for ((&i, below), learned) in chosen.iter().zip(below).zip(learned) {
+            let lacking = samples.log_stretch[i] - below;
+            with += f64::from(lacking - learned).powi(2);
+            without += f64::from(lacking).powi(2);
+        }
         if with > without {
             self.trainer.forget_output();
         }
@@ -119,12 +115,11 @@ impl Surrogate for Residual {
 
     fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
         let start = std::time::Instant::now();
-        let lacking = self.lacking(samples);
-        if std::mem::take(&mut self.slid) {
-            self.forget_if_worse(&lacking);
+        if !samples.is_empty() && std::mem::take(&mut self.slid) {
+            self.forget_if_worse(samples);
         }
         let left = seconds - start.elapsed().as_secs_f64();
-        let learned = self.trainer.learn(&lacking, left, max_steps);
+        let learned = self.trainer.learn(samples, Some(&self.table), left, max_steps);
         Learned { seconds: start.elapsed().as_secs_f64(), ..learned }
     }
 

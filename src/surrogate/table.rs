@@ -1,6 +1,7 @@
 //! The log-stretch traced at the nodes of a regular grid over the unit domain, interpolated multilinearly.
 
 use super::checkpoint::{Checkpoint, Entry};
+use super::network::Field;
 use super::{CheckpointError, Learned, Predict, Samples, Surrogate};
 use crate::flow::{Extras, Traced, Tracer};
 use rayon::prelude::*;
@@ -116,6 +117,12 @@ impl Table {
         let values = checkpoint.values("table.values", self.values.len())?;
         let not_finite = checkpoint.number("table.not_finite")?;
         Ok(Self { values, not_finite, ..self.clone() })
+    }
+}
+
+impl Field for Table {
+    fn values(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        self.predict_chunk(points, out);
     }
 }
 

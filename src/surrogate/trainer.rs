@@ -6,17 +6,21 @@
 //! only when the loss has stopped falling.
 
 use super::checkpoint::{Checkpoint, Entry};
-use super::network::{Architecture, Average, Encoding, Fused, Model, NetworkSettings, Objective, Pick, Predictor, Step};
+use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, Pick, Predictor, Step};
 use super::{CheckpointError, Learned, Predict, Samples, SurrogateError};
 use crate::field::Domain;
 use std::time::Instant;
 
 /// Steps between two moves of the average: it changes slowly, and every move reads and writes all parameters.
-const AVERAGE_EVERY: u64 = 4;
+const AVERAGE_EVERY: u64 = 8;
 /// Steps between two copies of the last good weights.
-const KEEP_EVERY: u64 = 256;
+const KEEP_EVERY: u64 = 512;
 /// A loss above this many times the first one (or the first one of this call, where the window has just slid) counts as diverged.
 const DIVERGED: f64 = 10.0;
+/// A window that has slid makes old weights wrong, but not more so than this many times the first loss.
+const HARDEST: f64 = 10.0;
+/// Factor on the rate below which more rollbacks make no sense in one call.
+const LEAST_CAUTION: f64 = 1e-6;
 /// Steps between two looks at whether the loss still falls.
 const LOOK_EVERY: u64 = 512;
 /// Fall of the smoothed loss between two looks, below which it counts as stalled.
@@ -44,6 +48,14 @@ struct Progress {
     looked: f64,
 }
 
+/// Weights and moments to come back to.
+struct Kept {
+    state: [[Vec<f32>; 3]; 2],
+    steps: usize,
+    average: Average,
+    progress: Progress,
+}
+
 /// A network, its optimizer and its schedule.
 pub(super) struct Trainer {
     model: Model,
@@ -54,10 +66,9 @@ pub(super) struct Trainer {
     settings: NetworkSettings,
     rate: f64,
     seed: u64,
-    /// Whether outputs start at 0 and stay centred there (the residual).
-    centred: bool,
     standardised: bool,
     fused: Option<Fused>,
+    kept: Option<Kept>,
 }
 
 /// A network as it was.
@@ -106,9 +117,9 @@ impl Trainer {
             settings: settings.clone(),
             rate,
             seed,
-            centred,
             standardised: false,
             fused: None,
+            kept: None,
         })
     }
 
@@ -134,6 +145,7 @@ impl Trainer {
 
     /// The window slid: weights carry over, but the average forgets what it has seen, and the rate is the first one again.
     pub(super) fn window_slid(&mut self) {
+        self.kept = None;
         self.progress.averaged = 0;
         self.progress.stall = 1.0;
         self.progress.smooth = 0.0;
@@ -142,35 +154,42 @@ impl Trainer {
 
     /// Sets the output layer back to 0, in the weights, the moments and the average.
     pub(super) fn forget_output(&mut self) {
+        self.kept = None;
         self.model.zero_output();
         let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
         self.average.layers[head.weights..head.biases + head.outputs].fill(0.0);
         self.predictor = Predictor::new(&self.model.shape, &self.average.layers);
     }
 
-    pub(super) fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
+    /// Trains on the samples, or on what they have beyond `base`.
+    pub(super) fn learn(&mut self, samples: &Samples, base: Option<&dyn Field>, seconds: f64, max_steps: u64) -> Learned {
         let start = Instant::now();
         let mut learned = Learned::default();
-        let usable: Vec<u32> = (0..samples.len() as u32).filter(|&i| self.objective.usable(samples, i as usize)).collect();
-        learned.dropped = (samples.len() - usable.len()) as u64;
-        if usable.is_empty() {
+        let sieved = self.objective.sieve(samples);
+        let among = sieved.as_deref();
+        let usable = among.map_or(samples.len(), <[u32]>::len);
+        learned.dropped = (samples.len() - usable) as u64;
+        if usable == 0 {
             learned.seconds = start.elapsed().as_secs_f64();
             return learned;
         }
         if !self.standardised {
-            self.objective.standardise(&self.model.shape, samples, self.centred);
+            self.objective.standardise(&self.model.shape, samples, base);
             self.standardised = true;
         }
-        let among = (learned.dropped > 0).then_some(&usable[..]);
         // Few samples need no large batch; they would only be drawn many times over.
-        let count = self.settings.batch.min(usable.len().max(256));
+        let count = self.settings.batch.min(usable.max(256));
         let mut fused = self.fused.take().unwrap_or_else(|| Fused::new(&self.model, &self.objective, self.settings.batch));
-        let mut kept = self.kept();
         let (mut losses, mut first_of_call) = (0.0, None::<f64>);
-        let mut diverged = false;
         while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
-            let most = KEEP_EVERY.min(max_steps - learned.steps);
-            let (mut taken, mut sum) = (0, 0.0);
+            let steps = self.model.steps() as u64;
+            // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
+            let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
+            if self.kept.as_ref().is_none_or(|kept| steps >= kept.steps as u64 + apart) {
+                self.keep();
+            }
+            let most = (KEEP_EVERY - steps % KEEP_EVERY).min(max_steps - learned.steps);
+            let (mut taken, mut sum, mut diverged) = (0, 0.0, false);
             let Self { model, objective, average, progress, settings, rate, seed, .. } = self;
             fused.steps(model, objective, average, |done, loss| {
                 if let Some(loss) = loss {
@@ -180,7 +199,7 @@ impl Trainer {
                         progress.first_loss = loss;
                     }
                     // Written so that NaN counts as diverged.
-                    diverged = !(loss <= DIVERGED * progress.first_loss.max(if first.is_finite() { first } else { 0.0 }));
+                    diverged = !(loss <= DIVERGED * progress.first_loss.max(if first.is_finite() { first.min(HARDEST * progress.first_loss) } else { 0.0 }));
                     if diverged {
                         return None;
                     }
@@ -199,21 +218,20 @@ impl Trainer {
                     0.0
                 };
                 let pick = Pick::Random { seed: *seed, counter, among };
-                Some(Step { samples, pick, count, rate: *rate * progress.stall * progress.caution, average_share: share })
+                let rate = *rate * progress.stall * progress.caution;
+                Some(Step { samples, pick, count, rate, average_share: share, lazy: true, base })
             });
             if diverged {
                 learned.rollbacks += 1;
-                self.restore(&kept);
-                if self.progress.caution < 1e-6 {
+                // The moments are part of what diverged; so the steps since the last copy are lost.
+                self.roll_back();
+                if self.progress.caution < LEAST_CAUTION {
                     break;
                 }
-                // The counter moves on, so that the same batches are not drawn again.
-                kept = self.kept();
                 continue;
             }
             learned.steps += taken;
             losses += sum;
-            kept = self.kept();
         }
         self.fused = Some(fused);
         if self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY {
@@ -226,16 +244,28 @@ impl Trainer {
         learned
     }
 
-    /// The present weights, as what to come back to. burn's buffers are shared until the next step writes to them.
-    fn kept(&self) -> (Model, Average, Progress) {
-        (self.model.clone(), self.average.clone(), self.progress)
+    /// Copies the present weights as what to come back to.
+    fn keep(&mut self) {
+        let (steps, average, progress) = (self.model.steps(), &self.average, self.progress);
+        match &mut self.kept {
+            Some(kept) => {
+                self.model.copy_state(&mut kept.state);
+                kept.average.tables.copy_from_slice(&average.tables);
+                kept.average.layers.copy_from_slice(&average.layers);
+                (kept.steps, kept.progress) = (steps, progress);
+            }
+            None => self.kept = Some(Kept { state: self.model.state(), steps, average: average.clone(), progress }),
+        }
     }
 
-    fn restore(&mut self, (model, average, progress): &(Model, Average, Progress)) {
-        let drawn = self.progress.drawn;
-        self.model = model.clone();
-        self.average = average.clone();
-        self.progress = Progress { drawn, caution: progress.caution * 0.5, ..*progress };
+    /// Back to the last good weights, at half the rate. The generator moves on, so that the same batches are not drawn again.
+    fn roll_back(&mut self) {
+        let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
+        if let Some(kept) = &self.kept {
+            self.model.set_state(kept.state.clone(), kept.steps);
+            self.average = kept.average.clone();
+            self.progress = Progress { drawn, caution, ..kept.progress };
+        }
     }
 
     pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
@@ -311,7 +341,7 @@ impl Trainer {
         let layers = checkpoint.values("network.layers.average", layer_values)?;
         self.model.set_state(state, steps);
         self.objective.scale = scale;
-        (self.progress, self.standardised) = (progress, standardised);
+        (self.progress, self.standardised, self.kept) = (progress, standardised, None);
         self.predictor = Predictor::new(&self.model.shape, &layers);
         self.average = Average { tables, layers };
         Ok(())

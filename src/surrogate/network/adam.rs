@@ -1,5 +1,7 @@
 //! Adam (Kingma and Ba 2015) on slices, with burn's arithmetic: same order, same f32 rounding up to fused multiply-adds.
 
+use super::encode::LINE;
+
 /// Decay of the first moment.
 pub(super) const BETA_1: f32 = 0.9;
 /// Decay of the second moment.
@@ -22,15 +24,8 @@ impl Adam {
         Self { rate: rate as f32, epsilon: epsilon * second, correction: second / (1.0 - BETA_1.powi(time)) }
     }
 
-    /// Updates parameters and moments, and zeroes the gradient. `average`, where given, moves the mean of the parameters by its share.
-    pub(super) fn step(
-        self,
-        parameters: &mut [f32],
-        gradient: &mut [f32],
-        first: &mut [f32],
-        second: &mut [f32],
-        average: Option<(&mut [f32], f32)>,
-    ) {
+    /// Updates parameters and moments, and zeroes the gradient.
+    pub(super) fn step(self, parameters: &mut [f32], gradient: &mut [f32], first: &mut [f32], second: &mut [f32]) {
         let Self { rate, epsilon, correction } = self;
         for (((p, g), m), v) in parameters.iter_mut().zip(gradient.iter_mut()).zip(first).zip(second) {
             *m = *m * BETA_1 + *g * (1.0 - BETA_1);
@@ -38,10 +33,38 @@ impl Adam {
             *p -= *m * correction / (v.sqrt() + epsilon) * rate;
             *g = 0.0;
         }
-        if let Some((average, share)) = average {
-            for (a, &p) in average.iter_mut().zip(parameters.iter()) {
-                *a += (p - *a) * share;
+    }
+
+    /// The same for those cache lines only that are marked; the marks are taken back. The others wait with the moments they have, as in
+    /// the lazy Adam for sparse gradients: of a fine level's entries a batch reaches a few percent, and all of them together are tens of
+    /// megabytes.
+    pub(super) fn lazy_step(
+        self,
+        parameters: &mut [f32],
+        gradient: &mut [f32],
+        first: &mut [f32],
+        second: &mut [f32],
+        touched: &mut [u8],
+    ) {
+        let len = parameters.len();
+        for (group, marks) in touched.chunks_mut(8).enumerate() {
+            if marks.iter().all(|&mark| mark == 0) {
+                continue;
+            }
+            for (line, mark) in marks.iter_mut().enumerate() {
+                if std::mem::take(mark) != 0 {
+                    let begin = (8 * group + line) * LINE;
+                    let range = begin..(begin + LINE).min(len);
+                    self.step(&mut parameters[range.clone()], &mut gradient[range.clone()], &mut first[range.clone()], &mut second[range]);
+                }
             }
         }
+    }
+}
+
+/// Moves a mean of the parameters by its share.
+pub(super) fn move_average(average: &mut [f32], parameters: &[f32], share: f32) {
+    for (a, &p) in average.iter_mut().zip(parameters) {
+        *a += (p - *a) * share;
     }
 }

@@ -129,15 +129,22 @@ impl Architecture {
         self.table_entries() * self.features + self.layer_parameters()
     }
 
-    /// Widest row of activations, padded.
+    /// Longest row of activations.
     pub(super) fn widest(&self) -> usize {
-        self.layers.iter().map(|layer| padded(layer.inputs)).max().unwrap_or(PANEL)
+        self.layers.iter().map(|layer| row_stride(layer.inputs)).max().unwrap_or(PANEL)
     }
 }
 
 /// Rounded up to whole panels.
 pub(super) fn padded(width: usize) -> usize {
     width.next_multiple_of(PANEL)
+}
+
+/// Distance of two rows of activations: an odd number of cache lines, so that a column of rows spreads over all sets of the first-level
+/// cache instead of fighting for a quarter of them.
+pub(super) fn row_stride(width: usize) -> usize {
+    let lines = padded(width) / PANEL;
+    (lines + (lines + 1) % 2) * PANEL
 }
 
 /// Cells of level `l`: base * growth^l along the longest axis; shorter axes get fewer in proportion, down to an eighth, so that

@@ -192,11 +192,17 @@ pub(super) fn weight_gradient(
             }
             input += take;
         }
-        let biases = inputs * wide + column;
-        for row in 0..primal {
-            for lane in 0..PANEL {
-                gradient[biases + lane] += dz[row * dz_stride + column + lane];
+        // SAFETY: column + PANEL <= wide bounds the biases, row < primal <= rows the rows.
+        unsafe {
+            let biases = gradient.as_mut_ptr().add(inputs * wide + column);
+            let mut sums = [load(biases), load(biases.add(8))];
+            for row in 0..primal {
+                let dz = dz.as_ptr().add(row * dz_stride + column);
+                sums[0] += load(dz);
+                sums[1] += load(dz.add(8));
             }
+            store(biases, sums[0]);
+            store(biases.add(8), sums[1]);
         }
     }
 }

@@ -5,6 +5,9 @@ use super::lanes::lanes;
 use std::f32::consts::FRAC_PI_2;
 use wide::{f32x8, i32x8};
 
+/// Values of a table that share one mark of having received a gradient: a cache line.
+pub(super) const LINE: usize = 16;
+
 /// The corners of the cell around each sample of a tile, for one level. Arrays are `[corner][lane]`, slopes `[axis][corner][lane]`.
 pub(super) struct Corners {
     lanes: usize,
@@ -94,16 +97,29 @@ impl Corners {
         }
     }
 
-    /// Adds `factors[corner] * gradient[sample]` to the table entries.
-    fn scatter<const D: usize, const F: usize>(&self, factors: &[f32], gradient: &[f32], table: &mut [f32], count: usize) {
-        assert!(count <= self.lanes && gradient.len() >= count * F && factors.len() >= (1 << D) * self.lanes);
-        for (sample, gradient) in gradient.chunks_exact(F).take(count).enumerate() {
+    /// Adds `factors[corner] * gradient[sample]` to the table entries; the gradient's columns `column..column + F`, one row a sample.
+    fn scatter<const D: usize, const F: usize>(
+        &self,
+        factors: &[f32],
+        gradient: &[f32],
+        stride: usize,
+        column: usize,
+        table: &mut [f32],
+        touched: &mut [u8],
+        count: usize,
+    ) {
+        assert!(count <= self.lanes && gradient.len() >= count * stride && factors.len() >= (1 << D) * self.lanes);
+        assert!(touched.len() >= table.len().div_ceil(LINE));
+        for (sample, row) in gradient.chunks_exact(stride).take(count).enumerate() {
+            let mut gradient = [0.0_f32; F];
+            gradient.copy_from_slice(&row[column..column + F]);
             for corner in 0..1 << D {
                 let at = corner * self.lanes + sample;
-                // SAFETY: as in `gather`.
+                // SAFETY: as in `gather`; entry < table.len(), so its line has a mark.
                 unsafe {
                     let entry = *self.index.get_unchecked(at) as usize * F;
                     let factor = *factors.get_unchecked(at);
+                    *touched.get_unchecked_mut(entry / LINE) = 1;
                     for (feature, gradient) in gradient.iter().enumerate() {
                         let value = table.get_unchecked_mut(entry + feature);
                         *value = factor.mul_add(*gradient, *value);
@@ -168,35 +184,36 @@ pub(super) fn encode(
     }
 }
 
-/// Adds the gradient of one level's features to its table gradient. `gradient` is `[group][run][features]`.
+/// Adds the gradient of the features of level `number` to its table gradient, for one tile. `gradient` has a row of `stride` values a sample;
+/// further groups of rows are `group` rows apart.
 pub(super) fn scatter_level(
     shape: &Architecture,
+    number: usize,
     level: &Level,
     coordinates: &[f32],
     run: usize,
     count: usize,
     groups: usize,
+    group: usize,
     gradient: &[f32],
+    stride: usize,
     corners: &mut Corners,
     table: &mut [f32],
+    touched: &mut [u8],
 ) {
     assert!(table.len() == level.entries * shape.features);
-    let features = shape.features;
-    for first in (0..count).step_by(corners.lanes) {
-        let take = (count - first).min(corners.lanes);
-        macro_rules! level {
-            ($d:literal, $f:literal) => {{
-                // The runs of the axes keep their distance when their starts move along together.
-                corners.locate::<$d>(level, &coordinates[first..], run, take, groups > 1);
-                corners.scatter::<$d, $f>(&corners.weight, &gradient[first * features..], table, take);
-                for axis in 0..groups - 1 {
-                    let slopes = &corners.slope[axis * 8 * corners.lanes..];
-                    corners.scatter::<$d, $f>(slopes, &gradient[((axis + 1) * run + first) * features..], table, take);
-                }
-            }};
-        }
-        dispatch!(shape.dimensions(), features, level);
+    let column = number * shape.features;
+    macro_rules! level {
+        ($d:literal, $f:literal) => {{
+            corners.locate::<$d>(level, coordinates, run, count, groups > 1);
+            corners.scatter::<$d, $f>(&corners.weight, gradient, stride, column, table, touched, count);
+            for axis in 0..groups - 1 {
+                let slopes = &corners.slope[axis * 8 * corners.lanes..];
+                corners.scatter::<$d, $f>(slopes, &gradient[(axis + 1) * group * stride..], stride, column, table, touched, count);
+            }
+        }};
     }
+    dispatch!(shape.dimensions(), shape.features, level);
 }
 
 /// sin and cos of 2^l (pi/2) p with p = 2x - 1 in [-1, 1], ordered axis, octave, (sin, cos).

@@ -61,6 +61,14 @@ impl Model {
         [[tables, table_1, table_2], [layers, layer_1, layer_2]]
     }
 
+    /// Copies what [`Model::state`] gives into buffers that it gave before.
+    pub(crate) fn copy_state(&self, [tables, layers]: &mut [[Vec<f32>; 3]; 2]) {
+        if let Some(parameter) = &self.module.tables {
+            copy(&parameter.val(), self.table_moments.as_ref(), tables);
+        }
+        copy(&self.module.layers.val(), self.layer_moments.as_ref(), layers);
+    }
+
     /// Sets what [`Model::state`] gave, after `steps` steps. Lengths must be those of the shape.
     pub(crate) fn set_state(&mut self, [tables, layers]: [[Vec<f32>; 3]; 2], steps: usize) {
         let shape = [self.shape.table_entries(), self.shape.features];
@@ -101,6 +109,18 @@ impl Model {
 pub(super) fn contents<const D: usize>(tensor: &Tensor<Flex, D>) -> Vec<f32> {
     let primitive = tensor.clone().into_primitive().tensor();
     primitive.to_contiguous().storage::<f32>().to_vec()
+}
+
+fn copy<const D: usize>(parameter: &Tensor<Flex, D>, moments: Option<&AdamState<Flex, D>>, to: &mut [Vec<f32>; 3]) {
+    let mut part = |at: usize, tensor: &Tensor<Flex, D>| {
+        let tensor = primitive(tensor.clone());
+        to[at].copy_from_slice(tensor.storage());
+    };
+    part(0, parameter);
+    if let Some(state) = moments {
+        part(1, &state.momentum.moment_1);
+        part(2, &state.momentum.moment_2);
+    }
 }
 
 fn primitive<const D: usize>(tensor: Tensor<Flex, D>) -> FlexTensor {

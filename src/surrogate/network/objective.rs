@@ -1,7 +1,8 @@
 //! What the outputs mean, and what training minimises.
 
-use super::{Loss, NetworkSettings, Target, architecture::Architecture, tile::OUT};
+use super::{Field, Loss, NetworkSettings, Target, architecture::Architecture, tile::OUT};
 use crate::surrogate::Samples;
+use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 /// Outputs are trained as (value - mean) / deviation, so that rates mean the same on every scene. Per output.
@@ -71,6 +72,12 @@ impl Objective {
         self.jacobian_weight > 0.0
     }
 
+    /// The samples that can be trained on; none when all can.
+    pub fn sieve(&self, samples: &Samples) -> Option<Vec<u32>> {
+        let all = (0..samples.len()).into_par_iter().with_min_len(1 << 14).all(|index| self.usable(samples, index));
+        (!all).then(|| (0..samples.len() as u32).into_par_iter().filter(|&index| self.usable(samples, index as usize)).collect())
+    }
+
     /// Whether sample `index` can be trained on: everything it is asked for is there and finite.
     pub fn usable(&self, samples: &Samples, index: usize) -> bool {
         let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
@@ -99,16 +106,22 @@ impl Objective {
         values
     }
 
-    /// Sets mean and deviation from the first `4096` usable samples. The published loss has a scale of its own and keeps it; `centred` leaves the
-    /// mean at 0, so that an output of 0 stays 0.
-    pub fn standardise(&mut self, shape: &Architecture, samples: &Samples, centred: bool) {
+    /// Sets mean and deviation from about 4096 usable samples, spread over all. The published loss has a scale of its own and keeps it; a `base` below the network leaves
+    /// the mean at 0, so that an output of 0 stays 0.
+    pub fn standardise(&mut self, shape: &Architecture, samples: &Samples, base: Option<&dyn Field>) {
         if self.target == Target::Ftle && self.loss == Loss::Published {
             return;
         }
         let (mut sum, mut square, mut count) = ([0.0_f64; 3], [0.0_f64; 3], 0_u32);
         let stride = (samples.len() / 4096).max(1);
         for index in (0..samples.len()).step_by(stride).filter(|&i| self.usable(samples, i)) {
-            for (output, value) in self.raw(shape, samples, index).into_iter().enumerate() {
+            let mut raw = self.raw(shape, samples, index);
+            if let Some(base) = base {
+                let mut below = [0.0];
+                base.values(&samples.points[index..=index], &mut below);
+                raw[0] -= below[0];
+            }
+            for (output, value) in raw.into_iter().enumerate() {
                 sum[output] += f64::from(value);
                 square[output] += f64::from(value).powi(2);
             }
@@ -118,7 +131,7 @@ impl Objective {
             return;
         }
         for output in 0..shape.outputs() {
-            let mean = if centred { 0.0 } else { sum[output] / f64::from(count) };
+            let mean = if base.is_some() { 0.0 } else { sum[output] / f64::from(count) };
             let deviation = (square[output] / f64::from(count) - mean * mean).max(0.0).sqrt();
             self.scale.mean[output] = mean as f32;
             // A constant field has nothing to be scaled by.

@@ -16,7 +16,7 @@
 //! ```
 
 use super::architecture::Architecture;
-use super::encode::Corners;
+use super::encode::LINE;
 use super::module::Network;
 use super::tile::{self, Batch, OUT, Weights};
 use burn::backend::autodiff::{
@@ -130,10 +130,11 @@ impl FusedNetwork for Flex {
         let mut d_layers = vec![0.0; layers.len()];
         batch.layer_gradient(shape, &mut d_layers);
         let mut d_tables = vec![0.0; tables.len()];
-        let mut corners = Corners::new(1024);
+        let mut corners = batch.corners();
         for (number, level) in shape.levels.iter().enumerate() {
             let table = &mut d_tables[level.offset * shape.features..][..level.entries * shape.features];
-            batch.table_gradient(shape, number, level, &mut corners, table);
+            let mut touched = vec![0; table.len().div_ceil(LINE)];
+            batch.table_gradient(shape, number, level, &mut corners, table, &mut touched);
         }
         (
             FlexTensor::from_data(TensorData::new(d_tables, table_shape)),

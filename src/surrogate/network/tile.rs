@@ -1,7 +1,7 @@
 //! One tile of samples through the network and back, with everything it touches held in the first two cache levels; and a batch of
 //! tiles on all cores.
 
-use super::architecture::{Architecture, Level, padded};
+use super::architecture::{Architecture, Level, padded, row_stride};
 use super::dense::{self, BLOCK, Packed, packed_len};
 use super::encode::{self, Corners};
 use super::lanes::{Aligned, lanes};
@@ -9,6 +9,9 @@ use rayon::prelude::*;
 
 /// Values an output row is padded to.
 pub(super) const OUT: usize = 4;
+
+/// Most samples of a tile.
+pub(super) const MOST_SAMPLES: usize = 16 * BLOCK;
 
 /// Packed weights of all layers.
 pub(super) struct Weights {
@@ -103,7 +106,7 @@ impl Scratch {
     pub(super) fn new(shape: &Architecture, derivatives: bool, training: bool) -> Self {
         let groups = if derivatives { 1 + shape.dimensions() } else { 1 };
         // 96 rows of 64 f32 are 24 KiB; wider networks get fewer rows so that two rows of layers stay in L2.
-        let rows = if shape.widest() > 128 { 8 * BLOCK } else { 16 * BLOCK };
+        let rows = if shape.widest() > 128 { MOST_SAMPLES / 2 } else { MOST_SAMPLES };
         let samples = (rows / groups / BLOCK).max(1) * BLOCK;
         let rows = samples * groups;
         let hidden = shape.layers.len() - 1;
@@ -113,9 +116,9 @@ impl Scratch {
             groups,
             coordinates: vec![0.0; shape.dimensions() * samples.next_multiple_of(8)],
             corners: Corners::new(samples),
-            encoded: Aligned::zeros(rows * padded(shape.encoded())),
+            encoded: Aligned::zeros(rows * row_stride(shape.encoded())),
             activations: (0..if training { hidden } else { hidden.min(2) })
-                .map(|layer| Aligned::zeros(rows * if training { padded(shape.layers[layer].outputs) } else { shape.widest() }))
+                .map(|layer| Aligned::zeros(rows * if training { row_stride(shape.layers[layer].outputs) } else { shape.widest() }))
                 .collect(),
             gradients: [buffer(training), buffer(training)],
             outputs: vec![0.0; rows * OUT],
@@ -143,7 +146,7 @@ impl Scratch {
     pub(super) fn forward(&mut self, shape: &Architecture, weights: &Weights, tables: &[f32], count: usize, point: impl Fn(usize) -> [f32; 3]) {
         assert!(count <= self.samples);
         self.place(shape, count, point);
-        let (run, stride) = (self.run(), padded(shape.encoded()));
+        let (run, stride) = (self.run(), row_stride(shape.encoded()));
         if count < self.samples {
             // Rows behind the last sample go through the products with weight 0; what an earlier tile left there could be NaN.
             self.encoded.fill(0.0);
@@ -154,28 +157,47 @@ impl Scratch {
         let primal = if self.groups == 1 { rows } else { self.samples };
         let held = self.activations.len();
         for (number, layer) in weights.hidden.iter().enumerate() {
-            let y_stride = padded(layer.outputs);
+            let y_stride = row_stride(layer.outputs);
             if number == 0 {
                 dense::forward(layer, &self.encoded, stride, &mut self.activations[0], y_stride, rows, primal);
             } else {
                 let [x, y] = self.activations.get_disjoint_mut([(number - 1) % held, number % held]).expect("two different buffers");
-                dense::forward(layer, x, padded(layer.inputs), y, y_stride, rows, primal);
+                dense::forward(layer, x, row_stride(layer.inputs), y, y_stride, rows, primal);
             }
         }
         let last = &self.activations[(weights.hidden.len() - 1) % held];
-        for row in 0..rows {
-            let x = &last[row * weights.head_stride..][..weights.head_stride];
-            for output in 0..shape.outputs() {
-                let w = &weights.head[output * weights.head_stride..][..weights.head_stride];
-                let sum = x.chunks_exact(8).zip(w.chunks_exact(8)).fold(wide::f32x8::splat(0.0), |sum, (x, w)| lanes(x).mul_add(lanes(w), sum));
-                self.outputs[row * OUT + output] = sum.reduce_add() + if row < primal { weights.head_bias[output] } else { 0.0 };
+        let (len, stride) = (weights.head_stride, row_stride(weights.head_stride));
+        for output in 0..shape.outputs() {
+            let w = &weights.head[output * len..][..len];
+            for row in (0..rows).step_by(BLOCK) {
+                // Six rows side by side hide the latency of each other's sums.
+                let x: [&[f32]; BLOCK] = std::array::from_fn(|m| &last[(row + m) * stride..][..len]);
+                let mut sums = [wide::f32x8::splat(0.0); BLOCK];
+                for k in (0..len).step_by(8) {
+                    let w = lanes(&w[k..]);
+                    for (sum, x) in sums.iter_mut().zip(x) {
+                        *sum = lanes(&x[k..]).mul_add(w, *sum);
+                    }
+                }
+                let bias = if row < primal { weights.head_bias[output] } else { 0.0 };
+                for (m, sum) in sums.into_iter().enumerate() {
+                    self.outputs[(row + m) * OUT + output] = sum.reduce_add() + bias;
+                }
             }
         }
     }
 
-    /// The gradient of `sum(d_outputs * outputs)`: added to `gradient` for the layers, and left in `self.gradients[0]` for the encoding.
+    /// The gradient of `sum(d_outputs * outputs)`: added to `gradient` for the layers, and written to `d_encoded` (a row a row of the tile) for the encoding.
     /// Follows a `forward` of the same `count` samples.
-    fn backward(&mut self, shape: &Architecture, weights: &Weights, layout: &GradientLayout, count: usize, gradient: &mut [f32]) {
+    fn backward(
+        &mut self,
+        shape: &Architecture,
+        weights: &Weights,
+        layout: &GradientLayout,
+        count: usize,
+        gradient: &mut [f32],
+        d_encoded: &mut [f32],
+    ) {
         let rows = if self.groups == 1 { count.next_multiple_of(BLOCK) } else { self.samples * self.groups };
         let primal = if self.groups == 1 { rows } else { self.samples };
         for group in 0..self.groups {
@@ -184,21 +206,21 @@ impl Scratch {
             self.d_outputs[start..end].fill(0.0);
         }
         let hidden = weights.hidden.len();
-        let stride = weights.head_stride;
+        let (len, stride) = (weights.head_stride, row_stride(weights.head_stride));
         let [current, next] = &mut self.gradients;
         // The output layer: rank-one updates, row by row.
         let active = &self.activations[hidden - 1];
-        let (head, biases) = gradient[layout.head..layout.len].split_at_mut(OUT * stride);
+        let (head, biases) = gradient[layout.head..layout.len].split_at_mut(OUT * len);
         for row in 0..rows {
-            let x = &active[row * stride..][..stride];
-            let mask = &active[(row % primal) * stride..][..stride];
-            let dx = &mut current[row * stride..][..stride];
+            let x = &active[row * stride..][..len];
+            let mask = &active[(row % primal) * stride..][..len];
+            let dx = &mut current[row * stride..][..len];
             dx.fill(0.0);
             for output in 0..shape.outputs() {
                 let d = self.d_outputs[row * OUT + output];
-                let w = &weights.head[output * stride..][..stride];
-                let dw = &mut head[output * stride..][..stride];
-                for k in 0..stride {
+                let w = &weights.head[output * len..][..len];
+                let dw = &mut head[output * len..][..len];
+                for k in 0..len {
                     dw[k] = d.mul_add(x[k], dw[k]);
                     dx[k] = d.mul_add(if mask[k] > 0.0 { w[k] } else { 0.0 }, dx[k]);
                 }
@@ -209,14 +231,15 @@ impl Scratch {
         }
         for number in (0..hidden).rev() {
             let layer = &weights.hidden[number];
-            let (dz_stride, x_stride) = (padded(layer.outputs), padded(layer.inputs));
+            let (dz_stride, x_stride) = (row_stride(layer.outputs), row_stride(layer.inputs));
             let x = if number == 0 { &self.encoded } else { &self.activations[number - 1] };
             let packed = &mut gradient[layout.starts[number]..][..packed_len(&shape.layers[number])];
             dense::weight_gradient(layer.inputs, layer.outputs, x, x_stride, current, dz_stride, packed, rows, primal);
-            if number > 0 || !shape.levels.is_empty() {
-                let active = (number > 0).then_some(&x[..]);
-                dense::input_gradient(layer, current, dz_stride, next, x_stride, active, rows, primal);
+            if number > 0 {
+                dense::input_gradient(layer, current, dz_stride, next, x_stride, Some(x), rows, primal);
                 std::mem::swap(current, next);
+            } else if !shape.levels.is_empty() {
+                dense::input_gradient(layer, current, dz_stride, d_encoded, x_stride, None, rows, primal);
             }
         }
     }
@@ -225,10 +248,10 @@ impl Scratch {
 /// A fixed share of the batch with its own gradient, so that sums do not depend on the number of threads.
 struct Chunk {
     scratch: Scratch,
-    /// `[axis][run]`.
+    /// Per tile `[axis][run]`.
     coordinates: Vec<f32>,
-    /// Gradient for the encoded position, `[level][group][run][features]`.
-    d_encoded: Vec<f32>,
+    /// Gradient for the encoded position, per tile `[group][sample][row stride]`.
+    d_encoded: Aligned,
     gradient: Aligned,
     loss: f64,
     count: usize,
@@ -239,7 +262,8 @@ pub(super) struct Batch {
     chunks: Vec<Chunk>,
     layout: GradientLayout,
     groups: usize,
-    run: usize,
+    /// Tiles of a chunk.
+    tiles: usize,
 }
 
 impl Batch {
@@ -251,19 +275,20 @@ impl Batch {
         let tile = Scratch::new(shape, derivatives, false).samples;
         let chunks = most.min(batch.div_ceil(tile)).max(1);
         let share = batch.div_ceil(chunks);
-        let run = share.next_multiple_of(8);
+        let tiles = share.div_ceil(tile);
         let groups = if derivatives { 1 + shape.dimensions() } else { 1 };
+        let encoded = if shape.levels.is_empty() { 0 } else { tiles * tile * groups * row_stride(shape.encoded()) };
         let chunks = (0..chunks)
             .map(|_| Chunk {
                 scratch: Scratch::new(shape, derivatives, true),
-                coordinates: vec![0.0; run * shape.dimensions()],
-                d_encoded: vec![0.0; shape.levels.len() * groups * run * shape.features],
+                coordinates: vec![0.0; tiles * tile.next_multiple_of(8) * shape.dimensions()],
+                d_encoded: Aligned::zeros(encoded),
                 gradient: Aligned::zeros(layout.len),
                 loss: 0.0,
                 count: 0,
             })
             .collect();
-        Self { chunks, layout, groups, run }
+        Self { chunks, layout, groups, tiles }
     }
 
     /// Forward and backward over `count` samples. `announce` is called for every sample one tile before `point` is. `loss` sees the first sample's number, the number of samples, the distance of two groups in
@@ -279,8 +304,9 @@ impl Batch {
         loss: impl Fn(usize, usize, usize, &[f32], &mut [f32]) -> f64 + Sync,
     ) -> f64 {
         let share = count.div_ceil(self.chunks.len());
-        assert!(share <= self.run, "a batch of {count} samples in memory for {} a chunk", self.run);
-        let (layout, groups, run) = (&self.layout, self.groups, self.run);
+        let tile = self.chunks[0].scratch.samples;
+        assert!(share <= self.tiles * tile, "a batch of {count} samples in memory for {} tiles a chunk", self.tiles);
+        let (layout, groups, stride) = (&self.layout, self.groups, row_stride(shape.encoded()));
         self.chunks.par_iter_mut().enumerate().with_max_len(1).for_each(|(number, chunk)| {
             let begin = (number * share).min(count);
             chunk.count = ((number + 1) * share).min(count) - begin;
@@ -295,24 +321,16 @@ impl Batch {
                 (next..end.min(next + scratch.samples)).for_each(&announce);
                 scratch.forward(shape, weights, tables, take, |sample| point(begin + first + sample));
                 chunk.loss += loss(begin + first, take, scratch.samples, &scratch.outputs, &mut scratch.d_outputs);
-                scratch.backward(shape, weights, layout, take, &mut chunk.gradient);
-                if shape.levels.is_empty() {
-                    continue;
-                }
-                for axis in 0..shape.dimensions() {
-                    let from = &scratch.coordinates[axis * scratch.run()..][..take];
-                    chunk.coordinates[axis * run + first..][..take].copy_from_slice(from);
-                }
-                let (stride, features) = (padded(shape.encoded()), shape.features);
-                for level in 0..shape.levels.len() {
-                    for group in 0..groups {
-                        let to = &mut chunk.d_encoded[((level * groups + group) * run + first) * features..][..take * features];
-                        let rows = &scratch.gradients[0][group * scratch.samples * stride..];
-                        for (to, row) in to.chunks_exact_mut(features).zip(rows.chunks_exact(stride)) {
-                            to.copy_from_slice(&row[level * features..][..features]);
-                        }
-                    }
-                }
+                let number = first / scratch.samples;
+                let d_encoded = if shape.levels.is_empty() {
+                    &mut []
+                } else {
+                    let rows = scratch.samples * groups * stride;
+                    let held = scratch.coordinates.len();
+                    chunk.coordinates[number * held..][..held].copy_from_slice(&scratch.coordinates);
+                    &mut chunk.d_encoded[number * rows..][..rows]
+                };
+                scratch.backward(shape, weights, layout, take, &mut chunk.gradient, d_encoded);
             }
         });
         self.chunks.iter().map(|chunk| chunk.loss).sum()
@@ -325,12 +343,36 @@ impl Batch {
         }
     }
 
-    /// Adds the gradient of level `number`'s entries to `table`.
-    pub(super) fn table_gradient(&self, shape: &Architecture, number: usize, level: &Level, corners: &mut Corners, table: &mut [f32]) {
+    /// Adds the gradient of level `number`'s entries to `table`, and marks the cache lines of it that were written to in `touched`.
+    pub(super) fn table_gradient(
+        &self,
+        shape: &Architecture,
+        number: usize,
+        level: &Level,
+        corners: &mut Corners,
+        table: &mut [f32],
+        touched: &mut [u8],
+    ) {
+        let stride = row_stride(shape.encoded());
         for chunk in &self.chunks {
-            let gradient = &chunk.d_encoded[number * self.groups * self.run * shape.features..];
-            encode::scatter_level(shape, level, &chunk.coordinates, self.run, chunk.count, self.groups, gradient, corners, table);
+            let tile = chunk.scratch.samples;
+            let (rows, held) = (tile * self.groups * stride, chunk.scratch.coordinates.len());
+            for first in (0..chunk.count).step_by(tile) {
+                let at = first / tile;
+                let coordinates = &chunk.coordinates[at * held..][..held];
+                let gradient = &chunk.d_encoded[at * rows..][..rows];
+                let count = (chunk.count - first).min(tile);
+                let run = chunk.scratch.run();
+                encode::scatter_level(
+                    shape, number, level, coordinates, run, count, self.groups, tile, gradient, stride, corners, table, touched,
+                );
+            }
         }
+    }
+
+    /// Room for the corners of a tile.
+    pub(super) fn corners(&self) -> Corners {
+        Corners::new(self.chunks[0].scratch.samples)
     }
 }
 

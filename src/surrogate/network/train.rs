@@ -1,14 +1,14 @@
 //! Optimizer steps, three ways over the same model: burn's stock operations ([`stock_step`]), the fused operation inside burn's autodiff
 //! ([`operation_step`]), and the production path ([`Fused::steps`]): forward, backward and Adam in burn's own buffers.
 
-use super::adam::{Adam, BETA_1, BETA_2};
+use super::adam::{Adam, BETA_1, BETA_2, move_average};
 use super::architecture::Architecture;
-use super::encode::Corners;
+use super::encode::LINE;
 use super::lanes::Aligned;
 use super::model::{Loan, Model};
 use super::module::{Network, mix};
 use super::objective::{Objective, signed_exp};
-use super::tile::{self, Batch, OUT, Weights};
+use super::tile::{self, Batch, MOST_SAMPLES, OUT, Weights};
 use super::{Loss, Target};
 use crate::surrogate::Samples;
 use burn::backend::{Autodiff, Flex};
@@ -61,6 +61,8 @@ pub struct Fused {
     batch: Batch,
     weights: Weights,
     table_gradient: Aligned,
+    /// A mark for each cache line of each level's gradient.
+    touched: Vec<Vec<u8>>,
     layer_gradient: Vec<f32>,
     /// Numbers of the samples of the present batch.
     drawn: Vec<u32>,
@@ -68,7 +70,7 @@ pub struct Fused {
 }
 
 /// One step's inputs, apart from the model.
-#[derive(Debug, Clone, Copy)]
+#[derive(Clone, Copy)]
 pub struct Step<'a> {
     /// Samples to draw from.
     pub samples: &'a Samples,
@@ -80,6 +82,16 @@ pub struct Step<'a> {
     pub rate: f64,
     /// Share by which the average moves towards the new parameters; 0 leaves it.
     pub average_share: f32,
+    /// Whether cache lines of the tables that got no gradient wait. Otherwise every entry takes part in every step, as with burn's Adam.
+    pub lazy: bool,
+    /// A field below the network: it is trained on what the log-stretch has beyond it.
+    pub base: Option<&'a dyn Field>,
+}
+
+/// Something with a value at every unit point.
+pub trait Field: Sync {
+    /// Writes the value at each point.
+    fn values(&self, points: &[[f32; 3]], out: &mut [f32]);
 }
 
 impl Fused {
@@ -90,6 +102,7 @@ impl Fused {
             batch: Batch::new(shape, size, objective.derivatives()),
             weights: Weights::new(shape, &model.layers(), true),
             table_gradient: Aligned::zeros(shape.table_entries() * shape.features),
+            touched: shape.levels.iter().map(|level| vec![0; (level.entries * shape.features).div_ceil(LINE)]).collect(),
             layer_gradient: vec![0.0; shape.layer_parameters()],
             drawn: Vec::with_capacity(size),
             size,
@@ -126,15 +139,25 @@ impl Fused {
         self.drawn.extend((0..count).map(|position| pick.index(position, samples.len()) as u32));
         let drawn = &self.drawn[..];
         let index = |position: usize| drawn[position] as usize;
+        let scale = objective.scale;
         let (penalty, slope) = mean_penalty(shape, objective, &self.weights, tables, count, samples, index);
         let outputs = shape.outputs();
         let groups = if objective.derivatives() { 1 + shape.dimensions() } else { 1 };
         let loss = |first: usize, take: usize, group_rows: usize, out: &[f32], gradient: &mut [f32]| {
             let mut sum = 0.0;
+            let mut below = [0.0; MOST_SAMPLES];
+            if let Some(base) = step.base {
+                let mut points = [[0.0; 3]; MOST_SAMPLES];
+                for (sample, point) in points[..take].iter_mut().enumerate() {
+                    *point = samples.points[index(first + sample)];
+                }
+                base.values(&points[..take], &mut below[..take]);
+            }
             for group in 0..groups {
                 let weight = objective.weight(shape, group, count);
                 for sample in 0..take {
-                    let targets = objective.targets(shape, samples, index(first + sample), group);
+                    let mut targets = objective.targets(shape, samples, index(first + sample), group);
+                    targets[0] -= below[sample] / scale.deviation[0];
                     let row = (group * group_rows + sample) * OUT;
                     for output in 0..outputs {
                         let difference = out[row + output] - targets[output];
@@ -161,16 +184,19 @@ impl Fused {
 
     /// Scatters the gradient into the tables, level by level (each level belongs to one task, so nothing is shared), and applies Adam.
     fn update(&mut self, shape: &Architecture, epsilon: f32, loan: &mut Loan, average: &mut Average, step: &Step<'_>) {
-        let share = step.average_share;
-        let Self { batch, table_gradient, layer_gradient, .. } = self;
+        let (share, lazy) = (step.average_share, step.lazy);
+        let Self { batch, table_gradient, touched, layer_gradient, .. } = self;
         let Average { tables: average_tables, layers: average_layers } = average;
         let Loan { tables, layers } = loan;
         let update_layers = || {
             batch.layer_gradient(shape, layer_gradient);
             layers.time += 1;
-            let adam = Adam::at(layers.time, step.rate, epsilon);
+            let time = layers.time;
             let [parameters, first, second] = layers.buffers();
-            adam.step(parameters, layer_gradient, first, second, (share > 0.0).then_some((average_layers, share)));
+            Adam::at(time, step.rate, epsilon).step(parameters, layer_gradient, first, second);
+            if share > 0.0 {
+                move_average(average_layers, parameters, share);
+            }
         };
         let update_tables = || {
             let Some(tables) = tables else { return };
@@ -180,18 +206,26 @@ impl Fused {
             let mut gradient = &mut table_gradient[..];
             let mut average = &mut average_tables[..];
             let mut work = Vec::with_capacity(shape.levels.len());
-            for (number, level) in shape.levels.iter().enumerate() {
+            for (number, (level, touched)) in shape.levels.iter().zip(touched).enumerate() {
                 let len = level.entries * shape.features;
-                let mean = if share > 0.0 { split(&mut average, len) } else { &mut [] };
-                work.push((number, split(&mut gradient, len), split(&mut parameters, len), split(&mut first, len), split(&mut second, len), mean));
+                let moments = [split(&mut first, len), split(&mut second, len)];
+                work.push((number, touched, split(&mut gradient, len), split(&mut parameters, len), moments, split(&mut average, len)));
             }
             // The largest levels first, so that the small ones fill the gaps at the end.
             work.reverse();
             work.into_par_iter().with_max_len(1).for_each_init(
-                || Corners::new(512),
-                |corners, (number, gradient, parameters, first, second, mean)| {
-                    batch.table_gradient(shape, number, &shape.levels[number], corners, gradient);
-                    adam.step(parameters, gradient, first, second, (share > 0.0).then_some((mean, share)));
+                || batch.corners(),
+                |corners, (number, touched, gradient, parameters, [first, second], average)| {
+                    batch.table_gradient(shape, number, &shape.levels[number], corners, gradient, touched);
+                    if lazy {
+                        adam.lazy_step(parameters, gradient, first, second, touched);
+                    } else {
+                        adam.step(parameters, gradient, first, second);
+                        touched.fill(0);
+                    }
+                    if share > 0.0 {
+                        move_average(average, parameters, share);
+                    }
                 },
             );
         };

@@ -1,0 +1,243 @@
+//! Surrogates through their trait: learning, divergence, bad samples, checkpoints, the slide of the window.
+
+mod network_support;
+
+use network_support::{DoubleGyre, traced, uniform_points};
+use ridgewatch::flow::Tracer;
+use ridgewatch::surrogate::network::{Encoding, Loss, NetworkSettings, Target};
+use ridgewatch::surrogate::{CheckpointError, Kind, Residual, Samples, Surrogate, SurrogateSettings, Table, build};
+
+fn small() -> NetworkSettings {
+    NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }
+}
+
+fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Tracer) -> Box<dyn Surrogate> {
+    let settings = SurrogateSettings { kind, table_nodes: Some([33, 17, 1]) };
+    build(&settings, network, tracer.domain(), 5, tracer).unwrap()
+}
+
+fn rms(surrogate: &dyn Surrogate, samples: &Samples) -> f64 {
+    let mut predicted = vec![0.0; samples.len()];
+    surrogate.predict(&samples.points, &mut predicted);
+    let sum: f64 = predicted.iter().zip(&samples.log_stretch).map(|(p, t)| f64::from(p - t).powi(2)).sum();
+    (sum / samples.len() as f64).sqrt()
+}
+
+fn psnr(surrogate: &dyn Surrogate, samples: &Samples) -> f64 {
+    let peak = samples.log_stretch.iter().copied().fold(f32::MIN, f32::max);
+    20.0 * (f64::from(peak) / rms(surrogate, samples)).log10()
+}
+
+/// Every kind of network learns the double gyre: the error of a constant is 1 deviation; what is reached by 300 small steps is a fraction of it.
+#[test]
+fn every_variant_learns() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 40);
+    let samples = traced(&tracer, uniform_points(1, 20_000), true);
+    let held_out = traced(&tracer, uniform_points(2, 2_000), false);
+    let mean = held_out.log_stretch.iter().sum::<f32>() / held_out.len() as f32;
+    let deviation = (held_out.log_stretch.iter().map(|s| f64::from(s - mean).powi(2)).sum::<f64>() / held_out.len() as f64).sqrt();
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, octaves: 5, hidden_layers: 3, ..small() };
+    for (name, network, share) in [
+        ("mean square", small(), 0.4),
+        ("published loss", NetworkSettings { loss: Loss::Published, ..small() }, 0.6),
+        ("frequency", frequency, 0.8),
+    ] {
+        let mut surrogate = surrogate(Kind::Network, &network, &tracer);
+        let learned = surrogate.learn(&samples, 60.0, 300);
+        assert_eq!((learned.steps, learned.rollbacks, learned.dropped), (300, 0, 0), "{name}");
+        assert_eq!(learned.samples, 300 * 2048);
+        let error = rms(&*surrogate, &held_out) / deviation;
+        assert!(error < share, "{name}: {error} of the deviation");
+    }
+}
+
+#[test]
+fn jacobians_help_the_flow_map() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 40);
+    let samples = traced(&tracer, uniform_points(1, 20_000), true);
+    let held_out = traced(&tracer, uniform_points(2, 2_000), false);
+    let error = |jacobian_weight| {
+        let network = NetworkSettings { target: Target::FlowMap, jacobian_weight, ..small() };
+        let mut surrogate = surrogate(Kind::Network, &network, &tracer);
+        assert_eq!(surrogate.learn(&samples, 60.0, 300).steps, 300);
+        rms(&*surrogate, &held_out)
+    };
+    let (without, with) = (error(0.0), error(0.1));
+    assert!(with < 0.9 * without, "with Jacobians {with}, without {without}");
+}
+
+#[test]
+fn a_residual_starts_as_its_table_and_improves_on_it() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 40);
+    let held_out = traced(&tracer, uniform_points(2, 4_000), false);
+    let table = Table::trace(&tracer, [33, 17, 1]);
+    let mut residual = Residual::new(&small(), [33, 17, 1], 5, &tracer).unwrap();
+    let (mut a, mut b) = (vec![0.0; held_out.len()], vec![0.0; held_out.len()]);
+    table.predict(&held_out.points, &mut a);
+    residual.predict(&held_out.points, &mut b);
+    assert_eq!(a, b);
+    let before = psnr(&residual, &held_out);
+    residual.learn(&traced(&tracer, uniform_points(1, 40_000), false), 60.0, 400);
+    let after = psnr(&residual, &held_out);
+    assert!(after > before + 2.0, "{before} dB, then {after} dB");
+    // Another start time: the table is traced anew; a residual that no longer fits is forgotten at the next samples.
+    let later = DoubleGyre::new(5.0, 10.0, 40);
+    let held_out = traced(&later, uniform_points(3, 4_000), false);
+    residual.window_slid(&later);
+    residual.learn(&traced(&later, uniform_points(4, 40_000), false), 60.0, 1);
+    let (slid, table) = (psnr(&residual, &held_out), psnr(&Table::trace(&later, [33, 17, 1]), &held_out));
+    // One step at the full rate may cost a little.
+    assert!(slid > table - 1.0, "residual {slid} dB on a table of {table} dB");
+}
+
+#[test]
+fn a_network_does_not_lose_to_the_constant_after_a_slide() {
+    let (early, late) = (DoubleGyre::new(0.0, 10.0, 40), DoubleGyre::new(0.5, 10.0, 40));
+    let mut network = surrogate(Kind::Network, &small(), &early);
+    network.learn(&traced(&early, uniform_points(1, 20_000), false), 60.0, 300);
+    network.window_slid(&late);
+    let held_out = traced(&late, uniform_points(2, 4_000), false);
+    let carried = rms(&*network, &held_out);
+    network.learn(&traced(&late, uniform_points(3, 20_000), false), 60.0, 300);
+    assert!(rms(&*network, &held_out) < carried);
+}
+
+#[test]
+fn samples_without_a_value_are_dropped_and_counted() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let mut samples = traced(&tracer, uniform_points(1, 5_000), false);
+    samples.log_stretch[3] = f32::NAN;
+    samples.log_stretch[77] = f32::INFINITY;
+    samples.points[100][1] = f32::NAN;
+    let mut network = surrogate(Kind::Network, &small(), &tracer);
+    let learned = network.learn(&samples, 60.0, 50);
+    assert_eq!((learned.dropped, learned.rollbacks, learned.steps), (3, 0, 50));
+    assert!(learned.loss.unwrap().is_finite());
+    assert!(rms(&*network, &traced(&tracer, uniform_points(2, 500), false)).is_finite());
+    let nothing = Samples { points: vec![[0.5; 3]], log_stretch: vec![f32::NAN], ..Samples::default() };
+    let learned = network.learn(&nothing, 60.0, 50);
+    assert_eq!((learned.dropped, learned.steps, learned.loss), (1, 0, None));
+}
+
+#[test]
+fn a_diverging_loss_is_rolled_back_and_counted() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let samples = traced(&tracer, uniform_points(1, 5_000), false);
+    // A rate at which Adam throws every weight across the whole landscape.
+    let network = NetworkSettings { learning_rate: Some(1.0), ..small() };
+    let mut wild = surrogate(Kind::Network, &network, &tracer);
+    let learned = wild.learn(&samples, 60.0, 300);
+    assert!(learned.rollbacks > 0, "{learned:?}");
+    let held_out = traced(&tracer, uniform_points(2, 2_000), false);
+    let error = rms(&*wild, &held_out);
+    let scale = held_out.log_stretch.iter().map(|s| f64::from(*s).powi(2)).sum::<f64>().sqrt() / (held_out.len() as f64).sqrt();
+    assert!(error.is_finite() && error < 4.0 * scale, "{error} beside labels of {scale}");
+    // A label from hell: finite, but its square is not.
+    let mut calm = surrogate(Kind::Network, &small(), &tracer);
+    calm.learn(&samples, 60.0, 100);
+    let before = rms(&*calm, &held_out);
+    let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples.clone() };
+    let learned = calm.learn(&poison, 2.0, 20);
+    assert!(learned.rollbacks > 0 && learned.steps == 0, "{learned:?}");
+    assert_eq!(rms(&*calm, &held_out), before);
+}
+
+#[test]
+fn a_resumed_run_goes_on_bit_for_bit() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let samples = traced(&tracer, uniform_points(1, 5_000), true);
+    let folder = tempfile::tempdir().unwrap();
+    let flow_map = NetworkSettings { target: Target::FlowMap, ..small() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, octaves: 4, ..small() };
+    for (kind, network) in
+        [(Kind::Network, small()), (Kind::Residual, small()), (Kind::Network, flow_map), (Kind::Network, frequency), (Kind::Table, small())]
+    {
+        let path = folder.path().join(format!("{kind:?}"));
+        let mut first = surrogate(kind, &network, &tracer);
+        first.learn(&samples, 60.0, 37);
+        first.save(&path).unwrap();
+        first.learn(&samples, 60.0, 23);
+        let mut second = surrogate(kind, &network, &tracer);
+        second.load(&path).unwrap();
+        second.learn(&samples, 60.0, 23);
+        let (mut a, mut b) = (vec![0.0; 5_000], vec![0.0; 5_000]);
+        first.predict(&samples.points, &mut a);
+        second.predict(&samples.points, &mut b);
+        assert!(a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()), "{kind:?}");
+        // Saving again gives the same file: weights, both moments, averages and all that is noted.
+        let again = [folder.path().join("a"), folder.path().join("b")];
+        first.save(&again[0]).unwrap();
+        second.save(&again[1]).unwrap();
+        assert_eq!(std::fs::read(&again[0]).unwrap(), std::fs::read(&again[1]).unwrap(), "{kind:?}");
+    }
+    // Nothing but the checkpoints is left in the folder.
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 5);
+}
+
+#[test]
+fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let samples = traced(&tracer, uniform_points(1, 3_000), false);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("checkpoint");
+    let mut network = surrogate(Kind::Network, &small(), &tracer);
+    network.learn(&samples, 60.0, 20);
+    network.save(&path).unwrap();
+    let good = std::fs::read(&path).unwrap();
+    let reference = rms(&*network, &samples);
+
+    let mut damaged: Vec<(String, Vec<u8>)> = vec![
+        ("empty".into(), Vec::new()),
+        ("foreign".into(), b"not a checkpoint at all, but a few words of text".to_vec()),
+        ("longer".into(), [&good[..], &[0; 16]].concat()),
+    ];
+    for keep in [4, 9, 200, good.len() / 2, good.len() - 1] {
+        damaged.push((format!("cut at {keep}"), good[..keep].to_vec()));
+    }
+    let mut flipped = good.clone();
+    let last = flipped.len() - 3;
+    flipped[last] ^= 0x40;
+    damaged.push(("one bit flipped".into(), flipped));
+    for (name, bytes) in damaged {
+        std::fs::write(&path, bytes).unwrap();
+        assert!(matches!(network.load(&path), Err(CheckpointError::Mismatch { .. })), "{name}");
+        assert_eq!(rms(&*network, &samples), reference, "{name}");
+    }
+    assert!(matches!(network.load(&folder.path().join("missing")), Err(CheckpointError::Io { .. })));
+
+    // A sound checkpoint of another shape, kind or scene.
+    std::fs::write(&path, &good).unwrap();
+    let wider = NetworkSettings { width: 48, ..small() };
+    assert!(matches!(surrogate(Kind::Network, &wider, &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
+    assert!(matches!(surrogate(Kind::Residual, &small(), &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
+    assert!(matches!(surrogate(Kind::Table, &small(), &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
+    network.load(&path).unwrap();
+    assert_eq!(rms(&*network, &samples), reference);
+    // A folder that is not there: an error, and nothing written.
+    assert!(matches!(network.save(&folder.path().join("no/such/checkpoint")), Err(CheckpointError::Io { .. })));
+}
+
+#[test]
+fn wrong_settings_are_refused_by_name() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let fault = |kind, network: NetworkSettings, nodes| {
+        let settings = SurrogateSettings { kind, table_nodes: nodes };
+        build(&settings, &network, tracer.domain(), 0, &tracer).err().unwrap().to_string()
+    };
+    assert!(fault(Kind::Network, NetworkSettings { width: 0, ..small() }, None).contains("network.width = 0"));
+    assert!(fault(Kind::Residual, NetworkSettings { target: Target::FlowMap, ..small() }, None).contains("network.target = flow_map"));
+    assert!(fault(Kind::Table, small(), Some([1, 5, 5])).contains("surrogate.table_nodes = [1, 5, 5]"));
+    assert!(fault(Kind::Table, small(), Some([1 << 20, 1 << 20, 1])).contains("at most 2^30"));
+}
+
+#[test]
+fn time_and_steps_bound_learning() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let samples = traced(&tracer, uniform_points(1, 5_000), false);
+    let mut network = surrogate(Kind::Network, &small(), &tracer);
+    assert_eq!(network.learn(&samples, 0.0, 100).steps, 0);
+    assert_eq!(network.learn(&samples, 60.0, 0).steps, 0);
+    let learned = network.learn(&samples, 0.3, u64::MAX);
+    // One step of 2048 samples takes milliseconds; a second is for a machine under load.
+    assert!(learned.steps > 0 && learned.seconds < 1.3, "{learned:?}");
+}
