@@ -113,6 +113,8 @@ struct Place {
 
 /// Random stream of the first probe, apart from those of audit points.
 const PROBE_STREAM: u64 = 1 << 62;
+/// Number of the pilot's picture.
+const PILOT_PICTURE: u64 = 1 << 41;
 /// Number of the first warm-up picture, far beyond all others.
 const WARMUP_PICTURES: u64 = 1 << 40;
 
@@ -127,6 +129,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
     let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
+    cycle.pilot(&*tracer)?;
     cycle.probe(&*tracer, slide.index);
     loop {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
@@ -198,13 +201,29 @@ impl<'a> Cycle<'a> {
         let probe = self.threads.render.install(|| audit::trace(tracer, &unit, flow_map));
         let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
         self.renderer.observe(&points, &probe.samples.log_stretch);
-        if let Some(live) = &self.live {
-            let front = live.freeze();
-            let residuals =
-                self.threads.render.install(|| audit::residuals(&*front, &probe.samples, self.renderer.transfer(), tracer.tau()));
-            self.trust.observe(&residuals);
-            self.ring.push(&probe.samples);
-        }
+        self.learn_of(tracer, &probe.samples);
+    }
+
+    /// A picture of one sample a pixel, by RK4 and for nobody's eyes: a renderer that has seen nothing walks with the largest majorant
+    /// everywhere and makes several times the queries, so that the first frame had better not be its first.
+    fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), EngineError> {
+        let gate = Gate::uniform(false);
+        let mut answers = Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring).with_flow_map(self.wants_flow_map());
+        let renderer = &mut self.renderer;
+        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, &AtomicBool::new(false)))?;
+        let samples = answers.samples;
+        self.learn_of(tracer, &samples);
+        Ok(())
+    }
+
+    /// Holds traced samples against the surrogate, then keeps them for training.
+    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples) {
+        let Some(live) = &self.live else { return };
+        let front = live.freeze();
+        let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
+        let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
+        self.trust.observe(&residuals);
+        self.ring.push(samples);
     }
 
     fn wants_flow_map(&self) -> bool {

@@ -58,7 +58,7 @@ pub struct TransferSettings {
     pub low: Option<f64>,
     /// FTLE at which it saturates; None: 99.5th percentile of the first frame's FTLE.
     pub high: Option<f64>,
-    /// Largest extinction, per unit of length; None: 50 over the domain's shortest visible edge.
+    /// Largest extinction, per unit of length; None: 12 over the domain's shortest visible edge.
     pub extinction: Option<f64>,
     /// Polynomial coefficients of the red, green and blue albedo, lowest power first. A scene file may give the name of a preset
     /// instead ([`super::ALBEDO_PRESETS`]).

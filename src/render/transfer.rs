@@ -10,7 +10,7 @@ pub const ALBEDO_PRESETS: [&str; 4] = ["published", "grey", "ember", "deep"];
 const ALBEDO_SLACK: f64 = 0.05;
 
 /// Optical depth of the shortest edge at full extinction, when no extinction is given.
-const DEFAULT_OPTICAL_DEPTH: f64 = 50.0;
+const DEFAULT_OPTICAL_DEPTH: f64 = 12.0;
 
 /// Coefficients a0..a4 of the small renderer published with Günther, Kuhn and Theisel, "MCFTLE" (2016): dark red ridges, pale
 /// yellow flanks, blue rims.
