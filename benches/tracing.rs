@@ -8,15 +8,15 @@ use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
 use ridgewatch::flow::{
-    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Order, Precision, Steps, Traced, Tracer, VelocitySource,
-    cpu_tracer, scalar_tracer, tracer_in_order,
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Order, Precision, Steps, Traced, Tracer,
+    VelocitySource, cpu_tracer, scalar_tracer, tracer_in_order,
 };
 use std::error::Error;
 use std::f64::consts::TAU;
 use std::sync::Arc;
 use std::time::Instant;
 
-const ROUNDS: usize = 7;
+const ROUNDS: usize = 5;
 
 fn map(tau: f64, steps: usize, precision: Precision, boundary: Boundary) -> FlowMap {
     FlowMap {
@@ -95,13 +95,36 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     let closed = |flow: &Analytic, domain: &Domain| VelocitySource::Analytic(flow.clone(), domain.clone());
     let scenes = [
-        ("double gyre, tau 10, 100 steps", closed(&gyre, &plane), plane.clone(), map(10.0, 100, Precision::F32, Boundary::Unbounded), 200_000),
-        ("gridded double gyre 401x201, 21 snapshots, tau 10, 100 steps", gridded_gyre, plane.clone(), map(10.0, 100, Precision::F32, Boundary::Clamp), 60_000),
+        (
+            "double gyre, tau 10, 100 steps",
+            closed(&gyre, &plane),
+            plane.clone(),
+            map(10.0, 100, Precision::F32, Boundary::Unbounded),
+            200_000,
+        ),
+        (
+            "gridded double gyre 401x201, 21 snapshots, tau 10, 100 steps",
+            gridded_gyre,
+            plane.clone(),
+            map(10.0, 100, Precision::F32, Boundary::Clamp),
+            60_000,
+        ),
         ("ABC, tau 5, 50 steps", closed(&abc, &cube), cube, map(5.0, 50, Precision::F32, Boundary::Unbounded), 200_000),
-        ("easy turbulence 96x48x48x12, tau 11, 22 steps", turbulence.clone(), cells.clone(), map(11.0, 22, Precision::F32, Boundary::Clamp), 150_000),
+        (
+            "easy turbulence 96x48x48x12, tau 11, 22 steps",
+            turbulence.clone(),
+            cells.clone(),
+            map(11.0, 22, Precision::F32, Boundary::Clamp),
+            150_000,
+        ),
     ];
-    println!("\n{:<62} {:>10} {:>10} {:>10} {:>9} {:>9}", "M samples/s (all threads)", "tangent", "differences", "scalar", "x differ.", "x scalar");
-    for (name, source, domain, map, count) in &scenes {
+    println!(
+        "\n{:<62} {:>10} {:>10} {:>10} {:>9} {:>9}",
+        "M samples/s (all threads)", "tangent", "differences", "scalar", "x differ.", "x scalar"
+    );
+    let filter = std::env::args().skip(1).find(|argument| !argument.starts_with('-'));
+    let chosen = |name: &str| filter.as_ref().is_none_or(|filter| name.contains(filter.as_str()));
+    for (name, source, domain, map, count) in scenes.iter().filter(|scene| chosen(scene.0)) {
         let seeds = scattered(domain, *count);
         let few = &seeds[..count / 4];
         for precision in [Precision::F32, Precision::F64] {
@@ -125,6 +148,9 @@ fn main() -> Result<(), Box<dyn Error>> {
 
     println!();
     for (name, shape, count) in [("96x48x48x12 (42 MB)", shape, 1 << 18), ("240x96x96x12 (425 MB)", [240, 96, 96], 1 << 20)] {
+        if !chosen("sorted") {
+            continue;
+        }
         let window = Turbulence::easy(shape, 0).window(&Turbulence::grid(shape)?, 12)?;
         let domain = Domain::cuboid([0.0; 3], shape.map(|n| n as f64 - 1.0));
         let source = VelocitySource::Window(Arc::new(window));
@@ -141,6 +167,9 @@ fn main() -> Result<(), Box<dyn Error>> {
         );
     }
 
+    if !chosen("reference scene") {
+        return Ok(());
+    }
     let reference = cpu_tracer(closed(&gyre, &plane), &map(40.0, 400, Precision::F32, Boundary::Zero), 0.0)?;
     let seeds = scattered(&plane, 1 << 17);
     let rate = rates(&[&*reference], &[&seeds])[0];

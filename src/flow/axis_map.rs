@@ -142,9 +142,8 @@ impl<R: Real> Table<R> {
         let cells = positions.len() - 1;
         let intervals = cells * INTERVALS;
         let density = intervals as f64 / positions[cells];
-        let begins = (0..intervals)
-            .map(|i| (positions.partition_point(|&p| p <= i as f64 / density).max(1) - 1).min(cells - 1) as u32)
-            .collect();
+        let begins =
+            (0..intervals).map(|i| (positions.partition_point(|&p| p <= i as f64 / density).max(1) - 1).min(cells - 1) as u32).collect();
         let real = |values: Vec<f64>| values.into_iter().map(R::from_f64).collect::<Vec<R>>();
         let inverse = real(positions.windows(2).map(|w| 1.0 / (w[1] - w[0])).collect());
         Self { positions: real(positions), inverse, begins, density: R::from_f64(density) }
