@@ -528,6 +528,7 @@ fn fine_steps_on_a_grid_converge_to_the_reference() {
     let coarse = rms_and_max(&with(map(3.0, 24, Precision::F64)), &exact).0;
     let fine = rms_and_max(&with(map(3.0, 1536, Precision::F64)), &exact).0;
     println!("gridded turbulence against the reference: 24 steps {coarse:.1e}, 1536 steps {fine:.1e}");
-    // The linear interpolant's derivative jumps at cell faces: first order in the step, with changing sign from face to face.
-    assert!(fine < coarse / 16.0 && fine < 1e-5, "{coarse:e} {fine:e}");
+    // The linear interpolant's derivative jumps at cell faces, which makes the tangent first order in the step: 64 times as many
+    // steps leave a 64th. Half of that is asked for, since signs change from face to face.
+    assert!(fine < coarse / 32.0, "{coarse:e} {fine:e}");
 }

@@ -71,6 +71,16 @@ pub enum FlowError {
         /// Nodes found.
         nodes: usize,
     },
+    /// A snapshot does not fit its grid.
+    #[error("snapshot at time {time} has {found} velocities; its grid has {expected} nodes")]
+    SnapshotShape {
+        /// Its time.
+        time: f64,
+        /// Velocities found.
+        found: usize,
+        /// Nodes of the grid.
+        expected: usize,
+    },
     /// No number of steps was enough.
     #[error(
         "{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}"

@@ -67,7 +67,9 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         }
         let snapshots: Vec<_> = window.snapshots().cloned().collect();
         // Reading nodes without bounds checks relies on this.
-        assert!(snapshots.iter().all(|s| s.nodes.len() == grid.nodes()), "a snapshot has one velocity a node");
+        if let Some(odd) = snapshots.iter().find(|s| s.nodes.len() != grid.nodes()) {
+            return Err(FlowError::SnapshotShape { time: odd.time, found: odd.nodes.len(), expected: grid.nodes() });
+        }
         let axes: [AxisMap<R>; N] = array(|k| AxisMap::new(&grid.axes[k], policy));
         let [nx, ny, _] = grid.shape();
         let [u, v, w] = rate(&axes);
