@@ -24,7 +24,7 @@ fn main() {
         let mut average = Average { tables: model.tables(), layers: model.layers() };
         let mut fused = Fused::new(&model, &objective, 1 << 14);
         fused.steps(&mut model, &objective, &mut average, |done, _| {
-            let pick = Pick::Random { seed: 1, counter: done << 14, among: None };
+            let pick = Pick::Random { seed: 1, counter: done << 14, among: None, hold_out: false };
             (done < steps).then_some(Step { samples: &samples, pick, count: 1 << 14, rate: 1e-3, average_share: if done % 4 == 0 { 0.01 } else { 0.0 }, lazy: true, base: None })
         });
     } else {

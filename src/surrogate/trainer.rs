@@ -120,7 +120,7 @@ impl Trainer {
         self.progress.looked = 0.0;
     }
 
-    /// Sets the output layer back to 0, in the weights, the moments and the average.
+    /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
         self.kept = None;
         self.model.zero_output();
@@ -185,7 +185,7 @@ impl Trainer {
                 } else {
                     0.0
                 };
-                let pick = Pick::Random { seed: *seed, counter, among };
+                let pick = Pick::Random { seed: *seed, counter, among, hold_out: base.is_some() };
                 let rate = *rate * progress.stall * progress.caution;
                 Some(Step { samples, pick, count, rate, average_share: share, lazy: true, base })
             });

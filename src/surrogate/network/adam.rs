@@ -1,6 +1,7 @@
 //! Adam (Kingma and Ba 2015) on slices, with burn's arithmetic: same order, same f32 rounding up to fused multiply-adds.
 
 use super::encode::LINE;
+use super::lanes::prefetch;
 
 /// Decay of the first moment.
 pub(super) const BETA_1: f32 = 0.9;
@@ -25,6 +26,7 @@ impl Adam {
     }
 
     /// Updates parameters and moments, and zeroes the gradient.
+    #[inline]
     pub(super) fn step(self, parameters: &mut [f32], gradient: &mut [f32], first: &mut [f32], second: &mut [f32]) {
         let Self { rate, epsilon, correction } = self;
         for (((p, g), m), v) in parameters.iter_mut().zip(gradient.iter_mut()).zip(first).zip(second) {
@@ -47,20 +49,25 @@ impl Adam {
         touched: &mut [u8],
     ) {
         let len = parameters.len();
-        for (group, marks) in touched.chunks_mut(8).enumerate() {
-            if marks.iter().all(|&mark| mark == 0) {
-                continue;
-            }
-            for (line, mark) in marks.iter_mut().enumerate() {
-                if std::mem::take(mark) != 0 {
-                    let begin = (8 * group + line) * LINE;
-                    let range = begin..(begin + LINE).min(len);
-                    self.step(&mut parameters[range.clone()], &mut gradient[range.clone()], &mut first[range.clone()], &mut second[range]);
+        assert!(gradient.len() == len && first.len() == len && second.len() == len && touched.len() >= len.div_ceil(LINE));
+        for (group, marks) in touched[..len.div_ceil(LINE)].chunks_mut(AHEAD).enumerate() {
+            let begin = |line: usize| (AHEAD * group + line) * LINE;
+            for (line, _) in marks.iter().enumerate().filter(|(_, mark)| **mark != 0) {
+                for buffer in [&*parameters, &*gradient, &*first, &*second] {
+                    prefetch(buffer, begin(line));
                 }
+            }
+            for (line, mark) in marks.iter_mut().enumerate().filter(|(_, mark)| **mark != 0) {
+                *mark = 0;
+                let range = begin(line)..(begin(line) + LINE).min(len);
+                self.step(&mut parameters[range.clone()], &mut gradient[range.clone()], &mut first[range.clone()], &mut second[range]);
             }
         }
     }
 }
+
+/// Lines that are asked for together before the first of them is used: enough to have all the memory's answers under way.
+const AHEAD: usize = 32;
 
 /// Moves a mean of the parameters by its share.
 pub(super) fn move_average(average: &mut [f32], parameters: &[f32], share: f32) {
