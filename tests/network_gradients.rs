@@ -144,6 +144,7 @@ struct Case {
 fn cases() -> Vec<Case> {
     let small = NetworkSettings {
         levels: 3,
+        features: 2,
         log2_table: 7,
         base_resolution: 4,
         growth: 2.0,

@@ -75,3 +75,33 @@ pub(super) fn move_average(average: &mut [f32], parameters: &[f32], share: f32) 
         *a += (p - *a) * share;
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lazy_step_is_the_step_where_there_is_a_gradient() {
+        // Not a whole number of lines, and more of them than are asked for at once.
+        let len = 40 * LINE + 5;
+        let value = |i: usize, k: u64| super::super::module::uniform(k, i as u64) - 0.5;
+        let mut touched: Vec<u8> = (0..len.div_ceil(LINE)).map(|line| u8::from(line % 3 == 1 || line >= 39)).collect();
+        let marked: Vec<bool> = (0..len).map(|i| touched[i / LINE] != 0).collect();
+        let gradient: Vec<f32> = (0..len).map(|i| if marked[i] { value(i, 1) } else { 0.0 }).collect();
+        let start = [2, 3, 4].map(|k| (0..len).map(|i| value(i, k).abs()).collect::<Vec<f32>>());
+        let adam = Adam::at(7, 1e-2, 1e-15);
+        let [mut p, mut m, mut v] = start.clone();
+        adam.step(&mut p, &mut gradient.clone(), &mut m, &mut v);
+        let [mut lazy_p, mut lazy_m, mut lazy_v] = start.clone();
+        let mut lazy_gradient = gradient;
+        adam.lazy_step(&mut lazy_p, &mut lazy_gradient, &mut lazy_m, &mut lazy_v, &mut touched);
+        for i in 0..len {
+            let expected = if marked[i] { [p[i], m[i], v[i]] } else { [start[0][i], start[1][i], start[2][i]] };
+            // Vectors and scalars may round a multiply-add differently in the last place.
+            for (found, expected) in [lazy_p[i], lazy_m[i], lazy_v[i]].into_iter().zip(expected) {
+                assert!((found - expected).abs() <= 2.0 * f32::EPSILON * expected.abs().max(0.01), "{i}: {found} and {expected}");
+            }
+        }
+        assert!(touched.iter().all(|&mark| mark == 0) && lazy_gradient.iter().all(|&g| g == 0.0));
+    }
+}
