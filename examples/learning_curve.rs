@@ -119,7 +119,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let nodes = std::array::from_fn(|axis| ((extent[axis] * scale) as usize).max(2));
         let start = Instant::now();
         let table = build(&SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) }, &network, &domain, 0, &*coarse)?;
-        println!("table     {:6.1} s  {:6.2} dB  {nodes:?} nodes, {} bytes", start.elapsed().as_secs_f64(), psnr(&*table, &held_out), table.bytes());
+        println!(
+            "table     {:6.1} s  {:6.2} dB  {nodes:?} nodes, {} bytes",
+            start.elapsed().as_secs_f64(),
+            psnr(&*table, &held_out),
+            table.bytes()
+        );
     }
     if wanted("residual") && !flow_map {
         let mut surrogate = build(&of(Kind::Residual), &network, &domain, 0, &*coarse)?;

@@ -1,7 +1,7 @@
 //! Flows in closed form: velocity and exact gradient, for any lanes.
 
 use super::{Geometry, Grid, Snapshot};
-use crate::simd::{Lanes, Real};
+use crate::simd::{Lanes, Real, array};
 use rayon::prelude::*;
 use std::f64::consts::PI;
 use std::sync::Arc;
@@ -86,7 +86,7 @@ impl ClosedForm<2> for DoubleGyre {
     }
     #[inline(always)]
     fn velocity<L: Lanes>(constants: &Constants<L::Real>, x: &[L; 2]) -> [L; 2] {
-        let [scale, _, a, b] = constants.map(L::splat);
+        let [scale, _, a, b] = array(|i| L::splat(constants[i]));
         let ax = a * x[0];
         let slope = ax + ax + b;
         let (sin_f, cos_f) = ((ax + b) * x[0]).sin_cos_pi();
@@ -95,7 +95,7 @@ impl ClosedForm<2> for DoubleGyre {
     }
     #[inline(always)]
     fn tangent<L: Lanes, const C: usize>(constants: &Constants<L::Real>, x: &[L; 2], m: &[[L; C]; 2]) -> ([L; 2], [[L; C]; 2]) {
-        let [scale, scale_pi, a, b] = constants.map(L::splat);
+        let [scale, scale_pi, a, b] = array(|i| L::splat(constants[i]));
         let ax = a * x[0];
         let slope = ax + ax + b;
         let (sin_f, cos_f) = ((ax + b) * x[0]).sin_cos_pi();
@@ -106,10 +106,7 @@ impl ClosedForm<2> for DoubleGyre {
         let q = scale_pi * slope * (cos_f * cos_y);
         let r = scale_pi * across;
         let p = (-r * slope).mul_add(slope, along * (a + a));
-        let product = [
-            std::array::from_fn(|k| r.mul_add(m[1][k], -(q * m[0][k]))),
-            std::array::from_fn(|k| p.mul_add(m[0][k], q * m[1][k])),
-        ];
+        let product = [array(|k| r.mul_add(m[1][k], -(q * m[0][k]))), array(|k| p.mul_add(m[0][k], q * m[1][k]))];
         (velocity, product)
     }
 }
@@ -130,20 +127,20 @@ impl ClosedForm<3> for Abc {
     }
     #[inline(always)]
     fn velocity<L: Lanes>(constants: &Constants<L::Real>, x: &[L; 3]) -> [L; 3] {
-        let [a, b, c, _] = constants.map(L::splat);
-        let [(sx, cx), (sy, cy), (sz, cz)] = x.map(L::sin_cos);
+        let [a, b, c, _] = array(|i| L::splat(constants[i]));
+        let [(sx, cx), (sy, cy), (sz, cz)] = array(|i| x[i].sin_cos());
         [a.mul_add(sz, c * cy), b.mul_add(sx, a * cz), c.mul_add(sy, b * cx)]
     }
     #[inline(always)]
     fn tangent<L: Lanes, const C: usize>(constants: &Constants<L::Real>, x: &[L; 3], m: &[[L; C]; 3]) -> ([L; 3], [[L; C]; 3]) {
-        let [a, b, c, _] = constants.map(L::splat);
-        let [(sx, cx), (sy, cy), (sz, cz)] = x.map(L::sin_cos);
+        let [a, b, c, _] = array(|i| L::splat(constants[i]));
+        let [(sx, cx), (sy, cy), (sz, cz)] = array(|i| x[i].sin_cos());
         let (asz, acz, bsx, bcx, csy, ccy) = (a * sz, a * cz, b * sx, b * cx, c * sy, c * cy);
         let velocity = [asz + ccy, bsx + acz, csy + bcx];
         let product = [
-            std::array::from_fn(|k| acz.mul_add(m[2][k], -(csy * m[1][k]))),
-            std::array::from_fn(|k| bcx.mul_add(m[0][k], -(asz * m[2][k]))),
-            std::array::from_fn(|k| ccy.mul_add(m[1][k], -(bsx * m[0][k]))),
+            array(|k| acz.mul_add(m[2][k], -(csy * m[1][k]))),
+            array(|k| bcx.mul_add(m[0][k], -(asz * m[2][k]))),
+            array(|k| ccy.mul_add(m[1][k], -(bsx * m[0][k]))),
         ];
         (velocity, product)
     }
@@ -170,8 +167,8 @@ impl ClosedForm<2> for Linear {
     }
     #[inline(always)]
     fn tangent<L: Lanes, const C: usize>(constants: &Constants<L::Real>, x: &[L; 2], m: &[[L; C]; 2]) -> ([L; 2], [[L; C]; 2]) {
-        let g = constants.map(L::splat);
-        let row = |i: usize| std::array::from_fn(|k| g[2 * i].mul_add(m[0][k], g[2 * i + 1] * m[1][k]));
+        let g: [L; 4] = array(|i| L::splat(constants[i]));
+        let row = |i: usize| array(|k| g[2 * i].mul_add(m[0][k], g[2 * i + 1] * m[1][k]));
         (Self::velocity(constants, x), [row(0), row(1)])
     }
 }
@@ -220,7 +217,7 @@ impl Analytic {
         match self.form() {
             Form::DoubleGyre(form) => flat(form, point, time),
             Form::Abc(form) => {
-                let identity: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))));
+                let identity: [[f64; 3]; 3] = array(|i| array(|j| f64::from(u8::from(i == j))));
                 Abc::tangent(&form.constants(time), &point, &identity).1
             }
             Form::Linear(form) => flat(form, point, time),

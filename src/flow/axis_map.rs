@@ -103,11 +103,6 @@ impl<R: Real> AxisMap<R> {
         [before.map(|b| -length(b) / here), after.map(|a| 1.0 + length(a) / here)]
     }
 
-    /// Whether the axis needs a table.
-    pub fn is_uneven(&self) -> bool {
-        self.table.is_some()
-    }
-
     /// Finds each lane's cell. Cells are in range whatever the state is.
     #[inline(always)]
     pub fn locate<L: Gather<Real = R>>(&self, state: L) -> Place<L> {
@@ -147,9 +142,8 @@ impl<R: Real> Table<R> {
         let cells = positions.len() - 1;
         let intervals = cells * INTERVALS;
         let density = intervals as f64 / positions[cells];
-        let begins = (0..intervals)
-            .map(|i| (positions.partition_point(|&p| p <= i as f64 / density).max(1) - 1).min(cells - 1) as u32)
-            .collect();
+        let begins =
+            (0..intervals).map(|i| (positions.partition_point(|&p| p <= i as f64 / density).max(1) - 1).min(cells - 1) as u32).collect();
         let real = |values: Vec<f64>| values.into_iter().map(R::from_f64).collect::<Vec<R>>();
         let inverse = real(positions.windows(2).map(|w| 1.0 / (w[1] - w[0])).collect());
         Self { positions: real(positions), inverse, begins, density: R::from_f64(density) }

@@ -17,8 +17,7 @@ const A: [[f64; 6]; 7] = [
     [35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
 ];
 /// Fifth order less fourth.
-const E: [f64; 7] =
-    [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0];
+const E: [f64; 7] = [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0];
 
 /// Local error allowed, relative to the size of position (at least 1) and tangent.
 pub const TOLERANCE: f64 = 1e-10;
@@ -63,7 +62,8 @@ pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
     let (mut alive, mut left) = (field.inside(&state.0), false);
     left |= !alive;
     // Ends of smooth stretches of time, in the direction of travel.
-    let mut ends: Vec<f64> = field.breaks().iter().copied().filter(|b| (b - from) / span > SHORTEST && (b - from) / span < 1.0 - SHORTEST).collect();
+    let mut ends: Vec<f64> =
+        field.breaks().iter().copied().filter(|b| (b - from) / span > SHORTEST && (b - from) / span < 1.0 - SHORTEST).collect();
     if span < 0.0 {
         ends.reverse();
     }

@@ -72,7 +72,9 @@ pub enum FlowError {
         nodes: usize,
     },
     /// No number of steps was enough.
-    #[error("{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}")]
+    #[error(
+        "{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}"
+    )]
     StepsNotFound {
         /// Most steps tried.
         steps: usize,

@@ -4,7 +4,7 @@ use super::sampler::{GridStage, Sampler};
 use super::velocity::{Chart, Velocity, bounds, identity, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
-use crate::simd::{Gather, Real};
+use crate::simd::{Gather, Real, array};
 
 /// A window on a Cartesian grid of D axes.
 #[derive(Debug, Clone)]
@@ -20,14 +20,13 @@ pub struct GridFlow<R, const D: usize> {
 impl<R: Real, const D: usize> GridFlow<R, D> {
     /// Prepares a window.
     pub fn new(window: &Window, grid: &Grid, policy: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
-        let sampler = Sampler::new(window, grid, policy, interpolation, |axes| {
-            std::array::from_fn(|c| axes.get(c).map_or(0.0, |axis| 1.0 / axis.spacing))
-        })?;
-        let spacing = std::array::from_fn(|k| sampler.axes[k].spacing);
-        let ends: [[f64; 2]; D] = std::array::from_fn(|k| sampler.axes[k].ends());
-        let end = |i: usize| std::array::from_fn(|k| R::from_f64(ends[k][i]));
+        let sampler =
+            Sampler::new(window, grid, policy, interpolation, |axes| array(|c| axes.get(c).map_or(0.0, |axis| 1.0 / axis.spacing)))?;
+        let spacing = array(|k| sampler.axes[k].spacing);
+        let ends: [[f64; 2]; D] = array(|k| sampler.axes[k].ends());
+        let end = |i: usize| array(|k| R::from_f64(ends[k][i]));
         let equal = spacing.iter().all(|&s| s == spacing[0]);
-        let ratios = std::array::from_fn(|i| std::array::from_fn(|j| R::from_f64(spacing[i] / spacing[j])));
+        let ratios = array(|i| array(|j| R::from_f64(spacing[i] / spacing[j])));
         Ok(Self { bounds: bounds(policy, end(0), end(1)), spacing, ratios: (!equal).then_some(ratios), sampler })
     }
 }
@@ -37,7 +36,7 @@ impl<R: Real, const D: usize> Chart<D, D> for GridFlow<R, D> {
         Some(self.sampler.sort_key(&self.start(point.map(f64::from))))
     }
     fn start(&self, point: [f64; 3]) -> [f64; D] {
-        std::array::from_fn(|k| self.sampler.axes[k].state(point[k]))
+        array(|k| self.sampler.axes[k].state(point[k]))
     }
     fn first_tangent(&self, _: [f64; 3]) -> [[f64; D]; D] {
         identity()
@@ -46,7 +45,7 @@ impl<R: Real, const D: usize> Chart<D, D> for GridFlow<R, D> {
         2.0 * gap / self.spacing[axis]
     }
     fn arrival(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| state.get(k).map_or(seed[k], |&x| self.sampler.axes[k].coordinate(x) as f32))
+        array(|k| state.get(k).map_or(seed[k], |&x| self.sampler.axes[k].coordinate(x) as f32))
     }
     fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], metric: [[f64; D]; D]) -> [[f64; D]; D] {
         metric
@@ -66,13 +65,13 @@ impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
     #[inline(always)]
     fn velocity(&self, stage: &Self::Stage, x: &[L; D]) -> ([L; D], L) {
         let (velocity, mark) = self.sampler.value(stage, x);
-        (std::array::from_fn(|i| velocity[i]), mark)
+        (array(|i| velocity[i]), mark)
     }
     #[inline(always)]
     fn tangent(&self, stage: &Self::Stage, x: &[L; D], m: &[[L; D]; D]) -> ([L; D], [[L; D]; D], L) {
         let sample = self.sampler.sample(stage, x);
-        let product = std::array::from_fn(|i| {
-            std::array::from_fn(|c| {
+        let product = array(|i| {
+            array(|c| {
                 let mut sum = sample.slopes[0][i] * m[0][c];
                 for k in 1..D {
                     sum = sample.slopes[k][i].mul_add(m[k][c], sum);
@@ -80,7 +79,7 @@ impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
                 sum
             })
         });
-        (std::array::from_fn(|i| sample.velocity[i]), product, sample.mark)
+        (array(|i| sample.velocity[i]), product, sample.mark)
     }
     #[inline(always)]
     fn inside(&self, x: &[L; D]) -> L::Mask {
@@ -90,7 +89,7 @@ impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
     fn metric(&self, _: &[L; D], m: &[[L; D]; D]) -> [[L; D]; D] {
         match &self.ratios {
             None => *m,
-            Some(ratios) => std::array::from_fn(|i| std::array::from_fn(|j| m[i][j] * L::splat(ratios[i][j]))),
+            Some(ratios) => array(|i| array(|j| m[i][j] * L::splat(ratios[i][j]))),
         }
     }
 }

@@ -1,6 +1,6 @@
 //! Whether the snapshots follow one another closely enough.
 
-use super::{FlowError, FlowMap, Extras, Traced, VelocitySource, assemble::cpu_tracer, steps};
+use super::{Extras, FlowError, FlowMap, Traced, VelocitySource, assemble::cpu_tracer, steps};
 use crate::field::{Geometry, Grid, Snapshot, Window};
 use rayon::prelude::*;
 use std::sync::Arc;
@@ -58,12 +58,7 @@ pub fn time_resolution(window: &Arc<Window>, map: &FlowMap, t0: f64) -> Result<T
         let (sum, known, most) = displacements(pair[0], pair[1].time - pair[0].time);
         (squares, nodes, largest) = (squares + sum, nodes + known, largest.max(most));
     }
-    Ok(TimeResolution {
-        displacement_rms: (squares / nodes.max(1) as f64).sqrt(),
-        displacement_max: largest.sqrt(),
-        ftle_change,
-        ftle_rms,
-    })
+    Ok(TimeResolution { displacement_rms: (squares / nodes.max(1) as f64).sqrt(), displacement_max: largest.sqrt(), ftle_change, ftle_rms })
 }
 
 /// Sum of the squared displacements in cells during `interval`, number of known nodes, largest squared displacement.

@@ -2,7 +2,7 @@
 
 use super::stretch::{log_stretch, rescale};
 use super::velocity::Velocity;
-use crate::simd::{Lanes, Mask, Real};
+use crate::simd::{Lanes, Mask, Real, array};
 
 /// Where a batch of particles ended, one a lane.
 pub struct Paths<L: Lanes, const D: usize, const C: usize> {
@@ -30,18 +30,18 @@ pub fn lanes_of<L: Lanes, const N: usize, P: Copy>(points: &[P], f: impl Fn(P) -
     for lane in 0..L::LANES {
         rows[lane] = if lane < points.len() { f(points[lane]) } else { rows[lane - 1] };
     }
-    std::array::from_fn(|n| L::from_fn(|lane| L::Real::from_f64(rows[lane][n])))
+    array(|n| L::from_fn(|lane| L::Real::from_f64(rows[lane][n])))
 }
 
 /// a * b + c for every component.
 #[inline(always)]
 fn along<L: Lanes, const D: usize>(h: L, k: &[L; D], x: &[L; D]) -> [L; D] {
-    std::array::from_fn(|i| h.mul_add(k[i], x[i]))
+    array(|i| h.mul_add(k[i], x[i]))
 }
 
 #[inline(always)]
 fn along_tangent<L: Lanes, const C: usize, const D: usize>(h: L, k: &[[L; C]; D], m: &[[L; C]; D]) -> [[L; C]; D] {
-    std::array::from_fn(|i| along(h, &k[i], &m[i]))
+    array(|i| along(h, &k[i], &m[i]))
 }
 
 /// Which particles go on, and how long the others lived.
@@ -86,13 +86,13 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
     let (h, half, sixth, two) = (L::of(step), L::of(step / 2.0), L::of(step / 6.0), L::of(2.0));
     let mut x: [L; D] = lanes_of(points, |p| field.start(p.map(f64::from)));
     let mut m: [[L; C]; D] = {
-        let columns: [[L; D]; C] = std::array::from_fn(|c| {
+        let columns: [[L; D]; C] = array(|c| {
             lanes_of(points, |p| {
                 let tangent = field.first_tangent(p.map(f64::from));
-                std::array::from_fn(|i| tangent[i][c])
+                array(|i| tangent[i][c])
             })
         });
-        std::array::from_fn(|i| std::array::from_fn(|c| columns[c][i]))
+        array(|i| array(|c| columns[c][i]))
     };
     let mut exponent = L::zero();
     let mut fates = Fates::<L>::new(field.inside(&x), steps);
@@ -107,9 +107,8 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
         sum = along(two, &k, &sum);
         sums = along_tangent(two, &g, &sums);
         let (k, g, mark4) = field.tangent(last, &along(h, &k, &x), &along_tangent(h, &g, &m));
-        let mut end = std::array::from_fn(|i| sixth.mul_add(sum[i] + k[i], x[i]));
-        let mut tangent =
-            std::array::from_fn(|i| std::array::from_fn(|c| sixth.mul_add(sums[i][c] + g[i][c], m[i][c])));
+        let mut end = array(|i| sixth.mul_add(sum[i] + k[i], x[i]));
+        let mut tangent = array(|i| array(|c| sixth.mul_add(sums[i][c] + g[i][c], m[i][c])));
         field.settle_tangent(&mut end, &mut tangent);
 
         let known = if V::MARKS { (mark1 + mark2 + (mark3 + mark4)).is_number() } else { L::Mask::splat(true) };
@@ -119,8 +118,8 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
             if !fates.alive.any() {
                 break;
             }
-            x = std::array::from_fn(|i| L::select(fates.alive, end[i], x[i]));
-            m = std::array::from_fn(|i| std::array::from_fn(|c| L::select(fates.alive, tangent[i][c], m[i][c])));
+            x = array(|i| L::select(fates.alive, end[i], x[i]));
+            m = array(|i| array(|c| L::select(fates.alive, tangent[i][c], m[i][c])));
         }
         rescale(&mut m, &mut exponent);
     }
@@ -145,7 +144,7 @@ fn advance<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
     let (k, mark3) = field.velocity(&stages[1], &along(half, &k, x));
     sum = along(two, &k, &sum);
     let (k, mark4) = field.velocity(&stages[2], &along(h, &k, x));
-    let mut end = std::array::from_fn(|i| sixth.mul_add(sum[i] + k[i], x[i]));
+    let mut end = array(|i| sixth.mul_add(sum[i] + k[i], x[i]));
     field.settle(&mut end);
     (end, mark1 + mark2 + (mark3 + mark4))
 }
@@ -162,7 +161,7 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
 ) -> Paths<L, D, C> {
     let steps = stages.len() / 2;
     let factors = [L::of(step), L::of(step / 2.0), L::of(step / 6.0), L::of(2.0)];
-    let mut pairs: [[[L; D]; 2]; C] = std::array::from_fn(|axis| {
+    let mut pairs: [[[L; D]; 2]; C] = array(|axis| {
         [gap, -gap].map(|offset| {
             lanes_of(points, |p| {
                 let mut p = p.map(f64::from);
@@ -171,9 +170,7 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
             })
         })
     });
-    let all_inside = |pairs: &[[[L; D]; 2]; C]| {
-        pairs.iter().flatten().fold(L::Mask::splat(true), |inside, x| inside & field.inside(x))
-    };
+    let all_inside = |pairs: &[[[L; D]; 2]; C]| pairs.iter().flatten().fold(L::Mask::splat(true), |inside, x| inside & field.inside(x));
     let mut fates = Fates::<L>::new(all_inside(&pairs), steps);
     for n in 0..steps {
         let mut mark = L::zero();
@@ -191,17 +188,14 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
                 break;
             }
             for (x, end) in pairs.iter_mut().flatten().zip(ends.iter().flatten()) {
-                *x = std::array::from_fn(|i| L::select(fates.alive, end[i], x[i]));
+                *x = array(|i| L::select(fates.alive, end[i], x[i]));
             }
         }
     }
-    let [inverse]: [[L; C]; 1] =
-        [lanes_of(points, |p| std::array::from_fn(|axis| 1.0 / field.separation(p.map(f64::from), axis, gap)))];
-    let m: [[L; C]; D] = std::array::from_fn(|i| std::array::from_fn(|c| (pairs[c][0][i] - pairs[c][1][i]) * inverse[c]));
+    let [inverse]: [[L; C]; 1] = [lanes_of(points, |p| array(|axis| 1.0 / field.separation(p.map(f64::from), axis, gap)))];
+    let m: [[L; C]; D] = array(|i| array(|c| (pairs[c][0][i] - pairs[c][1][i]) * inverse[c]));
     let half = L::of(0.5 / C as f64);
-    let mut state = std::array::from_fn(|i| {
-        pairs.iter().flatten().fold(L::zero(), |sum, x| half.mul_add(x[i], sum))
-    });
+    let mut state = array(|i| pairs.iter().flatten().fold(L::zero(), |sum, x| half.mul_add(x[i], sum)));
     field.settle(&mut state);
     let metric = field.metric(&state, &m);
     Paths {

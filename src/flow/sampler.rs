@@ -12,7 +12,7 @@
 use super::axis_map::{AxisMap, Place};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Snapshot, Window};
-use crate::simd::{Gather, Lanes, NodePair, Real};
+use crate::simd::{Gather, Lanes, NodePair, Real, Rows, array};
 use std::sync::Arc;
 
 /// A window of snapshots that can be asked for velocities. `N` is the number of grid axes.
@@ -68,7 +68,7 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         let snapshots: Vec<_> = window.snapshots().cloned().collect();
         // Reading nodes without bounds checks relies on this.
         assert!(snapshots.iter().all(|s| s.nodes.len() == grid.nodes()), "a snapshot has one velocity a node");
-        let axes: [AxisMap<R>; N] = std::array::from_fn(|k| AxisMap::new(&grid.axes[k], policy));
+        let axes: [AxisMap<R>; N] = array(|k| AxisMap::new(&grid.axes[k], policy));
         let [nx, ny, _] = grid.shape();
         let [u, v, w] = rate(&axes);
         Ok(Self {
@@ -127,10 +127,19 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         key
     }
 
+    #[inline(always)]
+    fn locate<L: Gather<Real = R>>(&self, x: &[L; N]) -> [Place<L>; N] {
+        let mut places = [self.axes[0].locate(x[0]); N];
+        for k in 1..N {
+            places[k] = self.axes[k].locate(x[k]);
+        }
+        places
+    }
+
     /// Velocity and mark.
     #[inline(always)]
     pub fn value<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> ([L; 3], L) {
-        let places = std::array::from_fn(|k| self.axes[k].locate(x[k]));
+        let places = self.locate(x);
         match self.interpolation {
             Interpolation::Linear => {
                 let [pair] = self.linear::<L, 1>(stage, &places);
@@ -138,7 +147,7 @@ impl<R: Real, const N: usize> Sampler<R, N> {
             }
             Interpolation::Cubic => {
                 let [pair] = self.cubic::<L, 1>(stage, &places);
-                (std::array::from_fn(|c| pair[c] + pair[c + 4]), pair[3] + pair[7])
+                (array(|c| pair[c] + pair[c + 4]), pair[3] + pair[7])
             }
         }
     }
@@ -146,29 +155,29 @@ impl<R: Real, const N: usize> Sampler<R, N> {
     /// Velocity, derivatives and mark.
     #[inline(always)]
     pub fn sample<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> Sample<L, N> {
-        let places: [Place<L>; N] = std::array::from_fn(|k| self.axes[k].locate(x[k]));
+        let places = self.locate(x);
         let mut sample = match self.interpolation {
             Interpolation::Linear => {
                 // The value, and its derivatives along all axes but x.
                 let pairs = self.linear::<L, N>(stage, &places);
                 let fraction = places[0].fraction;
                 let mut slopes = [[L::zero(); 3]; N];
-                slopes[0] = std::array::from_fn(|c| pairs[0][c + 4] - pairs[0][c]);
+                slopes[0] = array(|c| pairs[0][c + 4] - pairs[0][c]);
                 for k in 1..N {
                     slopes[k] = lerp_x(&pairs[k], fraction);
                 }
-                let velocity = std::array::from_fn(|c| fraction.mul_add(slopes[0][c], pairs[0][c]));
+                let velocity = array(|c| fraction.mul_add(slopes[0][c], pairs[0][c]));
                 Sample { velocity, slopes, mark: pairs[0][3] + pairs[0][7] }
             }
             Interpolation::Cubic => {
                 let pairs = self.cubic::<L, 4>(stage, &places);
-                let joined = |k: usize| std::array::from_fn(|c| pairs[k][c] + pairs[k][c + 4]);
-                Sample { velocity: joined(0), slopes: std::array::from_fn(|k| joined(k + 1)), mark: pairs[0][3] + pairs[0][7] }
+                let joined = |k: usize| array(|c| pairs[k][c] + pairs[k][c + 4]);
+                Sample { velocity: joined(0), slopes: array(|k| joined(k + 1)), mark: pairs[0][3] + pairs[0][7] }
             }
         };
         if places.iter().any(|p| p.sloped) {
             for k in 0..N {
-                sample.slopes[k] = sample.slopes[k].map(|s| s * places[k].slope);
+                sample.slopes[k] = array(|c| sample.slopes[k][c] * places[k].slope);
             }
         }
         sample
@@ -178,128 +187,169 @@ impl<R: Real, const N: usize> Sampler<R, N> {
     #[inline(always)]
     fn linear<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
         if self.seams {
-            self.linear_across_seams(stage, places)
-        } else if stage.single {
-            self.linear_inside::<L, K, true>(stage, places)
-        } else {
-            self.linear_inside::<L, K, false>(stage, places)
+            return self.linear_across_seams(stage, places);
         }
-    }
-
-    #[inline(always)]
-    fn linear_inside<L: Gather<Real = R>, const K: usize, const SINGLE: bool>(
-        &self,
-        stage: &GridStage<R>,
-        places: &[Place<L>; N],
-    ) -> [[L; 8]; K] {
         let first = self.snapshots[stage.first].nodes.as_ptr();
-        let second = if SINGLE { first } else { self.snapshots[stage.first + 1].nodes.as_ptr() };
-        let weights = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
+        let weights = array(|i| L::Pair::repeat(stage.weights[i]));
         let mut flat = places[N - 1].cell;
         for k in (0..N - 1).rev() {
             flat = L::flatten(flat, self.axes[k].nodes, places[k].cell);
         }
         let (row, plane) = (self.row, self.plane);
-        L::gather(|lane| {
-            let base = L::cell(&flat, lane) as usize;
-            let fetch = |offset: usize| {
-                // SAFETY: each cell index is at most its axis' number of nodes less 2 (`truncate`, `find`; no axis has a seam here), so
-                // that the cell's nodes, and the ones behind them along x, lie within the snapshot, whose length `new` checked.
-                unsafe {
-                    let a = L::Pair::adjacent(first.add(base + offset)) * weights[0];
-                    if SINGLE { a } else { L::Pair::adjacent(second.add(base + offset)).mul_add(weights[1], a) }
-                }
-            };
-            let y = L::Pair::splat(places[1].fraction.lane(lane));
-            if N == 2 {
-                bilinear::<L::Pair, K>(y, [fetch(0), fetch(row)])
-            } else {
-                let z = L::Pair::splat(places[N - 1].fraction.lane(lane));
-                trilinear::<L::Pair, K>(y, z, [fetch(0), fetch(row), fetch(plane), fetch(plane + row)])
-            }
-        })
+        if stage.single {
+            L::gather(&InsideRows::<L, N, true> { first, second: first, weights, flat, row, plane, places })
+        } else {
+            let second = self.snapshots[stage.first + 1].nodes.as_ptr();
+            L::gather(&InsideRows::<L, N, false> { first, second, weights, flat, row, plane, places })
+        }
     }
 
     /// The same where a cell's nodes may lie at opposite ends of an axis.
     #[inline(never)]
     fn linear_across_seams<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
-        let first = &self.snapshots[stage.first].nodes;
-        let second = if stage.single { first } else { &self.snapshots[stage.first + 1].nodes };
-        let weights = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
-        L::gather(|lane| {
-            let ends: [[usize; 2]; N] = std::array::from_fn(|k| {
-                let cell = L::cell(&places[k].cell, lane);
-                let next = if cell + 1 == self.axes[k].nodes { 0 } else { cell + 1 };
-                [cell as usize, next as usize]
-            });
-            let fetch = |y: usize, z: usize| {
-                let base = ends[1][y] * self.row + if N == 3 { ends[N - 1][z] * self.plane } else { 0 };
-                let (left, right) = (base + ends[0][0], base + ends[0][1]);
-                let a = L::Pair::joined(first[left], first[right]) * weights[0];
-                if stage.single { a } else { L::Pair::joined(second[left], second[right]).mul_add(weights[1], a) }
-            };
-            let y = L::Pair::splat(places[1].fraction.lane(lane));
-            if N == 2 {
-                bilinear::<L::Pair, K>(y, [fetch(0, 0), fetch(1, 0)])
-            } else {
-                let z = L::Pair::splat(places[N - 1].fraction.lane(lane));
-                trilinear::<L::Pair, K>(y, z, [fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)])
-            }
-        })
+        L::gather(&SeamRows { nodes: self.nodes(stage), sampler: self, places })
     }
 
     /// Sums over the stencil whose two halves are to be added: the value and, where K > 1, its derivatives along x, y (and z).
     #[inline(never)]
     fn cubic<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
-        let first = &self.snapshots[stage.first].nodes;
-        let second = if stage.single { first } else { &self.snapshots[stage.first + 1].nodes };
-        let in_time = [L::Pair::repeat(stage.weights[0]), L::Pair::repeat(stage.weights[1])];
-        let zero = L::Pair::zero();
-        L::gather(|lane| {
-            let stencils: [Stencil<R>; N] = std::array::from_fn(|k| {
-                Stencil::new(&self.axes[k], L::cell(&places[k].cell, lane), places[k].fraction.lane(lane))
-            });
-            let x = &stencils[0];
-            let spread = |w: &[R; 4], half: usize| L::Pair::spread(w[2 * half], w[2 * half + 1]);
-            let along_x = [spread(&x.weights, 0), spread(&x.weights, 1)];
-            let slope_x = [spread(&x.slopes, 0), spread(&x.slopes, 1)];
-            let mut sums = [zero; K];
-            for iz in 0..if N == 3 { 4 } else { 1 } {
-                let (z_weight, z_slope, z_base) = if N == 3 {
-                    let z = &stencils[N - 1];
-                    (z.weights[iz], z.slopes[iz], z.nodes[iz] * self.plane)
-                } else {
-                    (R::one(), R::zero(), 0)
-                };
-                for iy in 0..4 {
-                    let y = &stencils[1];
-                    let base = z_base + y.nodes[iy] * self.row;
-                    let fetch = |half: usize| {
-                        let (left, right) = (base + x.nodes[2 * half], base + x.nodes[2 * half + 1]);
-                        let a = L::Pair::joined(first[left], first[right]) * in_time[0];
-                        if stage.single { a } else { L::Pair::joined(second[left], second[right]).mul_add(in_time[1], a) }
-                    };
-                    let halves = [fetch(0), fetch(1)];
-                    let row = halves[0].mul_add(along_x[0], halves[1] * along_x[1]);
-                    let weight = L::Pair::splat(y.weights[iy] * z_weight);
-                    sums[0] = row.mul_add(weight, sums[0]);
-                    if K > 1 {
-                        let row_slope = halves[0].mul_add(slope_x[0], halves[1] * slope_x[1]);
-                        sums[1] = row_slope.mul_add(weight, sums[1]);
-                        sums[2] = row.mul_add(L::Pair::splat(y.slopes[iy] * z_weight), sums[2]);
-                        sums[3] = row.mul_add(L::Pair::splat(y.weights[iy] * z_slope), sums[3]);
-                    }
+        L::gather(&CubicRows { nodes: self.nodes(stage), sampler: self, places })
+    }
+
+    fn nodes<P: NodePair<Real = R>>(&self, stage: &GridStage<R>) -> NodesInTime<'_, P> {
+        let second = (!stage.single).then(|| self.snapshots[stage.first + 1].nodes.as_slice());
+        NodesInTime { first: &self.snapshots[stage.first].nodes, second, weights: array(|i| P::repeat(stage.weights[i])) }
+    }
+}
+
+/// Two snapshots, one or both read.
+struct NodesInTime<'a, P> {
+    first: &'a [[f32; 4]],
+    second: Option<&'a [[f32; 4]]>,
+    weights: [P; 2],
+}
+
+impl<P: NodePair> NodesInTime<'_, P> {
+    /// Two nodes, interpolated in time.
+    #[inline(always)]
+    fn pair(&self, left: usize, right: usize) -> P {
+        let a = P::joined(self.first[left], self.first[right]) * self.weights[0];
+        match self.second {
+            None => a,
+            Some(second) => P::joined(second[left], second[right]).mul_add(self.weights[1], a),
+        }
+    }
+}
+
+/// Linear interpolation where the nodes of every cell lie side by side in memory.
+struct InsideRows<'a, L: Gather, const N: usize, const SINGLE: bool> {
+    first: *const [f32; 4],
+    second: *const [f32; 4],
+    weights: [L::Pair; 2],
+    /// Index of each cell's first node.
+    flat: L::Cells,
+    row: usize,
+    plane: usize,
+    places: &'a [Place<L>; N],
+}
+
+impl<L: Gather, const N: usize, const SINGLE: bool, const K: usize> Rows<L::Pair, K> for InsideRows<'_, L, N, SINGLE> {
+    #[inline(always)]
+    fn rows(&self, lane: usize) -> [L::Pair; K] {
+        let base = L::cell(&self.flat, lane) as usize;
+        let fetch = |offset: usize| {
+            // SAFETY: each cell index is at most its axis' number of nodes less 2 (`truncate`, `find`; no axis has a seam here), so
+            // that the cell's nodes, and the ones behind them along x, lie within the snapshot, whose length `Sampler::new` checked.
+            unsafe {
+                let a = L::Pair::adjacent(self.first.add(base + offset)) * self.weights[0];
+                if SINGLE { a } else { L::Pair::adjacent(self.second.add(base + offset)).mul_add(self.weights[1], a) }
+            }
+        };
+        let (row, plane) = (self.row, self.plane);
+        let y = L::Pair::splat(self.places[1].fraction.lane(lane));
+        if N == 2 {
+            bilinear(y, [fetch(0), fetch(row)])
+        } else {
+            let z = L::Pair::splat(self.places[N - 1].fraction.lane(lane));
+            trilinear(y, z, [fetch(0), fetch(row), fetch(plane), fetch(plane + row)])
+        }
+    }
+}
+
+/// Linear interpolation anywhere.
+struct SeamRows<'a, L: Gather, const N: usize> {
+    nodes: NodesInTime<'a, L::Pair>,
+    sampler: &'a Sampler<L::Real, N>,
+    places: &'a [Place<L>; N],
+}
+
+impl<L: Gather, const N: usize, const K: usize> Rows<L::Pair, K> for SeamRows<'_, L, N> {
+    #[inline(always)]
+    fn rows(&self, lane: usize) -> [L::Pair; K] {
+        let ends: [[usize; 2]; N] = array(|k| {
+            let cell = L::cell(&self.places[k].cell, lane);
+            let next = if cell + 1 == self.sampler.axes[k].nodes { 0 } else { cell + 1 };
+            [cell as usize, next as usize]
+        });
+        let fetch = |y: usize, z: usize| {
+            let base = ends[1][y] * self.sampler.row + if N == 3 { ends[N - 1][z] * self.sampler.plane } else { 0 };
+            self.nodes.pair(base + ends[0][0], base + ends[0][1])
+        };
+        let y = L::Pair::splat(self.places[1].fraction.lane(lane));
+        if N == 2 {
+            bilinear(y, [fetch(0, 0), fetch(1, 0)])
+        } else {
+            let z = L::Pair::splat(self.places[N - 1].fraction.lane(lane));
+            trilinear(y, z, [fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)])
+        }
+    }
+}
+
+/// Cubic interpolation.
+struct CubicRows<'a, L: Gather, const N: usize> {
+    nodes: NodesInTime<'a, L::Pair>,
+    sampler: &'a Sampler<L::Real, N>,
+    places: &'a [Place<L>; N],
+}
+
+impl<L: Gather, const N: usize, const K: usize> Rows<L::Pair, K> for CubicRows<'_, L, N> {
+    #[inline(always)]
+    fn rows(&self, lane: usize) -> [L::Pair; K] {
+        let stencils: [Stencil<L::Real>; N] =
+            array(|k| Stencil::new(&self.sampler.axes[k], L::cell(&self.places[k].cell, lane), self.places[k].fraction.lane(lane)));
+        let (x, y) = (&stencils[0], &stencils[1]);
+        let spread = |w: &[L::Real; 4]| [L::Pair::spread(w[0], w[1]), L::Pair::spread(w[2], w[3])];
+        let (weights_x, slopes_x) = (spread(&x.weights), spread(&x.slopes));
+        let mut sums = [L::Pair::zero(); K];
+        for iz in 0..if N == 3 { 4 } else { 1 } {
+            let (z_weight, z_slope, z_base) = if N == 3 {
+                let z = &stencils[N - 1];
+                (z.weights[iz], z.slopes[iz], z.nodes[iz] * self.sampler.plane)
+            } else {
+                (L::Real::one(), L::Real::zero(), 0)
+            };
+            for iy in 0..4 {
+                let base = z_base + y.nodes[iy] * self.sampler.row;
+                let halves = [self.nodes.pair(base + x.nodes[0], base + x.nodes[1]), self.nodes.pair(base + x.nodes[2], base + x.nodes[3])];
+                let row = halves[0].mul_add(weights_x[0], halves[1] * weights_x[1]);
+                let weight = L::Pair::splat(y.weights[iy] * z_weight);
+                sums[0] = row.mul_add(weight, sums[0]);
+                if K > 1 {
+                    let row_slope = halves[0].mul_add(slopes_x[0], halves[1] * slopes_x[1]);
+                    sums[1] = row_slope.mul_add(weight, sums[1]);
+                    sums[2] = row.mul_add(L::Pair::splat(y.slopes[iy] * z_weight), sums[2]);
+                    sums[3] = row.mul_add(L::Pair::splat(y.weights[iy] * z_slope), sums[3]);
                 }
             }
-            sums
-        })
+        }
+        sums
     }
 }
 
 /// The last interpolation, along x.
 #[inline(always)]
 fn lerp_x<L: Lanes>(pair: &[L; 8], fraction: L) -> [L; 3] {
-    std::array::from_fn(|c| fraction.mul_add(pair[c + 4] - pair[c], pair[c]))
+    array(|c| fraction.mul_add(pair[c + 4] - pair[c], pair[c]))
 }
 
 /// Value and, where K > 1, derivative along y of two rows.

@@ -8,7 +8,7 @@ use super::sampler::{GridStage, Sampler};
 use super::velocity::{Chart, Velocity, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
-use crate::simd::{Gather, Lanes, Real};
+use crate::simd::{Gather, Lanes, Real, array};
 
 /// A window on a longitude-latitude grid in degrees.
 #[derive(Debug, Clone)]
@@ -33,7 +33,7 @@ impl<R: Real> SphereFlow<R> {
         let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
         let (sine, cosine) = middle.to_radians().sin_cos();
         let ends: [[f64; 2]; 2] = [longitude.ends(), latitude.ends()];
-        let end = |i: usize| std::array::from_fn(|k| R::from_f64(ends[k][i]));
+        let end = |i: usize| array(|k| R::from_f64(ends[k][i]));
         let real = R::from_f64;
         Ok(Self {
             bounds: bounds(policy, end(0), end(1)),
@@ -68,14 +68,14 @@ impl<R: Real> SphereFlow<R> {
     #[inline(always)]
     fn here<L: Gather<Real = R>>(&self, x: &[L; 3]) -> Here<L> {
         let inverse_length = L::one() / dot(x, x).sqrt();
-        let p = x.map(|c| c * inverse_length);
+        let p: [L; 3] = array(|i| x[i] * inverse_length);
         let cosine = p[0].mul_add(p[0], p[1] * p[1]).sqrt();
-        let [c, s] = self.turn.map(L::splat);
+        let [c, s] = [L::splat(self.turn[0]), L::splat(self.turn[1])];
         let (ahead, aside) = (c.mul_add(p[0], s * p[1]), c.mul_add(p[1], -(s * p[0])));
         // At a pole any longitude will do.
         let ahead = L::select(L::lt(cosine, L::of(AT_POLE)), L::one(), ahead);
         let angles = [aside.atan2(ahead), p[2].atan2(cosine)];
-        let place = std::array::from_fn(|k| angles[k].mul_add(L::splat(self.per_radian[k]), L::splat(self.origin[k])));
+        let place = array(|k| angles[k].mul_add(L::splat(self.per_radian[k]), L::splat(self.origin[k])));
         Here { p, inverse_length, cosine: cosine.max(L::of(AT_POLE)), place }
     }
 
@@ -96,7 +96,7 @@ fn trigonometry(point: [f64; 3]) -> [f64; 4] {
 
 impl<R: Real> Chart<3, 2> for SphereFlow<R> {
     fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
-        Some(self.sampler.sort_key(&std::array::from_fn(|k| self.sampler.axes[k].state(f64::from(point[k])))))
+        Some(self.sampler.sort_key(&array(|k| self.sampler.axes[k].state(f64::from(point[k])))))
     }
     fn start(&self, point: [f64; 3]) -> [f64; 3] {
         let [sin_lon, cos_lon, sin_lat, cos_lat] = trigonometry(point);
@@ -137,7 +137,7 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
         let here = self.here(x);
         let (velocity, mark) = self.sampler.value(stage, &here.place);
         let radial = dot(&here.p, &velocity);
-        (std::array::from_fn(|i| (-radial).mul_add(here.p[i], velocity[i])), mark)
+        (array(|i| (-radial).mul_add(here.p[i], velocity[i])), mark)
     }
     #[inline(always)]
     fn tangent(&self, stage: &Self::Stage, x: &[L; 3], m: &[[L; 2]; 3]) -> ([L; 3], [[L; 2]; 3], L) {
@@ -149,20 +149,19 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
         let mut product = [[L::zero(); 2]; 3];
         for c in 0..2 {
             // Change of direction for a change of the state along the column.
-            let column: [L; 3] = std::array::from_fn(|i| m[i][c]);
+            let column: [L; 3] = array(|i| m[i][c]);
             let outward = dot(p, &column);
-            let change: [L; 3] = std::array::from_fn(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
+            let change: [L; 3] = array(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
             let longitude = dot(&east, &change) / here.cosine * L::splat(self.per_radian[0]);
             let latitude = dot(&north, &change) * L::splat(self.per_radian[1]);
-            let interpolated: [L; 3] =
-                std::array::from_fn(|i| longitude.mul_add(sample.slopes[0][i], latitude * sample.slopes[1][i]));
+            let interpolated: [L; 3] = array(|i| longitude.mul_add(sample.slopes[0][i], latitude * sample.slopes[1][i]));
             // Derivative of V - p (p . V).
             let turned = dot(&change, &sample.velocity) + dot(p, &interpolated);
             for i in 0..3 {
                 product[i][c] = (-radial).mul_add(change[i], (-turned).mul_add(p[i], interpolated[i]));
             }
         }
-        (std::array::from_fn(|i| (-radial).mul_add(p[i], sample.velocity[i])), product, sample.mark)
+        (array(|i| (-radial).mul_add(p[i], sample.velocity[i])), product, sample.mark)
     }
     #[inline(always)]
     fn inside(&self, x: &[L; 3]) -> L::Mask {
@@ -171,14 +170,14 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     #[inline(always)]
     fn settle(&self, x: &mut [L; 3]) {
         let inverse = L::one() / dot(x, x).sqrt();
-        *x = x.map(|c| c * inverse);
+        *x = array(|i| x[i] * inverse);
     }
     #[inline(always)]
     fn settle_tangent(&self, x: &mut [L; 3], m: &mut [[L; 2]; 3]) {
         let inverse = L::one() / dot(x, x).sqrt();
-        *x = x.map(|c| c * inverse);
+        *x = array(|i| x[i] * inverse);
         for c in 0..2 {
-            let outward = dot(x, &std::array::from_fn(|i| m[i][c]));
+            let outward = dot(x, &array(|i| m[i][c]));
             for i in 0..3 {
                 m[i][c] = (-outward).mul_add(x[i], m[i][c]) * inverse;
             }
@@ -188,6 +187,6 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     fn metric(&self, x: &[L; 3], m: &[[L; 2]; 3]) -> [[L; 2]; 2] {
         let cosine = x[0].mul_add(x[0], x[1] * x[1]).sqrt().max(L::of(AT_POLE));
         let basis = Self::basis(x, cosine);
-        std::array::from_fn(|i| std::array::from_fn(|c| dot(&basis[i], &std::array::from_fn(|k| m[k][c]))))
+        array(|i| array(|c| dot(&basis[i], &array(|k| m[k][c]))))
     }
 }

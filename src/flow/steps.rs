@@ -29,8 +29,7 @@ pub fn difference(a: &Traced, b: &Traced) -> f64 {
     let lived = all.clone().filter(whole).count();
     let chosen: Vec<usize> = if lived >= ENOUGH { all.filter(whole).collect() } else { all.collect() };
     let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
-    let squares: Vec<f64> =
-        chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    let squares: Vec<f64> = chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
     if squares.is_empty() { 0.0 } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
 }
 
@@ -76,8 +75,8 @@ mod tests {
         for octant in 0..8 {
             let inside = |p: &&[f32; 3]| (0..3).all(|k| (domain.to_unit(**p)[k] >= 0.5) == (octant >> k & 1 == 1));
             let count = points.iter().filter(inside).count();
-            // An even share is 64; random points would be within 15 of it.
-            assert!((56..=72).contains(&count), "{count}");
+            // An even share is 64, from which independent points would stray by 7.5 on average and by about 15 somewhere.
+            assert!((54..=74).contains(&count), "{count}");
         }
     }
 

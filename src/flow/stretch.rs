@@ -1,6 +1,6 @@
 //! The log-stretch of a flow map's gradient: ln of its largest singular value.
 
-use crate::simd::{Lanes, Mask};
+use crate::simd::{Lanes, Mask, array};
 
 /// ln sigma_max of a 2x2 or 3x3 matrix. Minus infinity for the zero matrix.
 #[inline(always)]
@@ -8,7 +8,7 @@ pub fn log_stretch<L: Lanes, const C: usize>(m: &[[L; C]; C]) -> L {
     // Scaling by the largest entry keeps squares in range.
     let size = largest(m);
     let scale = L::one() / L::select(L::lt(L::zero(), size), size, L::one());
-    let scaled = m.map(|row| row.map(|entry| entry * scale));
+    let scaled: [[L; C]; C] = array(|i| array(|j| m[i][j] * scale));
     let sigma = if C == 2 { sigma_max_2(&scaled) } else { sigma_max_3(&scaled) };
     sigma.ln() - scale.ln()
 }

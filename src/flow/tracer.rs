@@ -151,11 +151,8 @@ where
             return None;
         }
         self.field.sort_key(seeds[0])?;
-        let mut keys: Vec<u64> = seeds
-            .par_iter()
-            .enumerate()
-            .map(|(i, &seed)| u64::from(self.field.sort_key(seed).unwrap_or(0)) << 32 | i as u64)
-            .collect();
+        let mut keys: Vec<u64> =
+            seeds.par_iter().enumerate().map(|(i, &seed)| u64::from(self.field.sort_key(seed).unwrap_or(0)) << 32 | i as u64).collect();
         keys.par_sort_unstable();
         Some(keys.into_par_iter().map(|key| key as u32).collect())
     }

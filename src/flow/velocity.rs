@@ -2,7 +2,7 @@
 
 use super::Boundary;
 use crate::field::{Domain, analytic::ClosedForm};
-use crate::simd::{Lanes, Mask, Real};
+use crate::simd::{Lanes, Mask, Real, array};
 
 /// How seeds become states and states become arrival points. A state has `D` components, its tangent `C` columns.
 pub trait Chart<const D: usize, const C: usize>: Send + Sync {
@@ -58,8 +58,8 @@ pub struct Closed<F, R, const D: usize> {
 impl<F, R: Real, const D: usize> Closed<F, R, D> {
     /// The flow in the domain's first D axes.
     pub fn new(form: F, domain: &Domain, policy: Boundary) -> Self {
-        let low = std::array::from_fn(|k| R::from_f64(domain.min[k]));
-        let high = std::array::from_fn(|k| R::from_f64(domain.max[k]));
+        let low = array(|k| R::from_f64(domain.min[k]));
+        let high = array(|k| R::from_f64(domain.max[k]));
         Self { form, policy, low, high, bounds: bounds(policy, low, high) }
     }
 
@@ -100,7 +100,7 @@ impl<F: ClosedForm<D>, R: Real, const D: usize> Chart<D, D> for Closed<F, R, D> 
         None
     }
     fn start(&self, point: [f64; 3]) -> [f64; D] {
-        std::array::from_fn(|k| point[k])
+        array(|k| point[k])
     }
     fn first_tangent(&self, _: [f64; 3]) -> [[f64; D]; D] {
         identity()
@@ -109,7 +109,7 @@ impl<F: ClosedForm<D>, R: Real, const D: usize> Chart<D, D> for Closed<F, R, D> 
         2.0 * gap
     }
     fn arrival(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
-        std::array::from_fn(|k| state.get(k).map_or(seed[k], |&x| x as f32))
+        array(|k| state.get(k).map_or(seed[k], |&x| x as f32))
     }
     fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], metric: [[f64; D]; D]) -> [[f64; D]; D] {
         metric
@@ -121,7 +121,7 @@ impl<F: ClosedForm<D>, R: Real, const D: usize> Chart<D, D> for Closed<F, R, D> 
 
 /// The unit matrix.
 pub fn identity<const D: usize>() -> [[f64; D]; D] {
-    std::array::from_fn(|i| std::array::from_fn(|j| f64::from(u8::from(i == j))))
+    array(|i| array(|j| f64::from(u8::from(i == j))))
 }
 
 impl<F: ClosedForm<D>, L: Lanes, const D: usize> Velocity<L, D, D> for Closed<F, L::Real, D> {
@@ -133,18 +133,18 @@ impl<F: ClosedForm<D>, L: Lanes, const D: usize> Velocity<L, D, D> for Closed<F,
     }
     #[inline(always)]
     fn velocity(&self, stage: &Self::Stage, x: &[L; D]) -> ([L; D], L) {
-        (F::velocity(stage, &std::array::from_fn(|k| self.confine(k, x[k]))), L::zero())
+        (F::velocity(stage, &array(|k| self.confine(k, x[k]))), L::zero())
     }
     #[inline(always)]
     fn tangent(&self, stage: &Self::Stage, x: &[L; D], m: &[[L; D]; D]) -> ([L; D], [[L; D]; D], L) {
         if self.policy == Boundary::Clamp {
             // The clamped velocity does not change along an axis beyond whose end the particle is.
-            let held: [L; D] = std::array::from_fn(|k| self.confine(k, x[k]));
-            let m = std::array::from_fn(|k| m[k].map(|entry| L::select(held[k].equal(x[k]), entry, L::zero())));
+            let held: [L; D] = array(|k| self.confine(k, x[k]));
+            let m = array(|k| array(|c| L::select(held[k].equal(x[k]), m[k][c], L::zero())));
             let (v, product) = F::tangent(stage, &held, &m);
             return (v, product, L::zero());
         }
-        let (v, product) = F::tangent(stage, &std::array::from_fn(|k| self.confine(k, x[k])), m);
+        let (v, product) = F::tangent(stage, &array(|k| self.confine(k, x[k])), m);
         (v, product, L::zero())
     }
     #[inline(always)]

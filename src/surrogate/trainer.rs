@@ -167,7 +167,9 @@ impl Trainer {
                         progress.first_loss = loss;
                     }
                     // Written so that NaN counts as diverged.
-                    diverged = !(loss <= DIVERGED * progress.first_loss.max(if first.is_finite() { first.min(HARDEST * progress.first_loss) } else { 0.0 }));
+                    diverged = !(loss
+                        <= DIVERGED
+                            * progress.first_loss.max(if first.is_finite() { first.min(HARDEST * progress.first_loss) } else { 0.0 }));
                     if diverged {
                         return None;
                     }

@@ -40,14 +40,7 @@ impl Adam {
     /// The same for those cache lines only that are marked; the marks are taken back. The others wait with the moments they have, as in
     /// the lazy Adam for sparse gradients: of a fine level's entries a batch reaches a few percent, and all of them together are tens of
     /// megabytes.
-    pub(super) fn lazy_step(
-        self,
-        parameters: &mut [f32],
-        gradient: &mut [f32],
-        first: &mut [f32],
-        second: &mut [f32],
-        touched: &mut [u8],
-    ) {
+    pub(super) fn lazy_step(self, parameters: &mut [f32], gradient: &mut [f32], first: &mut [f32], second: &mut [f32], touched: &mut [u8]) {
         let len = parameters.len();
         assert!(gradient.len() == len && first.len() == len && second.len() == len && touched.len() >= len.div_ceil(LINE));
         for (group, marks) in touched[..len.div_ceil(LINE)].chunks_mut(AHEAD).enumerate() {

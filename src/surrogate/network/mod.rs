@@ -22,9 +22,9 @@ mod train;
 pub use architecture::{Architecture, Layer, Level};
 pub use model::Model;
 pub use module::Network;
+pub(crate) use module::mix;
 #[cfg(test)]
 pub(crate) use module::uniform;
-pub(crate) use module::mix;
 pub use objective::{Objective, Scale, signed_exp, signed_log};
 pub use operation::FusedNetwork;
 pub(crate) use predictor::Predictor;
