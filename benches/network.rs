@@ -87,8 +87,16 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
             }),
             Box::new(|| {
                 fused.steps(&mut production, &objective, &mut average, |done, _| {
-                    let pick = Pick::Random { seed: 1, counter: done * training as u64, among: None };
-                    (done < 4).then_some(Step { samples: &samples, pick, count: training, rate: 1e-3, average_share: 0.01, lazy: true, base: None })
+                    let pick = Pick::Random { seed: 1, counter: done * training as u64, among: None, hold_out: false };
+                    (done < 4).then_some(Step {
+                        samples: &samples,
+                        pick,
+                        count: training,
+                        rate: 1e-3,
+                        average_share: 0.01,
+                        lazy: true,
+                        base: None,
+                    })
                 });
             }),
         ],

@@ -51,7 +51,7 @@ fn curve(name: &str, surrogate: &mut dyn Surrogate, tracer: &dyn Tracer, held_ou
         // A frame's worth of labels, as long as tracing takes at most a quarter of the time.
         if tracing <= 0.25 * now {
             let before = Instant::now();
-            ring.push(&support::traced(tracer, support::uniform_points(seed, 1 << 16), flow_map));
+            ring.push(&support::traced(tracer, support::uniform_points(seed, 1 << 17), flow_map));
             seed += 1;
             tracing += before.elapsed().as_secs_f64();
         }
@@ -82,7 +82,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         "turbulence" => {
             let shape = [96, 48, 48];
             let window = Turbulence::easy(shape, 0).window(&Turbulence::grid(shape)?, 12)?;
-            (VelocitySource::Window(Arc::new(window)), 11.0, 22)
+            (VelocitySource::Window(Arc::new(window)), 11.0, 11)
         }
         other => return Err(format!("unknown scene `{other}`; there are gyre and turbulence").into()),
     };
@@ -97,6 +97,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
     };
+    // The steps of the labels: their own error (41 dB on turbulence with 11 steps, more on the gyre) stays below the network's.
     let coarse = cpu_tracer(source.clone(), &map(steps, Precision::F32), 0.0)?;
     let fine = cpu_tracer(source, &map(10 * steps, Precision::F64), 0.0)?;
     let domain = coarse.domain().clone();
@@ -118,7 +119,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         let nodes = std::array::from_fn(|axis| ((extent[axis] * scale) as usize).max(2));
         let start = Instant::now();
         let table = build(&SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) }, &network, &domain, 0, &*coarse)?;
-        println!("table     {:6.1} s  {:6.2} dB  {nodes:?} nodes, {} bytes", start.elapsed().as_secs_f64(), psnr(&*table, &held_out), table.bytes());
+        println!(
+            "table     {:6.1} s  {:6.2} dB  {nodes:?} nodes, {} bytes",
+            start.elapsed().as_secs_f64(),
+            psnr(&*table, &held_out),
+            table.bytes()
+        );
     }
     if wanted("residual") && !flow_map {
         let mut surrogate = build(&of(Kind::Residual), &network, &domain, 0, &*coarse)?;

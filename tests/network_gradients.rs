@@ -144,6 +144,7 @@ struct Case {
 fn cases() -> Vec<Case> {
     let small = NetworkSettings {
         levels: 3,
+        features: 2,
         log2_table: 7,
         base_resolution: 4,
         growth: 2.0,
@@ -165,7 +166,11 @@ fn cases() -> Vec<Case> {
             axes: &[0, 1],
         },
         Case { name: "one hidden layer", settings: NetworkSettings { hidden_layers: 1, ..small.clone() }, axes: &[0, 1] },
-        Case { name: "published loss", settings: NetworkSettings { loss: Loss::Published, mean_penalty: 0.7, ..small.clone() }, axes: &[0, 1] },
+        Case {
+            name: "published loss",
+            settings: NetworkSettings { loss: Loss::Published, mean_penalty: 0.7, ..small.clone() },
+            axes: &[0, 1],
+        },
         Case { name: "flow map, 2 axes", settings: flow_map.clone(), axes: &[0, 1] },
         Case { name: "flow map, 3 axes", settings: flow_map.clone(), axes: &[0, 1, 2] },
         Case {
@@ -181,9 +186,7 @@ fn labels(count: usize, seed: u64) -> Samples {
     let points = uniform_points(seed, count);
     let value = |p: &[f32; 3]| 1.5 * (4.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2] - 0.4;
     let arrival = |p: &[f32; 3]| [p[0] + 0.2 * (3.0 * p[1]).sin(), p[1] - 0.3 * p[0] * p[2], p[2] + 0.1 * p[0]];
-    let jacobian = |p: &[f32; 3]| {
-        [1.0, 0.6 * (3.0 * p[1]).cos(), 0.0, -0.3 * p[2], 1.0, -0.3 * p[0], 0.1, 0.0, 1.0]
-    };
+    let jacobian = |p: &[f32; 3]| [1.0, 0.6 * (3.0 * p[1]).cos(), 0.0, -0.3 * p[2], 1.0, -0.3 * p[0], 0.1, 0.0, 1.0];
     Samples {
         log_stretch: points.iter().map(value).collect(),
         arrival: points.iter().map(arrival).collect(),

@@ -180,16 +180,17 @@ pub struct FlowSettings {
     pub precision: Precision,
     /// Runge-Kutta steps a path.
     pub steps: StepsSetting,
-    /// With `steps = "auto"`: root mean square of the log-stretch that a doubling of the steps may change.
-    pub tolerance: f64,
+    /// With `steps = "auto"`: root mean square of the log-stretch that a doubling of the steps may change; none: 0.01 for closed forms
+    /// and the synthetic turbulence, 0.1 for archives, whose interpolated gradient converges slowly.
+    pub tolerance: Option<f64>,
     /// Distance of difference particles, in coordinate units.
     pub gap: f64,
     /// Edge policy; none: `unbounded` for closed forms, `stop` for archives, `clamp` for the synthetic turbulence.
     pub boundary: Option<Boundary>,
     /// Divisor for particles that stopped early.
     pub normalisation: Normalisation,
-    /// Interpolation in space.
-    pub interpolation: Interpolation,
+    /// Interpolation in space; none: cubic for two-dimensional archives, linear otherwise.
+    pub interpolation: Option<Interpolation>,
 }
 
 impl Default for FlowSettings {
@@ -198,11 +199,11 @@ impl Default for FlowSettings {
             integrator: Integrator::Tangent,
             precision: Precision::F32,
             steps: StepsSetting::Auto,
-            tolerance: 0.01,
+            tolerance: None,
             gap: 1e-4,
             boundary: None,
             normalisation: Normalisation::Tau,
-            interpolation: Interpolation::Linear,
+            interpolation: None,
         }
     }
 }

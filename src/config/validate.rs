@@ -117,7 +117,9 @@ fn check_flow(scene: &SceneFile) -> Result<(), Fault> {
     if let StepsSetting::Fixed(steps) = flow.steps {
         count("flow.steps", steps, 1, 10_000_000)?;
     }
-    positive("flow.tolerance", flow.tolerance)?;
+    if let Some(tolerance) = flow.tolerance {
+        positive("flow.tolerance", tolerance)?;
+    }
     positive("flow.gap", flow.gap)?;
     let gridded = matches!(scene.source.kind, SourceKind::Archive | SourceKind::Turbulence);
     if gridded && flow.boundary == Some(Boundary::Unbounded) {

@@ -129,6 +129,12 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
     let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
+    if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
+        slide.warnings.push(format!(
+            "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+            chosen.steps, chosen.difference
+        ));
+    }
     cycle.pilot(&*tracer)?;
     cycle.probe(&*tracer, slide.index);
     loop {

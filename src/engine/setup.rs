@@ -4,7 +4,7 @@ use super::EngineError;
 use super::feed::{Feed, closed_form, open_snapshots};
 use crate::config::{SceneFile, SourceKind, StepsSetting};
 use crate::field::Domain;
-use crate::flow::{Boundary, Direction, FlowMap, Steps};
+use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps};
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
 #[derive(Debug, Clone)]
@@ -35,6 +35,7 @@ impl Setup {
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
+        let flat = snapshots.as_ref().is_some_and(|s| s.grid().dimensions() == 2);
         let archive = scene.source.kind == SourceKind::Archive;
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
         let tau = match (&scene.time.tau, &snapshots) {
@@ -62,13 +63,13 @@ impl Setup {
             integrator: scene.flow.integrator,
             precision: scene.flow.precision,
             steps: match scene.flow.steps {
-                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance },
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
             gap: scene.flow.gap,
             boundary,
             normalisation: scene.flow.normalisation,
-            interpolation: scene.flow.interpolation,
+            interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
         };
         let domain = match (&closed, &scene.domain, &snapshots) {
             (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },

@@ -5,6 +5,7 @@ use super::sphere::SphereFlow;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{Chart, Closed, Velocity};
 use super::voids::Voids;
+use super::steps::Chosen;
 use super::{FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
 use crate::field::analytic::{ClosedForm, Form};
 use crate::field::{Domain, Geometry, Window};
@@ -150,34 +151,35 @@ impl<'a> Assembly<'a> {
             let kernel = AdaptiveKernel { from, to, tolerance: dormand_prince::TOLERANCE };
             return Ok(Box::new(self.tracer::<_, _, f64, N, C>(double()?, kernel)));
         }
-        let count = match self.map.steps {
-            Steps::Fixed(steps) => steps,
+        let (count, chosen) = match self.map.steps {
+            Steps::Fixed(steps) => (steps, None),
             Steps::Auto { tolerance } => {
                 // Rounding must not decide, so steps are chosen in double precision.
                 let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
                 let intervals = intervals(Chart::breaks(&tracer.field), from, to);
-                steps::choose(tolerance, intervals, &self.domain, |steps, points, out| {
+                let chosen = steps::choose(tolerance, intervals, &self.domain, |steps, points, out| {
                     tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
                     tracer.trace(points, super::Extras::default(), out);
-                })?
+                })?;
+                (chosen.steps, Some(chosen))
             }
         };
         match self.map.precision {
-            Precision::F32 => Ok(self.fixed::<V32, S, N, C>(single()?, count)),
-            Precision::F64 => Ok(self.fixed::<V64, D, N, C>(double()?, count)),
+            Precision::F32 => Ok(self.fixed::<V32, S, N, C>(single()?, count, chosen)),
+            Precision::F64 => Ok(self.fixed::<V64, D, N, C>(double()?, count, chosen)),
         }
     }
 
-    fn fixed<V, L, const N: usize, const C: usize>(&self, field: V, steps: usize) -> Box<dyn Tracer>
+    fn fixed<V, L, const N: usize, const C: usize>(&self, field: V, steps: usize, chosen: Option<Chosen>) -> Box<dyn Tracer>
     where
         L: Lanes,
         V: Velocity<L, N, C> + 'static,
     {
         let stages = Stages::new::<V, L, N, C>(&field, self.from, self.to, steps);
         if self.map.integrator == Integrator::Differences {
-            Box::new(self.tracer::<_, _, L, N, C>(field, DifferencesKernel(stages, self.map.gap)))
+            Box::new(CpuTracer { chosen, ..self.tracer::<_, _, L, N, C>(field, DifferencesKernel(stages, self.map.gap)) })
         } else {
-            Box::new(self.tracer::<_, _, L, N, C>(field, TangentKernel(stages)))
+            Box::new(CpuTracer { chosen, ..self.tracer::<_, _, L, N, C>(field, TangentKernel(stages)) })
         }
     }
 
@@ -194,6 +196,7 @@ impl<'a> Assembly<'a> {
             boundary: self.map.boundary,
             normalisation: self.map.normalisation,
             order: self.order,
+            chosen: None,
             voids: match &self.source {
                 VelocitySource::Analytic(..) => Voids::none(),
                 VelocitySource::Window(window) => Voids::at(window, self.from),

@@ -24,6 +24,7 @@ mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 pub use error::FlowError;
+pub use steps::Chosen;
 pub use resolution::{TimeResolution, time_resolution};
 pub use tracer::Order;
 
@@ -189,6 +190,10 @@ pub trait Tracer: Send + Sync {
     fn tau(&self) -> f64;
     /// Runge-Kutta steps a path gets.
     fn steps(&self) -> usize;
+    /// How the number of steps was chosen; none where it was given.
+    fn chosen(&self) -> Option<Chosen> {
+        None
+    }
     /// Whether a seed lies where the velocity is missing at its start time (land): it has no FTLE. Closed forms
     /// have velocity everywhere.
     fn is_void(&self, _seed: [f32; 3]) -> bool {

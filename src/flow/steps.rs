@@ -9,6 +9,10 @@ const POINTS: usize = 2048;
 const FEWEST: usize = 4;
 /// Most steps tried.
 const MOST: usize = 16_384;
+/// Most steps a snapshot interval.
+const MOST_AN_INTERVAL: usize = 32;
+/// Share of the points, the most different ones, that does not count on grids.
+const TRIMMED: f64 = 0.02;
 /// Points that must have lived the whole span for the judgement to rest on them alone.
 const ENOUGH: usize = 64;
 
@@ -24,38 +28,64 @@ pub fn points(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
 /// Root mean square difference of two traces, over the points that lived the whole span in both (where such are rare: over all):
 /// a path that stops is cut to whole steps, an error of another kind and order that would hide the integrator's.
 pub fn difference(a: &Traced, b: &Traced) -> f64 {
+    trimmed_difference(a, b, 0.0)
+}
+
+/// The same without the share `trimmed` of the points that differ most.
+fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> f64 {
     let whole = |i: &usize| a.lived[*i] >= 1.0 && b.lived[*i] >= 1.0;
     let all = 0..a.lived.len();
     let lived = all.clone().filter(whole).count();
     let chosen: Vec<usize> = if lived >= ENOUGH { all.filter(whole).collect() } else { all.collect() };
     let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
-    let squares: Vec<f64> = chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    let mut squares: Vec<f64> = chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    squares.sort_unstable_by(f64::total_cmp);
+    squares.truncate((squares.len() as f64 * (1.0 - trimmed)).ceil() as usize);
     if squares.is_empty() { 0.0 } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
+}
+
+/// What [`choose`] came to.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Chosen {
+    /// Steps a path gets.
+    pub steps: usize,
+    /// Difference of the log-stretch from twice as many steps (see [`choose`]).
+    pub difference: f64,
+    /// Whether the difference is within the tolerance.
+    pub met: bool,
 }
 
 /// The fewest steps of a ladder (by halves upwards, from `intervals`) whose log-stretch differs from that of twice as many by at
 /// most `tolerance`, root mean square.
+///
+/// On grids the gradient of the interpolant jumps at cell faces, and a few paths along a separatrix turn one way with n steps and the
+/// other with 2n, at any n: there the most different [`TRIMMED`] of the points is left out, and the ladder ends at [`MOST_AN_INTERVAL`]
+/// steps a snapshot interval, beyond which the data's own resolution decides. Not meeting the tolerance is then told, not refused.
 pub fn choose(
     tolerance: f64,
     intervals: usize,
     domain: &Domain,
     mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
-) -> Result<usize, FlowError> {
+) -> Result<Chosen, FlowError> {
     let points = points(domain, POINTS);
     let (mut once, mut twice) = (Traced::default(), Traced::default());
-    let mut steps = if intervals > 0 { intervals } else { FEWEST };
-    let mut reached = f64::INFINITY;
-    while steps <= MOST {
+    let gridded = intervals > 0;
+    let most = if gridded { MOST_AN_INTERVAL * intervals } else { MOST };
+    let trimmed = if gridded { TRIMMED } else { 0.0 };
+    let mut steps = if gridded { intervals } else { FEWEST };
+    let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
+    while steps <= most {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
-        reached = difference(&once, &twice);
-        if reached <= tolerance {
-            return Ok(steps);
+        let difference = trimmed_difference(&once, &twice, trimmed);
+        last = Chosen { steps, difference, met: difference <= tolerance };
+        if last.met {
+            return Ok(last);
         }
         // On a grid a whole number of steps an interval, or of intervals, keeps stages on snapshots.
-        steps = if intervals > 0 { next_on_grid(steps, intervals) } else { (steps * 3).div_ceil(2) };
+        steps = if gridded { next_on_grid(steps, intervals) } else { (steps * 3).div_ceil(2) };
     }
-    Err(FlowError::StepsNotFound { steps: MOST, reached, tolerance })
+    if gridded { Ok(last) } else { Err(FlowError::StepsNotFound { steps: most, reached: last.difference, tolerance }) }
 }
 
 /// The next multiple of `intervals`, at least 1.5 times `steps` when that is large.

@@ -1,6 +1,7 @@
 //! Batches: seeds sorted by cell, traced in lanes by all threads, and put back in order.
 
 use super::rk4::{self, MAX_LANES, Paths};
+use super::steps::Chosen;
 use super::velocity::{Chart, Velocity};
 use super::voids::Voids;
 use super::{Boundary, Extras, Normalisation, Traced, Tracer, dormand_prince};
@@ -101,6 +102,8 @@ pub struct CpuTracer<K, V, L, const D: usize, const C: usize> {
     pub normalisation: Normalisation,
     /// Whether batches are sorted.
     pub order: Order,
+    /// How the number of steps was chosen, where it was.
+    pub chosen: Option<Chosen>,
     /// Where seeds have no velocity.
     pub voids: Voids,
     /// Kind of lanes.
@@ -200,6 +203,10 @@ where
 
     fn steps(&self) -> usize {
         self.kernel.steps()
+    }
+
+    fn chosen(&self) -> Option<Chosen> {
+        self.chosen
     }
 
     fn is_void(&self, seed: [f32; 3]) -> bool {

@@ -99,7 +99,8 @@ impl<'a> Checkpoint<'a> {
     /// Reads a checkpoint of this kind.
     pub(super) fn read(path: &Path, kind: &str) -> Result<Checkpoint<'static>, CheckpointError> {
         let io = |source| CheckpointError::Io { path: path.into(), source };
-        let foreign = |found: &str| CheckpointError::Mismatch { path: path.into(), found: found.into(), expected: format!("a {kind} checkpoint") };
+        let foreign =
+            |found: &str| CheckpointError::Mismatch { path: path.into(), found: found.into(), expected: format!("a {kind} checkpoint") };
         let mut file = std::fs::File::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
         let mut length = [0; 8];

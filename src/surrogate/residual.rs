@@ -1,20 +1,26 @@
-//! A coarse traced table plus a network that learns what the table lacks. The network's output layer starts at 0, so the sum starts as
-//! the table.
+//! A coarse traced table plus a network that learns what the table lacks: s = table + shrinkage * network.
+//!
+//! The network's output layer starts at 0, so the sum starts as the table. With few labels a network fits their noise and would make the sum worse
+//! than the table; so one sample in [`HELD_OUT`] is never trained on, and the shrinkage in [0, 1] is the least-squares factor on those.
 
 use super::checkpoint::Checkpoint;
+use super::network::HELD_OUT;
 use super::trainer::{FrozenNetwork, Trainer};
 use super::{CheckpointError, Learned, NetworkSettings, Predict, Samples, Surrogate, SurrogateError, Table};
 use crate::flow::Tracer;
 use std::path::Path;
 use std::sync::Arc;
 
-/// Samples on which the network is compared with nothing, after the table below it has changed.
-const COMPARED: usize = 4096;
+/// Held-out samples, at most, that decide the shrinkage.
+const COMPARED: usize = 8192;
+/// Shrinkage after a slide of the window below which the network starts anew: it knows nothing about the new table's errors.
+const USELESS: f32 = 0.05;
 
-/// Table and network; the prediction is their sum.
+/// Table and network.
 pub struct Residual {
     table: Table,
     trainer: Trainer,
+    shrinkage: f32,
     /// Whether the table has changed since the network last learned.
     slid: bool,
 }
@@ -32,7 +38,7 @@ impl Residual {
             return refuse("network.loss", "published".into(), "mean_square");
         }
         let trainer = Trainer::new(network, tracer.domain(), tracer.tau(), seed, true)?;
-        Ok(Self { table: Table::trace(tracer, nodes), trainer, slid: false })
+        Ok(Self { table: Table::trace(tracer, nodes), trainer, shrinkage: 0.0, slid: false })
     }
 
     /// The table below.
@@ -40,23 +46,26 @@ impl Residual {
         &self.table
     }
 
-    /// A residual learned on the previous table may be worse than none; then it starts from 0 again.
-    fn forget_if_worse(&mut self, samples: &Samples) {
-        let stride = (samples.len() / COMPARED).max(1);
-        let chosen: Vec<usize> = (0..samples.len()).step_by(stride).filter(|&i| samples.log_stretch[i].is_finite()).collect();
+    /// Factor on the network's output.
+    pub fn shrinkage(&self) -> f32 {
+        self.shrinkage
+    }
+
+    /// The factor that fits the held-out samples best. Training noise is independent of them, so what it adds is weighed down.
+    fn fitted_shrinkage(&self, samples: &Samples) -> f32 {
+        let stride = HELD_OUT * (samples.len() / HELD_OUT / COMPARED).max(1);
+        let finite = |&i: &usize| samples.log_stretch[i].is_finite() && samples.points[i].iter().all(|x| x.is_finite());
+        let chosen: Vec<usize> = (0..samples.len()).step_by(stride).filter(finite).collect();
         let points: Vec<[f32; 3]> = chosen.iter().map(|&i| samples.points[i]).collect();
         let (mut below, mut learned) = (vec![0.0; points.len()], vec![0.0; points.len()]);
         self.table.predict(&points, &mut below);
         self.trainer.predict(&points, &mut learned);
-        let (mut with, mut without) = (0.0, 0.0);
+        let (mut common, mut square) = (0.0, 0.0);
         for ((&i, below), learned) in chosen.iter().zip(below).zip(learned) {
-            let lacking = samples.log_stretch[i] - below;
-            with += f64::from(lacking - learned).powi(2);
-            without += f64::from(lacking).powi(2);
+            common += f64::from(samples.log_stretch[i] - below) * f64::from(learned);
+            square += f64::from(learned).powi(2);
         }
-        if with > without {
-            self.trainer.forget_output();
-        }
+        if square > 0.0 { (common / square).clamp(0.0, 1.0) as f32 } else { 0.0 }
     }
 }
 
@@ -66,12 +75,8 @@ impl Predict for Residual {
     }
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        let mut below = vec![0.0; points.len()];
-        self.table.predict(points, &mut below);
         self.trainer.predict(points, out);
-        for (out, below) in out.iter_mut().zip(below) {
-            *out += below;
-        }
+        add_below(&self.table, self.shrinkage, points, out);
     }
 
     fn bytes(&self) -> usize {
@@ -83,6 +88,16 @@ impl Predict for Residual {
 struct Frozen {
     table: Table,
     network: FrozenNetwork,
+    shrinkage: f32,
+}
+
+/// Turns the network's outputs into table + shrinkage * network.
+fn add_below(table: &Table, shrinkage: f32, points: &[[f32; 3]], out: &mut [f32]) {
+    let mut below = vec![0.0; points.len()];
+    table.predict(points, &mut below);
+    for (out, below) in out.iter_mut().zip(below) {
+        *out = shrinkage.mul_add(*out, below);
+    }
 }
 
 impl Predict for Frozen {
@@ -91,12 +106,8 @@ impl Predict for Frozen {
     }
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        let mut below = vec![0.0; points.len()];
-        self.table.predict(points, &mut below);
         self.network.predict(points, out);
-        for (out, below) in out.iter_mut().zip(below) {
-            *out += below;
-        }
+        add_below(&self.table, self.shrinkage, points, out);
     }
 
     fn bytes(&self) -> usize {
@@ -106,7 +117,7 @@ impl Predict for Frozen {
 
 impl Surrogate for Residual {
     fn freeze(&self) -> Arc<dyn Predict> {
-        Arc::new(Frozen { table: self.table.clone(), network: self.trainer.frozen() })
+        Arc::new(Frozen { table: self.table.clone(), network: self.trainer.frozen(), shrinkage: self.shrinkage })
     }
 
     fn learns(&self) -> bool {
@@ -115,23 +126,27 @@ impl Surrogate for Residual {
 
     fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
         let start = std::time::Instant::now();
-        if !samples.is_empty() && std::mem::take(&mut self.slid) {
-            self.forget_if_worse(samples);
+        if !samples.is_empty() && std::mem::take(&mut self.slid) && self.fitted_shrinkage(samples) < USELESS {
+            self.trainer.forget_output();
         }
         let left = seconds - start.elapsed().as_secs_f64();
         let learned = self.trainer.learn(samples, Some(&self.table), left, max_steps);
+        if learned.steps > 0 {
+            self.shrinkage = self.fitted_shrinkage(samples);
+        }
         Learned { seconds: start.elapsed().as_secs_f64(), ..learned }
     }
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.table.retrace(tracer);
         self.trainer.window_slid();
-        self.slid = true;
+        (self.slid, self.shrinkage) = (true, 0.0);
     }
 
     fn save(&self, path: &Path) -> Result<(), CheckpointError> {
         let mut checkpoint = Checkpoint::new("residual");
         checkpoint.note("slid", self.slid.to_string());
+        checkpoint.note("shrinkage", self.shrinkage.to_string());
         self.table.entries(&mut checkpoint);
         self.trainer.entries(&mut checkpoint);
         checkpoint.write(path)
@@ -140,9 +155,9 @@ impl Surrogate for Residual {
     fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
         let checkpoint = Checkpoint::read(path, "residual")?;
         let table = self.table.restored(&checkpoint)?;
-        let slid = checkpoint.number("slid")?;
+        let (slid, shrinkage) = (checkpoint.number("slid")?, checkpoint.number("shrinkage")?);
         self.trainer.restored(&checkpoint)?;
-        (self.table, self.slid) = (table, slid);
+        (self.table, self.slid, self.shrinkage) = (table, slid, shrinkage);
         Ok(())
     }
 }

@@ -152,7 +152,7 @@ impl Trainer {
         self.progress.looked = 0.0;
     }
 
-    /// Sets the output layer back to 0, in the weights, the moments and the average.
+    /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
         self.kept = None;
         self.model.zero_output();
@@ -199,7 +199,9 @@ impl Trainer {
                         progress.first_loss = loss;
                     }
                     // Written so that NaN counts as diverged.
-                    diverged = !(loss <= DIVERGED * progress.first_loss.max(if first.is_finite() { first.min(HARDEST * progress.first_loss) } else { 0.0 }));
+                    diverged = !(loss
+                        <= DIVERGED
+                            * progress.first_loss.max(if first.is_finite() { first.min(HARDEST * progress.first_loss) } else { 0.0 }));
                     if diverged {
                         return None;
                     }
@@ -217,7 +219,7 @@ impl Trainer {
                 } else {
                     0.0
                 };
-                let pick = Pick::Random { seed: *seed, counter, among };
+                let pick = Pick::Random { seed: *seed, counter, among, hold_out: base.is_some() };
                 let rate = *rate * progress.stall * progress.caution;
                 Some(Step { samples, pick, count, rate, average_share: share, lazy: true, base })
             });

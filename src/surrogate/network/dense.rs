@@ -44,7 +44,12 @@ impl Packed {
     /// Room for a layer; `transposed` when the gradient for its input will be asked for.
     pub(super) fn new(layer: &Layer, transposed: bool) -> Self {
         let backward = if transposed { padded(layer.inputs) * layer.outputs } else { 0 };
-        Self { inputs: layer.inputs, outputs: layer.outputs, forward: Aligned::zeros(packed_len(layer)), backward: Aligned::zeros(backward) }
+        Self {
+            inputs: layer.inputs,
+            outputs: layer.outputs,
+            forward: Aligned::zeros(packed_len(layer)),
+            backward: Aligned::zeros(backward),
+        }
     }
 
     /// Copies the layer's parameters out of the flat vector.
@@ -105,8 +110,7 @@ pub(super) fn forward(layer: &Packed, x: &[f32], x_stride: usize, y: &mut [f32],
                     let value = y.as_ptr().add(((row + m) % primal) * y_stride + column);
                     for (half, sum) in sum.into_iter().enumerate() {
                         // `max(0, sum)` in this order lets NaN through, so that a diverged network is seen and not painted black.
-                        let passed =
-                            if row < primal { zero.fast_max(sum) } else { load(value.add(8 * half)).simd_gt(zero) & sum };
+                        let passed = if row < primal { zero.fast_max(sum) } else { load(value.add(8 * half)).simd_gt(zero) & sum };
                         store(out.add(8 * half), passed);
                     }
                 }

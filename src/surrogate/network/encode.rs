@@ -77,7 +77,15 @@ impl Corners {
     }
 
     /// Adds up `factors[corner] * table[index]` into columns `column..column + F` of `out`, one row a sample.
-    fn gather<const D: usize, const F: usize>(&self, factors: &[f32], table: &[f32], out: &mut [f32], stride: usize, column: usize, count: usize) {
+    fn gather<const D: usize, const F: usize>(
+        &self,
+        factors: &[f32],
+        table: &[f32],
+        out: &mut [f32],
+        stride: usize,
+        column: usize,
+        count: usize,
+    ) {
         assert!(count <= self.lanes && column + F <= stride && out.len() >= count * stride && factors.len() >= (1 << D) * self.lanes);
         for (sample, row) in out.chunks_exact_mut(stride).take(count).enumerate() {
             let mut sum = [0.0_f32; F];
@@ -217,7 +225,16 @@ pub(super) fn scatter_level(
 }
 
 /// sin and cos of 2^l (pi/2) p with p = 2x - 1 in [-1, 1], ordered axis, octave, (sin, cos).
-fn frequencies(shape: &Architecture, coordinates: &[f32], run: usize, count: usize, groups: usize, group: usize, out: &mut [f32], stride: usize) {
+fn frequencies(
+    shape: &Architecture,
+    coordinates: &[f32],
+    run: usize,
+    count: usize,
+    groups: usize,
+    group: usize,
+    out: &mut [f32],
+    stride: usize,
+) {
     let (dimensions, octaves) = (shape.dimensions(), shape.octaves);
     assert!(stride >= 2 * dimensions * octaves);
     for first in (0..count).step_by(8) {

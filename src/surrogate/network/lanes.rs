@@ -64,3 +64,16 @@ pub(super) fn lanes(from: &[f32]) -> f32x8 {
     values.copy_from_slice(&from[..8]);
     f32x8::from(values)
 }
+
+/// Asks for `values[index]` to be brought into the cache.
+#[inline(always)]
+pub(super) fn prefetch<T>(values: &[T], index: usize) {
+    #[cfg(target_arch = "x86_64")]
+    if let Some(value) = values.get(index) {
+        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
+        // SAFETY: a prefetch reads nothing and faults on nothing; the address is that of a live value.
+        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) };
+    }
+    #[cfg(not(target_arch = "x86_64"))]
+    let _ = (values, index);
+}

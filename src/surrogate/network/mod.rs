@@ -22,13 +22,13 @@ mod train;
 pub use architecture::{Architecture, Layer, Level};
 pub use model::Model;
 pub use module::Network;
+pub(crate) use module::mix;
 #[cfg(test)]
 pub(crate) use module::uniform;
-pub(crate) use module::mix;
 pub use objective::{Objective, Scale, signed_exp, signed_log};
 pub use operation::FusedNetwork;
 pub(crate) use predictor::Predictor;
-pub use train::{Average, Field, Fused, Pick, Step, autodiff_gradient, operation_step, stock_step};
+pub use train::{Average, Field, Fused, HELD_OUT, Pick, Step, autodiff_gradient, operation_step, stock_step};
 
 /// How a position is shown to the MLP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -94,7 +94,8 @@ pub struct NetworkSettings {
     pub batch: usize,
     /// Whether shorter axes of the domain get fewer cells, so that cells are about as wide as high.
     pub follow_aspect: bool,
-    /// Weight of the flow map's derivatives in the loss (target `flow_map`); 0 trains on arrivals alone.
+    /// Weight of the flow map's derivatives in the loss (target `flow_map`); 0 trains on arrivals alone, which has rendered better in the
+    /// same time: derivatives of the network cost a pass each, and those of a hash grid jump from cell to cell.
     pub jacobian_weight: f32,
     /// Share of the steps so far over which the weights used for prediction are averaged; 0 predicts with the latest weights.
     pub averaging: f32,
@@ -104,9 +105,9 @@ impl Default for NetworkSettings {
     fn default() -> Self {
         Self {
             encoding: Encoding::HashGrid,
-            levels: 8,
-            features: 2,
-            log2_table: 16,
+            levels: 6,
+            features: 4,
+            log2_table: 21,
             base_resolution: 16,
             growth: 1.6,
             octaves: 10,
@@ -118,7 +119,7 @@ impl Default for NetworkSettings {
             learning_rate: None,
             batch: 1 << 14,
             follow_aspect: true,
-            jacobian_weight: 0.1,
+            jacobian_weight: 0.0,
             averaging: 0.1,
         }
     }

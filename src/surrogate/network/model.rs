@@ -126,7 +126,11 @@ fn copy<const D: usize>(parameter: &Tensor<Flex, D>, moments: Option<&AdamState<
 fn primitive<const D: usize>(tensor: Tensor<Flex, D>) -> FlexTensor {
     // Fresh parameters are contiguous; only a view (which burn's own operations may leave) is copied here.
     let tensor = tensor.into_primitive().tensor();
-    if tensor.as_slice::<f32>().is_some_and(|values| values.len() == tensor.storage::<f32>().len()) { tensor } else { tensor.to_contiguous() }
+    if tensor.as_slice::<f32>().is_some_and(|values| values.len() == tensor.storage::<f32>().len()) {
+        tensor
+    } else {
+        tensor.to_contiguous()
+    }
 }
 
 fn from_values<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> Tensor<Flex, D> {

@@ -57,12 +57,8 @@ impl<B: FusedNetwork> Network<B> {
         let device = points.device();
         let tables = self.tables.as_ref().map_or_else(|| Tensor::zeros([1, 1], &device), |tables| tables.val());
         let float = |primitive: TensorPrimitive<B>| primitive.tensor();
-        let outputs = B::network(
-            float(points.into_primitive()),
-            float(tables.into_primitive()),
-            float(self.layers.val().into_primitive()),
-            shape,
-        );
+        let outputs =
+            B::network(float(points.into_primitive()), float(tables.into_primitive()), float(self.layers.val().into_primitive()), shape);
         Tensor::from_primitive(TensorPrimitive::Float(outputs))
     }
 }
@@ -136,10 +132,7 @@ impl FusedNetwork for Flex {
             let mut touched = vec![0; table.len().div_ceil(LINE)];
             batch.table_gradient(shape, number, level, &mut corners, table, &mut touched);
         }
-        (
-            FlexTensor::from_data(TensorData::new(d_tables, table_shape)),
-            FlexTensor::from_data(TensorData::new(d_layers, layer_shape)),
-        )
+        (FlexTensor::from_data(TensorData::new(d_tables, table_shape)), FlexTensor::from_data(TensorData::new(d_layers, layer_shape)))
     }
 }
 

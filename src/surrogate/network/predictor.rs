@@ -1,9 +1,9 @@
 //! Prediction of the log-stretch, fused: encoding and layers tile by tile on all cores.
 
+use super::Target;
 use super::architecture::Architecture;
 use super::objective::Objective;
 use super::tile::{self, OUT, Weights};
-use super::Target;
 
 /// Layers packed for prediction.
 pub(crate) struct Predictor {

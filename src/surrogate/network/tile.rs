@@ -143,7 +143,14 @@ impl Scratch {
     }
 
     /// Positions to outputs.
-    pub(super) fn forward(&mut self, shape: &Architecture, weights: &Weights, tables: &[f32], count: usize, point: impl Fn(usize) -> [f32; 3]) {
+    pub(super) fn forward(
+        &mut self,
+        shape: &Architecture,
+        weights: &Weights,
+        tables: &[f32],
+        count: usize,
+        point: impl Fn(usize) -> [f32; 3],
+    ) {
         assert!(count <= self.samples);
         self.place(shape, count, point);
         let (run, stride) = (self.run(), row_stride(shape.encoded()));
@@ -364,7 +371,19 @@ impl Batch {
                 let count = (chunk.count - first).min(tile);
                 let run = chunk.scratch.run();
                 encode::scatter_level(
-                    shape, number, level, coordinates, run, count, self.groups, tile, gradient, stride, corners, table, touched,
+                    shape,
+                    number,
+                    level,
+                    coordinates,
+                    run,
+                    count,
+                    self.groups,
+                    tile,
+                    gradient,
+                    stride,
+                    corners,
+                    table,
+                    touched,
                 );
             }
         }

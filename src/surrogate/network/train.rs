@@ -4,7 +4,7 @@
 use super::adam::{Adam, BETA_1, BETA_2, move_average};
 use super::architecture::Architecture;
 use super::encode::LINE;
-use super::lanes::Aligned;
+use super::lanes::{Aligned, prefetch};
 use super::model::{Loan, Model};
 use super::module::{Network, mix};
 use super::objective::{Objective, signed_exp};
@@ -16,6 +16,9 @@ use burn::optim::{AdamConfig, GradientsParams, SimpleOptimizer};
 use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
 use std::sync::Arc;
+
+/// One sample of this many is held out where that is asked for.
+pub const HELD_OUT: usize = 64;
 
 /// Which samples make up a batch.
 #[derive(Debug, Clone, Copy)]
@@ -30,6 +33,8 @@ pub enum Pick<'a> {
         counter: u64,
         /// Numbers of the samples that may be drawn.
         among: Option<&'a [u32]>,
+        /// Whether samples whose number is a multiple of [`HELD_OUT`] are left for validation.
+        hold_out: bool,
     },
 }
 
@@ -37,11 +42,16 @@ impl Pick<'_> {
     fn index(self, position: usize, samples: usize) -> usize {
         match self {
             Pick::InOrder => position,
-            Pick::Random { seed, counter, among } => {
+            Pick::Random { seed, counter, among, hold_out } => {
                 let count = among.map_or(samples, <[u32]>::len);
                 // Multiply-shift: the bias of 2^-64 * count is far below anything that training could notice.
                 let drawn = ((u128::from(mix(seed, counter + position as u64)) * count as u128) >> 64) as usize;
-                among.map_or(drawn, |among| among[drawn] as usize)
+                let at = |drawn: usize| among.map_or(drawn, |among| among[drawn] as usize);
+                match at(drawn) {
+                    // The next one stands in; after the last, or in a list with gaps, that may be a held-out one too: one draw of very many.
+                    index if hold_out && index % HELD_OUT == 0 => at((drawn + 1) % count),
+                    index => index,
+                }
             }
         }
     }
@@ -231,19 +241,6 @@ impl Fused {
         };
         rayon::join(update_tables, update_layers);
     }
-}
-
-/// Asks for `values[index]` to be brought into the cache.
-#[inline(always)]
-fn prefetch<T>(values: &[T], index: usize) {
-    #[cfg(target_arch = "x86_64")]
-    if let Some(value) = values.get(index) {
-        use std::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: a prefetch reads nothing and faults on nothing; the address is that of a live value.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(std::ptr::from_ref(value).cast()) };
-    }
-    #[cfg(not(target_arch = "x86_64"))]
-    let _ = (values, index);
 }
 
 /// Cuts `len` values off the front.
