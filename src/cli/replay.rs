@@ -163,6 +163,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "waited_seconds": report.waited,
         "optimizer_steps": report.train_steps,
         "integration_steps": report.integration_steps,
+        "integration_difference": report.integration_difference,
         "surrogate_bytes": report.surrogate_bytes,
         "window_bytes_peak": report.window_bytes,
     }) else { unreachable!("an object literal") };

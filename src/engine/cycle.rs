@@ -61,6 +61,8 @@ pub struct RunReport {
     pub train_steps: u64,
     /// Runge-Kutta steps a path.
     pub integration_steps: usize,
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
+    pub integration_difference: Option<f64>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
     /// Largest size of the window, bytes.
@@ -180,7 +182,7 @@ impl<'a> Cycle<'a> {
             live,
             frame: 0,
             pictures: 0,
-            report: RunReport { integration_steps: tracer.steps(), ..RunReport::default() },
+            report: RunReport { integration_steps: tracer.steps(), integration_difference: tracer.chosen().map(|c| c.difference), ..RunReport::default() },
         })
     }
 

@@ -63,7 +63,7 @@ impl Setup {
             integrator: scene.flow.integrator,
             precision: scene.flow.precision,
             steps: match scene.flow.steps {
-                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.5 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
             gap: scene.flow.gap,

@@ -114,7 +114,7 @@ impl Default for RenderSettings {
             method: Method::Gated,
             width: 320,
             height: 160,
-            samples: 16,
+            samples: 8,
             background: [1.0; 3],
             missing: [0.3; 3],
             majorant_cells: None,

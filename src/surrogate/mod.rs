@@ -150,7 +150,7 @@ pub struct SurrogateSettings {
 
 impl Default for SurrogateSettings {
     fn default() -> Self {
-        Self { kind: Kind::Network, table_nodes: None }
+        Self { kind: Kind::Residual, table_nodes: None }
     }
 }
 
