@@ -1,5 +1,7 @@
 //! The three ways to train, against one another, against finite differences in f64, and Adam against burn's.
 
+#![allow(clippy::unwrap_used)]
+
 mod network_support;
 
 use network_support::uniform_points;

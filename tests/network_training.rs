@@ -1,5 +1,7 @@
 //! Surrogates through their trait: learning, divergence, bad samples, checkpoints, the slide of the window.
 
+#![allow(clippy::unwrap_used)]
+
 mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};

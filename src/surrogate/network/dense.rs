@@ -92,7 +92,7 @@ unsafe fn product<const M: usize>(x: *const f32, stride: usize, depth: usize, pa
 /// Y = relu(X W + b) on `rows` rows; tangent rows: (X W) where the value row's Y is above 0. `rows` and `primal` are multiples of [`BLOCK`].
 pub(super) fn forward(layer: &Packed, x: &[f32], x_stride: usize, y: &mut [f32], y_stride: usize, rows: usize, primal: usize) {
     let (depth, wide) = (layer.inputs, padded(layer.outputs));
-    assert!(rows % BLOCK == 0 && primal % BLOCK == 0 && x_stride >= depth && y_stride >= wide);
+    assert!(rows.is_multiple_of(BLOCK) && primal.is_multiple_of(BLOCK) && x_stride >= depth && y_stride >= wide);
     assert!(rows == 0 || (x.len() >= rows * x_stride && y.len() >= rows * y_stride));
     let biases = depth * wide;
     let zero = f32x8::splat(0.0);
@@ -131,7 +131,7 @@ pub(super) fn input_gradient(
     primal: usize,
 ) {
     let (depth, wide) = (layer.outputs, padded(layer.inputs));
-    assert!(rows % BLOCK == 0 && primal % BLOCK == 0 && dz_stride >= depth && dx_stride >= wide);
+    assert!(rows.is_multiple_of(BLOCK) && primal.is_multiple_of(BLOCK) && dz_stride >= depth && dx_stride >= wide);
     assert!(dz.len() >= rows * dz_stride && dx.len() >= rows * dx_stride && layer.backward.len() == depth * wide);
     assert!(active.is_none_or(|a| a.len() >= primal * dx_stride));
     let zero = f32x8::splat(0.0);

@@ -63,8 +63,8 @@ impl<B: Backend> Network<B> {
     fn layers_forward(&self, shape: &Architecture, mut rows: Vec<Tensor<B, 2>>) -> Vec<Tensor<B, 2>> {
         let flat = self.layers.val();
         for (number, layer) in shape.layers.iter().enumerate() {
-            let weights = flat.clone().slice([layer.weights..layer.biases]).reshape([layer.inputs, layer.outputs]);
-            let biases = flat.clone().slice([layer.biases..layer.biases + layer.outputs]).reshape([1, layer.outputs]);
+            let weights = flat.clone().slice(layer.weights..layer.biases).reshape([layer.inputs, layer.outputs]);
+            let biases = flat.clone().slice(layer.biases..layer.biases + layer.outputs).reshape([1, layer.outputs]);
             for (group, row) in rows.iter_mut().enumerate() {
                 *row = row.clone().matmul(weights.clone());
                 if group == 0 {

@@ -340,14 +340,19 @@ impl Batch {
                 scratch.backward(shape, weights, layout, take, &mut chunk.gradient, d_encoded);
             }
         });
+        // The first chunk's gradient becomes the sum, in a fixed order.
+        let (sum, rest) = self.chunks.split_at_mut(1);
+        for chunk in rest {
+            for (sum, part) in sum[0].gradient.iter_mut().zip(chunk.gradient.iter()) {
+                *sum += part;
+            }
+        }
         self.chunks.iter().map(|chunk| chunk.loss).sum()
     }
 
-    /// Adds the gradient of the layers to a flat vector, in a fixed order.
+    /// Adds the gradient of the layers to a flat vector.
     pub(super) fn layer_gradient(&self, shape: &Architecture, flat: &mut [f32]) {
-        for chunk in &self.chunks {
-            self.layout.unpack(shape, &chunk.gradient, flat);
-        }
+        self.layout.unpack(shape, &self.chunks[0].gradient, flat);
     }
 
     /// Adds the gradient of level `number`'s entries to `table`, and marks the cache lines of it that were written to in `touched`.
