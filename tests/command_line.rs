@@ -50,8 +50,16 @@ fn bad_usage_is_status_2() {
 #[test]
 fn bad_scenes_are_status_2_and_point_at_the_line() {
     let folder = tempfile::tempdir().unwrap();
-    refused(&["replay", &small_scene(folder.path(), "[trust]\ntolerence = 1\n")], 2, &["scene.toml:", "tolerence", "Did you mean `tolerance`?"]);
-    refused(&["replay", &small_scene(folder.path(), "[trust]\ntolerance = -1\n")], 2, &["scene.toml:", "`trust.tolerance` is -1", "above 0"]);
+    refused(
+        &["replay", &small_scene(folder.path(), "[trust]\ntolerence = 1\n")],
+        2,
+        &["scene.toml:", "tolerence", "Did you mean `tolerance`?"],
+    );
+    refused(
+        &["replay", &small_scene(folder.path(), "[trust]\ntolerance = -1\n")],
+        2,
+        &["scene.toml:", "`trust.tolerance` is -1", "above 0"],
+    );
     refused(&["replay", &small_scene(folder.path(), ""), "--set", "render.width=0"], 2, &["--set render.width=0", "from 1 to"]);
     refused(&["replay", &small_scene(folder.path(), "[camera]\neye=[1,1,1]\nlook_at=[1,1,1]\nup=[0,1,0]\n")], 2, &["camera"]);
     refused(&["replay", &folder.path().join("none.toml").display().to_string()], 2, &["cannot read", "none.toml"]);

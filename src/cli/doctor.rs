@@ -44,7 +44,10 @@ pub fn run(common: &Common) -> Result<()> {
     let Cpu { threads, built_for, has_avx2_and_fma } = diagnosis.cpu;
     print_text(format_args!("ridgewatch {}", diagnosis.version));
     print_text(format_args!("computes on  cpu"));
-    print_text(format_args!("cpu          {threads} threads; built for {built_for}; AVX2 and FMA {}", if has_avx2_and_fma { "present" } else { "absent" }));
+    print_text(format_args!(
+        "cpu          {threads} threads; built for {built_for}; AVX2 and FMA {}",
+        if has_avx2_and_fma { "present" } else { "absent" }
+    ));
     for device in &diagnosis.gpu.found {
         print_text(format_args!("gpu          {device}"));
     }
@@ -61,7 +64,8 @@ fn cpu() -> Cpu {
     let has_avx2_and_fma = std::is_x86_feature_detected!("avx2") && std::is_x86_feature_detected!("fma");
     #[cfg(not(target_arch = "x86_64"))]
     let has_avx2_and_fma = false;
-    let built_for = if cfg!(all(target_feature = "avx2", target_feature = "fma")) { "AVX2 and FMA" } else { "this architecture's baseline" };
+    let built_for =
+        if cfg!(all(target_feature = "avx2", target_feature = "fma")) { "AVX2 and FMA" } else { "this architecture's baseline" };
     Cpu { threads: std::thread::available_parallelism().map_or(1, |n| n.get()), built_for, has_avx2_and_fma }
 }
 

@@ -36,7 +36,8 @@ struct Grid([usize; 3]);
 
 fn grid(text: &str) -> Result<Grid, String> {
     const ACCEPTED: &str = "accepted: NXxNY or NXxNYxNZ with numbers from 2 to 16384";
-    let numbers: Vec<usize> = text.split(['x', 'X']).map(|n| n.trim().parse().map_err(|_| ACCEPTED.to_owned())).collect::<Result<_, _>>()?;
+    let numbers: Vec<usize> =
+        text.split(['x', 'X']).map(|n| n.trim().parse().map_err(|_| ACCEPTED.to_owned())).collect::<Result<_, _>>()?;
     if !numbers.iter().all(|n| (2..=16_384).contains(n)) {
         return Err(ACCEPTED.into());
     }
@@ -123,7 +124,8 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
     tracer.trace(&seeds, Extras::default(), &mut traced);
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
-    let ftle: Vec<f64> = unrounded(&traced).iter().zip(&traced.lived).map(|(s, lived)| if *lived > 0.0 { s / tau } else { f64::NAN }).collect();
+    let ftle: Vec<f64> =
+        unrounded(&traced).iter().zip(&traced.lived).map(|(s, lived)| if *lived > 0.0 { s / tau } else { f64::NAN }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| !f.is_nan()).collect();
     let check = if options.check { Some(check(plan, slide, &seeds, &ftle)?) } else { None };
     let convergence = if options.convergence { Some(convergence(plan, slide, &seeds)?) } else { None };
@@ -175,7 +177,11 @@ fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
 
 /// Log-stretch as precise as it was integrated.
 fn unrounded(traced: &Traced) -> Vec<f64> {
-    if traced.log_stretch_f64.is_empty() { traced.log_stretch.iter().map(|s| f64::from(*s)).collect() } else { traced.log_stretch_f64.clone() }
+    if traced.log_stretch_f64.is_empty() {
+        traced.log_stretch.iter().map(|s| f64::from(*s)).collect()
+    } else {
+        traced.log_stretch_f64.clone()
+    }
 }
 
 /// FTLE at the seeds that is taken for the truth.

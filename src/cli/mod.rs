@@ -97,7 +97,10 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
     let configuration = error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || cause.is::<Usage>()
-            || matches!(cause.downcast_ref(), Some(EngineError::TauUnit | EngineError::NoDomain | EngineError::Render(_) | EngineError::Surrogate(_)))
+            || matches!(
+                cause.downcast_ref(),
+                Some(EngineError::TauUnit | EngineError::NoDomain | EngineError::Render(_) | EngineError::Surrogate(_))
+            )
     });
     if configuration { 2 } else { 1 }
 }
@@ -125,7 +128,8 @@ fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
 fn method(word: &str) -> Result<ridgewatch::render::Method, String> {
     use serde::Deserialize;
     use serde::de::{IntoDeserializer, value::Error};
-    ridgewatch::render::Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word)).map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
+    ridgewatch::render::Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word))
+        .map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
 }
 
 /// Runs `work` on a pool of `--threads` threads.

@@ -56,7 +56,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     }
     scene.publish.endpoint = options.publish.clone().or(scene.publish.endpoint);
     scene.training.resume = options.resume.clone().or(scene.training.resume);
-    let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
     runtime.block_on(replay(common, &options, scene))
 }
 
@@ -166,7 +167,9 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "integration_difference": report.integration_difference,
         "surrogate_bytes": report.surrogate_bytes,
         "window_bytes_peak": report.window_bytes,
-    }) else { unreachable!("an object literal") };
+    }) else {
+        unreachable!("an object literal")
+    };
     map
 }
 

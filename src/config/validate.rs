@@ -75,8 +75,14 @@ fn check_source(scene: &SceneFile) -> Result<(), Fault> {
         require(k > 2.0, "source.k_max", k, "a number above 2, the smallest wave number")?;
     }
     match (kind, &scene.domain) {
-        (Archive | Turbulence, Some(_)) => fault("domain", "is given for gridded velocity", "no [domain]: the grid is the domain (archives may be cropped with archive.region)")?,
-        (DoubleGyre | Abc | Saddle | Rotation | Shear, None) => fault("domain", "is missing", "[domain] with min = [x, y, z] and max = [x, y, z], since a closed form has no grid")?,
+        (Archive | Turbulence, Some(_)) => fault(
+            "domain",
+            "is given for gridded velocity",
+            "no [domain]: the grid is the domain (archives may be cropped with archive.region)",
+        )?,
+        (DoubleGyre | Abc | Saddle | Rotation | Shear, None) => {
+            fault("domain", "is missing", "[domain] with min = [x, y, z] and max = [x, y, z], since a closed form has no grid")?
+        }
         _ => {}
     }
     if let Some(domain) = &scene.domain {
@@ -153,7 +159,12 @@ fn check_learning(scene: &SceneFile) -> Result<(), Fault> {
     }
     let t = &scene.training;
     require((0.0..1.0).contains(&t.share), "training.share", t.share, "a number from 0 up to, not including, 1")?;
-    require(t.seconds_per_frame.is_finite() && t.seconds_per_frame >= 0.0, "training.seconds_per_frame", t.seconds_per_frame, "0 or a number above")?;
+    require(
+        t.seconds_per_frame.is_finite() && t.seconds_per_frame >= 0.0,
+        "training.seconds_per_frame",
+        t.seconds_per_frame,
+        "0 or a number above",
+    )?;
     count("training.ring", t.ring, 1024, 1 << 28)
 }
 

@@ -182,7 +182,11 @@ impl<'a> Cycle<'a> {
             live,
             frame: 0,
             pictures: 0,
-            report: RunReport { integration_steps: tracer.steps(), integration_difference: tracer.chosen().map(|c| c.difference), ..RunReport::default() },
+            report: RunReport {
+                integration_steps: tracer.steps(),
+                integration_difference: tracer.chosen().map(|c| c.difference),
+                ..RunReport::default()
+            },
         })
     }
 
@@ -252,7 +256,13 @@ impl<'a> Cycle<'a> {
         held as f64 / chosen.len().max(1) as f64
     }
 
-    fn frame(&mut self, tracer: &dyn Tracer, slide: &mut Slide, place: Place, sink: &mut (dyn FnMut(Event) + Send)) -> Result<Frame, EngineError> {
+    fn frame(
+        &mut self,
+        tracer: &dyn Tracer,
+        slide: &mut Slide,
+        place: Place,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<Frame, EngineError> {
         let start = Instant::now();
         let scene = &self.plan.scene;
         let method = scene.render.method;
@@ -279,14 +289,21 @@ impl<'a> Cycle<'a> {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
                     match &threads.train {
-                        Some(pool) => Trainer::Beside(scope.spawn(move || pool.install(|| train(&mut **live, ring.samples(), settings, Some(rendered))))),
+                        Some(pool) => Trainer::Beside(
+                            scope.spawn(move || pool.install(|| train(&mut **live, ring.samples(), settings, Some(rendered)))),
+                        ),
                         None => Trainer::After(live, ring),
                     }
                 });
                 let mut render = || -> Result<Rendered, EngineError> {
-                    let mut answers =
-                        Answers::new(tracer, front.as_deref(), &gate, scene.trust.trace_budget, if front.is_some() { scene.training.ring } else { 0 })
-                            .with_flow_map(flow_map);
+                    let mut answers = Answers::new(
+                        tracer,
+                        front.as_deref(),
+                        &gate,
+                        scene.trust.trace_budget,
+                        if front.is_some() { scene.training.ring } else { 0 },
+                    )
+                    .with_flow_map(flow_map);
                     let progress = std::sync::Mutex::new(&mut *sink);
                     let report = |share: f32| {
                         if let Ok(mut sink) = progress.lock() {
@@ -294,7 +311,8 @@ impl<'a> Cycle<'a> {
                         }
                     };
                     let walk = Instant::now();
-                    let (film, stats) = renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
+                    let (film, stats) =
+                        renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
@@ -304,14 +322,26 @@ impl<'a> Cycle<'a> {
                     });
                     let unit = audit::stratified_points(cells, per_cell, seed, 2 * frame);
                     let audit = audit::trace(tracer, &unit, flow_map);
-                    let residuals = front.as_deref().map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
-                    Ok(Rendered { film, stats, tally, samples, audit, residuals, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() })
+                    let residuals =
+                        front.as_deref().map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
+                    Ok(Rendered {
+                        film,
+                        stats,
+                        tally,
+                        samples,
+                        audit,
+                        residuals,
+                        render_seconds,
+                        audit_seconds: auditing.elapsed().as_secs_f64(),
+                    })
                 };
                 work = Some(threads.render.install(&mut render));
                 rendered.store(true, Ordering::Release);
                 learned = match training {
                     Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
-                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| train(&mut **live, ring.samples(), &scene.training, None))),
+                    Some(Trainer::After(live, ring)) => {
+                        Some(threads.render.install(|| train(&mut **live, ring.samples(), &scene.training, None)))
+                    }
                     None => None,
                 };
             });
@@ -350,7 +380,10 @@ impl<'a> Cycle<'a> {
             let answering = if work.tally.over_budget > 0 { crate::trust::TrustedError::of(audited) } else { record.trusted };
             record.over_tolerance = answering.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0);
             if work.tally.over_budget > 0 {
-                record.warnings.push(format!("the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate", work.tally.over_budget));
+                record.warnings.push(format!(
+                    "the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate",
+                    work.tally.over_budget
+                ));
             }
             if self.options.verify_points > 0 {
                 let per_cell = self.options.verify_points.div_ceil(cells.iter().product());
@@ -372,7 +405,9 @@ impl<'a> Cycle<'a> {
         if let Some(learned) = &learned {
             self.report.train_steps += learned.steps;
             if learned.rollbacks > 0 {
-                record.warnings.push(format!("training diverged {} time(s): rolled back to the last good weights at a lower rate", learned.rollbacks));
+                record
+                    .warnings
+                    .push(format!("training diverged {} time(s): rolled back to the last good weights at a lower rate", learned.rollbacks));
             }
         }
         record.training = learned;

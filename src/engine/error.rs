@@ -28,7 +28,9 @@ pub enum EngineError {
     #[error("a closed form needs [domain] with min and max")]
     NoDomain,
     /// "30 days" where time has no seconds.
-    #[error("time.tau has a unit, but the source's time is not in seconds (with the index metric it counts snapshots): give a plain number")]
+    #[error(
+        "time.tau has a unit, but the source's time is not in seconds (with the index metric it counts snapshots): give a plain number"
+    )]
     TauUnit,
     /// A synthetic grid.
     #[error(transparent)]

@@ -113,7 +113,12 @@ const TURBULENCE_SEED: u64 = 0;
 
 impl Feed {
     /// The feed of a scene whose |tau| is known.
-    pub fn open(scene: &SceneFile, snapshots: Option<Box<dyn SnapshotSource>>, tau: f64, direction: Direction) -> Result<Self, EngineError> {
+    pub fn open(
+        scene: &SceneFile,
+        snapshots: Option<Box<dyn SnapshotSource>>,
+        tau: f64,
+        direction: Direction,
+    ) -> Result<Self, EngineError> {
         let slides = scene.time.slides.map(|n| n as u64);
         match (closed_form(&scene.source), snapshots) {
             (Some(flow), _) => {

@@ -11,8 +11,8 @@ mod record;
 mod setup;
 
 pub use crate::trust::TrustedError;
-pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use answers::{Answers, Tally};
+pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};

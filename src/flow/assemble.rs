@@ -2,10 +2,10 @@
 
 use super::grid_flow::GridFlow;
 use super::sphere::SphereFlow;
+use super::steps::Chosen;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{Chart, Closed, Velocity};
 use super::voids::Voids;
-use super::steps::Chosen;
 use super::{FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
 use crate::field::analytic::{ClosedForm, Form};
 use crate::field::{Domain, Geometry, Window};

@@ -24,8 +24,8 @@ mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 pub use error::FlowError;
-pub use steps::Chosen;
 pub use resolution::{TimeResolution, time_resolution};
+pub use steps::Chosen;
 pub use tracer::Order;
 
 /// Which way particles travel from the seed.

@@ -38,7 +38,8 @@ fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> f64 {
     let lived = all.clone().filter(whole).count();
     let chosen: Vec<usize> = if lived >= ENOUGH { all.filter(whole).collect() } else { all.collect() };
     let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
-    let mut squares: Vec<f64> = chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    let mut squares: Vec<f64> =
+        chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
     squares.sort_unstable_by(f64::total_cmp);
     squares.truncate((squares.len() as f64 * (1.0 - trimmed)).ceil() as usize);
     if squares.is_empty() { 0.0 } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }

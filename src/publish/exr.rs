@@ -28,8 +28,7 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
         ("missing.share", &film.missing),
         ("queries.count", &film.queries),
     ];
-    for (name, layer) in layers
-    {
+    for (name, layer) in layers {
         match layer.len() {
             0 => {}
             n if n == pixels => channels.push((name, layer.clone())),
@@ -39,7 +38,9 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     let mut attributes = LayerAttributes { software_name: Some(Text::from("ridgewatch")), ..Default::default() };
     if let Some(record) = record {
         let json = serde_json::to_string(record).map_err(|e| e.to_string())?;
-        attributes.comments = Some(Text::from("linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples, share missing, queries"));
+        attributes.comments = Some(Text::from(
+            "linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples, share missing, queries",
+        ));
         let frame = i32::try_from(record.frame).unwrap_or(i32::MAX);
         attributes.other.insert(Text::from("ridgewatch.frame"), AttributeValue::I32(frame));
         attributes.other.insert(Text::from("ridgewatch.time"), AttributeValue::F64(record.time));

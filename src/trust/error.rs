@@ -83,8 +83,7 @@ mod tests {
 
     #[test]
     fn figures_are_those_of_the_sample() {
-        let sample: Vec<Residual> =
-            (1..=100).map(|i| Residual { point: [0.0; 3], optical: i as f32, log_stretch: 2.0 }).collect();
+        let sample: Vec<Residual> = (1..=100).map(|i| Residual { point: [0.0; 3], optical: i as f32, log_stretch: 2.0 }).collect();
         let e = TrustedError::of(&sample).unwrap();
         assert_eq!((e.points, e.optical_mean, e.optical_p99, e.log_stretch_rms), (100, 50.5, 99.0, 2.0));
         assert!((e.optical_rms - (338_350f64 / 100.0).sqrt()).abs() < 1e-9);

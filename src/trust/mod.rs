@@ -35,6 +35,14 @@ pub struct TrustSettings {
 
 impl Default for TrustSettings {
     fn default() -> Self {
-        Self { tolerance: 0.03, cells: None, min_samples: 16.0, audit_share: 0.01, audit_per_cell: 8, slide_inflation: 4.0, trace_budget: None }
+        Self {
+            tolerance: 0.03,
+            cells: None,
+            min_samples: 16.0,
+            audit_share: 0.01,
+            audit_per_cell: 8,
+            slide_inflation: 4.0,
+            trace_budget: None,
+        }
     }
 }
