@@ -20,5 +20,9 @@ pub struct Options {
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let tone_map = [options.tone_map[0], options.tone_map[1], options.tone_map[2]];
     let comparison = ridgewatch::publish::compare_files(&options.a, &options.b, tone_map)?;
-    if common.json { print_json(&comparison) } else { Ok(print_text(comparison)) }
+    if common.json {
+        return print_json(&comparison);
+    }
+    print_text(comparison);
+    Ok(())
 }

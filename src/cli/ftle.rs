@@ -102,7 +102,11 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let slide = slide.context("the source gave no slide")?;
     let report = on_threads(common, || compute(&plan, &slide, options))??;
-    if common.json { print_json(&report) } else { Ok(print_report(&report)) }
+    if common.json {
+        return print_json(&report);
+    }
+    print_report(&report);
+    Ok(())
 }
 
 fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {

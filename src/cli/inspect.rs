@@ -28,5 +28,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
     };
     let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)?;
-    if common.json { print_json(&inspection) } else { Ok(print_text(inspection)) }
+    if common.json {
+        return print_json(&inspection);
+    }
+    print_text(inspection);
+    Ok(())
 }

@@ -151,7 +151,7 @@ fn check_learning(scene: &SceneFile) -> Result<(), Fault> {
     require(n.growth.is_finite() && n.growth >= 1.0 && n.growth <= 8.0, "network.growth", n.growth, "a number from 1 to 8")?;
     count("network.octaves", n.octaves, 1, 24)?;
     count("network.hidden_layers", n.hidden_layers, 1, 64)?;
-    require((8..=1024).contains(&n.width) && n.width % 8 == 0, "network.width", n.width, "a multiple of 8 from 8 to 1024")?;
+    require((8..=1024).contains(&n.width) && n.width.is_multiple_of(8), "network.width", n.width, "a multiple of 8 from 8 to 1024")?;
     count("network.batch", n.batch, 64, 1 << 24)?;
     require(n.mean_penalty.is_finite() && n.mean_penalty >= 0.0, "network.mean_penalty", n.mean_penalty, "0 or a number above")?;
     if let Some(rate) = n.learning_rate {

@@ -1,5 +1,6 @@
 //! One coordinate axis of a grid.
 
+use std::cmp::Ordering;
 use thiserror::Error;
 
 /// A strictly ascending coordinate axis. Readers flip descending axes (latitude, pressure) before they come here.
@@ -46,7 +47,7 @@ impl Axis {
         if coordinates.len() < 2 {
             return Err(AxisFault::TooShort { name, found: coordinates.len() });
         }
-        if let Some(i) = (1..coordinates.len()).find(|&i| !(coordinates[i] > coordinates[i - 1])) {
+        if let Some(i) = (1..coordinates.len()).find(|&i| coordinates[i].partial_cmp(&coordinates[i - 1]) != Some(Ordering::Greater)) {
             return Err(AxisFault::NotAscending { name, index: i, here: coordinates[i], before: coordinates[i - 1] });
         }
         if !(coordinates[0].is_finite() && coordinates[coordinates.len() - 1].is_finite()) {
