@@ -75,7 +75,9 @@ impl SceneFile {
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
         let mut scene = Self::parse(path, &text, overrides)?;
         let folder = path.parent().unwrap_or(Path::new("."));
-        for file in &mut scene.archive.files {
+        // Files named by `--set` are relative to where the command runs, as on any command line.
+        let given = overrides.iter().any(|o| o.trim_start().starts_with("archive.files"));
+        for file in scene.archive.files.iter_mut().filter(|_| !given) {
             if file.is_relative() {
                 *file = folder.join(&*file);
             }

@@ -1,6 +1,8 @@
 //! Through the front door: what a user types, and what comes back. Every refusal is one clear message with exit status 1 or 2,
 //! nothing half-written, no panic.
 
+#![allow(clippy::unwrap_used)]
+
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
@@ -18,7 +20,9 @@ fn standard_error(output: &Output) -> String {
 
 /// Asserts the status and that one message of standard error holds all `parts`.
 fn refused(arguments: &[&str], status: i32, parts: &[&str]) {
-    let output = ridgewatch(arguments);
+    // Defaults such as `out/run` are relative: nothing of this may touch the project's own folder.
+    let elsewhere = tempfile::tempdir().unwrap();
+    let output = Command::new(env!("CARGO_BIN_EXE_ridgewatch")).args(arguments).current_dir(elsewhere.path()).output().unwrap();
     let said = standard_error(&output);
     assert_eq!(output.status.code(), Some(status), "{arguments:?}: {said}");
     assert!(!said.contains("panicked"), "{said}");
@@ -32,7 +36,7 @@ fn small_scene(folder: &Path, more: &str) -> String {
     let path = folder.join("scene.toml");
     let text = format!(
         "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 2\nstep = 0.1\nslides = 2\n\
-         [flow]\nsteps = 20\n[render]\nwidth = 32\nheight = 16\nsamples = 2\n[training]\nsteps_per_frame = 20\n{more}"
+         [flow]\nsteps = 20\n[render]\nwidth = 32\nheight = 16\nsamples = 2\n[training]\nsteps_per_frame = 20\n[surrogate]\nkind = \"network\"\n{more}"
     );
     std::fs::write(&path, text).unwrap();
     path.display().to_string()

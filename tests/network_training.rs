@@ -7,7 +7,7 @@ mod network_support;
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Loss, NetworkSettings, Target};
-use ridgewatch::surrogate::{CheckpointError, Kind, Residual, Samples, Surrogate, SurrogateSettings, Table, build};
+use ridgewatch::surrogate::{CheckpointError, Kind, Predict, Residual, Samples, Surrogate, SurrogateSettings, Table, build};
 
 fn small() -> NetworkSettings {
     NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }

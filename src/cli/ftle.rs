@@ -129,7 +129,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
     let ftle: Vec<f64> =
-        unrounded(&traced).iter().zip(&traced.lived).map(|(s, lived)| if *lived > 0.0 { s / tau } else { f64::NAN }).collect();
+        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| !f.is_nan()).collect();
     let check = if options.check { Some(check(plan, slide, &seeds, &ftle)?) } else { None };
     let convergence = if options.convergence { Some(convergence(plan, slide, &seeds)?) } else { None };
@@ -148,7 +148,8 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
         mean: known.iter().sum::<f64>() / known.len().max(1) as f64,
         maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
         missing_seeds: seeds.len() - known.len(),
-        stopped_early_share: traced.lived.iter().filter(|l| **l > 0.0 && **l < 1.0).count() as f64 / seeds.len() as f64,
+        stopped_early_share: traced.lived.iter().zip(&ftle).filter(|(lived, ftle)| **lived < 1.0 && !ftle.is_nan()).count() as f64
+            / seeds.len() as f64,
         seconds,
         samples_per_second: seeds.len() as f64 / seconds,
         check,

@@ -12,6 +12,7 @@ use anyhow::{Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::engine::EngineError;
+use ridgewatch::publish::PublishError;
 use std::path::{Path, PathBuf};
 
 /// Shows the Lagrangian coherent structures of a flow simulation while it runs.
@@ -97,6 +98,7 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
     let configuration = error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || cause.is::<Usage>()
+            || matches!(cause.downcast_ref(), Some(PublishError::Setting { .. } | PublishError::Endpoint { .. }))
             || matches!(
                 cause.downcast_ref(),
                 Some(EngineError::TauUnit | EngineError::NoDomain | EngineError::Render(_) | EngineError::Surrogate(_))
@@ -138,14 +140,14 @@ fn on_threads<T: Send>(common: &Common, work: impl FnOnce() -> T + Send) -> Resu
 }
 
 /// Prints the machine-readable result.
-#[allow(clippy::print_stdout)]
 fn print_json(value: &impl serde::Serialize) -> Result<()> {
-    println!("{}", serde_json::to_string_pretty(value)?);
+    print_text(serde_json::to_string_pretty(value)?);
     Ok(())
 }
 
 /// Prints the result for people.
-#[allow(clippy::print_stdout)]
 fn print_text(text: impl std::fmt::Display) {
-    println!("{text}");
+    use std::io::Write;
+    // A reader that has gone away (`| head`) is no failure of ours.
+    let _ = writeln!(std::io::stdout(), "{text}");
 }

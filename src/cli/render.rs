@@ -25,13 +25,13 @@ pub struct Options {
     #[arg(long, value_name = "N")]
     warmup: Option<usize>,
     /// Checks the stated error on N fresh points.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    verify: usize,
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
+    verify: u64,
     /// Starts from a surrogate written by `replay --checkpoint`.
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
     /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it.
-    #[arg(long, short, default_value = "render.exr")]
+    #[arg(long, short, default_value = "out/render.exr")]
     out: PathBuf,
 }
 
@@ -56,7 +56,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     scene.time.warmup_frames = options.warmup.unwrap_or(scene.time.warmup_frames);
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let run_options = RunOptions {
-        verify_points: options.verify,
+        verify_points: options.verify as usize,
         threads: common.threads,
         warmup_samples: Some(warmup_samples),
         ..RunOptions::default()

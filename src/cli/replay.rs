@@ -1,7 +1,7 @@
 //! `ridgewatch replay`.
 
 use super::{Common, Usage, messages, print_json, print_text, scene};
-use anyhow::{Context, Result, bail};
+use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
 use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, RunFolder};
@@ -32,8 +32,8 @@ pub struct Options {
     #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
     publish: Option<String>,
     /// Checks each frame's stated error on N fresh points afterwards and records that too.
-    #[arg(long, value_name = "N", default_value_t = 0)]
-    verify: usize,
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
+    verify: u64,
     /// Writes the trained surrogate here at the end.
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
@@ -64,14 +64,19 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
     let setup = Setup::new(scene)?;
     let scene = setup.plan.scene.clone();
-    let mut output = Output::start(&scene.publish, Some(RunFolder::create(&options.out, options.overwrite)?))?;
+    if let Some(checkpoint) = &options.checkpoint {
+        super::render::check_folder(checkpoint)?;
+    }
+    // The socket first: a port in use must not cost the run that the folder holds.
+    let mut output = Output::start(&scene.publish, None)?;
+    output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }
     let stop = Arc::new(AtomicBool::new(false));
     let signals = tokio::spawn(watch_signals(stop.clone()));
     let run_options = RunOptions {
-        verify_points: options.verify,
+        verify_points: options.verify as usize,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
         ..RunOptions::default()
@@ -80,12 +85,16 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     let worker = tokio::task::spawn_blocking(move || {
         let mut bar = messages::progress(None);
         let mut last: Option<Arc<FrameRecord>> = None;
-        let result = engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
+        let run = || engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
+        // A fault of ours must not cost the frames that are already made.
+        let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
+        let result = result.and_then(|result| result.map_err(anyhow::Error::from));
         bar.finish_and_clear();
         // Whatever happened, the frames made so far and their records are completed.
         let mut run = serde_json::Map::new();
         run.insert("title".into(), scene.title.into());
         run.insert("seed".into(), scene.seed.into());
+        run.insert("version".into(), env!("CARGO_PKG_VERSION").into());
         match &result {
             Ok(report) => run.extend(run_json(report)),
             Err(error) => drop(run.insert("failed".into(), error.to_string().into())),
@@ -167,6 +176,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "integration_difference": report.integration_difference,
         "surrogate_bytes": report.surrogate_bytes,
         "window_bytes_peak": report.window_bytes,
+        "time_resolution": report.time_resolution,
     }) else {
         unreachable!("an object literal")
     };
@@ -183,7 +193,7 @@ async fn watch_signals(stop: Arc<AtomicBool>) {
     loop {
         let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
         if stop.swap(true, Ordering::Relaxed) {
-            messages::note("stopped at once; the current frame is lost");
+            messages::note("stopped at once; what was not written yet is lost");
             std::process::exit(status);
         }
         messages::note("finishing the current frame; once more to stop at once");

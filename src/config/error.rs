@@ -91,7 +91,8 @@ fn span_of(text: &str, key: &str) -> Option<usize> {
     let mut item = document.as_item();
     let mut best = None;
     for part in key.split('.') {
-        item = item.get(part)?;
+        let Some(next) = item.get(part) else { break };
+        item = next;
         best = item.span().map(|s| s.start).or(best);
     }
     best

@@ -5,7 +5,7 @@ use super::{SceneFile, SourceKind, StepsSetting};
 use crate::flow::{Boundary, Integrator, Precision};
 
 /// Largest picture edge and sample count: beyond them a typing slip is more likely than a wish.
-const MAX_EDGE: usize = 32_768;
+const MAX_EDGE: usize = 16_384;
 const MAX_SAMPLES: usize = 1 << 20;
 
 fn fault(key: &str, found: impl std::fmt::Display, accepted: &str) -> Result<(), Fault> {
@@ -64,6 +64,7 @@ fn check_source(scene: &SceneFile) -> Result<(), Fault> {
         for n in nodes {
             count("source.nodes", n, 4, 4096)?;
         }
+        count("source.nodes", nodes.iter().product(), 64, 1 << 28)?;
     }
     if let Some(n) = source.modes {
         count("source.modes", n, 1, 4096)?;
@@ -146,13 +147,13 @@ fn check_learning(scene: &SceneFile) -> Result<(), Fault> {
     let n = &scene.network;
     count("network.levels", n.levels, 1, 32)?;
     require([1, 2, 4, 8].contains(&n.features), "network.features", n.features, "1, 2, 4 or 8")?;
-    require((4..=28).contains(&n.log2_table), "network.log2_table", n.log2_table, "a whole number from 4 to 28")?;
+    require((4..=24).contains(&n.log2_table), "network.log2_table", n.log2_table, "a whole number from 4 to 24")?;
     count("network.base_resolution", n.base_resolution, 2, 4096)?;
-    require(n.growth.is_finite() && n.growth >= 1.0 && n.growth <= 8.0, "network.growth", n.growth, "a number from 1 to 8")?;
-    count("network.octaves", n.octaves, 1, 24)?;
+    require(n.growth.is_finite() && n.growth >= 1.0 && n.growth <= 4.0, "network.growth", n.growth, "a number from 1 to 4")?;
+    count("network.octaves", n.octaves, 1, 16)?;
     count("network.hidden_layers", n.hidden_layers, 1, 64)?;
     require((8..=1024).contains(&n.width) && n.width.is_multiple_of(8), "network.width", n.width, "a multiple of 8 from 8 to 1024")?;
-    count("network.batch", n.batch, 64, 1 << 24)?;
+    count("network.batch", n.batch, 64, 1 << 22)?;
     require(n.mean_penalty.is_finite() && n.mean_penalty >= 0.0, "network.mean_penalty", n.mean_penalty, "0 or a number above")?;
     if let Some(rate) = n.learning_rate {
         positive("network.learning_rate", f64::from(rate))?;
@@ -165,6 +166,10 @@ fn check_learning(scene: &SceneFile) -> Result<(), Fault> {
         t.seconds_per_frame,
         "0 or a number above",
     )?;
+    require(t.seconds_per_frame <= 86_400.0, "training.seconds_per_frame", t.seconds_per_frame, "at most 86400 (a day)")?;
+    if let Some(steps) = t.steps_per_frame {
+        require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
+    }
     count("training.ring", t.ring, 1024, 1 << 28)
 }
 
@@ -172,8 +177,8 @@ fn check_trust(scene: &SceneFile) -> Result<(), Fault> {
     let t = &scene.trust;
     positive("trust.tolerance", t.tolerance)?;
     require((0.01..=1.0).contains(&t.audit_share), "trust.audit_share", t.audit_share, "a number from 0.01 to 1")?;
-    count("trust.audit_per_cell", t.audit_per_cell, 1, 65_536)?;
-    require(t.min_samples.is_finite() && t.min_samples >= 4.0, "trust.min_samples", t.min_samples, "a number from 4 up")?;
+    count("trust.audit_per_cell", t.audit_per_cell, 1, 4096)?;
+    require((4.0..=4096.0).contains(&t.min_samples), "trust.min_samples", t.min_samples, "a number from 4 to 4096")?;
     require(t.slide_inflation.is_finite() && t.slide_inflation >= 1.0, "trust.slide_inflation", t.slide_inflation, "a number from 1 up")?;
     if let Some(seconds) = t.trace_budget {
         positive("trust.trace_budget", seconds)?;
@@ -182,7 +187,7 @@ fn check_trust(scene: &SceneFile) -> Result<(), Fault> {
         for n in cells {
             count("trust.cells", n, 1, 1024)?;
         }
-        count("trust.cells", cells.iter().product(), 1, 1 << 22)?;
+        count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
     }
     Ok(())
 }

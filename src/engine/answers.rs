@@ -5,7 +5,7 @@ use crate::flow::{Extras, Traced, Tracer};
 use crate::render::LogStretch;
 use crate::surrogate::{Predict, Samples};
 use crate::trust::Gate;
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
 /// Whom to ask, and what was found out on the way.
 pub struct Answers<'a> {
@@ -13,10 +13,12 @@ pub struct Answers<'a> {
     surrogate: Option<&'a dyn Predict>,
     gate: &'a Gate,
     /// Time after which even untrusted cells are answered by the surrogate.
-    trace_budget: Option<Duration>,
+    trace_budget: Option<f64>,
     keep: usize,
+    stride: usize,
+    since_kept: usize,
     keep_arrival: bool,
-    /// Traced queries, kept evenly over the frame (at most `keep`), with the log-stretch that was traced.
+    /// Traced queries, kept evenly over the frame (fewer than `keep`), with the log-stretch that was traced.
     pub samples: Samples,
     /// Figures of the frame so far.
     pub tally: Tally,
@@ -31,6 +33,8 @@ pub struct Tally {
     pub queries: u64,
     /// Of them by RK4.
     pub traced: u64,
+    /// Of them without a value (land).
+    pub missing: u64,
     /// Queries of untrusted cells that the surrogate answered because the tracing budget was spent.
     pub over_budget: u64,
     /// Seconds spent tracing.
@@ -55,8 +59,10 @@ impl<'a> Answers<'a> {
             tracer,
             surrogate,
             gate,
-            trace_budget: trace_budget.map(Duration::from_secs_f64),
+            trace_budget,
             keep,
+            stride: 1,
+            since_kept: 0,
             keep_arrival: false,
             samples: Samples::default(),
             tally: Tally::default(),
@@ -76,20 +82,42 @@ impl<'a> Answers<'a> {
     }
 
     fn budget_spent(&self) -> bool {
-        self.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget.as_secs_f64())
+        self.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget)
     }
 
-    fn keep_samples(&mut self) {
-        // Every stride-th traced query: wavefront order mixes pixels, so this is an even draw.
-        let stride = (self.tally.traced as usize / self.keep.max(1)).max(1);
-        let room = self.keep.saturating_sub(self.samples.len());
+    /// Every stride-th traced query is kept; when there is no more room, every other one is let go and the stride doubles, so that
+    /// what is kept is spread evenly over the frame.
+    fn keep_samples(&mut self, count: usize) {
         let domain = self.domain();
         let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
-        let chosen = (0..self.scratch.points.len()).step_by(stride).filter(|&i| self.traced.lived[i] > 0.0).take(room);
-        for i in chosen {
+        for i in 0..count {
+            self.since_kept += 1;
+            if self.since_kept < self.stride {
+                continue;
+            }
+            self.since_kept = 0;
             push_sample(&mut self.samples, domain, self.scratch.points[i], &self.traced, i, extras);
+            if self.samples.len() >= self.keep {
+                halve(&mut self.samples);
+                self.stride *= 2;
+            }
         }
     }
+}
+
+/// Lets go of every other sample.
+fn halve(samples: &mut Samples) {
+    fn every_other<T>(values: &mut Vec<T>) {
+        let mut keep = false;
+        values.retain(|_| {
+            keep = !keep;
+            keep
+        });
+    }
+    every_other(&mut samples.points);
+    every_other(&mut samples.log_stretch);
+    every_other(&mut samples.arrival);
+    every_other(&mut samples.jacobian);
 }
 
 /// Appends traced seed `i` to `samples`, in unit coordinates.
@@ -114,23 +142,21 @@ impl LogStretch for Answers<'_> {
         let mut scratch = std::mem::take(&mut self.scratch);
         scratch.to_trace.clear();
         scratch.to_predict.clear();
-        match self.surrogate {
-            None => scratch.to_trace.extend(0..points.len() as u32),
-            Some(_) => {
-                let spent = self.budget_spent();
-                for (i, &point) in points.iter().enumerate() {
-                    if self.tracer.is_void(point) {
-                        log_stretch[i] = f32::NAN;
-                        traced[i] = false;
-                    } else if self.gate.trusts(domain.to_unit(point)) {
-                        scratch.to_predict.push(i as u32);
-                    } else if spent {
-                        self.tally.over_budget += 1;
-                        scratch.to_predict.push(i as u32);
-                    } else {
-                        scratch.to_trace.push(i as u32);
-                    }
-                }
+        let spent = self.budget_spent();
+        for (i, &point) in points.iter().enumerate() {
+            if self.tracer.is_void(point) {
+                log_stretch[i] = f32::NAN;
+                traced[i] = false;
+                self.tally.missing += 1;
+            } else if self.surrogate.is_none() {
+                scratch.to_trace.push(i as u32);
+            } else if self.gate.trusts(domain.to_unit(point)) {
+                scratch.to_predict.push(i as u32);
+            } else if spent {
+                self.tally.over_budget += 1;
+                scratch.to_predict.push(i as u32);
+            } else {
+                scratch.to_trace.push(i as u32);
             }
         }
         if let Some(surrogate) = self.surrogate.filter(|_| !scratch.to_predict.is_empty()) {
@@ -152,8 +178,7 @@ impl LogStretch for Answers<'_> {
             let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
             self.tracer.trace(&scratch.points, extras, &mut self.traced);
             for (k, &i) in scratch.to_trace.iter().enumerate() {
-                // A particle that never lived started on land: there is no FTLE here.
-                log_stretch[i as usize] = if self.traced.lived[k] > 0.0 { self.traced.log_stretch[k] } else { f32::NAN };
+                log_stretch[i as usize] = self.traced.log_stretch[k];
                 traced[i as usize] = true;
             }
             self.tally.traced += scratch.to_trace.len() as u64;
@@ -161,8 +186,8 @@ impl LogStretch for Answers<'_> {
         }
         let any_traced = !scratch.to_trace.is_empty();
         self.scratch = scratch;
-        if any_traced && self.keep > 0 {
-            self.keep_samples();
+        if any_traced && self.keep > 1 {
+            self.keep_samples(self.scratch.to_trace.len());
         }
     }
 }

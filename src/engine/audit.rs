@@ -31,7 +31,7 @@ pub struct Audit {
     pub samples: Samples,
     /// Points drawn, voids included.
     pub drawn: usize,
-    /// Mean lived share over points that lived at all.
+    /// Mean lived share over points that are not void.
     pub lived_share: f64,
 }
 
@@ -45,7 +45,7 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
     let mut samples = Samples::default();
     let mut lived = 0.0;
     for (i, &point) in points.iter().enumerate() {
-        if traced.lived[i] > 0.0 {
+        if !tracer.is_void(point) {
             push_sample(&mut samples, domain, point, &traced, i, extras);
             lived += f64::from(traced.lived[i]);
         }

@@ -6,10 +6,10 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::Slide;
-use super::setup::{Plan, Setup};
+use super::setup::{Plan, Setup, assemble};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
-use crate::config::TrainingSettings;
-use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use crate::config::{SceneFile, TrainingSettings};
+use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, TrustMap};
@@ -65,10 +65,16 @@ pub struct RunReport {
     pub integration_difference: Option<f64>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
+    /// Whether the snapshots are close enough in time; none for closed forms.
+    pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
     pub window_bytes: usize,
 }
 
+/// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
+const COARSE_IN_TIME: f64 = 0.25;
+/// A frame keeps at most one in so many of the ring's places, so that the ring remembers several frames.
+const KEEP_A_FRAME: usize = 4;
 /// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
 const RENDER_RESIDUALS: usize = 1 << 16;
 
@@ -79,7 +85,9 @@ struct Threads {
 
 impl Threads {
     /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
-    fn new(threads: usize, share: f64, learns: bool) -> Result<Self, EngineError> {
+    fn new(threads: usize, scene: &SceneFile) -> Result<Self, EngineError> {
+        let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
+        let share = scene.training.share;
         let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
         let pool = |n: usize, name: &'static str| {
             rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
@@ -102,6 +110,8 @@ struct Cycle<'a> {
     ring: SampleRing,
     live: Option<Box<dyn Surrogate>>,
     frame: u64,
+    /// Points traced since the last frame to prepare the next.
+    probed: u64,
     /// Frames that were no warm-up.
     pictures: u64,
     report: RunReport,
@@ -111,6 +121,8 @@ struct Cycle<'a> {
 #[derive(Clone, Copy)]
 struct Place {
     warmup: bool,
+    /// Seconds that preparing the slide took, for its first frame.
+    preparing: f64,
 }
 
 /// Random stream of the first probe, apart from those of audit points.
@@ -127,22 +139,34 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
     let mut slide = feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
-    let mut tracer = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+    let threads = Threads::new(options.threads, &plan.scene)?;
+    let mut prepared = Instant::now();
+    let mut tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
-    let mut cycle = Cycle::new(&plan, options, &*tracer, &slide)?;
+    let mut cycle = Cycle::new(&plan, options, threads, &*tracer, &slide)?;
     if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
         slide.warnings.push(format!(
             "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
             chosen.steps, chosen.difference
         ));
     }
+    if let VelocitySource::Window(window) = &slide.velocity {
+        let resolution = cycle.threads.render.install(|| time_resolution(window, &map, slide.time))?;
+        if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
+            slide.warnings.push(format!(
+                "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
+                100.0 * change / resolution.ftle_rms
+            ));
+        }
+        cycle.report.time_resolution = Some(resolution);
+    }
     cycle.pilot(&*tracer)?;
     cycle.probe(&*tracer, slide.index);
     loop {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
-            let place = Place { warmup: number < warmups };
+            let place = Place { warmup: number < warmups, preparing: if number == 0 { prepared.elapsed().as_secs_f64() } else { 0.0 } };
             let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
             sink(Event::Frame(frame));
             if stop.load(Ordering::Relaxed) {
@@ -152,6 +176,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
         }
         let Some(next) = feed.next_slide()? else { return cycle.finish() };
         slide = next;
+        prepared = Instant::now();
         tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
         cycle.slid(&*tracer);
         cycle.probe(&*tracer, slide.index);
@@ -159,28 +184,28 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
 }
 
 impl<'a> Cycle<'a> {
-    fn new(plan: &'a Plan, options: &'a RunOptions, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
+    fn new(plan: &'a Plan, options: &'a RunOptions, threads: Threads, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
         let scene = &plan.scene;
-        let renderer = Renderer::new(settled_scene(plan, tracer, first.time)?, &plan.domain, plan.map.tau)?;
+        let renderer = Renderer::new(threads.render.install(|| settled_scene(plan, tracer, first.time))?, &plan.domain, plan.map.tau)?;
         let method = scene.render.method;
         let mut live = if method == Method::Reference {
             None
         } else {
-            Some(crate::surrogate::build(&scene.surrogate, &scene.network, &plan.domain, scene.seed, tracer)?)
+            Some(threads.render.install(|| crate::surrogate::build(&scene.surrogate, &scene.network, &plan.domain, scene.seed, tracer))?)
         };
         if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live) {
             surrogate.load(path)?;
         }
-        let learns = live.as_ref().is_some_and(|s| s.learns());
         Ok(Self {
             plan,
             options,
-            threads: Threads::new(options.threads, scene.training.share, learns)?,
+            threads,
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
             live,
             frame: 0,
+            probed: 0,
             pictures: 0,
             report: RunReport {
                 integration_steps: tracer.steps(),
@@ -213,28 +238,32 @@ impl<'a> Cycle<'a> {
         let probe = self.threads.render.install(|| audit::trace(tracer, &unit, flow_map));
         let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
         self.renderer.observe(&points, &probe.samples.log_stretch);
-        self.learn_of(tracer, &probe.samples);
+        self.probed += probe.drawn as u64;
+        self.learn_of(tracer, &probe.samples, true);
     }
 
     /// A picture of one sample a pixel, by RK4 and for nobody's eyes: a renderer that has seen nothing walks with the largest majorant
     /// everywhere and makes several times the queries, so that the first frame had better not be its first.
     fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), EngineError> {
         let gate = Gate::uniform(false);
-        let mut answers = Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring).with_flow_map(self.wants_flow_map());
+        let mut answers =
+            Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME).with_flow_map(self.wants_flow_map());
         let renderer = &mut self.renderer;
         self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, &AtomicBool::new(false)))?;
-        let samples = answers.samples;
-        self.learn_of(tracer, &samples);
+        let (samples, traced) = (answers.samples, answers.tally.traced);
+        self.probed += traced;
+        self.learn_of(tracer, &samples, false);
         Ok(())
     }
 
     /// Holds traced samples against the surrogate, then keeps them for training.
-    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples) {
+    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, uniform: bool) {
         let Some(live) = &self.live else { return };
         let front = live.freeze();
         let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
         let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
-        self.trust.observe(&residuals);
+        let (uniform, others) = if uniform { (&residuals[..], &[][..]) } else { (&[][..], &residuals[..]) };
+        self.trust.observe(uniform, others);
         self.ring.push(samples);
     }
 
@@ -301,7 +330,7 @@ impl<'a> Cycle<'a> {
                         front.as_deref(),
                         &gate,
                         scene.trust.trace_budget,
-                        if front.is_some() { scene.training.ring } else { 0 },
+                        if front.is_some() { scene.training.ring / KEEP_A_FRAME } else { 0 },
                     )
                     .with_flow_map(flow_map);
                     let progress = std::sync::Mutex::new(&mut *sink);
@@ -366,8 +395,13 @@ impl<'a> Cycle<'a> {
             samples_per_pixel,
             queries: work.tally.queries,
             traced: work.tally.traced,
-            traced_share: work.tally.traced as f64 / work.tally.queries.max(1) as f64,
-            audited: work.audit.drawn as u64,
+            missing: work.tally.missing,
+            over_budget: work.tally.over_budget,
+            traced_share: work.tally.traced as f64 / (work.tally.queries - work.tally.missing).max(1) as f64,
+            integration_steps: tracer.steps() as u64,
+            integration_difference: self.report.integration_difference,
+            probed: std::mem::take(&mut self.probed),
+            audited: work.audit.samples.len() as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
             warnings: std::mem::take(&mut slide.warnings),
@@ -376,9 +410,13 @@ impl<'a> Cycle<'a> {
         if let (Some(front), Some(audited)) = (front.as_deref(), &work.residuals) {
             record.trusted_share = gate.share();
             record.trusted = audit::trusted_error(audited, &gate);
-            // Over budget the surrogate answers everywhere, so all audit points speak for the picture.
-            let answering = if work.tally.over_budget > 0 { crate::trust::TrustedError::of(audited) } else { record.trusted };
-            record.over_tolerance = answering.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0);
+            record.over_tolerance = if work.tally.over_budget > 0 {
+                // The surrogate answered where it is not trusted: the points there speak for that, and the frame is flagged whatever they say.
+                let untrusted: Vec<_> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
+                Some(crate::trust::TrustedError::of(&untrusted).map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)))
+            } else {
+                record.trusted.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0)
+            };
             if work.tally.over_budget > 0 {
                 record.warnings.push(format!(
                     "the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate",
@@ -393,13 +431,12 @@ impl<'a> Cycle<'a> {
                     audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &gate)
                 });
             }
-            let mut residuals = audited.clone();
-            let stride = work.samples.len().div_ceil(RENDER_RESIDUALS).max(1);
-            let some = every(&work.samples, stride);
-            residuals.extend(self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau())));
-            self.trust.observe(&residuals);
-            self.ring.push(&work.audit.samples);
+            let some = every(&work.samples, work.samples.len().div_ceil(RENDER_RESIDUALS).max(1));
+            let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
+            self.trust.decay();
+            self.trust.observe(audited, &rendered);
             self.ring.push(&work.samples);
+            self.ring.push(&work.audit.samples);
         }
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {
@@ -413,6 +450,7 @@ impl<'a> Cycle<'a> {
         record.training = learned;
         record.ring = self.ring.len() as u64;
         record.seconds = StageSeconds {
+            slide: place.preparing,
             waiting: std::mem::take(&mut slide.waited),
             render: work.render_seconds - work.tally.trace_seconds - work.tally.predict_seconds,
             trace: work.tally.trace_seconds,
@@ -501,8 +539,7 @@ fn every(samples: &Samples, stride: usize) -> Samples {
 /// for the whole run, so that colours compare.
 fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
     let file = &plan.scene;
-    let mut scene =
-        Scene::assemble(&plan.domain, file.camera.clone(), file.light.clone(), file.transfer.clone(), file.render.clone(), file.seed);
+    let mut scene = assemble(file, &plan.domain);
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };

@@ -172,11 +172,13 @@ impl Feed {
                 let start = Instant::now();
                 while !(window.is_full() && (*given == 0 || *taken >= *stride)) {
                     let Some(snapshot) = reader.next() else { return Ok(None) };
+                    let newest = window.newest();
                     match window.push(snapshot?) {
                         Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
                         Err(fault) => warnings.push(fault.to_string()),
                     }
-                    *taken += 1;
+                    // Only what moves the window counts toward its stride.
+                    *taken += usize::from(window.newest() != newest);
                 }
                 *taken = 0;
                 *given += 1;

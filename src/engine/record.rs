@@ -30,7 +30,11 @@ pub struct FrameRecord {
     pub queries: u64,
     /// Of them, answered by RK4.
     pub traced: u64,
-    /// `traced / queries`.
+    /// Of them, without a value (land).
+    pub missing: u64,
+    /// Of them, answered by the surrogate in untrusted cells because the tracing budget was spent.
+    pub over_budget: u64,
+    /// `traced / (queries - missing)`.
     pub traced_share: f64,
     /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within.
     pub over_tolerance: Option<f64>,
@@ -40,7 +44,13 @@ pub struct FrameRecord {
     pub trusted_share: f64,
     /// The same error measured on fresh points with the same weights after the frame (`--verify`).
     pub verified: Option<TrustedError>,
-    /// Audit points traced for this frame.
+    /// Runge-Kutta steps a path.
+    pub integration_steps: u64,
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it: the error of "the truth" itself.
+    pub integration_difference: Option<f64>,
+    /// Points traced before this frame to open the gate and to tighten the majorants (first frame of a slide).
+    pub probed: u64,
+    /// Audit points traced for this frame, land left out.
     pub audited: u64,
     /// Mean lived share of the audit points (1 when every particle lived the whole tau).
     pub lived_share: f64,
@@ -59,6 +69,8 @@ pub struct FrameRecord {
 /// Where a frame's time went.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
 pub struct StageSeconds {
+    /// Preparing the slide before its first frame: steps, tables, probes.
+    pub slide: f64,
     /// Waiting for snapshots.
     pub waiting: f64,
     /// Rendering without its traces.
@@ -71,6 +83,6 @@ pub struct StageSeconds {
     pub audit: f64,
     /// Training.
     pub train: f64,
-    /// The whole frame.
+    /// The frame, without `waiting` and `slide`.
     pub total: f64,
 }

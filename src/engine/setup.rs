@@ -5,6 +5,7 @@ use super::feed::{Feed, closed_form, open_snapshots};
 use crate::config::{SceneFile, SourceKind, StepsSetting};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps};
+use crate::render::{Renderer, Scene};
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
 #[derive(Debug, Clone)]
@@ -76,9 +77,24 @@ impl Setup {
             (_, _, Some(source)) => source.grid().domain(),
             _ => return Err(EngineError::NoDomain),
         };
+        check_picture(&scene, &domain, tau)?;
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let feed = Feed::open(&scene, snapshots, tau, direction)?;
         let slides = feed.expected_slides(times.as_deref(), tau);
         Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
     }
+}
+
+/// Refuses a camera, light or transfer function before anything is read, rendered or written.
+fn check_picture(scene: &SceneFile, domain: &Domain, tau: f64) -> Result<(), EngineError> {
+    let mut picture = assemble(scene, domain);
+    // What is left open is scaled later, to values that are accepted.
+    picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);
+    Renderer::new(picture, domain, tau)?;
+    Ok(())
+}
+
+/// The picture's scene, its transfer function as far as the file gives it.
+pub(super) fn assemble(scene: &SceneFile, domain: &Domain) -> Scene {
+    Scene::assemble(domain, scene.camera.clone(), scene.light.clone(), scene.transfer.clone(), scene.render.clone(), scene.seed)
 }

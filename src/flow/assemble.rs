@@ -199,7 +199,7 @@ impl<'a> Assembly<'a> {
             chosen: None,
             voids: match &self.source {
                 VelocitySource::Analytic(..) => Voids::none(),
-                VelocitySource::Window(window) => Voids::at(window, self.from),
+                VelocitySource::Window(window) => Voids::at(window, self.from, self.map.interpolation),
             },
             lanes: PhantomData,
         }

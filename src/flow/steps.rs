@@ -42,15 +42,15 @@ fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> f64 {
         chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
     squares.sort_unstable_by(f64::total_cmp);
     squares.truncate((squares.len() as f64 * (1.0 - trimmed)).ceil() as usize);
-    if squares.is_empty() { 0.0 } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
+    if squares.is_empty() { f64::INFINITY } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
 }
 
-/// What [`choose`] came to.
+/// How the number of steps was chosen.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Chosen {
     /// Steps a path gets.
     pub steps: usize,
-    /// Difference of the log-stretch from twice as many steps (see [`choose`]).
+    /// Difference of the log-stretch from twice as many steps: root mean square; on grids without the most different 2 % of the points.
     pub difference: f64,
     /// Whether the difference is within the tolerance.
     pub met: bool,

@@ -1,38 +1,62 @@
 //! Cells in which no particle can start.
 
+use super::Interpolation;
 use crate::field::{Axis, Snapshot, Window};
 use std::sync::Arc;
 
-/// The snapshots that bracket the start time, where any of their velocities is missing.
-pub struct Voids(Vec<Arc<Snapshot>>);
+/// The snapshots that bracket the start time, where any of their velocities is missing, and how many nodes an interpolation reads
+/// beyond a cell on either side.
+pub struct Voids {
+    snapshots: Vec<Arc<Snapshot>>,
+    beyond: usize,
+}
 
 impl Voids {
     /// Velocity everywhere.
     pub fn none() -> Self {
-        Self(Vec::new())
+        Self { snapshots: Vec::new(), beyond: 0 }
     }
 
     /// Of a window, for seeds at `time`.
-    pub fn at(window: &Window, time: f64) -> Self {
+    pub fn at(window: &Window, time: f64, interpolation: Interpolation) -> Self {
         let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
         let after = times.partition_point(|t| *t < time);
         let exact = times.get(after).is_some_and(|t| *t == time);
         let bracket = if exact { after..after + 1 } else { after.saturating_sub(1)..(after + 1).min(times.len()) };
         let count = bracket.len();
-        Self(window.snapshots().skip(bracket.start).take(count).filter(|s| s.missing() > 0).cloned().collect())
+        let snapshots = window.snapshots().skip(bracket.start).take(count).filter(|s| s.missing() > 0).cloned().collect();
+        Self { snapshots, beyond: usize::from(interpolation == Interpolation::Cubic) }
     }
 
-    /// Whether a corner of the seed's cell has no velocity.
+    /// Whether a node that the interpolation reads at the seed has no velocity.
     pub fn hold(&self, seed: [f32; 3]) -> bool {
-        self.0.iter().any(|snapshot| {
+        self.snapshots.iter().any(|snapshot| {
             let axes = &snapshot.grid.axes;
             let [nx, ny, _] = snapshot.grid.shape();
-            let corners: Vec<[usize; 2]> = axes.iter().zip(seed).map(|(axis, x)| cell(axis, f64::from(x))).collect();
-            (0..1 << axes.len()).any(|corner| {
-                let index = |k: usize| corners.get(k).map_or(0, |pair: &[usize; 2]| pair[corner >> k & 1]);
-                snapshot.nodes[(index(2) * ny + index(1)) * nx + index(0)][3].is_nan()
+            let width = 2 + 2 * self.beyond;
+            let mut nodes = [[0; 4]; 3];
+            for (k, axis) in axes.iter().enumerate() {
+                nodes[k] = stencil(axis, f64::from(seed[k]), self.beyond);
+            }
+            let along = |k: usize| if k < axes.len() { width } else { 1 };
+            (0..along(0) * along(1) * along(2)).any(|i| {
+                let (x, y, z) = (i % along(0), i / along(0) % along(1), i / (along(0) * along(1)));
+                snapshot.nodes[(nodes[2][z] * ny + nodes[1][y]) * nx + nodes[0][x]][3].is_nan()
             })
         })
+    }
+}
+
+/// Indices of the nodes around a coordinate, `beyond` further ones on either side (the last ones again past an end of the axis).
+fn stencil(axis: &Axis, x: f64, beyond: usize) -> [usize; 4] {
+    let [low, high] = cell(axis, x);
+    if beyond == 0 {
+        return [low, high, high, high];
+    }
+    let n = axis.len();
+    match axis.period() {
+        Some(_) => [(low + n - 1) % n, low, high, (high + 1) % n],
+        None => [low.saturating_sub(1), low, high, (high + 1).min(n - 1)],
     }
 }
 
@@ -66,12 +90,14 @@ mod tests {
         for time in [0.0, 1.0] {
             window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &[0.0; 16], &[]))).unwrap();
         }
-        let voids = Voids::at(&window, 1.0);
+        let voids = Voids::at(&window, 1.0, Interpolation::Linear);
         assert!(voids.hold([10.0, 0.5, 0.0]) && voids.hold([350.0, 1.5, 0.0]), "on both sides of the seam");
+        let wider = Voids::at(&window, 1.0, Interpolation::Cubic);
+        assert!(wider.hold([100.0, 0.5, 0.0]) && wider.hold([10.0, 2.5, 0.0]), "cubic reads one node further");
         assert!(!voids.hold([100.0, 0.5, 0.0]) && !voids.hold([10.0, 2.5, 0.0]));
         u[4] = 0.0;
         window.push(Arc::new(Snapshot::from_components(2.0, grid, &u, &[0.0; 16], &[]))).unwrap();
-        assert!(!Voids::at(&window, 2.0).hold([10.0, 0.5, 0.0]), "the newest snapshot has it");
-        assert!(Voids::at(&window, 1.5).hold([10.0, 0.5, 0.0]), "between snapshots both count");
+        assert!(!Voids::at(&window, 2.0, Interpolation::Linear).hold([10.0, 0.5, 0.0]), "the newest snapshot has it");
+        assert!(Voids::at(&window, 1.5, Interpolation::Linear).hold([10.0, 0.5, 0.0]), "between snapshots both count");
     }
 }

@@ -32,6 +32,13 @@ impl Output {
         Ok(Self { folder: path, files, publisher, totals: Totals::default(), frames: 0, started: Instant::now() })
     }
 
+    /// Writes frames into a run folder from now on.
+    pub fn write_to(&mut self, folder: RunFolder, settings: &PublishSettings) -> Result<(), PublishError> {
+        self.folder = Some(folder.path().to_owned());
+        self.files = Some(FileWriter::start(folder, settings.clone())?);
+        Ok(())
+    }
+
     /// Where subscribers find the frames, with the port that was got.
     pub fn endpoint(&self) -> Option<&str> {
         self.publisher.as_ref().map(Publisher::endpoint)

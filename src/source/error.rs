@@ -68,7 +68,7 @@ pub enum SourceError {
     },
     /// No pair of variables is a horizontal velocity.
     #[error(
-        "{}: no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [source]. \
+        "{}: no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive]. \
          Variables in the file:\n{candidates}",
         path.display()
     )]

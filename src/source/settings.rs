@@ -1,4 +1,4 @@
-//! `[source]` of a scene file, for NetCDF archives.
+//! `[archive]` of a scene file, for NetCDF archives.
 
 use serde::{Deserialize, Deserializer, Serialize};
 use std::path::PathBuf;

@@ -28,7 +28,7 @@ pub struct TrustMap {
     shape: [usize; 3],
     cells: Vec<Cell>,
     settings: TrustSettings,
-    /// Mean square over all residuals of the last frame before a slide, and of the first one after: their ratio is the drift.
+    /// Mean square residual over the latest uniform points; its ratio across a slide is the drift.
     before_slide: Option<f64>,
     just_slid: bool,
     measured_growth: f64,
@@ -78,11 +78,19 @@ impl TrustMap {
         self.shape
     }
 
-    /// Takes in one frame's residuals, older ones decaying. Call once a frame, after it was rendered.
-    pub fn observe(&mut self, residuals: &[Residual]) {
-        // Drift is read off all residuals of a frame; audit points make them comparable from frame to frame.
-        if !residuals.is_empty() {
-            let mean = residuals.iter().map(|r| f64::from(r.optical).powi(2)).sum::<f64>() / residuals.len() as f64;
+    /// Older residuals lose weight, since the weights that they were measured with have changed. Call once a frame.
+    pub fn decay(&mut self) {
+        for cell in &mut self.cells {
+            cell.weight *= DECAY;
+            cell.optical_square *= DECAY;
+            cell.optical_fourth *= DECAY;
+        }
+    }
+
+    /// Takes residuals in: those of `uniform` points, from which drift is read off, and those of points drawn otherwise.
+    pub fn observe(&mut self, uniform: &[Residual], others: &[Residual]) {
+        if !uniform.is_empty() {
+            let mean = uniform.iter().map(|r| f64::from(r.optical).powi(2)).sum::<f64>() / uniform.len() as f64;
             if self.just_slid
                 && let Some(before) = self.before_slide.filter(|b| *b > 0.0)
             {
@@ -91,12 +99,7 @@ impl TrustMap {
             self.before_slide = Some(mean);
             self.just_slid = false;
         }
-        for cell in &mut self.cells {
-            cell.weight *= DECAY;
-            cell.optical_square *= DECAY;
-            cell.optical_fourth *= DECAY;
-        }
-        for residual in residuals.iter().filter(|r| r.optical.is_finite()) {
+        for residual in uniform.iter().chain(others).filter(|r| r.optical.is_finite()) {
             let cell = &mut self.cells[cell_of(self.shape, residual.point)];
             let square = f64::from(residual.optical).powi(2);
             cell.weight += 1.0;
@@ -179,7 +182,8 @@ mod tests {
             let point = [(cell % nx) as f32 / nx as f32 + 1e-4, (cell / nx) as f32 / ny as f32 + 1e-4, 0.5];
             residuals.extend((0..per_cell).map(|_| Residual { point, optical, log_stretch: 0.0 }));
         }
-        map.observe(&residuals);
+        map.decay();
+        map.observe(&residuals, &[]);
     }
 
     #[test]
@@ -208,7 +212,8 @@ mod tests {
         let mut map = TrustMap::new(&TrustSettings::default(), &domain());
         filled(&mut map, 0.01, 64);
         let bad = [0.51, 0.51, 0.0];
-        map.observe(&(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>());
+        map.decay();
+        map.observe(&[], &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>());
         let gate = map.gate();
         assert!(!gate.trusts(bad));
         assert!(gate.trusts([0.45, 0.51, 0.0]));
