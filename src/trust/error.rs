@@ -39,6 +39,8 @@ impl TrustedError {
         let standard_error = (variance / (n - 1.0)).sqrt();
         let bound = |z: f64| (square - standard_error * hall_inverse(z, skewness / n.sqrt())).max(0.0).sqrt();
         let rms = square.sqrt();
+        // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
+        let interval = if variance > 0.0 { [bound(1.96), bound(-1.96)] } else { [0.0, (square + 3.0 / n).min(1.0).sqrt()] };
         let mut sorted: Vec<f32> = residuals.iter().map(|r| r.optical).collect();
         let rank = ((0.99 * n).ceil() as usize).clamp(1, sorted.len()) - 1;
         let (_, p99, _) = sorted.select_nth_unstable_by(rank, f32::total_cmp);
@@ -46,7 +48,7 @@ impl TrustedError {
             points: residuals.len() as u64,
             optical_mean: mean(|r| f64::from(r.optical)),
             optical_rms: rms,
-            optical_rms_interval: [bound(1.96), bound(-1.96)],
+            optical_rms_interval: interval,
             optical_p99: f64::from(*p99),
             log_stretch_rms: mean(|r| f64::from(r.log_stretch).powi(2)).sqrt(),
         })
@@ -107,5 +109,7 @@ mod tests {
         assert_eq!((e.points, e.optical_mean, e.optical_p99, e.log_stretch_rms), (100, 50.5, 99.0, 2.0));
         assert!((e.optical_rms - (338_350f64 / 100.0).sqrt()).abs() < 1e-9);
         assert!(TrustedError::of(&sample[..1]).is_none());
+        let alike = [Residual { point: [0.0; 3], optical: 0.0, log_stretch: 0.0 }; 300];
+        assert_eq!(TrustedError::of(&alike).unwrap().optical_rms_interval, [0.0, 0.1]);
     }
 }
