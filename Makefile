@@ -23,7 +23,7 @@ build: packages
 	$(CARGO) build --release
 
 demo: build
-	./target/release/ridgewatch replay configs/double_gyre.toml --out out/demo --overwrite
+	$(CARGO) run --release --quiet -- replay configs/double_gyre.toml --out out/demo --overwrite
 	@echo "pictures: out/demo/frames/*.png   figures: out/demo/records.jsonl, out/demo/summary.json"
 
 # One profile for everything: dependencies are built once, and numerics run optimised.
