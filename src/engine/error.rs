@@ -24,6 +24,14 @@ pub enum EngineError {
     /// A checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// The GPU that was asked for.
+    #[cfg(feature = "cuda")]
+    #[error(transparent)]
+    Device(Box<super::cuda::DeviceError>),
+    /// A GPU was asked for.
+    #[cfg(not(feature = "cuda"))]
+    #[error("built without the feature `cuda`; accepted: --device auto, cpu")]
+    NoCuda,
     /// A closed form without a box.
     #[error("a closed form needs [domain] with min and max")]
     NoDomain,

@@ -4,7 +4,10 @@
 
 mod answers;
 mod audit;
+#[cfg(feature = "cuda")]
+pub mod cuda;
 mod cycle;
+mod device;
 mod error;
 mod feed;
 mod record;
@@ -14,6 +17,7 @@ pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
 pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
+pub use device::{Device, DeviceChoice, UnknownDevice};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};

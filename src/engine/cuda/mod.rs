@@ -1,0 +1,16 @@
+//! The GPU engine: device, window ring, sorted tracing and tables on CUDA.
+//!
+//! In: a velocity source, a flow map and seeds, on the host (as a [`crate::flow::Tracer`]) or on the device. Out: what the CPU's tracer
+//! gives. Kernels are in `kernels/`, compiled at start for the device found. Everything here returns [`DeviceError`]; nothing panics where
+//! libraries or devices are missing.
+
+pub mod compile;
+mod device;
+mod error;
+mod launch;
+mod memory;
+
+pub use device::{FoundDevice, Gpu, GpuSettings, probe};
+pub use error::DeviceError;
+pub use launch::{launch, threads};
+pub use memory::{Budget, Buffer};
