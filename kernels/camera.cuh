@@ -14,7 +14,7 @@ struct Camera {
 };
 
 // Origin and unit direction of the ray through a point of the film: x from -1 (left) to 1, y from -1 (bottom) to 1.
-RW_HD inline void camera_ray(const Camera& camera, double x, double y, double origin[3], double direction[3]) {
+RW_FN void camera_ray(const Camera& camera, double x, double y, double origin[3], double direction[3]) {
     for (int k = 0; k < 3; ++k) {
         const double offset = x * camera.right[k] + y * camera.up[k];
         origin[k] = camera.orthographic ? camera.eye[k] + offset : camera.eye[k];

@@ -1,6 +1,6 @@
 // The film: what a pixel's paths add up to (see `render::film`).
 #pragma once
-#include "portable.cuh"
+#include "atomics.cuh"
 
 namespace rw {
 
@@ -10,8 +10,8 @@ struct PathSample {
     float scattered;  // weight of the path, if it scattered; else 0
     float ftle;       // that weight times the FTLE there
     float missing;    // weight of the path, if it left and saw missing values; else 0
-    u32 queries;
-    u32 traced;
+    uint32_t queries;
+    uint32_t traced;
 };
 
 // Sums over some of a pixel's paths, in f64.
@@ -28,7 +28,7 @@ struct PixelSum {
 
 constexpr int PIXEL_SUM_FIELDS = 11;
 
-RW_HD inline void add_path(PixelSum& sum, const PathSample& path) {
+RW_FN void add_path(PixelSum& sum, const PathSample& path) {
     const double r = path.radiance[0], g = path.radiance[1], b = path.radiance[2];
     sum.samples += 1.0;
     sum.rgba[0] += r;
@@ -46,7 +46,7 @@ RW_HD inline void add_path(PixelSum& sum, const PathSample& path) {
 }
 
 // Adds a later part of the pixel's samples: the pairwise update of Chan, Golub and LeVeque.
-RW_HD inline void merge(PixelSum& sum, const PixelSum& other) {
+RW_FN void merge(PixelSum& sum, const PixelSum& other) {
     const double samples = sum.samples + other.samples;
     if (samples == 0.0) return;
     const double step = other.luminance - sum.luminance;
@@ -71,8 +71,8 @@ struct PixelValue {
     float queries;
 };
 
-RW_HD inline PixelValue pixel_value(const PixelSum& sum) {
-    PixelValue value = {{0.0f, 0.0f, 0.0f, 0.0f}, RW_NAN, 0.0f, RW_NAN, 0.0f, 0.0f, 0.0f};
+RW_FN PixelValue pixel_value(const PixelSum& sum) {
+    PixelValue value = {{0.0f, 0.0f, 0.0f, 0.0f}, not_a_number(), 0.0f, not_a_number(), 0.0f, 0.0f, 0.0f};
     if (sum.samples == 0.0) return value;
     value.samples = (float)sum.samples;
     for (int k = 0; k < 4; ++k) value.rgba[k] = (float)(sum.rgba[k] / sum.samples);

@@ -1,6 +1,6 @@
 // Which points the surrogate may answer (see `trust::map`), and its answer from a table (see `surrogate::table`).
 #pragma once
-#include "portable.cuh"
+#include "atomics.cuh"
 
 namespace rw {
 
@@ -11,7 +11,7 @@ struct Gate {
 };
 
 // `point` in unit coordinates.
-RW_HD inline bool trusts(const Gate& gate, const float point[3]) {
+RW_FN bool trusts(const Gate& gate, const float point[3]) {
     int index[3];
     for (int k = 0; k < 3; ++k) {
         const int i = (int)(fminf(fmaxf(point[k], 0.0f), 1.0f) * (float)gate.shape[k]);
@@ -28,7 +28,7 @@ struct Table {
 };
 
 // Multilinear interpolation at a unit point; a point outside is moved to the nearest one inside.
-RW_HD inline float look_up(const Table& table, const float point[3]) {
+RW_FN float look_up(const Table& table, const float point[3]) {
     int base = 0, stride[3] = {0, 0, 0}, pitch = 1;
     float fraction[3] = {0.0f, 0.0f, 0.0f};
     for (int k = 0; k < table.dimensions; ++k) {

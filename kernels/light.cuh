@@ -11,13 +11,13 @@ struct Light {
 };
 
 // Unit vector toward the light, distance to it, and the radiance that would arrive at `point` through empty space.
-RW_HD inline void light_seen_from(const Light& light, const double point[3], double toward[3], double& distance, float radiance[3]) {
+RW_FN void light_seen_from(const Light& light, const double point[3], double toward[3], double& distance, float radiance[3]) {
     if (!light.is_point) {
         for (int k = 0; k < 3; ++k) {
             toward[k] = light.vector[k];
             radiance[k] = light.radiance[k];
         }
-        distance = RW_INFINITY;
+        distance = infinity();
         return;
     }
     for (int k = 0; k < 3; ++k) toward[k] = light.vector[k] - point[k];

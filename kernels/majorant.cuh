@@ -13,54 +13,54 @@ struct MajorantGrid {
 
 // What the frame in progress sees.
 struct Watch {
-    u32* count;
-    u32* highest;  // order-preserving image of the highest FTLE; 0 is none
-    u32* missing;  // 0 or 1
+    uint32_t* count;
+    uint32_t* highest;  // order-preserving image of the highest FTLE; 0 is none
+    uint32_t* missing;  // 0 or 1
 };
 
 // Maps floats to integers of the same order (no NaN).
-RW_HD inline u32 ordered(float value) {
-    const u32 bits = float_bits(value);
+RW_FN uint32_t ordered(float value) {
+    const uint32_t bits = float_bits(value);
     return bits >> 31 ? ~bits : bits | 0x80000000u;
 }
 
-RW_HD inline void observe(const Watch& watch, u32 cell, float ftle) {
+RW_FN void observe(const Watch& watch, uint32_t cell, float ftle) {
     atomic_add(&watch.count[cell], 1u);
-    const u32 image = ordered(ftle);
+    const uint32_t image = ordered(ftle);
     // Most values are below the highest: a read saves the atomic.
     if (image > relaxed_load(&watch.highest[cell])) atomic_max(&watch.highest[cell], image);
 }
 
-RW_HD inline void observe_missing(const Watch& watch, u32 cell) {
+RW_FN void observe_missing(const Watch& watch, uint32_t cell) {
     atomic_add(&watch.count[cell], 1u);
     if (relaxed_load(&watch.missing[cell]) == 0u) atomic_max(&watch.missing[cell], 1u);
 }
 
-RW_HD inline u32 cell_at(const SceneBox& box, const float point[3]) {
+RW_FN uint32_t cell_at(const SceneBox& box, const float point[3]) {
     int index[3];
     for (int k = 0; k < 3; ++k) {
         const int i = (int)point[k];
         index[k] = i < box.cells[k] - 1 ? i : box.cells[k] - 1;
     }
-    return (u32)((index[2] * box.cells[1] + index[1]) * box.cells[0] + index[0]);
+    return (uint32_t)((index[2] * box.cells[1] + index[1]) * box.cells[0] + index[0]);
 }
 
 // A tentative collision.
 struct Hit {
     float t;
     float majorant;
-    u32 cell;
+    uint32_t cell;
 };
 
 // Walks from `t` along origin + t direction (grid coordinates) until the majorants add up to `depth`; false when that lies beyond
 // `end`. Touches at most as many cells as the grid has along its three axes together.
-RW_HD inline bool walk(const SceneBox& box, const float* majorants, const float origin[3], const float direction[3], float t, float end,
+RW_FN bool walk(const SceneBox& box, const float* majorants, const float origin[3], const float direction[3], float t, float end,
                        float depth, Hit& hit) {
     const int strides[3] = {1, box.cells[0], box.cells[0] * box.cells[1]};
     int index = 0;
     // Cells left along each axis before the walk leaves the grid, t of the next wall, and t between walls.
     int left[3] = {0, 0, 0}, step[3] = {0, 0, 0};
-    float wall[3] = {RW_INFINITY, RW_INFINITY, RW_INFINITY}, pace[3] = {0.0f, 0.0f, 0.0f};
+    float wall[3] = {infinity(), infinity(), infinity()}, pace[3] = {0.0f, 0.0f, 0.0f};
     RW_UNROLL
     for (int k = 0; k < 3; ++k) {
         const float place = origin[k] + t * direction[k];
@@ -89,7 +89,7 @@ RW_HD inline bool walk(const SceneBox& box, const float* majorants, const float 
         if (crossed > depth) {
             hit.t = t + depth / majorant;
             hit.majorant = majorant;
-            hit.cell = (u32)index;
+            hit.cell = (uint32_t)index;
             return true;
         }
         if (nearest >= end || remaining == 0) return false;

@@ -22,7 +22,7 @@ struct FrameScene {
     Light light;
     Transfer transfer;
     FrameRandom random;
-    u32 width, height;
+    uint32_t width, height;
     float background[3];
     float missing[3];
     float per_tau;
@@ -39,20 +39,20 @@ struct Flight {
     float t;
     float end;
     float weight;  // camera stage: of the path; shadow stage: transmittance so far
-    u32 pixel;
-    u32 sample;
-    u32 dimension;  // of the next draw
-    u32 stage;
+    uint32_t pixel;
+    uint32_t sample;
+    uint32_t dimension;  // of the next draw
+    uint32_t stage;
     PathSample path;  // what the path adds at full transmittance
 };
 
 // What the waves of a frame count.
 struct Counts {
-    u64 queries;
-    u64 traced;
-    u64 missing;
-    u64 exceeded;
-    u64 paths;
+    uint64_t queries;
+    uint64_t traced;
+    uint64_t missing;
+    uint64_t exceeded;
+    uint64_t paths;
 };
 
 // A tentative collision's answer.
@@ -61,18 +61,18 @@ struct Answer {
     bool traced;
 };
 
-RW_HD inline void flight_point(const Flight& flight, float t, float point[3]) {
+RW_FN void flight_point(const Flight& flight, float t, float point[3]) {
     for (int k = 0; k < 3; ++k) point[k] = flight.origin[k] + t * flight.direction[k];
 }
 
 // A camera path that did not scatter sees what lies behind.
-RW_HD inline void see(Flight& flight, const float colour[3], float missing) {
+RW_FN void see(Flight& flight, const float colour[3], float missing) {
     for (int k = 0; k < 3; ++k) flight.path.radiance[k] = colour[k] * flight.weight;
     flight.path.missing = missing * flight.weight;
 }
 
 // Draws the free flight of random dimension `dimension` from `t` on; false past the end. `place` is a further number of that draw.
-RW_HD inline bool draw(const FrameScene& scene, const MajorantGrid& grid, const Flight& flight, u32 dimension, float t, Hit& hit,
+RW_FN bool draw(const FrameScene& scene, const MajorantGrid& grid, const Flight& flight, uint32_t dimension, float t, Hit& hit,
                        float& place) {
     const Words random = words(scene.random, flight.pixel, flight.sample, dimension);
     // 1 - u lies in (0, 1].
@@ -82,7 +82,7 @@ RW_HD inline bool draw(const FrameScene& scene, const MajorantGrid& grid, const 
 }
 
 // Flies to the next tentative collision: true, and `hit` waits for its answer; or false, and the path is over.
-RW_HD inline bool fly(const FrameScene& scene, const MajorantGrid& grid, Flight& flight, Hit& hit) {
+RW_FN bool fly(const FrameScene& scene, const MajorantGrid& grid, Flight& flight, Hit& hit) {
     float place;
     const bool collides = draw(scene, grid, flight, flight.dimension, flight.t, hit, place);
     flight.dimension += 1;
@@ -99,7 +99,7 @@ RW_HD inline bool fly(const FrameScene& scene, const MajorantGrid& grid, Flight&
     flight.t = place * flight.end;
     float point[3];
     flight_point(flight, flight.t, point);
-    const u32 cell = cell_at(scene.box, point);
+    const uint32_t cell = cell_at(scene.box, point);
     if (!grid.may_miss[cell]) {
         see(flight, scene.background, 0.0f);
         return false;
@@ -112,9 +112,9 @@ RW_HD inline bool fly(const FrameScene& scene, const MajorantGrid& grid, Flight&
 }
 
 // Starts the path of a sample and flies to its first tentative collision.
-RW_HD inline bool start(const FrameScene& scene, const MajorantGrid& grid, u32 pixel, u32 sample, Flight& flight, Hit& hit) {
+RW_FN bool start(const FrameScene& scene, const MajorantGrid& grid, uint32_t pixel, uint32_t sample, Flight& flight, Hit& hit) {
     const Words random = words(scene.random, pixel, sample, 0);
-    const u32 column = pixel % scene.width, row = pixel / scene.width;
+    const uint32_t column = pixel % scene.width, row = pixel / scene.width;
     const double x = ((double)column + (double)unit(random.w[0])) / (double)scene.width * 2.0 - 1.0;
     const double y = 1.0 - ((double)row + (double)unit(random.w[1])) / (double)scene.height * 2.0;
     double origin[3], direction[3], enter, leave;
@@ -140,7 +140,7 @@ RW_HD inline bool start(const FrameScene& scene, const MajorantGrid& grid, u32 p
 }
 
 // The draw after a hit that is taken to be a null collision; false where none follows. Dimension `drawn` is that of the hit before.
-RW_HD inline bool look_ahead(const FrameScene& scene, const MajorantGrid& grid, const Flight& flight, u32 drawn, const Hit& before,
+RW_FN bool look_ahead(const FrameScene& scene, const MajorantGrid& grid, const Flight& flight, uint32_t drawn, const Hit& before,
                              Hit& hit) {
     float place;
     return flight.stage != PROBE && draw(scene, grid, flight, drawn + 1, before.t, hit, place);
@@ -153,7 +153,7 @@ enum Verdict {
 };
 
 // Takes the answer at the tentative collision `hit`, whose draw was the one before `flight.dimension`.
-RW_HD inline Verdict resolve(const FrameScene& scene, Flight& flight, const Hit& hit, Answer answer, const Watch& watch, Counts& counts) {
+RW_FN Verdict resolve(const FrameScene& scene, Flight& flight, const Hit& hit, Answer answer, const Watch& watch, Counts& counts) {
     const float isotropic = 0.25f / 3.14159274f;
     // Transmittance below which Russian roulette decides whether a shadow flight goes on.
     const float roulette_below = 1.0f / 16.0f;

@@ -1,6 +1,6 @@
 // FTLE to extinction and albedo (see `render::transfer`).
 #pragma once
-#include "portable.cuh"
+#include "atomics.cuh"
 
 namespace rw {
 
@@ -13,13 +13,13 @@ struct Transfer {
 };
 
 // saturate((FTLE - low) / (high - low)). FTLE is finite here: missing values are dealt with before.
-RW_HD inline float ramp(const Transfer& transfer, float ftle) {
+RW_FN float ramp(const Transfer& transfer, float ftle) {
     return fminf(fmaxf((ftle - transfer.low) * transfer.per_range, 0.0f), 1.0f);
 }
 
-RW_HD inline float extinction(const Transfer& transfer, float ftle) { return transfer.extinction_max * ramp(transfer, ftle); }
+RW_FN float extinction(const Transfer& transfer, float ftle) { return transfer.extinction_max * ramp(transfer, ftle); }
 
-RW_HD inline void albedo(const Transfer& transfer, float ftle, float colour[3]) {
+RW_FN void albedo(const Transfer& transfer, float ftle, float colour[3]) {
     const float t = 1.0f - ramp(transfer, ftle);
     for (int k = 0; k < 3; ++k) {
         float sum = 0.0f;

@@ -9,50 +9,50 @@
 
 namespace rw {
 
-constexpr u32 NONE = 0xFFFFFFFFu;
+constexpr uint32_t NONE = 0xFFFFFFFFu;
 
 // A run of pixels and a range of samples, divided into parts that run side by side.
 struct Band {
-    u32 first_pixel;
-    u32 pixels;
-    u32 parts;
-    u32 first_sample;
-    u32 samples;
-    u32 pad;
+    uint32_t first_pixel;
+    uint32_t pixels;
+    uint32_t parts;
+    uint32_t first_sample;
+    uint32_t samples;
+    uint32_t pad;
 };
 
-RW_HD inline u32 part_start(const Band& band, u32 part) {
-    return band.first_sample + (u32)((u64)band.samples * part / band.parts);
+RW_FN uint32_t part_start(const Band& band, uint32_t part) {
+    return band.first_sample + (uint32_t)((uint64_t)band.samples * part / band.parts);
 }
 
 // State of the slots, one array a group of fields that are read together.
 struct Slots {
-    Vec4* place;       // origin, t
-    Vec4* way;         // direction, end
-    Vec4* colour;      // radiance, weight
-    UVec4* progress;   // sample, dimension and (in the upper two bits) stage, queries, traced
-    Vec2* seen;        // weight and weighted FTLE of the scattering event
-    u32* first;        // first pending collision in the queue
+    Four* place;       // origin, t
+    Four* way;         // direction, end
+    Four* colour;      // radiance, weight
+    Words4* progress;   // sample, dimension and (in the upper two bits) stage, queries, traced
+    Two* seen;        // weight and weighted FTLE of the scattering event
+    uint32_t* first;        // first pending collision in the queue
     double* sums;      // PIXEL_SUM_FIELDS arrays of `count` sums
-    u32 count;
-    u32 pad;
+    uint32_t count;
+    uint32_t pad;
 };
 
-// The pending collisions, in any order; those of one flight are linked from near to far.
+// The pending collisions, in any order; those of one flight are linked from near to far. Answers belong to the collisions of the wave
+// before, whose records are read while new ones are written.
 struct Queue {
-    float* points;          // domain coordinates, three a collision
-    Vec4* hits;             // t, majorant, cell, next
-    float* log_stretch;     // the answers; NaN: no value there
-    unsigned char* traced;  // whether RK4 answered
-    u32* length;
-    u32 capacity;
-    u32 pad;
+    float* points;                // domain coordinates, three a collision
+    Four* hits;                   // t, majorant, cell, next
+    uint32_t* length;
+    const Four* answered;         // records that the answers belong to
+    const float* log_stretch;     // NaN: no value there
+    const unsigned char* traced;  // whether RK4 answered
 };
 
-RW_HD inline void load_flight(const Slots& slots, const Band& band, u32 slot, Flight& flight) {
-    const Vec4 place = slots.place[slot], way = slots.way[slot], colour = slots.colour[slot];
-    const UVec4 progress = slots.progress[slot];
-    const Vec2 seen = slots.seen[slot];
+RW_FN void load_flight(const Slots& slots, const Band& band, uint32_t slot, Flight& flight) {
+    const Four place = slots.place[slot], way = slots.way[slot], colour = slots.colour[slot];
+    const Words4 progress = slots.progress[slot];
+    const Two seen = slots.seen[slot];
     flight.origin[0] = place.x, flight.origin[1] = place.y, flight.origin[2] = place.z, flight.t = place.w;
     flight.direction[0] = way.x, flight.direction[1] = way.y, flight.direction[2] = way.z, flight.end = way.w;
     flight.path.radiance[0] = colour.x, flight.path.radiance[1] = colour.y, flight.path.radiance[2] = colour.z;
@@ -68,7 +68,7 @@ RW_HD inline void load_flight(const Slots& slots, const Band& band, u32 slot, Fl
     flight.path.missing = 0.0f;
 }
 
-RW_HD inline void store_flight(const Slots& slots, u32 slot, const Flight& flight) {
+RW_FN void store_flight(const Slots& slots, uint32_t slot, const Flight& flight) {
     slots.place[slot] = {flight.origin[0], flight.origin[1], flight.origin[2], flight.t};
     slots.way[slot] = {flight.direction[0], flight.direction[1], flight.direction[2], flight.end};
     slots.colour[slot] = {flight.path.radiance[0], flight.path.radiance[1], flight.path.radiance[2], flight.weight};
@@ -76,7 +76,7 @@ RW_HD inline void store_flight(const Slots& slots, u32 slot, const Flight& fligh
     slots.seen[slot] = {flight.path.scattered, flight.path.ftle};
 }
 
-RW_HD inline void load_sum(const Slots& slots, u32 slot, PixelSum& sum) {
+RW_FN void load_sum(const Slots& slots, uint32_t slot, PixelSum& sum) {
     const double* at = slots.sums + slot;
     const size_t pitch = slots.count;
     sum.samples = at[0];
@@ -85,7 +85,7 @@ RW_HD inline void load_sum(const Slots& slots, u32 slot, PixelSum& sum) {
     sum.deviations = at[8 * pitch], sum.queries = at[9 * pitch], sum.traced = at[10 * pitch];
 }
 
-RW_HD inline void store_sum(const Slots& slots, u32 slot, const PixelSum& sum) {
+RW_FN void store_sum(const Slots& slots, uint32_t slot, const PixelSum& sum) {
     double* at = slots.sums + slot;
     const size_t pitch = slots.count;
     at[0] = sum.samples;
@@ -95,19 +95,19 @@ RW_HD inline void store_sum(const Slots& slots, u32 slot, const PixelSum& sum) {
 }
 
 // Puts the flight's pending collision and up to `ahead` - 1 that follow it, should it go on, into the queue.
-RW_HD inline void enqueue(const FrameScene& scene, const MajorantGrid& grid, const Queue& queue, const Flight& flight, Hit hit, u32 ahead,
-                          u32& first) {
-    u32 drawn = flight.dimension - 1;
-    u32 at = reserve(queue.length);
+RW_FN void enqueue(const FrameScene& scene, const MajorantGrid& grid, const Queue& queue, const Flight& flight, Hit hit, uint32_t ahead,
+                          uint32_t& first) {
+    uint32_t drawn = flight.dimension - 1;
+    uint32_t at = reserve(queue.length);
     first = at;
-    for (u32 k = 1;; ++k) {
+    for (uint32_t k = 1;; ++k) {
         float cell[3], point[3];
         flight_point(flight, hit.t, cell);
         domain_point(scene.box, cell, point);
         for (int a = 0; a < 3; ++a) queue.points[3 * (size_t)at + a] = point[a];
         Hit following;
         const bool more = k < ahead && look_ahead(scene, grid, flight, drawn, hit, following);
-        const u32 next = more ? reserve(queue.length) : NONE;
+        const uint32_t next = more ? reserve(queue.length) : NONE;
         queue.hits[at] = {hit.t, hit.majorant, bits_float(hit.cell), bits_float(next)};
         if (!more) return;
         at = next;
@@ -117,10 +117,10 @@ RW_HD inline void enqueue(const FrameScene& scene, const MajorantGrid& grid, con
 }
 
 // One slot's part of a wave; false when the slot has no more work. `fresh` slots have no path yet.
-RW_HD inline bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watch& watch, const Band& band, const Slots& slots,
-                          const Queue& queue, u32 slot, bool fresh, u32 ahead_camera, u32 ahead_shadow, Counts& counts) {
-    const u32 end = part_start(band, slot / band.pixels + 1);
-    Flight flight;
+RW_FN bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watch& watch, const Band& band, const Slots& slots,
+                          const Queue& queue, uint32_t slot, bool fresh, uint32_t ahead_camera, uint32_t ahead_shadow, Counts& counts) {
+    const uint32_t end = part_start(band, slot / band.pixels + 1);
+    Flight flight = {};
     Hit hit = {0.0f, 0.0f, 0u};
     PixelSum sum = {0.0, {0.0, 0.0, 0.0, 0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     bool summed = fresh, flying = false;
@@ -130,13 +130,13 @@ RW_HD inline bool advance(const FrameScene& scene, const MajorantGrid& grid, con
         flying = flight.sample < end && start(scene, grid, flight.pixel, flight.sample, flight, hit);
     } else {
         load_flight(slots, band, slot, flight);
-        u32 at = slots.first[slot];
+        uint32_t at = slots.first[slot];
         Verdict verdict;
         for (;;) {
-            const Vec4 record = queue.hits[at];
+            const Four record = queue.answered[at];
             const Answer answer = {queue.log_stretch[at], queue.traced[at] != 0};
             verdict = resolve(scene, flight, Hit{record.x, record.y, float_bits(record.z)}, answer, watch, counts);
-            const u32 next = float_bits(record.w);
+            const uint32_t next = float_bits(record.w);
             if (verdict != NULL_COLLISION || next == NONE) break;
             at = next;
             flight.dimension += 1;
@@ -159,10 +159,10 @@ RW_HD inline bool advance(const FrameScene& scene, const MajorantGrid& grid, con
 }
 
 // A pixel of the band: its parts merged in order.
-RW_HD inline PixelValue finished(const Band& band, const Slots& slots, u32 pixel) {
+RW_FN PixelValue finished(const Band& band, const Slots& slots, uint32_t pixel) {
     PixelSum sum;
     load_sum(slots, pixel, sum);
-    for (u32 part = 1; part < band.parts; ++part) {
+    for (uint32_t part = 1; part < band.parts; ++part) {
         PixelSum other;
         load_sum(slots, part * band.pixels + pixel, other);
         merge(sum, other);
