@@ -46,14 +46,15 @@ struct Flight {
     PathSample path;  // what the path adds at full transmittance
 };
 
-// What the waves of a frame count.
+// What one thread counts in one wave.
 struct Counts {
-    uint64_t queries;
-    uint64_t traced;
-    uint64_t missing;
-    uint64_t exceeded;
-    uint64_t paths;
+    uint32_t queries;
+    uint32_t traced;
+    uint32_t missing;
+    uint32_t exceeded;
+    uint32_t paths;
 };
+constexpr int COUNTS = 5;
 
 // A tentative collision's answer.
 struct Answer {

@@ -164,7 +164,7 @@ fn tracked(renderer: &mut Renderer, frame: u64, samples: std::ops::Range<u32>, p
     input.extend(bytes(&ahead));
     let output = ask("frame", &input);
     let mut output = &output[..];
-    let counts: [u64; 5] = read(&mut output, 1)[0];
+    let counts = read::<[u32; 5]>(&mut output, 1)[0].map(u64::from);
     let mut film = Film::new(37, 23);
     film.write_pixels(0, &read::<PixelValue>(&mut output, pixels));
     let seen = SeenInCells { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };

@@ -17,10 +17,23 @@ macro_rules! kernel {
 }
 
 /// The `.cu` files, by name.
-pub const SOURCES: &[(&str, &str)] = &[kernel!("sort.cu")];
+pub const SOURCES: &[(&str, &str)] = &[kernel!("render.cu"), kernel!("sort.cu")];
 
 /// The headers that they include.
-pub const HEADERS: &[(&str, &str)] = &[kernel!("base.cuh")];
+pub const HEADERS: &[(&str, &str)] = &[
+    kernel!("atomics.cuh"),
+    kernel!("base.cuh"),
+    kernel!("camera.cuh"),
+    kernel!("film.cuh"),
+    kernel!("gate.cuh"),
+    kernel!("light.cuh"),
+    kernel!("majorant.cuh"),
+    kernel!("rng.cuh"),
+    kernel!("space.cuh"),
+    kernel!("tracking.cuh"),
+    kernel!("transfer.cuh"),
+    kernel!("wavefront.cuh"),
+];
 
 /// Macros that every kernel is compiled without and with: nothing but what speed and parity need.
 const OPTIONS: &[&str] = &["--std=c++17", "--device-as-default-execution-space", "--extra-device-vectorization", "-lineinfo"];

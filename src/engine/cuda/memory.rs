@@ -102,6 +102,25 @@ impl<T: DeviceRepr> Buffer<T> {
         self.stream.memcpy_htod(values, &mut self.slice).map_err(DeviceError::driver("copying to the device"))
     }
 
+    /// Copies `values` to where value `first` is, in the order of the work stream.
+    pub fn write_at(&mut self, first: usize, values: &[T]) -> Result<(), DeviceError> {
+        if values.is_empty() {
+            return Ok(());
+        }
+        let mut view = self.slice.slice_mut(first..first + values.len());
+        self.stream.memcpy_htod(values, &mut view).map_err(DeviceError::driver("copying to the device"))
+    }
+
+    /// Sets the bytes of `count` values from value `first` on to 0, in the order of the work stream.
+    pub fn zero_at(&self, first: usize, count: usize) -> Result<(), DeviceError> {
+        assert!(first + count <= self.len(), "the buffer holds as many");
+        let doing = DeviceError::driver("filling device memory");
+        self.stream.context().bind_to_thread().map_err(&doing)?;
+        let at = self.address() + (first * size_of::<T>()) as u64;
+        // SAFETY: within the buffer, which is freed behind this on the same stream.
+        unsafe { result::memset_d8_async(at, 0, count * size_of::<T>(), self.stream.cu_stream()) }.map_err(doing)
+    }
+
     /// Copies the front of the buffer back; waits for the work before it.
     pub fn read(&self, out: &mut [T]) -> Result<(), DeviceError> {
         if out.is_empty() {

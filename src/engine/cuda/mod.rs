@@ -9,8 +9,12 @@ mod device;
 mod error;
 mod launch;
 mod memory;
+mod pinned;
+mod render;
+mod render_memory;
 
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use launch::{launch, threads};
 pub use memory::{Budget, Buffer};
+pub use render::{DeviceTracer, GpuRenderer, Timeline};
