@@ -17,4 +17,4 @@ pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use launch::{launch, threads};
 pub use memory::{Budget, Buffer};
-pub use render::{DeviceTracer, GpuRenderer, Timeline};
+pub use render::{DeviceTracer, GpuRenderer, LookAhead, Timeline};

@@ -162,6 +162,21 @@ impl GpuRenderer {
         self
     }
 
+    /// The same with at most so many bytes of device memory, as far as a frame can be cut up.
+    pub fn with_memory(mut self, bytes: u64) -> Self {
+        self.allowed = bytes;
+        self
+    }
+
+    /// Overwrites the memory between frames with bytes that make NaN and far indices, so that a kernel that reads what it has not written
+    /// shows. For tests.
+    ///
+    /// # Errors
+    /// What the device says.
+    pub fn poison(&mut self) -> Result<(), DeviceError> {
+        self.memory.as_mut().map_or(Ok(()), |memory| memory.block.fill_bytes(0xFF))
+    }
+
     /// Where the time of the latest frame went.
     pub fn timeline(&self) -> Timeline {
         self.timeline

@@ -1,0 +1,4 @@
+#![cfg(feature = "cuda")]
+#![allow(missing_docs, clippy::unwrap_used)]
+#[path = "gpu/render.rs"]
+mod render;
