@@ -17,10 +17,18 @@ macro_rules! kernel {
 }
 
 /// The `.cu` files, by name.
-pub const SOURCES: &[(&str, &str)] = &[kernel!("sort.cu")];
+pub const SOURCES: &[(&str, &str)] =
+    &[kernel!("sort.cu"), kernel!("table.cu"), kernel!("trace_closed.cu"), kernel!("trace_grid.cu"), kernel!("window.cu")];
 
 /// The headers that they include.
-pub const HEADERS: &[(&str, &str)] = &[kernel!("base.cuh")];
+pub const HEADERS: &[(&str, &str)] = &[
+    kernel!("base.cuh"),
+    kernel!("closed.cuh"),
+    kernel!("grid.cuh"),
+    kernel!("integrate.cuh"),
+    kernel!("sphere.cuh"),
+    kernel!("stretch.cuh"),
+];
 
 /// Macros that every kernel is compiled without and with: nothing but what speed and parity need.
 const OPTIONS: &[&str] = &["--std=c++17", "--device-as-default-execution-space", "--extra-device-vectorization", "-lineinfo"];
