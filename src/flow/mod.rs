@@ -23,6 +23,8 @@ mod velocity;
 mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
+#[cfg(feature = "cuda")]
+pub(crate) use axis_map::AxisMap;
 pub use error::FlowError;
 pub use resolution::{TimeResolution, time_resolution};
 pub use steps::Chosen;

@@ -1,6 +1,6 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
-use ridgewatch::engine::cuda::{DeviceError, DeviceTracer, Gpu, GpuRenderer, GpuSettings, LookAhead};
+use ridgewatch::engine::cuda::{DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead};
 use ridgewatch::field::Domain;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{
@@ -35,8 +35,8 @@ impl LogStretch for OnHost {
 /// Answers device points on the host: the very same answers, so that what differs is tracking.
 struct ThroughHost<'a>(&'a Gpu);
 
-impl DeviceTracer for ThroughHost<'_> {
-    fn trace_on_device(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError> {
+impl DeviceAnswers for ThroughHost<'_> {
+    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError> {
         use cudarc::driver::result;
         let doing = DeviceError::driver("answering on the host");
         let stream = self.0.work().cu_stream();

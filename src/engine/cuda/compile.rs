@@ -17,19 +17,31 @@ macro_rules! kernel {
 }
 
 /// The `.cu` files, by name.
-pub const SOURCES: &[(&str, &str)] = &[kernel!("render.cu"), kernel!("sort.cu")];
+pub const SOURCES: &[(&str, &str)] = &[
+    kernel!("render.cu"),
+    kernel!("sort.cu"),
+    kernel!("table.cu"),
+    kernel!("trace_closed.cu"),
+    kernel!("trace_grid.cu"),
+    kernel!("window.cu"),
+];
 
 /// The headers that they include.
 pub const HEADERS: &[(&str, &str)] = &[
     kernel!("atomics.cuh"),
     kernel!("base.cuh"),
     kernel!("camera.cuh"),
+    kernel!("closed.cuh"),
     kernel!("film.cuh"),
     kernel!("gate.cuh"),
+    kernel!("grid.cuh"),
+    kernel!("integrate.cuh"),
     kernel!("light.cuh"),
     kernel!("majorant.cuh"),
     kernel!("rng.cuh"),
     kernel!("space.cuh"),
+    kernel!("sphere.cuh"),
+    kernel!("stretch.cuh"),
     kernel!("tracking.cuh"),
     kernel!("transfer.cuh"),
     kernel!("wavefront.cuh"),

@@ -185,6 +185,9 @@ impl Gpu {
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
     }
+    pub(super) fn budget(&self) -> &Arc<Budget> {
+        &self.budget
+    }
     /// Bytes taken and bytes that may be taken.
     pub fn memory(&self) -> (u64, u64) {
         (self.budget.used(), self.budget.cap())

@@ -50,12 +50,14 @@ impl Budget {
     }
 }
 
-/// Values on the device. Belongs to the work stream: freed in its order.
+/// Values on the device. Made, filled and freed in the order of one stream (mostly the work stream).
 #[derive(Debug)]
 pub struct Buffer<T> {
     slice: CudaSlice<T>,
     budget: Arc<Budget>,
     stream: Arc<CudaStream>,
+    /// Another stream that reads it: memory is freed behind its work too.
+    reader: Option<Arc<CudaStream>>,
     bytes: u64,
 }
 
@@ -70,7 +72,26 @@ impl<T: DeviceRepr> Buffer<T> {
             budget.give_back(bytes);
             DeviceError::driver("allocating device memory")(error)
         })?;
-        Ok(Self { slice, budget: budget.clone(), stream: stream.clone(), bytes })
+        Ok(Self { slice, budget: budget.clone(), stream: stream.clone(), reader: None, bytes })
+    }
+
+    /// The same, read by another stream. Whoever reads waits for an event behind the last write.
+    pub(super) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
+        self.reader = Some(reader.clone());
+        self
+    }
+
+    /// Copies page-locked values to `at` in the order of the buffer's stream, without waiting.
+    ///
+    /// # Safety
+    /// `values` is unchanged until the stream has passed this.
+    pub(super) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
+        assert!(at + values.len() <= self.len(), "values fit the buffer");
+        let doing = DeviceError::driver("copying to the device");
+        self.stream.context().bind_to_thread().map_err(&doing)?;
+        let address = self.address() + (at * size_of::<T>()) as u64;
+        // SAFETY: the destination is within the buffer; the source is the caller's.
+        unsafe { result::memcpy_htod_async(address, values, self.stream.cu_stream()) }.map_err(doing)
     }
 
     /// Number of values.
@@ -135,17 +156,30 @@ impl<T: DeviceRepr> Buffer<T> {
 
     /// Sets every byte, in the order of the work stream.
     pub fn fill_bytes(&mut self, byte: u8) -> Result<(), DeviceError> {
+        self.set_bytes(byte, self.bytes as usize)
+    }
+
+    /// Sets the bytes of the first `count` values to 0, in the order of the work stream.
+    pub fn zero_front(&mut self, count: usize) -> Result<(), DeviceError> {
+        assert!(count <= self.len(), "the buffer holds as many");
+        self.set_bytes(0, count * size_of::<T>())
+    }
+
+    fn set_bytes(&mut self, byte: u8, bytes: usize) -> Result<(), DeviceError> {
         let doing = DeviceError::driver("filling device memory");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let (address, _guard) = self.slice.device_ptr_mut(&self.stream);
-        // SAFETY: `address` holds `bytes` bytes until `self` is dropped, which is ordered behind this on the same stream.
-        unsafe { result::memset_d8_async(address, byte, self.bytes as usize, self.stream.cu_stream()) }.map_err(doing)
+        // SAFETY: `address` holds at least `bytes` bytes until `self` is dropped, which is ordered behind this on the same stream.
+        unsafe { result::memset_d8_async(address, byte, bytes, self.stream.cu_stream()) }.map_err(doing)
     }
 }
 
 impl<T> Drop for Buffer<T> {
     fn drop(&mut self) {
-        // The slice frees itself.
+        // The slice frees itself, in the order of its stream.
+        if let Some(reader) = &self.reader {
+            self.stream.context().record_err(self.stream.join(reader));
+        }
         self.budget.give_back(self.bytes);
     }
 }

@@ -7,14 +7,27 @@
 pub mod compile;
 mod device;
 mod error;
+mod grid;
 mod launch;
+mod layout;
 mod memory;
 mod pinned;
 mod render;
 mod render_memory;
+mod sort;
+mod table;
+mod trace;
+mod tracer;
+mod window;
 
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use launch::{launch, threads};
+pub use layout::Outputs;
 pub use memory::{Budget, Buffer};
-pub use render::{DeviceTracer, GpuRenderer, LookAhead, Timeline};
+pub use render::{DeviceAnswers, GpuRenderer, LookAhead, Timeline, Traced};
+pub use sort::{SortCells, Sorter};
+pub use table::DeviceTable;
+pub use trace::{DeviceTracer, Tuning};
+pub use tracer::{CudaTracer, CudaTracerError};
+pub use window::{DeviceSnapshot, DeviceWindow, SnapshotStore, Storage};

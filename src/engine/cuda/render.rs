@@ -4,10 +4,10 @@
 //! an order that depends on the picture's size alone. The host derives majorants between frames, from what the device saw.
 
 use super::render_memory::{Control, Memory, Plan};
-use super::{DeviceError, Gpu, launch, threads};
+use super::{DeviceError, DeviceTracer, Gpu, Outputs, launch, threads};
 use crate::engine::EngineError;
 use crate::render::{Film, FrameParameters, RenderStats, Renderer, SeenInCells};
-use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
+use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg, result};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,13 +19,29 @@ const LOOK_AHEAD: LookAhead = LookAhead { camera: 4, shadow: 8 };
 const MEMORY_SHARE: u64 = 2;
 
 /// Answers log-stretch queries that lie on the device.
-pub trait DeviceTracer {
+pub trait DeviceAnswers {
     /// Enqueues on the work stream: the log-stretch of `count` points (device address `points`, three f32 each, domain coordinates) goes
     /// to `log_stretch` (f32 each; NaN where there is no value), and whether RK4 answered to `traced` (a byte each, 0 or 1).
     ///
     /// # Errors
     /// What the device says.
-    fn trace_on_device(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError>;
+    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError>;
+}
+
+/// Every query traced.
+pub struct Traced<'a>(pub &'a DeviceTracer);
+
+impl DeviceAnswers for Traced<'_> {
+    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError> {
+        let gpu = self.0.gpu();
+        let doing = DeviceError::driver("filling device memory");
+        gpu.context().bind_to_thread().map_err(&doing)?;
+        // SAFETY: the renderer's queue holds `count` entries at each address until the next wave, which is behind this on the stream.
+        unsafe {
+            result::memset_d8_async(traced, 1, count, gpu.work().cu_stream()).map_err(&doing)?;
+            self.0.trace(points, count, &Outputs { log_stretch, ..Outputs::default() })
+        }
+    }
 }
 
 /// How many collisions of a flight may be answered at once. The picture does not depend on it.
@@ -191,7 +207,7 @@ impl GpuRenderer {
         renderer: &mut Renderer,
         frame: u64,
         samples: Range<u32>,
-        answers: &dyn DeviceTracer,
+        answers: &dyn DeviceAnswers,
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
@@ -255,7 +271,7 @@ impl GpuRenderer {
         &mut self,
         parameters: &FrameParameters,
         band: BandArgument,
-        answers: &dyn DeviceTracer,
+        answers: &dyn DeviceAnswers,
         report: &dyn Fn(u64),
         stop: &AtomicBool,
     ) -> Result<bool, DeviceError> {
@@ -303,7 +319,7 @@ impl GpuRenderer {
                 self.timeline.add(&timeline);
                 return Ok(stopped && control.live != 0);
             }
-            answers.trace_on_device(queue.points, control.length as usize, queue.log_stretch, queue.traced)?;
+            answers.answer(queue.points, control.length as usize, queue.log_stretch, queue.traced)?;
             answered = Some([ended, gpu.mark()?]);
             timeline.waves += 1;
             timeline.points += u64::from(control.length);
