@@ -33,6 +33,8 @@ pub struct RenderStats {
     pub missing: u64,
     /// Queries whose extinction exceeded the majorant in force.
     pub majorant_exceeded: u64,
+    /// Points that were answered besides, ahead of flights that ended before them.
+    pub ahead: u64,
     /// Calls of [`LogStretch::evaluate`].
     pub waves: u64,
     /// Wall-clock seconds of walking, accepting and summing.

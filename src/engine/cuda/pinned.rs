@@ -13,6 +13,8 @@ pub(super) struct Pinned<T: Copy> {
 
 // SAFETY: owned memory, reached through `&self` for reading and `&mut self` for writing only.
 unsafe impl<T: Copy + Send> Send for Pinned<T> {}
+// SAFETY: as above; through `&self` values are only read.
+unsafe impl<T: Copy + Sync> Sync for Pinned<T> {}
 
 impl<T: Copy + Default> Pinned<T> {
     /// `len` values of `T::default()`.

@@ -247,6 +247,7 @@ impl GpuRenderer {
         let known = renderer.absorb(&seen);
         debug_assert!(known);
         let timeline = self.timeline;
+        stats.ahead = timeline.points.saturating_sub(stats.queries);
         stats.waves = timeline.waves;
         stats.walk_seconds = timeline.start + timeline.advance + timeline.film;
         stats.evaluate_seconds = timeline.answer;
