@@ -24,7 +24,9 @@ pub const SOURCES: &[(&str, &str)] =
 pub const HEADERS: &[(&str, &str)] = &[
     kernel!("base.cuh"),
     kernel!("closed.cuh"),
+    kernel!("closed_variant.cuh"),
     kernel!("grid.cuh"),
+    kernel!("grid_variant.cuh"),
     kernel!("integrate.cuh"),
     kernel!("sphere.cuh"),
     kernel!("stretch.cuh"),
