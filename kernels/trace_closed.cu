@@ -1,22 +1,5 @@
-// Log-stretch of seeds in a closed-form flow. Macros: RW_REAL, RW_FORM, RW_BOUNDARY, RW_DIFFERENCES.
-#include "closed.cuh"
-#include "integrate.cuh"
-
-using namespace rw;
-
-struct Config {
-    static constexpr int FORM = RW_FORM, BOUNDARY = RW_BOUNDARY;
-};
-using Flow = ClosedFlow<Config, RW_REAL>;
-
-__device__ __forceinline__ void one(const Flow& flow, RW_REAL h, double gap, const Verdict& verdict, const float (&seed)[3], size_t at, const Outputs& out) {
-    const double from[3] = {seed[0], seed[1], seed[2]};
-#if RW_DIFFERENCES
-    give(flow, trace_differences(flow, verdict.steps, h, gap, from), verdict, seed, at, out);
-#else
-    give(flow, trace_tangent(flow, verdict.steps, h, from), verdict, seed, at, out);
-#endif
-}
+// Log-stretch of seeds in a closed-form flow.
+#include "closed_variant.cuh"
 
 // seeds: 3 floats each, domain coordinates. stages: two a step and one more.
 extern "C" __global__ void __launch_bounds__(256)

@@ -1,13 +1,12 @@
 //! A window and a flow map as kernels see them.
 
 use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
-use super::window::DeviceWindow;
-use super::{Buffer, DeviceError, Gpu, Storage};
+use super::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
 use crate::flow::{AxisMap, Boundary, FlowMap, Integrator, Interpolation};
 use crate::simd::Real;
 
-/// What a kernel for a window is launched with. Holds the memory that it points to.
+/// What a kernel for a window is launched with.
 #[derive(Debug)]
 pub struct GridArguments {
     /// `GridData`.
@@ -16,17 +15,30 @@ pub struct GridArguments {
     pub steps: u64,
     /// Macros of `trace_grid.cu`.
     pub defines: Vec<String>,
-    _memory: Vec<Buffer<u8>>,
+}
+
+/// The snapshots of a window as kernels see them.
+#[derive(Debug, Clone)]
+pub struct Nodes {
+    /// Addresses, oldest first.
+    pub addresses: Vec<u64>,
+    /// How velocities are held.
+    pub storage: Storage,
+    /// What stored velocities are multiplied by.
+    pub scale: f32,
+    /// Whether some node is missing.
+    pub missing: bool,
 }
 
 /// Beyond these times of an interval, a time is that of a snapshot (as the CPU's sampler has it).
 const SAME_TIME: f64 = 1e-9;
 
 impl GridArguments {
-    /// Everything for `steps` steps from `from` to `to`. `keep`: keep the current cell in registers (see `grid.cuh`).
+    /// Everything for `steps` steps over `span`. `keep`: keep the current cell in registers (see `grid.cuh`). `put` copies bytes to where
+    /// the kernel can read them and returns their address.
     pub fn new<R: DeviceReal>(
-        gpu: &Gpu,
-        window: &DeviceWindow,
+        put: &mut dyn FnMut(&[u8]) -> Result<u64, DeviceError>,
+        nodes: &Nodes,
         times: &[f64],
         grid: &Grid,
         map: &FlowMap,
@@ -34,13 +46,6 @@ impl GridArguments {
         steps: usize,
         keep: bool,
     ) -> Result<Self, DeviceError> {
-        let mut memory = Vec::new();
-        let mut put = |bytes: &[u8]| -> Result<u64, DeviceError> {
-            let buffer = gpu.upload("a flow map", bytes)?;
-            let address = buffer.address();
-            memory.push(buffer);
-            Ok(address)
-        };
         let maps: Vec<AxisMap<R>> = grid.axes.iter().map(|axis| AxisMap::new(axis, map.boundary)).collect();
         let (mut even, mut wrap, mut seam) = (0, 0, 0);
         let mut axes = Vec::new();
@@ -75,7 +80,7 @@ impl GridArguments {
         }
         let sphere = matches!(grid.geometry, Geometry::Sphere { .. });
         let spacing: [f64; 3] = std::array::from_fn(|k| axes[k].spacing);
-        let scale = f64::from(window.scale());
+        let scale = f64::from(nodes.scale);
         let rate = match grid.geometry {
             Geometry::Cartesian => spacing.map(|s| scale / s),
             Geometry::Sphere { radius } => [scale / radius; 3],
@@ -95,7 +100,7 @@ impl GridArguments {
         let (sine, cosine) = middle.to_radians().sin_cos();
         let real = R::from_f64;
         let data = GridData {
-            snapshots: put(bytes_of(&window.addresses()))?,
+            snapshots: put(bytes_of(&nodes.addresses))?,
             row: nx as u32,
             plane: (nx * ny) as u32,
             axes: [axes[0], axes[1], axes[2]],
@@ -118,17 +123,18 @@ impl GridArguments {
             format!("RW_REAL={}", R::NAME),
             format!("RW_AXES={}", grid.dimensions()),
             flag("RW_SPHERE", sphere),
-            format!("RW_STORAGE={}", u8::from(window.storage() == Storage::F16)),
+            format!("RW_STORAGE={}", u8::from(nodes.storage == Storage::F16)),
             flag("RW_CUBIC", cubic),
-            flag("RW_MARKS", window.missing()),
-            flag("RW_KEEP", keep),
+            flag("RW_MARKS", nodes.missing),
+            // In double precision the kept cell does not fit into the registers.
+            flag("RW_KEEP", keep && size_of::<R>() == size_of::<f32>()),
             flag("RW_SCALED", scaled),
             format!("RW_EVEN={even}"),
             format!("RW_WRAP={wrap}"),
             format!("RW_SEAM={seam}"),
             flag("RW_DIFFERENCES", map.integrator == Integrator::Differences),
         ];
-        Ok(Self { data: words(&data), steps, defines, _memory: memory })
+        Ok(Self { data: words(&data), steps, defines })
     }
 }
 

@@ -8,6 +8,8 @@ pub mod compile;
 mod device;
 mod error;
 mod grid;
+#[cfg(test)]
+mod host_parity;
 mod launch;
 mod layout;
 mod memory;

@@ -49,8 +49,7 @@ pub struct DeviceTracer {
     sorter: Mutex<Option<Sorter>>,
     // Memory that the kernels read.
     _window: Option<DeviceWindow>,
-    _grid: Option<GridArguments>,
-    _stages: Option<Buffer<u8>>,
+    _memory: Vec<Buffer<u8>>,
 }
 
 impl DeviceTracer {
@@ -86,22 +85,13 @@ impl DeviceTracer {
         tuning: Tuning,
     ) -> Result<Self, DeviceError> {
         let to = t0 + map.direction.sign() * map.tau;
-        let verdict = Verdict {
-            zero_where_left: i32::from(map.boundary == Boundary::Zero),
-            by_lived: i32::from(map.normalisation == Normalisation::Lived),
-            steps: steps as i32,
-        };
+        let verdict = verdict(map, steps);
         let mut step = [0u64; 1];
         step[0] = words(&R::from_f64((to - t0) / steps as f64))[0];
         match source {
             VelocitySource::Analytic(flow, domain) => {
                 let (stages, form) = closed_stages::<R>(flow, t0, to, steps);
-                let defines = [
-                    format!("RW_REAL={}", R::NAME),
-                    format!("RW_FORM={form}"),
-                    format!("RW_BOUNDARY={}", boundary_number(map.boundary)),
-                    format!("RW_DIFFERENCES={}", u8::from(map.integrator == Integrator::Differences)),
-                ];
+                let defines = closed_defines::<R>(map, form);
                 let stages = gpu.upload("the stages of a closed form", &stages)?;
                 Ok(Self {
                     plain: gpu.kernel("trace_closed.cu", &defines, "trace")?,
@@ -115,8 +105,7 @@ impl DeviceTracer {
                     cells: None,
                     sorter: Mutex::new(None),
                     _window: None,
-                    _grid: None,
-                    _stages: Some(stages),
+                    _memory: vec![stages],
                     gpu: gpu.clone(),
                 })
             }
@@ -124,7 +113,14 @@ impl DeviceTracer {
                 let grid = window.grid().ok_or_else(|| DeviceError::Unsupported { what: "an empty window".into() })?.clone();
                 let held = store.window(window, tuning.storage)?;
                 let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
-                let arguments = GridArguments::new::<R>(gpu, &held, &times, &grid, map, (t0, to), steps, tuning.keep)?;
+                let mut memory = Vec::new();
+                let mut put = |bytes: &[u8]| {
+                    let buffer = gpu.upload("a flow map", bytes)?;
+                    let address = buffer.address();
+                    memory.push(buffer);
+                    Ok(address)
+                };
+                let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, tuning.keep)?;
                 let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
                 Ok(Self {
                     plain: kernel("trace")?,
@@ -138,8 +134,7 @@ impl DeviceTracer {
                     cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
                     sorter: Mutex::new(None),
                     _window: Some(held),
-                    _grid: Some(arguments),
-                    _stages: None,
+                    _memory: memory,
                     gpu: gpu.clone(),
                 })
             }
@@ -230,6 +225,25 @@ fn shifted(out: &Outputs, first: usize) -> Outputs {
     }
 }
 
+/// Macros of `trace_closed.cu`.
+pub(super) fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8) -> Vec<String> {
+    vec![
+        format!("RW_REAL={}", R::NAME),
+        format!("RW_FORM={form}"),
+        format!("RW_BOUNDARY={}", boundary_number(map.boundary)),
+        format!("RW_DIFFERENCES={}", u8::from(map.integrator == Integrator::Differences)),
+    ]
+}
+
+/// What `give` does with a path.
+pub(super) fn verdict(map: &FlowMap, steps: usize) -> Verdict {
+    Verdict {
+        zero_where_left: i32::from(map.boundary == Boundary::Zero),
+        by_lived: i32::from(map.normalisation == Normalisation::Lived),
+        steps: steps as i32,
+    }
+}
+
 /// `Boundary` of `closed.cuh`.
 fn boundary_number(boundary: Boundary) -> u8 {
     match boundary {
@@ -241,7 +255,7 @@ fn boundary_number(boundary: Boundary) -> u8 {
     }
 }
 
-fn closed_data<R: Real>(domain: &Domain, boundary: Boundary) -> ClosedData<R> {
+pub(super) fn closed_data<R: Real>(domain: &Domain, boundary: Boundary) -> ClosedData<R> {
     let (low, high) = (domain.min.map(R::from_f64), domain.max.map(R::from_f64));
     let (inner_low, inner_high) = match boundary {
         Boundary::Zero => (low.map(R::above), high.map(R::below)),
@@ -251,7 +265,7 @@ fn closed_data<R: Real>(domain: &Domain, boundary: Boundary) -> ClosedData<R> {
 }
 
 /// Constants of every stage as bytes, and the number of the form in `closed.cuh`.
-fn closed_stages<R: Real>(flow: &Analytic, from: f64, to: f64, steps: usize) -> (Vec<u8>, u8) {
+pub(super) fn closed_stages<R: Real>(flow: &Analytic, from: f64, to: f64, steps: usize) -> (Vec<u8>, u8) {
     fn of<R: Real, F: ClosedForm<D>, const D: usize>(form: F, from: f64, to: f64, steps: usize) -> Vec<u8> {
         let halves = 2 * steps;
         let mut bytes = Vec::new();

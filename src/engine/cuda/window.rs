@@ -1,6 +1,7 @@
 //! Snapshots on the device: each comes over once, from page-locked memory on the transfer stream, while kernels run on the work stream.
 //! A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
 
+use super::grid::Nodes;
 use super::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::field::{Snapshot, Window};
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
@@ -64,21 +65,15 @@ pub struct DeviceWindow {
 }
 
 impl DeviceWindow {
-    /// Addresses, oldest first.
-    pub fn addresses(&self) -> Vec<u64> {
-        self.snapshots.iter().map(|s| s.nodes.address()).collect()
-    }
-    /// Whether some node of some snapshot is missing.
-    pub fn missing(&self) -> bool {
-        self.snapshots.iter().any(|s| s.missing)
-    }
-    /// What stored velocities are multiplied by.
-    pub fn scale(&self) -> f32 {
-        self.snapshots.first().map_or(1.0, |s| s.scale)
-    }
-    /// How velocities are held.
-    pub fn storage(&self) -> Storage {
-        self.snapshots.first().map_or(Storage::F32, |s| s.storage)
+    /// What kernels need to know of it.
+    pub(super) fn nodes(&self) -> Nodes {
+        let first = self.snapshots.first();
+        Nodes {
+            addresses: self.snapshots.iter().map(|s| s.nodes.address()).collect(),
+            storage: first.map_or(Storage::F32, |s| s.storage),
+            scale: first.map_or(1.0, |s| s.scale),
+            missing: self.snapshots.iter().any(|s| s.missing),
+        }
     }
     /// Bytes on the device.
     pub fn bytes(&self) -> u64 {

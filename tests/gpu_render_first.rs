@@ -1,4 +1,0 @@
-#![cfg(feature = "cuda")]
-#![allow(missing_docs, clippy::unwrap_used)]
-#[path = "gpu/render.rs"]
-mod render;
