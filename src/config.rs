@@ -8,7 +8,7 @@ mod sections;
 mod validate;
 
 pub use error::ConfigError;
-pub use sections::{DeviceSettings, DomainSettings, FlowSettings, OnLoss, SourceKind, SourceSettings, StepsSetting, TimeSettings, TimeSpan, TrainingSettings};
+pub use sections::{DomainSettings, FlowSettings, SourceKind, SourceSettings, StepsSetting, TimeSettings, TimeSpan, TrainingSettings};
 
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
@@ -62,9 +62,6 @@ pub struct SceneFile {
     pub light: Option<LightSettings>,
     /// Extinction and albedo; none: scaled to the first frame's FTLE.
     pub transfer: Option<TransferSettings>,
-    /// How a GPU is used.
-    #[serde(default)]
-    pub device: DeviceSettings,
     /// Frames out.
     #[serde(default)]
     pub publish: PublishSettings,

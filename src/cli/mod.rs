@@ -11,7 +11,7 @@ mod replay;
 use anyhow::{Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
-use ridgewatch::engine::{Device, DeviceChoice, EngineError, UnknownDevice};
+use ridgewatch::engine::EngineError;
 use ridgewatch::publish::PublishError;
 use std::path::{Path, PathBuf};
 
@@ -67,7 +67,7 @@ enum Command {
 /// Runs a command.
 pub fn run(arguments: Arguments) -> Result<()> {
     let common = arguments.common;
-    device_choice(&common)?;
+    check_device(&common.device)?;
     match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
         Command::Render(options) => render::run(&common, options),
@@ -83,23 +83,14 @@ pub fn run(arguments: Arguments) -> Result<()> {
 #[error("{0}")]
 pub struct Usage(pub String);
 
-/// The device that was asked for, by name.
-fn device_choice(common: &Common) -> Result<DeviceChoice> {
-    common.device.parse().map_err(|error: UnknownDevice| Usage(format!("--device: {error}")).into())
-}
-
-/// Opens the device that was asked for.
-#[cfg(feature = "cuda")]
-fn device(common: &Common, scene: &SceneFile) -> Result<Device> {
-    let memory_cap = scene.device.memory_mib.map(|mib| mib.saturating_mul(1 << 20));
-    let settings = ridgewatch::engine::cuda::GpuSettings { memory_cap, ..Default::default() };
-    Ok(Device::open(device_choice(common)?, &settings)?)
-}
-
-/// Opens the device that was asked for.
-#[cfg(not(feature = "cuda"))]
-fn device(common: &Common, _: &SceneFile) -> Result<Device> {
-    Ok(Device::open(device_choice(common)?)?)
+fn check_device(device: &str) -> Result<()> {
+    match device {
+        "auto" | "cpu" => Ok(()),
+        _ if device.strip_prefix("cuda:").is_some_and(|n| n.parse::<u32>().is_ok()) => {
+            bail!(Usage(format!("--device {device}: this version computes on the CPU only; accepted: auto, cpu")))
+        }
+        _ => bail!(Usage(format!("--device {device}: accepted: auto, cpu"))),
+    }
 }
 
 /// 2 for usage and config errors, 1 for everything else.

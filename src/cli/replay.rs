@@ -78,7 +78,6 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     let run_options = RunOptions {
         verify_points: options.verify as usize,
         threads: common.threads,
-        device: super::device(common, &scene)?,
         checkpoint: options.checkpoint.clone(),
         ..RunOptions::default()
     };

@@ -209,32 +209,6 @@ impl Default for FlowSettings {
     }
 }
 
-/// What happens when the GPU fails during a run.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum OnLoss {
-    /// The run goes on on the CPU, slower; the frame's record says so.
-    Cpu,
-    /// The run stops with an error after the frame.
-    Stop,
-}
-
-/// `[device]`: how a GPU is used, where one is (`--device`).
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DeviceSettings {
-    /// When it fails.
-    pub on_loss: OnLoss,
-    /// Most device memory that is taken, MiB; none: nine tenths of what is free at start.
-    pub memory_mib: Option<u64>,
-}
-
-impl Default for DeviceSettings {
-    fn default() -> Self {
-        Self { on_loss: OnLoss::Cpu, memory_mib: None }
-    }
-}
-
 /// `[training]`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]

@@ -7,10 +7,9 @@ use super::answers::Answers;
 use super::audit;
 use super::feed::Slide;
 use super::setup::{Plan, Setup, assemble};
-use super::workplace::{FrameRenderer, Workplace};
-use super::{Device, EngineError, Frame, FrameRecord, StageSeconds};
+use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::{SceneFile, TrainingSettings};
-use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, time_resolution};
+use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, Strata, TrustMap};
@@ -20,7 +19,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// What a run may be told besides its scene.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct RunOptions {
     /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
     pub verify_points: usize,
@@ -30,15 +29,6 @@ pub struct RunOptions {
     pub checkpoint: Option<PathBuf>,
     /// Samples a pixel of warm-up frames; none: the scene's.
     pub warmup_samples: Option<usize>,
-    /// What traces and renders.
-    pub device: Device,
-}
-
-impl Default for RunOptions {
-    /// On the CPU, with all threads.
-    fn default() -> Self {
-        Self { verify_points: 0, threads: 0, checkpoint: None, warmup_samples: None, device: Device::CPU }
-    }
 }
 
 /// What a run tells while it goes.
@@ -115,7 +105,6 @@ struct Cycle<'a> {
     plan: &'a Plan,
     options: &'a RunOptions,
     threads: Threads,
-    workplace: Workplace,
     renderer: Renderer,
     trust: TrustMap,
     ring: SampleRing,
@@ -152,11 +141,10 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     let mut slide = feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
     let threads = Threads::new(options.threads, &plan.scene)?;
     let mut prepared = Instant::now();
-    let mut workplace = Workplace::new(&options.device, plan.scene.device.on_loss)?;
-    let mut tracer = threads.render.install(|| workplace.tracer(&slide.velocity, &plan.map, slide.time))?;
+    let mut tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
-    let mut cycle = Cycle::new(&plan, options, threads, workplace, &*tracer, &slide)?;
+    let mut cycle = Cycle::new(&plan, options, threads, &*tracer, &slide)?;
     if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
         slide.warnings.push(format!(
             "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
@@ -189,21 +177,14 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
         let Some(next) = feed.next_slide()? else { return cycle.finish() };
         slide = next;
         prepared = Instant::now();
-        tracer = cycle.workplace.tracer(&slide.velocity, &map, slide.time)?;
+        tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
         cycle.slid(&*tracer);
         cycle.probe(&*tracer, slide.index);
     }
 }
 
 impl<'a> Cycle<'a> {
-    fn new(
-        plan: &'a Plan,
-        options: &'a RunOptions,
-        threads: Threads,
-        workplace: Workplace,
-        tracer: &dyn Tracer,
-        first: &Slide,
-    ) -> Result<Self, EngineError> {
+    fn new(plan: &'a Plan, options: &'a RunOptions, threads: Threads, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
         let scene = &plan.scene;
         let renderer = Renderer::new(threads.render.install(|| settled_scene(plan, tracer, first.time))?, &plan.domain, plan.map.tau)?;
         let method = scene.render.method;
@@ -219,7 +200,6 @@ impl<'a> Cycle<'a> {
             plan,
             options,
             threads,
-            workplace,
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
@@ -267,10 +247,10 @@ impl<'a> Cycle<'a> {
     /// everywhere and makes several times the queries, so that the first frame had better not be its first.
     fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), EngineError> {
         let gate = Gate::uniform(false);
-        let keep = if self.live.is_some() { self.plan.scene.training.ring / KEEP_A_FRAME } else { 0 };
-        let mut answers = Answers::new(tracer, None, &gate, None, keep).with_flow_map(self.wants_flow_map());
-        let (renderer, workplace) = (&mut self.renderer, &mut self.workplace);
-        self.threads.render.install(|| workplace.render(renderer, PILOT_PICTURE, 1, &mut answers, None))?;
+        let mut answers =
+            Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME).with_flow_map(self.wants_flow_map());
+        let renderer = &mut self.renderer;
+        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, &AtomicBool::new(false)))?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
         self.learn_of(tracer, &samples, None);
@@ -337,7 +317,6 @@ impl<'a> Cycle<'a> {
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
             let (renderer, trust, frame, seed) = (&mut self.renderer, &self.trust, self.frame, scene.seed);
-            let workplace = &mut self.workplace;
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
@@ -364,7 +343,8 @@ impl<'a> Cycle<'a> {
                         }
                     };
                     let walk = Instant::now();
-                    let (film, stats) = workplace.render(renderer, picture, samples_per_pixel, &mut answers, Some(&report))?;
+                    let (film, stats) =
+                        renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
@@ -405,8 +385,6 @@ impl<'a> Cycle<'a> {
         let work = work.ok_or(EngineError::EndedEarly)??;
         let auditing = Instant::now();
         let transfer = self.renderer.transfer();
-        let device = self.workplace.name().to_owned();
-        self.workplace.check(&mut slide.warnings)?;
         let mut record = FrameRecord {
             frame: self.frame,
             slide: slide.index,
@@ -433,8 +411,6 @@ impl<'a> Cycle<'a> {
             audited: work.audit.samples.len() as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
-            traced_ahead: work.stats.ahead,
-            device,
             warnings: std::mem::take(&mut slide.warnings),
             ..FrameRecord::default()
         };

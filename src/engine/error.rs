@@ -54,14 +54,6 @@ pub enum EngineError {
         /// Their time.
         time: f64,
     },
-    /// The GPU failed in a run that is to stop then.
-    #[error("{device} failed, and [device] on_loss is \"stop\": {reason}")]
-    DeviceFailed {
-        /// Its name.
-        device: String,
-        /// What it said.
-        reason: String,
-    },
     /// The thread pool.
     #[error("cannot start worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),

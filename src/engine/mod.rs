@@ -12,7 +12,6 @@ mod error;
 mod feed;
 mod record;
 mod setup;
-mod workplace;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
