@@ -10,6 +10,7 @@ mod validate;
 pub use error::ConfigError;
 pub use sections::{DomainSettings, FlowSettings, SourceKind, SourceSettings, StepsSetting, TimeSettings, TimeSpan, TrainingSettings};
 
+use crate::engine::DeviceSettings;
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
 use crate::source::NetCdfSettings;
@@ -65,6 +66,9 @@ pub struct SceneFile {
     /// Frames out.
     #[serde(default)]
     pub publish: PublishSettings,
+    /// How a GPU is used.
+    #[serde(default)]
+    pub device: DeviceSettings,
 }
 
 impl SceneFile {

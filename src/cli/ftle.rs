@@ -2,7 +2,7 @@
 
 use super::{Common, Usage, messages, on_threads, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{Plan, Setup, Slide};
+use ridgewatch::engine::{Device, Plan, Setup, Slide};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use serde::Serialize;
@@ -101,7 +101,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
     }
     let slide = slide.context("the source gave no slide")?;
-    let report = on_threads(common, || compute(&plan, &slide, options))??;
+    let device = super::device(common, &plan.scene)?;
+    let report = on_threads(common, || compute(&plan, &slide, options, &device))??;
     if common.json {
         return print_json(&report);
     }
@@ -109,8 +110,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     Ok(())
 }
 
-fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
-    let tracer = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Result<Report> {
+    let (tracer, told) = device.tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+    told.iter().for_each(messages::note);
     let mut grid = options.grid.0;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}

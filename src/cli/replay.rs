@@ -64,6 +64,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
     let setup = Setup::new(scene)?;
     let scene = setup.plan.scene.clone();
+    let device = super::device(common, &scene)?;
     if let Some(checkpoint) = &options.checkpoint {
         super::render::check_folder(checkpoint)?;
     }
@@ -79,6 +80,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         verify_points: options.verify as usize,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
+        device,
         ..RunOptions::default()
     };
     // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.

@@ -31,7 +31,13 @@ pub(super) fn check(scene: &SceneFile) -> Result<(), Fault> {
     check_flow(scene)?;
     check_learning(scene)?;
     check_trust(scene)?;
-    check_render(scene)
+    check_render(scene)?;
+    require(
+        scene.device.memory_mib.is_none_or(|mib| (1..=1 << 24).contains(&mib)),
+        "device.memory_mib",
+        scene.device.memory_mib,
+        "1 or more",
+    )
 }
 
 fn check_source(scene: &SceneFile) -> Result<(), Fault> {

@@ -7,9 +7,9 @@ use super::answers::Answers;
 use super::audit;
 use super::feed::Slide;
 use super::setup::{Plan, Setup, assemble};
-use super::{EngineError, Frame, FrameRecord, StageSeconds};
+use super::{Device, EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::{SceneFile, TrainingSettings};
-use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
+use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
 use crate::trust::{Gate, Strata, TrustMap};
@@ -29,6 +29,8 @@ pub struct RunOptions {
     pub checkpoint: Option<PathBuf>,
     /// Samples a pixel of warm-up frames; none: the scene's.
     pub warmup_samples: Option<usize>,
+    /// What traces.
+    pub device: Device,
 }
 
 /// What a run tells while it goes.
@@ -114,6 +116,8 @@ struct Cycle<'a> {
     probed: u64,
     /// Frames that were no warm-up.
     pictures: u64,
+    /// Whether a lost device was told of.
+    told_of_failure: bool,
     report: RunReport,
 }
 
@@ -141,7 +145,8 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     let mut slide = feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
     let threads = Threads::new(options.threads, &plan.scene)?;
     let mut prepared = Instant::now();
-    let mut tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    let (mut tracer, told) = threads.render.install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    slide.warnings.extend(told);
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
     let mut cycle = Cycle::new(&plan, options, threads, &*tracer, &slide)?;
@@ -177,7 +182,9 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
         let Some(next) = feed.next_slide()? else { return cycle.finish() };
         slide = next;
         prepared = Instant::now();
-        tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
+        let (next, told) = options.device.tracer(slide.velocity.clone(), &map, slide.time)?;
+        tracer = next;
+        slide.warnings.extend(told);
         cycle.slid(&*tracer);
         cycle.probe(&*tracer, slide.index);
     }
@@ -207,6 +214,7 @@ impl<'a> Cycle<'a> {
             frame: 0,
             probed: 0,
             pictures: 0,
+            told_of_failure: false,
             report: RunReport {
                 integration_steps: tracer.steps(),
                 integration_difference: tracer.chosen().map(|c| c.difference),
@@ -397,6 +405,7 @@ impl<'a> Cycle<'a> {
                 Method::Surrogate => "surrogate".into(),
                 Method::Gated => "gated".into(),
             },
+            device: self.options.device.name(),
             surrogate: front.as_ref().map(|s| s.name().to_owned()),
             size: [work.film.width, work.film.height],
             samples_per_pixel,
@@ -446,6 +455,10 @@ impl<'a> Cycle<'a> {
             self.trust.observe(audited, &work.strata, &rendered);
             self.ring.push(&work.samples);
             self.ring.push(&work.audit.samples);
+        }
+        self.options.device.check()?;
+        if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
+            record.warnings.push(format!("the GPU is lost, the CPU goes on: {failure}"));
         }
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {

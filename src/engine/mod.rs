@@ -17,7 +17,7 @@ pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
 pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
-pub use device::{Device, DeviceChoice, UnknownDevice};
+pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};

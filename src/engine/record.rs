@@ -20,6 +20,9 @@ pub struct FrameRecord {
     pub direction: String,
     /// `reference`, `surrogate` or `gated`.
     pub method: String,
+    /// What traced: `cpu`, or `cuda:N` with the device's name.
+    #[serde(default)]
+    pub device: String,
     /// `table`, `network` or `residual`; none for `reference`.
     pub surrogate: Option<String>,
     /// Pixels across and down.

@@ -90,7 +90,11 @@ pub fn even(shape: &[usize]) -> Vec<Axis> {
 
 pub fn uneven(shape: &[usize]) -> Vec<Axis> {
     let coordinate = |k: usize, i: usize| 0.7 * i as f64 + 0.2 * (1.3 * i as f64 + k as f64).sin() - 1.0;
-    shape.iter().enumerate().map(|(k, &n)| Axis::new(["x", "y", "z"][k], "m", (0..n).map(|i| coordinate(k, i)).collect()).unwrap()).collect()
+    shape
+        .iter()
+        .enumerate()
+        .map(|(k, &n)| Axis::new(["x", "y", "z"][k], "m", (0..n).map(|i| coordinate(k, i)).collect()).unwrap())
+        .collect()
 }
 
 pub fn cartesian(axes: Vec<Axis>) -> Arc<Grid> {

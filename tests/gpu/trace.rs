@@ -42,7 +42,8 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
     }
     // Every variant of the kernel in single precision: no worse than the CPU's single precision, but for the order of rounding.
-    let single = FlowMap { precision: Precision::F32, gap: if map.integrator == Integrator::Differences { 1e-2 } else { map.gap }, ..map.clone() };
+    let single =
+        FlowMap { precision: Precision::F32, gap: if map.integrator == Integrator::Differences { 1e-2 } else { map.gap }, ..map.clone() };
     let wide = FlowMap { precision: Precision::F64, ..single.clone() };
     let exact = on_cpu(source, &wide, t0, &seeds);
     let theirs = on_cpu(source, &single, t0, &seeds);
@@ -53,7 +54,9 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} lived alike", alike.len(), seeds.len());
         assert!(found.log_stretch.iter().all(|s| !s.is_nan()), "{name}: something was not written");
         let (ours, theirs) = (most(&exact, &found, &alike), most(&exact, &theirs, &alike));
-        println!("{name}, sorted {sorted}, keep {keep}: single precision off by {ours:.1e}, the CPU's by {theirs:.1e}; {odd} odd, {died} stopped");
+        println!(
+            "{name}, sorted {sorted}, keep {keep}: single precision off by {ours:.1e}, the CPU's by {theirs:.1e}; {odd} odd, {died} stopped"
+        );
         assert!(ours < 3.0 * theirs + 2e-6, "{name}: single precision is off by {ours:e}, the CPU's by {theirs:e}");
     }
 }
@@ -85,7 +88,12 @@ fn windows_in_the_plane() {
     let grid = || cartesian(even(&[19, 13]));
     check("linear", &smooth(&grid(), 0.6, false), &stop, 0.1);
     check("cubic", &smooth(&grid(), 0.6, false), &cubic, 0.1);
-    check("cubic, uneven", &smooth(&cartesian(uneven(&[19, 13])), 0.6, false), &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() }, 0.1);
+    check(
+        "cubic, uneven",
+        &smooth(&cartesian(uneven(&[19, 13])), 0.6, false),
+        &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
+        0.1,
+    );
     check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
     let mut around = even(&[19, 13]);
     around[0] = around[0].clone().with_period(11.0);

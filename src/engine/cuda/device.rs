@@ -255,6 +255,27 @@ impl Gpu {
         from.elapsed_ms(to).map_err(DeviceError::driver("measuring time"))
     }
 
+    /// Top clock of the multiprocessors.
+    pub fn top_clock_hz(&self) -> Result<f64, DeviceError> {
+        let kilohertz = self.context.attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_CLOCK_RATE);
+        Ok(f64::from(kilohertz.map_err(DeviceError::driver("asking for the clock"))?) * 1e3)
+    }
+
+    /// Bytes a second that a copy of `bytes` on the device moves, read and written: the ceiling of everything that is bound by memory.
+    pub fn copy_rate(&self, bytes: usize) -> Result<f64, DeviceError> {
+        let doing = DeviceError::driver("copying on the device");
+        let (mut from, to) = (self.alloc::<u8>("a copy", bytes)?, self.alloc::<u8>("a copy", bytes)?);
+        from.fill_bytes(0x5a)?;
+        let mut best = f32::INFINITY;
+        for _ in 0..5 {
+            let begin = self.mark()?;
+            // SAFETY: both buffers hold `bytes` bytes and do not overlap.
+            unsafe { result::memcpy_dtod_async(to.address(), from.address(), bytes, self.work.cu_stream()) }.map_err(&doing)?;
+            best = best.min(self.milliseconds(&begin, &self.mark()?)?);
+        }
+        Ok(2.0 * bytes as f64 / f64::from(best) * 1e3)
+    }
+
     /// Remembers the first failure of GPU work; later work is not tried.
     pub fn fail(&self, error: DeviceError) {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);

@@ -22,6 +22,7 @@ mod trace;
 mod tracer;
 mod window;
 
+pub use super::device::Storage;
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use launch::{launch, threads};
@@ -32,4 +33,4 @@ pub use sort::{SortCells, Sorter};
 pub use table::DeviceTable;
 pub use trace::{DeviceTracer, Tuning};
 pub use tracer::{CudaTracer, CudaTracerError};
-pub use window::{DeviceSnapshot, DeviceWindow, SnapshotStore, Storage};
+pub use window::{DeviceSnapshot, DeviceWindow, SnapshotStore};

@@ -2,23 +2,11 @@
 //! A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
 
 use super::grid::Nodes;
-use super::{Buffer, DeviceError, Gpu, launch, threads};
+use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::{Snapshot, Window};
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
 use rayon::prelude::*;
-use serde::{Deserialize, Serialize};
 use std::sync::{Arc, Mutex, PoisonError};
-
-/// How node velocities are held.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Storage {
-    /// 16 bytes a node.
-    #[default]
-    F32,
-    /// 8 bytes a node: velocities are rounded to 11 bits.
-    F16,
-}
 
 impl Storage {
     /// Bytes of a node.
