@@ -6,6 +6,7 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::Slide;
+use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup, assemble};
 use super::{Device, EngineError, Frame, FrameRecord, StageSeconds};
 use crate::config::{SceneFile, TrainingSettings};
@@ -107,6 +108,7 @@ struct Cycle<'a> {
     plan: &'a Plan,
     options: &'a RunOptions,
     threads: Threads,
+    frames: Box<dyn FrameRenderer>,
     renderer: Renderer,
     trust: TrustMap,
     ring: SampleRing,
@@ -207,6 +209,7 @@ impl<'a> Cycle<'a> {
             plan,
             options,
             threads,
+            frames: frame_renderer(&options.device),
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
@@ -255,10 +258,10 @@ impl<'a> Cycle<'a> {
     /// everywhere and makes several times the queries, so that the first frame had better not be its first.
     fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), EngineError> {
         let gate = Gate::uniform(false);
-        let mut answers =
-            Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME).with_flow_map(self.wants_flow_map());
-        let renderer = &mut self.renderer;
-        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, &AtomicBool::new(false)))?;
+        let keep = if self.live.is_some() { self.plan.scene.training.ring / KEEP_A_FRAME } else { 0 };
+        let mut answers = Answers::new(tracer, None, &gate, None, keep).with_flow_map(self.wants_flow_map());
+        let (renderer, frames) = (&mut self.renderer, &mut self.frames);
+        self.threads.render.install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None))?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
         self.learn_of(tracer, &samples, None);
@@ -325,6 +328,7 @@ impl<'a> Cycle<'a> {
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
             let (renderer, trust, frame, seed) = (&mut self.renderer, &self.trust, self.frame, scene.seed);
+            let frames = &mut self.frames;
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
@@ -351,8 +355,7 @@ impl<'a> Cycle<'a> {
                         }
                     };
                     let walk = Instant::now();
-                    let (film, stats) =
-                        renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
+                    let (film, stats) = frames.render(renderer, picture, samples_per_pixel, tracer, &mut answers, Some(&report))?;
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
@@ -420,6 +423,7 @@ impl<'a> Cycle<'a> {
             audited: work.audit.samples.len() as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
+            traced_ahead: work.stats.ahead,
             warnings: std::mem::take(&mut slide.warnings),
             ..FrameRecord::default()
         };
@@ -430,7 +434,10 @@ impl<'a> Cycle<'a> {
             record.over_tolerance = if work.tally.over_budget > 0 {
                 // The surrogate answered where it is not trusted: the points there speak for that, and the frame is flagged whatever they say.
                 let untrusted: Vec<_> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
-                Some(crate::trust::TrustedError::of(&untrusted, &work.strata).map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)))
+                Some(
+                    crate::trust::TrustedError::of(&untrusted, &work.strata)
+                        .map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)),
+                )
             } else {
                 record.trusted.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0)
             };

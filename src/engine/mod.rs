@@ -10,6 +10,7 @@ mod cycle;
 mod device;
 mod error;
 mod feed;
+mod frames;
 mod record;
 mod setup;
 

@@ -201,6 +201,10 @@ pub trait Tracer: Send + Sync {
     fn is_void(&self, _seed: [f32; 3]) -> bool {
         false
     }
+    /// The tracer itself, for an engine that knows its own ones again; none for others.
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        None
+    }
     /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
 }

@@ -1,8 +1,8 @@
 //! The camera: rays through points of the film.
 
 use super::CameraSettings;
-use super::parameters::CameraParameters;
 use super::error::{RenderError, require, require_finite};
+use super::parameters::CameraParameters;
 use super::space::{cross, dot, length, scaled, subtract};
 use crate::field::Domain;
 

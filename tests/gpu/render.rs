@@ -8,9 +8,7 @@ use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
 use ridgewatch::publish::compare_films;
-use ridgewatch::render::{
-    CameraSettings, Film, LightSettings, LogStretch, RenderSettings, RenderStats, Renderer, Scene, TransferSettings,
-};
+use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
 use std::ops::Range;
 use std::sync::atomic::AtomicBool;
 
@@ -115,7 +113,9 @@ fn the_same_answers_give_the_cpu_s_picture() {
                 assert!((found as f64 - expected as f64).abs() <= 2.0 + 1e-3 * expected as f64, "frame {frame}: {found} for {expected}");
             }
             let near = |a: f32, b: f32| (a.is_nan() && b.is_nan()) || (a - b).abs() <= 0.02 * (1.0 + b.abs());
-            let odd = (0..found.rgba.len()).filter(|&i| !near(found.variance[i], expected.variance[i]) || !near(found.ftle_mean[i], expected.ftle_mean[i])).count();
+            let odd = (0..found.rgba.len())
+                .filter(|&i| !near(found.variance[i], expected.variance[i]) || !near(found.ftle_mean[i], expected.ftle_mean[i]))
+                .count();
             assert!(odd * 100 <= found.rgba.len(), "{odd} pixels of {} differ in variance or FTLE", found.rgba.len());
         }
     }
@@ -245,7 +245,6 @@ fn a_stopped_frame_has_no_half_finished_pixels() {
     let gpu = gpu();
     let mut renderer = Renderer::new(scene(64, 32, false), &domain(), 1.0).unwrap();
     let mut device = GpuRenderer::new(&gpu).unwrap();
-    let (film, stats) =
-        device.render_samples(&mut renderer, 0, 0..100, &ThroughHost(&gpu), None, &AtomicBool::new(true)).unwrap();
+    let (film, stats) = device.render_samples(&mut renderer, 0, 0..100, &ThroughHost(&gpu), None, &AtomicBool::new(true)).unwrap();
     assert!(stats.stopped && film.samples.iter().all(|n| *n == 0.0));
 }

@@ -204,9 +204,24 @@ mod tests {
         let plan = Plan { band: 1000, parts: 3, queue: 5000, cells: 77 };
         let l = Layout::new(&plan);
         let ends = [
-            (l.place, 48_000), (l.way, 48_000), (l.colour, 48_000), (l.progress, 48_000), (l.seen, 24_000), (l.first, 12_000),
-            (l.sums, 264_000), (l.live[0], 12_000), (l.live[1], 12_000), (l.points, 60_000), (l.hits[0], 80_000), (l.hits[1], 80_000),
-            (l.log_stretch, 20_000), (l.traced, 5000), (l.film, 40_000), (l.majorants, 308), (l.may_miss, 77), (l.watch, 924),
+            (l.place, 48_000),
+            (l.way, 48_000),
+            (l.colour, 48_000),
+            (l.progress, 48_000),
+            (l.seen, 24_000),
+            (l.first, 12_000),
+            (l.sums, 264_000),
+            (l.live[0], 12_000),
+            (l.live[1], 12_000),
+            (l.points, 60_000),
+            (l.hits[0], 80_000),
+            (l.hits[1], 80_000),
+            (l.log_stretch, 20_000),
+            (l.traced, 5000),
+            (l.film, 40_000),
+            (l.majorants, 308),
+            (l.may_miss, 77),
+            (l.watch, 924),
             (l.control, 64),
         ];
         for pair in ends.windows(2) {
