@@ -67,14 +67,15 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     if let Some(checkpoint) = &options.checkpoint {
         super::render::check_folder(checkpoint)?;
     }
+    // Before anything is written: from here on a signal leaves a complete folder.
+    let stop = Arc::new(AtomicBool::new(false));
+    let signals = watch_signals(stop.clone()).map(tokio::spawn);
     // The socket first: a port in use must not cost the run that the folder holds.
     let mut output = Output::start(&scene.publish, None)?;
     output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let signals = tokio::spawn(watch_signals(stop.clone()));
     let run_options = RunOptions {
         verify_points: options.verify as usize,
         threads: common.threads,
@@ -102,7 +103,9 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         (result, last, output.finish(run))
     });
     let (result, last, summary) = worker.await.context("the cycle stopped unexpectedly")?;
-    signals.abort();
+    if let Some(signals) = signals {
+        signals.abort();
+    }
     let report = result?;
     if common.json {
         return print_json(&summary);
@@ -183,19 +186,23 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
     map
 }
 
-/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process.
-async fn watch_signals(stop: Arc<AtomicBool>) {
+/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process. Both are caught from this call on.
+fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output = ()>> {
     use tokio::signal::unix::{SignalKind, signal};
     let (Ok(mut interrupt), Ok(mut terminate)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
         messages::note("cannot watch for signals: an interrupt will end the run at once");
-        return;
+        return None;
     };
-    loop {
-        let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
-        if stop.swap(true, Ordering::Relaxed) {
-            messages::note("stopped at once; what was not written yet is lost");
-            std::process::exit(status);
+    Some(async move {
+        loop {
+            let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
+            if stop.swap(true, Ordering::Relaxed) {
+                messages::note("stopped at once; what was not written yet is lost");
+                // SAFETY: ends the process and touches no memory of ours. Not `exit`, whose handlers wait for libraries that may be
+                // waiting for a disk.
+                unsafe { libc::_exit(status) }
+            }
+            messages::note("finishing the current frame; once more to stop at once");
         }
-        messages::note("finishing the current frame; once more to stop at once");
-    }
+    })
 }

@@ -6,9 +6,13 @@ use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
-use crate::source::{DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, read_ahead};
+use crate::source::{DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, StillReading, read_ahead};
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// How often a wait for a snapshot looks up for a request to stop.
+const LOOK_UP: Duration = Duration::from_millis(100);
 
 /// One position of the window.
 pub struct Slide {
@@ -149,6 +153,11 @@ impl Feed {
 
     /// The next slide; none when the source has ended.
     pub fn next_slide(&mut self) -> Result<Option<Slide>, EngineError> {
+        self.next_slide_unless(&AtomicBool::new(false))
+    }
+
+    /// The same; also none when `stop` is set, which is looked at while snapshots are waited for.
+    pub fn next_slide_unless(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
         match self {
             Feed::Closed { flow, domain, start, step, given, slides } => {
                 if *given == *slides {
@@ -171,7 +180,16 @@ impl Feed {
                 }
                 let start = Instant::now();
                 while !(window.is_full() && (*given == 0 || *taken >= *stride)) {
-                    let Some(snapshot) = reader.next() else { return Ok(None) };
+                    let snapshot = loop {
+                        if stop.load(Ordering::Relaxed) {
+                            return Ok(None);
+                        }
+                        match reader.next_within(LOOK_UP) {
+                            Ok(Some(snapshot)) => break snapshot,
+                            Ok(None) => return Ok(None),
+                            Err(StillReading) => {}
+                        }
+                    };
                     let newest = window.newest();
                     match window.push(snapshot?) {
                         Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),

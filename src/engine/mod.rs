@@ -9,6 +9,7 @@ mod error;
 mod feed;
 mod record;
 mod setup;
+mod stop;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};

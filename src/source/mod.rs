@@ -29,7 +29,7 @@ pub use error::SourceError;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use libraries::{hdf5_version, netcdf_version};
 pub use memory::MemorySource;
-pub use reader::{DEFAULT_READ_AHEAD, ReadAhead, read_ahead};
+pub use reader::{DEFAULT_READ_AHEAD, ReadAhead, StillReading, read_ahead};
 pub use settings::{Metric, NetCdfSettings, VelocityUnit};
 
 use crate::field::{Grid, Snapshot};
