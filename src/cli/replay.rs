@@ -1,10 +1,10 @@
 //! `ridgewatch replay`.
 
-use super::{Common, Usage, messages, print_json, print_text, scene};
+use super::{Common, Usage, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
-use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, RunFolder};
+use ridgewatch::engine::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, PublishError, RunFolder};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -54,7 +54,12 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         }
         scene.publish.keep = Some(keep);
     }
-    scene.publish.endpoint = options.publish.clone().or(scene.publish.endpoint);
+    if let Some(endpoint) = &options.publish {
+        scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
+        scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
+    }
+    check_learns(&scene, "--checkpoint", options.checkpoint.as_deref())?;
+    check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
@@ -62,8 +67,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 }
 
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
-    let setup = Setup::new(scene)?;
-    let scene = setup.plan.scene.clone();
+    let setup = Setup::new(scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
     if let Some(checkpoint) = &options.checkpoint {
         super::render::check_folder(checkpoint)?;
     }
@@ -71,7 +75,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     let stop = Arc::new(AtomicBool::new(false));
     let signals = watch_signals(stop.clone()).map(tokio::spawn);
     // The socket first: a port in use must not cost the run that the folder holds.
-    let mut output = Output::start(&scene.publish, None)?;
+    let mut output = Output::start(&scene.publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
     output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
@@ -89,7 +93,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         let run = || engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
         // A fault of ours must not cost the frames that are already made.
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
-        let result = result.and_then(|result| result.map_err(anyhow::Error::from));
+        let result = result.and_then(|result| result.map_err(|error| located(&scene, error, EngineError::refused)));
         bar.finish_and_clear();
         // Whatever happened, the frames made so far and their records are completed.
         let mut run = serde_json::Map::new();
@@ -117,7 +121,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         "{} frames of {} slides; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps",
         report.frames,
         report.slides,
-        report.integration_steps,
+        report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
         report.surrogate_bytes as f64 / 1e6,
         report.train_steps
     ));

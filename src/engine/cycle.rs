@@ -6,10 +6,10 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::{Feed, Slide};
+use super::settings::{Settings, TrainingSettings};
 use super::setup::{Plan, Setup, assemble};
 use super::stop::{Halt, Interruptible, heed};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
-use crate::config::{SceneFile, TrainingSettings};
 use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
@@ -60,8 +60,8 @@ pub struct RunReport {
     pub waited: f64,
     /// Optimizer steps.
     pub train_steps: u64,
-    /// Runge-Kutta steps a path.
-    pub integration_steps: usize,
+    /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
+    pub integration_steps: Option<usize>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
     pub integration_difference: Option<f64>,
     /// Size of the surrogate, bytes.
@@ -86,7 +86,7 @@ struct Threads {
 
 impl Threads {
     /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
-    fn new(threads: usize, scene: &SceneFile) -> Result<Self, EngineError> {
+    fn new(threads: usize, scene: &Settings) -> Result<Self, EngineError> {
         let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
         let share = scene.training.share;
         let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
@@ -166,7 +166,10 @@ fn drive(
     let tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
     heed(stop)?;
     // The number of steps is settled once, on the first slide, so that frames compare.
-    let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
+    let map = match fixed_steps(&*tracer) {
+        Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
+        None => plan.map.clone(),
+    };
     let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, stop, report)?;
     let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| cycle.later_slides(&mut feed, &map, sink));
     // What was learned is kept whether or not the run was stopped.
@@ -190,21 +193,28 @@ impl<'a> Cycle<'a> {
         let settled = threads.render.install(|| settled_scene(plan, tracer, first.time));
         heed(stop)?;
         let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
+        let surrogate = match &first.velocity {
+            VelocitySource::Window(window) => window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape())),
+            VelocitySource::Analytic(..) => None,
+        };
+        let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
         let method = scene.render.method;
         let mut live = if method == Method::Reference {
             None
         } else {
-            Some(threads.render.install(|| crate::surrogate::build(&scene.surrogate, &scene.network, &plan.domain, scene.seed, tracer))?)
+            Some(threads.render.install(|| crate::surrogate::build(&surrogate, &scene.network, &plan.domain, scene.seed, tracer))?)
         };
         heed(stop)?;
-        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live) {
+        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
+            && surrogate.learns()
+        {
             surrogate.load(path)?;
             // Its table is that of another window, for all that is known.
             threads.render.install(|| surrogate.window_slid(tracer));
             heed(stop)?;
         }
-        report.integration_steps = tracer.steps();
-        report.integration_difference = tracer.chosen().map(|c| c.difference);
+        report.integration_steps = fixed_steps(tracer);
+        report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
         Ok(Self {
             plan,
             options,
@@ -252,12 +262,7 @@ impl<'a> Cycle<'a> {
     }
 
     /// Goes on until the source ends.
-    fn later_slides(
-        &mut self,
-        feed: &mut Feed,
-        map: &FlowMap,
-        sink: &mut (dyn FnMut(Event) + Send),
-    ) -> Result<(), Halt> {
+    fn later_slides(&mut self, feed: &mut Feed, map: &FlowMap, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
         loop {
             let next = feed.next_slide_unless(self.stop)?;
             heed(self.stop)?;
@@ -271,13 +276,7 @@ impl<'a> Cycle<'a> {
     }
 
     /// The frames of one slide.
-    fn frames(
-        &mut self,
-        tracer: &dyn Tracer,
-        slide: &mut Slide,
-        begun: Instant,
-        sink: &mut (dyn FnMut(Event) + Send),
-    ) -> Result<(), Halt> {
+    fn frames(&mut self, tracer: &dyn Tracer, slide: &mut Slide, begun: Instant, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
         let time = &self.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
@@ -328,8 +327,8 @@ impl<'a> Cycle<'a> {
     fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let gate = Gate::uniform(false);
         let interruptible = Interruptible::new(tracer, self.stop);
-        let mut answers =
-            Answers::new(&interruptible, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME).with_flow_map(self.wants_flow_map());
+        let mut answers = Answers::new(&interruptible, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME)
+            .with_flow_map(self.wants_flow_map());
         let (renderer, stop) = (&mut self.renderer, self.stop);
         self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, stop))?;
         heed(stop)?;
@@ -481,7 +480,7 @@ impl<'a> Cycle<'a> {
             missing: work.tally.missing,
             over_budget: work.tally.over_budget,
             traced_share: work.tally.traced as f64 / (work.tally.queries - work.tally.missing).max(1) as f64,
-            integration_steps: tracer.steps() as u64,
+            integration_steps: fixed_steps(tracer).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
             probed: std::mem::take(&mut self.probed),
             audited: work.audit.samples.len() as u64,
@@ -611,18 +610,24 @@ fn train(
         let slice = live.learn(samples, seconds, steps);
         sum.dropped += slice.dropped;
         sum.rollbacks += slice.rollbacks;
+        sum.lost_steps += slice.lost_steps;
         if slice.steps == 0 {
             break;
         }
         sum.steps += slice.steps;
         sum.samples += slice.samples;
-        if let Some(loss) = slice.loss {
+        if let Some(loss) = slice.loss.filter(|loss| loss.is_finite()) {
             losses = (losses.0 + loss * slice.steps as f64, losses.1 + slice.steps as f64);
         }
     }
     sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
     sum.seconds = start.elapsed().as_secs_f64();
     sum
+}
+
+/// Steps a path, unless each path chooses its own.
+fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+    Some(tracer.steps()).filter(|steps| *steps > 0)
 }
 
 fn every(samples: &Samples, stride: usize) -> Samples {

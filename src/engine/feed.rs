@@ -1,12 +1,14 @@
 //! One velocity after another: the slides of the window.
 
-use super::EngineError;
-use crate::config::{SceneFile, SourceKind, SourceSettings};
+use super::{EngineError, Settings};
 use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
-use crate::source::{DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, StillReading, read_ahead};
+use crate::setting::Refused;
+use crate::source::{
+    DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
+};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
@@ -93,7 +95,7 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
 }
 
 /// A gridded source, opened.
-pub fn open_snapshots(scene: &SceneFile) -> Result<Box<dyn SnapshotSource>, EngineError> {
+pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, EngineError> {
     let source = &scene.source;
     if source.kind == SourceKind::Archive {
         return Ok(Box::new(NetCdfArchive::open(&scene.archive.files, &scene.archive)?));
@@ -112,21 +114,21 @@ pub fn open_snapshots(scene: &SceneFile) -> Result<Box<dyn SnapshotSource>, Engi
     Ok(Box::new(MemorySource::new("synthetic turbulence", grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?))
 }
 
+/// A closed form without a box.
+pub(super) fn no_domain() -> EngineError {
+    Refused::new("domain", "is missing", "[domain] with min and max, since a closed form has no grid").into()
+}
+
 /// Seed of the standard turbulence (design: 0 for development).
 const TURBULENCE_SEED: u64 = 0;
 
 impl Feed {
     /// The feed of a scene whose |tau| is known.
-    pub fn open(
-        scene: &SceneFile,
-        snapshots: Option<Box<dyn SnapshotSource>>,
-        tau: f64,
-        direction: Direction,
-    ) -> Result<Self, EngineError> {
+    pub fn open(scene: &Settings, snapshots: Option<Box<dyn SnapshotSource>>, tau: f64, direction: Direction) -> Result<Self, EngineError> {
         let slides = scene.time.slides.map(|n| n as u64);
         match (closed_form(&scene.source), snapshots) {
             (Some(flow), _) => {
-                let box_ = scene.domain.as_ref().ok_or(EngineError::NoDomain)?;
+                let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
                 let domain = Domain { min: box_.min, max: box_.max, dimensions: flow.dimensions() };
                 Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
             }
@@ -147,7 +149,7 @@ impl Feed {
                     warnings: Vec::new(),
                 })
             }
-            (None, None) => Err(EngineError::NoDomain),
+            (None, None) => Err(no_domain()),
         }
     }
 
@@ -204,7 +206,7 @@ impl Feed {
                     Direction::Forward => window.oldest(),
                     Direction::Backward => window.newest(),
                 };
-                let time = ends.unwrap_or(f64::NAN);
+                let time = ends.ok_or(EngineError::EndedEarly)?;
                 Ok(Some(Slide {
                     index: *given - 1,
                     time,
