@@ -1,10 +1,14 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
-# make test    the whole suite
+# make test    the whole suite; what needs real archives runs where they are
+# make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-.PHONY: all demo test packages build check bench clean
+# The collection of real archives that tests/netcdf_real.rs reads.
+RIDGEWATCH_DATA ?= $(abspath ../shared/data)
+
+.PHONY: all demo test test-data packages build check bench clean
 
 all: build
 
@@ -29,6 +33,11 @@ demo: build
 # One profile for everything: dependencies are built once, and numerics run optimised.
 test: packages
 	$(CARGO) test --release --workspace
+	@if [ -d "$(RIDGEWATCH_DATA)" ]; then $(MAKE) --no-print-directory test-data; else \
+	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; fi
+
+test-data: packages
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test netcdf_real -- --ignored
 
 bench: packages
 	$(CARGO) bench

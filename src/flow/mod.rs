@@ -15,6 +15,7 @@ mod grid_flow;
 mod resolution;
 mod rk4;
 mod sampler;
+mod settings;
 mod sphere;
 mod steps;
 mod stretch;
@@ -25,6 +26,7 @@ mod voids;
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 pub use error::FlowError;
 pub use resolution::{TimeResolution, time_resolution};
+pub use settings::{FlowSettings, StepsSetting};
 pub use steps::Chosen;
 pub use tracer::Order;
 

@@ -55,7 +55,8 @@ impl TrustedError {
         for (residual, weight) in residuals.iter().zip(&weights) {
             let cell = cells[strata.cell(residual.point)];
             let share = weight / whole;
-            let (centre, correction) = if cell.count > 1.0 { (cell.square / cell.count, cell.count / (cell.count - 1.0)) } else { (square, 1.0) };
+            let (centre, correction) =
+                if cell.count > 1.0 { (cell.square / cell.count, cell.count / (cell.count - 1.0)) } else { (square, 1.0) };
             let deviation = squared(residual) - centre;
             variance += correction * (share * deviation).powi(2);
             third += (share * deviation).powi(3);

@@ -279,7 +279,11 @@ mod tests {
         let bad = [0.51, 0.51, 0.0];
         map.decay();
         let strata = Strata::even(map.shape(), 0);
-        map.observe(&[], &strata, &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>());
+        map.observe(
+            &[],
+            &strata,
+            &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>(),
+        );
         let gate = map.gate();
         assert!(!gate.trusts(bad));
         assert!(gate.trusts([0.45, 0.51, 0.0]));
