@@ -13,7 +13,7 @@ use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
-use crate::trust::{Gate, TrustMap};
+use crate::trust::{Gate, Strata, TrustMap};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -310,7 +310,8 @@ impl<'a> Cycle<'a> {
     fn probe(&mut self, tracer: &dyn Tracer, slide: u64) -> Result<(), Halt> {
         let scene = &self.plan.scene;
         let per_cell = scene.trust.min_samples.ceil() as usize;
-        let unit = audit::stratified_points(self.trust.shape(), per_cell, scene.seed, PROBE_STREAM + slide);
+        let strata = Strata::even(self.trust.shape(), per_cell as u32);
+        let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
         let flow_map = self.wants_flow_map();
         let interruptible = Interruptible::new(tracer, self.stop);
         let probe = self.threads.render.install(|| audit::trace(&interruptible, &unit, flow_map));
@@ -318,7 +319,7 @@ impl<'a> Cycle<'a> {
         let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
         self.renderer.observe(&points, &probe.samples.log_stretch);
         self.probed += probe.drawn as u64;
-        self.learn_of(tracer, &probe.samples, true);
+        self.learn_of(tracer, &probe.samples, Some(&strata));
         Ok(())
     }
 
@@ -334,18 +335,20 @@ impl<'a> Cycle<'a> {
         heed(stop)?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
-        self.learn_of(tracer, &samples, false);
+        self.learn_of(tracer, &samples, None);
         Ok(())
     }
 
-    /// Holds traced samples against the surrogate, then keeps them for training.
-    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, uniform: bool) {
+    /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.
+    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, strata: Option<&Strata>) {
         let Some(live) = &self.live else { return };
         let front = live.freeze();
         let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
         let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
-        let (uniform, others) = if uniform { (&residuals[..], &[][..]) } else { (&[][..], &residuals[..]) };
-        self.trust.observe(uniform, others);
+        match strata {
+            Some(strata) => self.trust.observe(&residuals, strata, &[]),
+            None => self.trust.observe(&[], &Strata::even(self.trust.shape(), 0), &residuals),
+        }
         self.ring.push(samples);
     }
 
@@ -395,7 +398,8 @@ impl<'a> Cycle<'a> {
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
-            let (renderer, frame, seed, stop) = (&mut self.renderer, self.frame, scene.seed, self.stop);
+            let (renderer, trust, frame, seed) = (&mut self.renderer, &self.trust, self.frame, scene.seed);
+            let stop = self.stop;
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
@@ -427,11 +431,14 @@ impl<'a> Cycle<'a> {
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
-                    let per_cell = front.as_ref().map_or(1, |_| {
-                        let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
-                        per_cell.max(wanted.div_ceil(cells.iter().product()))
-                    });
-                    let unit = audit::stratified_points(cells, per_cell, seed, 2 * frame);
+                    let strata = match front {
+                        Some(_) => {
+                            let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
+                            trust.audit_strata(&gate, per_cell.max(wanted.div_ceil(cells.iter().product())))
+                        }
+                        None => Strata::even(cells, 1),
+                    };
+                    let unit = audit::stratified_points(&strata, seed, 2 * frame);
                     let audit = audit::trace(tracer, &unit, flow_map);
                     let residuals =
                         front.as_deref().map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
@@ -441,6 +448,7 @@ impl<'a> Cycle<'a> {
                         tally,
                         samples,
                         audit,
+                        strata,
                         residuals,
                         render_seconds,
                         audit_seconds: auditing.elapsed().as_secs_f64(),
@@ -491,11 +499,15 @@ impl<'a> Cycle<'a> {
         };
         if let (Some(front), Some(audited)) = (front.as_deref(), &work.residuals) {
             record.trusted_share = gate.share();
-            record.trusted = audit::trusted_error(audited, &gate);
+            record.trusted = audit::trusted_error(audited, &work.strata, &gate);
+            record.surrogate_psnr = audit::psnr(audited, &work.audit.samples, &work.strata).filter(|decibels| decibels.is_finite());
             record.over_tolerance = if work.tally.over_budget > 0 {
                 // The surrogate answered where it is not trusted: the points there speak for that, and the frame is flagged whatever they say.
                 let untrusted: Vec<_> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
-                Some(crate::trust::TrustedError::of(&untrusted).map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)))
+                Some(
+                    crate::trust::TrustedError::of(&untrusted, &work.strata)
+                        .map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)),
+                )
             } else {
                 record.trusted.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0)
             };
@@ -507,11 +519,12 @@ impl<'a> Cycle<'a> {
             }
             if self.options.verify_points > 0 {
                 let per_cell = self.options.verify_points.div_ceil(cells.iter().product());
-                let unit = audit::stratified_points(cells, per_cell, scene.seed, 2 * self.frame + 1);
+                let strata = Strata::even(cells, per_cell as u32);
+                let unit = audit::stratified_points(&strata, scene.seed, 2 * self.frame + 1);
                 let interruptible = Interruptible::new(tracer, self.stop);
                 let verified = self.threads.render.install(|| {
                     let fresh = audit::trace(&interruptible, &unit, false);
-                    audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &gate)
+                    audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &strata, &gate)
                 });
                 // Cut short by a stop it would stand on the points that come first.
                 record.verified = verified.filter(|_| !self.stop.load(Ordering::Relaxed));
@@ -519,7 +532,7 @@ impl<'a> Cycle<'a> {
             let some = every(&work.samples, work.samples.len().div_ceil(RENDER_RESIDUALS).max(1));
             let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
             self.trust.decay();
-            self.trust.observe(audited, &rendered);
+            self.trust.observe(audited, &work.strata, &rendered);
             self.ring.push(&work.samples);
             self.ring.push(&work.audit.samples);
         }
@@ -571,6 +584,7 @@ struct Rendered {
     tally: super::answers::Tally,
     samples: Samples,
     audit: audit::Audit,
+    strata: Strata,
     residuals: Option<Vec<crate::trust::Residual>>,
     render_seconds: f64,
     audit_seconds: f64,
@@ -646,7 +660,7 @@ fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, E
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
-        let unit = audit::stratified_points([PROBES, PROBES, z], 1, file.seed, u64::MAX);
+        let unit = audit::stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
         let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
         let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {

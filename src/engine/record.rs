@@ -40,6 +40,9 @@ pub struct FrameRecord {
     pub over_tolerance: Option<f64>,
     /// Error measured on audit points of the trusted region; none when nothing is trusted.
     pub trusted: Option<TrustedError>,
+    /// PSNR in decibels of the surrogate alone over the whole domain, trusted or not, on the audit points; peak: their largest traced
+    /// log-stretch. None for `reference`.
+    pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
     pub trusted_share: f64,
     /// The same error measured on fresh points with the same weights after the frame (`--verify`).

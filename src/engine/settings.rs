@@ -205,6 +205,8 @@ fn check_trust(t: &TrustSettings) -> Result<(), Refused> {
     positive("trust.tolerance", t.tolerance)?;
     require((0.01..=1.0).contains(&t.audit_share), "trust.audit_share", t.audit_share, "a number from 0.01 to 1")?;
     count("trust.audit_per_cell", t.audit_per_cell, 1, 4096)?;
+    count("trust.audit_most_per_cell", t.audit_most_per_cell, 1, 65_536)?;
+    require((0.001..=1.0).contains(&t.audit_precision), "trust.audit_precision", t.audit_precision, "a number from 0.001 to 1")?;
     require((4.0..=4096.0).contains(&t.min_samples), "trust.min_samples", t.min_samples, "a number from 4 to 4096")?;
     require(t.slide_inflation.is_finite() && t.slide_inflation >= 1.0, "trust.slide_inflation", t.slide_inflation, "a number from 1 up")?;
     if let Some(seconds) = t.trace_budget {
