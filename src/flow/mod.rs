@@ -17,6 +17,7 @@ mod rk4;
 mod sampler;
 mod settings;
 mod sphere;
+mod stencil;
 mod steps;
 mod stretch;
 mod tracer;
@@ -149,6 +150,23 @@ pub struct FlowMap {
     pub normalisation: Normalisation,
     /// Interpolation of gridded velocity.
     pub interpolation: Interpolation,
+}
+
+impl FlowMap {
+    /// The production path with so many steps over `tau`: forward, tangent flow in single precision, unbounded, linear interpolation.
+    pub fn tangent(tau: f64, steps: usize) -> Self {
+        Self {
+            tau,
+            direction: Direction::Forward,
+            integrator: Integrator::Tangent,
+            precision: Precision::F32,
+            steps: Steps::Fixed(steps),
+            gap: 1e-4,
+            boundary: Boundary::Unbounded,
+            normalisation: Normalisation::Tau,
+            interpolation: Interpolation::Linear,
+        }
+    }
 }
 
 /// The velocity that is integrated.
