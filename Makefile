@@ -1,5 +1,6 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
-# make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/)
+# make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/); what needs real archives runs where they are
+# make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
@@ -9,7 +10,10 @@ NVRTC := target/nvrtc
 NVRTC_VERSION := 13.0.88
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-.PHONY: all demo test packages build check bench gpu-check clean
+# The collection of real archives that tests/netcdf_real.rs reads.
+RIDGEWATCH_DATA ?= $(abspath ../shared/data)
+
+.PHONY: all demo test test-data packages build check bench gpu-check clean
 
 all: build
 
@@ -35,6 +39,11 @@ demo: build
 test: packages $(NVRTC)/done
 	$(CARGO) test --release --workspace
 	LD_LIBRARY_PATH="$(CURDIR)/$(NVRTC)/nvidia/cu13/lib:$$LD_LIBRARY_PATH" $(CARGO) test --release --test kernels_compile -- --ignored
+	@if [ -d "$(RIDGEWATCH_DATA)" ]; then $(MAKE) --no-print-directory test-data; else \
+	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; fi
+
+test-data: packages
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test netcdf_real -- --ignored
 
 $(NVRTC)/done:
 	$(PYTHON) -m pip install -q --no-deps --target $(NVRTC) nvidia-cuda-nvrtc==$(NVRTC_VERSION)
