@@ -28,8 +28,6 @@ template <class R> struct AxisData {
 
 // A window on the device.
 template <class R> struct GridData {
-    // Addresses of the window's snapshots, oldest first.
-    const void* const* snapshots;
     uint32_t row, plane;
     AxisData<R> axes[3];
     // From stored velocities to state units per time.
@@ -43,9 +41,11 @@ template <class R> struct GridData {
     double middle;
 };
 
-// Times of one step's start, middle and end: between snapshots interval[i] and interval[i] + 1 with weight[i] of the latter.
+// Times of one step's start, middle and end: between two snapshots that follow one another, with weight[i] of the latter. Their addresses
+// are here, and not in a table of snapshots, so that a cell can be read without another load before it.
 template <class R> struct GridStep {
-    int interval[3];
+    const void* first[3];
+    const void* second[3];
     R weight[3];
 };
 
@@ -174,7 +174,7 @@ template <class Config, class Real> struct Sampler {
 
     // The cell last read. `first` and, in single precision, the change to the second snapshot; in double precision the second itself.
     struct Memory {
-        int interval = -1;
+        const void* snapshot = nullptr;
         uint32_t cell = 0;
         bool known_first = true, known_second = true;
         float first[KEPT][NC], second[KEPT][NC];
@@ -190,7 +190,6 @@ template <class Config, class Real> struct Sampler {
         p[1] = place<1>(x[1]);
         if constexpr (N == 3) p[2] = place<2>(x[2]);
     }
-    RW_FN const void* slot(int snapshot) const { return data.snapshots[snapshot]; }
 
     RW_FN void put(Memory& kept, int k, const void* first, const void* second, size_t index) const {
         const Node<Config> a = node_at<Config>(first, index), b = node_at<Config>(second, index);
@@ -211,11 +210,20 @@ template <class Config, class Real> struct Sampler {
             kept.known_second = kept.known_second && b.known;
         }
     }
-    // Reads the corners of a cell at both snapshots of an interval.
-    RW_FN void read(Memory& kept, int interval, const Place<R> (&p)[N]) const {
-        const void *first = slot(interval), *second = slot(interval + 1);
+    static constexpr size_t NODE = Config::STORAGE == F32 ? 16 : 8;
+
+    // Reads the corners of a cell at both snapshots.
+    RW_FN void read(Memory& kept, const void* first, const void* second, uint32_t cell, const Place<R> (&p)[N]) const {
         kept.known_first = kept.known_second = true;
-        if constexpr (!Config::CUBIC) {
+        if constexpr (!Config::CUBIC && Config::SEAM == 0) {
+            // Offsets from the first corner are the same for all threads, and that of the neighbour along x is a constant.
+            const char *a = static_cast<const char*>(first) + cell * NODE, *b = static_cast<const char*>(second) + cell * NODE;
+            RW_UNROLL for (int k = 0; k < KEPT; k += 2) {
+                const size_t offset = ((k & 2 ? size_t(data.row) : 0) + (k & 4 ? size_t(data.plane) : 0)) * NODE;
+                put(kept, k, a + offset, b + offset, 0);
+                put(kept, k + 1, a + offset, b + offset, 1);
+            }
+        } else if constexpr (!Config::CUBIC) {
             const int ex[2] = {p[0].cell, next_node<(Config::SEAM & 1) != 0>(data.axes[0], p[0].cell)};
             const int ey[2] = {p[1].cell, next_node<(Config::SEAM & 2) != 0>(data.axes[1], p[1].cell)};
             int ez[2] = {0, 0};
@@ -244,12 +252,12 @@ template <class Config, class Real> struct Sampler {
         // At a snapshot's own time the other one is not asked.
         return !Config::MARKS || ((kept.known_first || weight == R(1)) && (kept.known_second || weight == R(0)));
     }
-    RW_FN void visit(Memory& kept, int interval, const Place<R> (&p)[N]) const {
+    RW_FN void visit(Memory& kept, const Step& step, int stage, const Place<R> (&p)[N]) const {
         const uint32_t cell = flat(p);
-        if (!Config::KEEP || cell != kept.cell || interval != kept.interval) {
-            read(kept, interval, p);
+        if (!Config::KEEP || cell != kept.cell || step.first[stage] != kept.snapshot) {
+            read(kept, step.first[stage], step.second[stage], cell, p);
             kept.cell = cell;
-            kept.interval = interval;
+            kept.snapshot = step.first[stage];
         }
     }
     RW_FN R in_time(float first, float second, R weight) const {
@@ -266,7 +274,7 @@ template <class Config, class Real> struct Sampler {
         } else {
             Place<R> p[N];
             places(x, p);
-            visit(kept, step.interval[stage], p);
+            visit(kept, step, stage, p);
             const R weight = step.weight[stage];
             if constexpr (Config::CUBIC) {
                 const Stencil<R> sx = stencil<(Config::EVEN & 1) != 0, (Config::SEAM & 1) != 0>(data.axes[0], p[0].cell, p[0].fraction);
@@ -303,7 +311,7 @@ template <class Config, class Real> struct Sampler {
         } else {
             Place<R> p[N];
             places(x, p);
-            visit(kept, step.interval[stage], p);
+            visit(kept, step, stage, p);
             const R weight = step.weight[stage];
             if constexpr (Config::CUBIC) {
                 const Stencil<R> sx = stencil<(Config::EVEN & 1) != 0, (Config::SEAM & 1) != 0>(data.axes[0], p[0].cell, p[0].fraction);
@@ -377,7 +385,7 @@ template <class Config, class Real> struct Sampler {
         const Stencil<R> sy = stencil<(Config::EVEN & 2) != 0, (Config::SEAM & 2) != 0>(data.axes[1], p[1].cell, p[1].fraction);
         const Stencil<R> sz = stencil<(Config::EVEN & 4) != 0, (Config::SEAM & 4) != 0>(data.axes[N - 1], p[N - 1].cell, p[N - 1].fraction);
         const R weight = step.weight[stage];
-        const void *first = slot(step.interval[stage]), *second = slot(step.interval[stage] + 1);
+        const void *first = step.first[stage], *second = step.second[stage];
         bool known_first = true, known_second = true;
         R v[NC] = {}, d[3][NC] = {};
         for (int z = 0; z < 4; z++) {

@@ -1,25 +1,23 @@
-//! Real archives, where they are at hand (`RIDGEWATCH_DATA`, by default `../shared/data`).
+//! Real archives (`RIDGEWATCH_DATA`, by default `../shared/data`): `make test-data`.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
 use ridgewatch::field::Geometry;
 use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, inspect};
 use std::path::{Path, PathBuf};
 
-/// A file of the collection; says in one line when it is not there.
-fn data(name: &str) -> Option<PathBuf> {
+/// A file of the collection, which must be there: `make test` leaves these tests out, and says so, where it is not.
+fn data(name: &str) -> PathBuf {
     let root =
         std::env::var_os("RIDGEWATCH_DATA").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
     let path = root.join(name);
-    if !path.exists() {
-        println!("skipped: {} is not there", path.display());
-        return None;
-    }
-    Some(path)
+    assert!(path.exists(), "{} is not there; set RIDGEWATCH_DATA to the folder of the collection", path.display());
+    path
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn globcurrent() {
-    let Some(folder) = data("globcurrent") else { return };
+    let folder = data("globcurrent");
     let mut archive = NetCdfArchive::open(&[folder.join("*.nc")], &NetCdfSettings::default()).unwrap();
     let grid = archive.grid().clone();
     assert_eq!((grid.shape(), archive.times().len()), ([81, 41, 1], 60));
@@ -37,8 +35,9 @@ fn globcurrent() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn era5_on_a_projected_grid() {
-    let Some(first) = data("era5_utm32_2025_05_01_00.nc") else { return };
+    let first = data("era5_utm32_2025_05_01_00.nc");
     let pattern = first.with_file_name("era5_utm32_*.nc");
     let mut archive = NetCdfArchive::open(std::slice::from_ref(&pattern), &NetCdfSettings::default()).unwrap();
     assert_eq!((archive.grid().shape(), archive.times().len()), ([17, 30, 37], 3));
@@ -50,14 +49,14 @@ fn era5_on_a_projected_grid() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn what_is_not_read_yet_is_said() {
     for (name, pieces) in [
         ("wrf_katrina_uvw_4t.nc", &["west_east_stag", "staggered"][..]),
         ("jhtdb_iso1024coarse_pressure_64.h5", &["HDF5 archives are not read yet"]),
         ("jhtdb_legacy_cutout_10x10.h5", &["HDF5 archives are not read yet"]),
     ] {
-        let Some(file) = data(name) else { continue };
-        let message = NetCdfArchive::open(&[file], &NetCdfSettings::default()).err().unwrap().to_string();
+        let message = NetCdfArchive::open(&[data(name)], &NetCdfSettings::default()).err().unwrap().to_string();
         for piece in pieces.iter().chain([&name]) {
             assert!(message.contains(piece), "{message}");
         }

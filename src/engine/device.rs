@@ -4,6 +4,7 @@ use super::EngineError;
 #[cfg(feature = "cuda")]
 use super::cuda::{CudaTracer, CudaTracerError, DeviceError, Gpu, GpuSettings, SnapshotStore, Tuning};
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use crate::setting::{Refused, require};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -90,6 +91,14 @@ pub struct DeviceSettings {
     pub when_lost: WhenLost,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
+}
+
+impl DeviceSettings {
+    /// Checks ranges.
+    pub fn check(&self) -> Result<(), Refused> {
+        let fits = self.memory_mib.is_none_or(|mib| (1..=1 << 24).contains(&mib));
+        require(fits, "device.memory_mib", self.memory_mib, "a whole number from 1 to 16777216")
+    }
 }
 
 /// A device, opened.

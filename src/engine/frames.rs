@@ -11,7 +11,7 @@ use std::sync::atomic::AtomicBool;
 /// Makes the films of a run.
 pub(super) trait FrameRenderer: Send + Sync {
     /// Renders samples 0 to `samples` of every pixel. `answers`, which ask `tracer`, answer the queries, or at least are told how many were
-    /// answered.
+    /// answered. Setting `stop` ends the frame after the wave in progress.
     fn render(
         &mut self,
         renderer: &mut Renderer,
@@ -20,6 +20,7 @@ pub(super) trait FrameRenderer: Send + Sync {
         tracer: &dyn Tracer,
         answers: &mut Answers<'_>,
         progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError>;
 }
 
@@ -50,8 +51,9 @@ impl FrameRenderer for OnCpu {
         _: &dyn Tracer,
         answers: &mut Answers<'_>,
         progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
-        Ok(renderer.render(picture, answers, samples, progress, &AtomicBool::new(false))?)
+        Ok(renderer.render(picture, answers, samples, progress, stop)?)
     }
 }
 
@@ -69,12 +71,15 @@ impl FrameRenderer for OnGpu {
         tracer: &dyn Tracer,
         answers: &mut Answers<'_>,
         progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
         let on_device = tracer.as_any().and_then(|any| any.downcast_ref::<CudaTracer>());
         // Which seeds lie on land is known on the host alone.
-        if let Some(traced) = on_device.filter(|t| !t.meets_land() && t.device().gpu().failure().is_none() && answers.only_traces()) {
+        if let Some(traced) =
+            on_device.filter(|t| !t.device().meets_land() && t.device().gpu().failure().is_none() && answers.only_traces())
+        {
             let end = u32::try_from(samples).unwrap_or(u32::MAX);
-            match self.0.render_samples(renderer, picture, 0..end, &Traced(traced.device()), progress, &AtomicBool::new(false)) {
+            match self.0.render_samples(renderer, picture, 0..end, &Traced(traced.device()), progress, stop) {
                 Ok((film, stats)) => {
                     answers.answered_elsewhere(&stats);
                     return Ok((film, stats));
@@ -84,6 +89,6 @@ impl FrameRenderer for OnGpu {
                 Err(error) => return Err(error),
             }
         }
-        OnCpu.render(renderer, picture, samples, tracer, answers, progress)
+        OnCpu.render(renderer, picture, samples, tracer, answers, progress, stop)
     }
 }

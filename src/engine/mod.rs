@@ -1,6 +1,6 @@
 //! The work on a device, and the cycle that drives it.
 //!
-//! In: a scene. Out: frames with their records. Calls every room but `publish`.
+//! In: [`Settings`]. Out: frames with their records. Calls `field`, `source`, `flow`, `surrogate`, `trust` and `render`.
 
 mod answers;
 mod audit;
@@ -12,7 +12,9 @@ mod error;
 mod feed;
 mod frames;
 mod record;
+mod settings;
 mod setup;
+mod stop;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
@@ -22,6 +24,7 @@ pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, W
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};
+pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
 
 /// A finished frame on its way out.

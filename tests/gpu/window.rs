@@ -9,7 +9,8 @@ use std::sync::Arc;
 #[test]
 #[ignore = "needs a GPU"]
 fn a_slide_brings_only_what_is_new() {
-    let gpu = gpu();
+    // A handle of its own, so that no other test's memory counts.
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
     let store = SnapshotStore::new(&gpu);
     let grid = cartesian(even(&[40, 30, 20]));
     let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 12) };

@@ -100,7 +100,6 @@ impl GridArguments {
         let (sine, cosine) = middle.to_radians().sin_cos();
         let real = R::from_f64;
         let data = GridData {
-            snapshots: put(bytes_of(&nodes.addresses))?,
             row: nx as u32,
             plane: (nx * ny) as u32,
             axes: [axes[0], axes[1], axes[2]],
@@ -113,7 +112,14 @@ impl GridArguments {
             turn: [real(cosine), real(sine)],
             middle,
         };
-        let stages = stages::<R>(times, span.0, span.1, steps);
+        let stages: Vec<GridStep<R>> = stages(times, span.0, span.1, steps)
+            .into_iter()
+            .map(|step| GridStep {
+                first: step.map(|(interval, _)| nodes.addresses[interval]),
+                second: step.map(|(interval, _)| nodes.addresses[interval + 1]),
+                weight: step.map(|(_, weight)| real(weight)),
+            })
+            .collect();
         let steps = put(bytes_of(&stages))?;
         let one = R::from_f64(1.0);
         let scaled = data.rate[..if sphere { 3 } else { grid.dimensions() }].iter().any(|r| *r != one);
@@ -145,49 +151,24 @@ fn bytes_of<T: Copy>(values: &[T]) -> &[u8] {
     unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), size_of_val(values)) }
 }
 
-/// The times of every step. Where a time is a snapshot's own, it is put into the interval of the step's middle, so that a kernel that
-/// keeps the current cell does not read another one for it.
-pub fn stages<R: Real>(times: &[f64], from: f64, to: f64, steps: usize) -> Vec<GridStep<R>> {
+/// For start, middle and end of every step: the interval between snapshots, and the weight of its later one. A snapshot's own time is put
+/// into the interval that the particle comes to next: the end of a step then reads the cell that the next one starts with.
+pub fn stages(times: &[f64], from: f64, to: f64, steps: usize) -> Vec<[(usize, f64); 3]> {
     let last = times.len() - 1;
-    // (first snapshot, weight of the next one); weight 0 at a snapshot's own time.
+    let forward = to > from;
     let place = |time: f64| -> (usize, f64) {
-        let first = times.partition_point(|&t| t <= time).clamp(1, last.max(1)) - 1;
-        if first >= last {
-            return (last, 0.0);
-        }
-        let weight = ((time - times[first]) / (times[first + 1] - times[first])).clamp(0.0, 1.0);
-        if weight > 1.0 - SAME_TIME {
-            (first + 1, 0.0)
-        } else if weight < SAME_TIME {
-            (first, 0.0)
+        let interval = times.partition_point(|&t| t <= time).clamp(1, last) - 1;
+        let weight = ((time - times[interval]) / (times[interval + 1] - times[interval])).clamp(0.0, 1.0);
+        if weight < SAME_TIME {
+            if forward || interval == 0 { (interval, 0.0) } else { (interval - 1, 1.0) }
+        } else if weight > 1.0 - SAME_TIME {
+            if forward && interval + 1 < last { (interval + 1, 0.0) } else { (interval, 1.0) }
         } else {
-            (first, weight)
+            (interval, weight)
         }
     };
     let halves = 2 * steps;
-    (0..steps)
-        .map(|n| {
-            let at: [(usize, f64); 3] = std::array::from_fn(|j| place(from + (to - from) * ((2 * n + j) as f64 / halves as f64)));
-            let middle = if at[1].1 > 0.0 {
-                at[1].0
-            } else {
-                // The step spans intervals: that of its start.
-                let back = at[0].0 < at[1].0;
-                if back && at[1].0 > 0 { at[1].0 - 1 } else { at[1].0.min(last - 1) }
-            };
-            let mut step = GridStep { interval: [0; 3], weight: [R::from_f64(0.0); 3] };
-            for (j, (first, weight)) in at.into_iter().enumerate() {
-                let (interval, weight) = match (first, weight) {
-                    (first, weight) if weight > 0.0 => (first, weight),
-                    (first, _) if first == middle + 1 || first == last => (first - 1, 1.0),
-                    (first, _) => (first, 0.0),
-                };
-                step.interval[j] = interval as i32;
-                step.weight[j] = R::from_f64(weight);
-            }
-            step
-        })
-        .collect()
+    (0..steps).map(|n| std::array::from_fn(|j| place(from + (to - from) * ((2 * n + j) as f64 / halves as f64)))).collect()
 }
 
 #[cfg(test)]
@@ -195,13 +176,15 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_step_within_an_interval_stays_in_it() {
+    fn the_end_of_a_step_is_the_start_of_the_next() {
         let times = [0.0, 1.0, 2.0, 3.0];
         for (from, to) in [(0.0, 3.0), (3.0, 0.0)] {
-            for steps in [3, 6, 12] {
-                for step in stages::<f64>(&times, from, to, steps) {
-                    assert!(step.interval.iter().all(|i| *i == step.interval[0]), "{from} {to} {steps}: {step:?}");
-                }
+            for steps in [1, 3, 6, 12] {
+                let stages = stages(&times, from, to, steps);
+                assert!(stages.windows(2).all(|pair| pair[0][2] == pair[1][0]), "{from} {to} {steps}: {stages:?}");
+                // One change an interval, and none at the end, where there is nothing to come.
+                let changes = stages.iter().filter(|step| step[0].0 != step[2].0).count();
+                assert!(steps < 3 || changes == 2, "{from} {to} {steps}: {changes}");
             }
         }
     }
@@ -211,10 +194,9 @@ mod tests {
         let times = [0.0, 0.5, 2.0, 2.25, 5.0];
         for (from, to) in [(0.2, 4.9), (5.0, 0.0), (0.0, 5.0)] {
             for steps in [1, 2, 3, 7, 10] {
-                for (n, step) in stages::<f64>(&times, from, to, steps).iter().enumerate() {
-                    for j in 0..3 {
+                for (n, step) in stages(&times, from, to, steps).iter().enumerate() {
+                    for (j, &(i, w)) in step.iter().enumerate() {
                         let time = from + (to - from) * ((2 * n + j) as f64 / (2 * steps) as f64);
-                        let (i, w) = (step.interval[j] as usize, step.weight[j]);
                         let met = times[i] * (1.0 - w) + times[i + 1] * w;
                         // Times within 1e-9 of an interval of at most 2.75 are taken as a snapshot's.
                         assert!((met - time).abs() < 3e-9, "{time} {met}");

@@ -36,7 +36,6 @@ pub struct AxisData<R> {
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct GridData<R> {
-    pub snapshots: u64,
     pub row: u32,
     pub plane: u32,
     pub axes: [AxisData<R>; 3],
@@ -54,7 +53,8 @@ pub struct GridData<R> {
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct GridStep<R> {
-    pub interval: [i32; 3],
+    pub first: [u64; 3],
+    pub second: [u64; 3],
     pub weight: [R; 3],
 }
 
@@ -144,8 +144,8 @@ mod tests {
     fn sizes_are_those_of_cpp() {
         // As nvcc and g++ lay them out (static_asserts in tests/kernels_host.cpp hold the other side).
         assert_eq!((size_of::<AxisData<f32>>(), size_of::<AxisData<f64>>()), (64, 80));
-        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (312, 456));
-        assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (24, 40));
+        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (304, 448));
+        assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
         assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (48, 40, 12));
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
     }

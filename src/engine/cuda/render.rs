@@ -212,8 +212,8 @@ impl GpuRenderer {
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
         let settings = &renderer.scene().settings;
-        let mut film = Film::new(settings.width, settings.height);
-        let pixels = film.samples.len();
+        let (width, height) = (settings.width, settings.height);
+        let pixels = width * height;
         let setup = renderer.set_up(frame, samples.clone())?;
         let count = samples.end - samples.start;
         self.timeline = Timeline::default();
@@ -221,26 +221,36 @@ impl GpuRenderer {
         self.reserve(plan)?.begin_frame(setup.majorants, setup.may_miss)?;
         let parameters = setup.parameters;
         let mut stats = RenderStats::default();
+        let band = |first: usize| BandArgument {
+            first_pixel: first as u32,
+            pixels: plan.band.min((pixels - first) as u32),
+            parts: plan.parts,
+            first_sample: samples.start,
+            samples: count,
+            pad: 0,
+        };
+        let paths = pixels as f64 * f64::from(count);
+        let report = |done: u64| {
+            if let Some(progress) = progress {
+                progress((done as f64 / paths) as f32);
+            }
+        };
+        // The film's memory is made ready while the device works on the first band.
+        let (tracked, film) = std::thread::scope(|scope| {
+            let making = scope.spawn(|| Film::resident(width, height));
+            let tracked = self.band(&parameters, band(0), answers, &report, stop);
+            (tracked, making.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+        });
+        let (mut film, mut stopped) = (film, tracked?);
         for first in (0..pixels).step_by(plan.band as usize) {
-            let band = BandArgument {
-                first_pixel: first as u32,
-                pixels: plan.band.min((pixels - first) as u32),
-                parts: plan.parts,
-                first_sample: samples.start,
-                samples: count,
-                pad: 0,
-            };
-            let paths = pixels as f64 * f64::from(count);
-            let report = |done: u64| {
-                if let Some(progress) = progress {
-                    progress((done as f64 / paths) as f32);
-                }
-            };
-            if self.band(&parameters, band, answers, &report, stop)? {
+            if first > 0 {
+                stopped = self.band(&parameters, band(first), answers, &report, stop)?;
+            }
+            if stopped {
                 stats.stopped = true;
                 break;
             }
-            self.read_film(&parameters, band, &mut film)?;
+            self.read_film(&parameters, band(first), &mut film)?;
         }
         let seen = self.end_frame(&mut stats)?;
         // The grid cannot have changed: the renderer was borrowed all the while.

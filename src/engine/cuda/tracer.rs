@@ -28,7 +28,6 @@ pub struct CudaTracer {
     device: DeviceTracer,
     host: Box<dyn Tracer>,
     double: bool,
-    land: bool,
     /// One call at a time.
     room: Mutex<Option<Room>>,
 }
@@ -59,19 +58,13 @@ impl CudaTracer {
         tuning: Tuning,
     ) -> Result<Self, CudaTracerError> {
         let host = cpu_tracer(source.clone(), map, t0)?;
-        let land = matches!(&source, VelocitySource::Window(window) if window.snapshots().any(|s| s.missing() > 0));
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
-        Ok(Self { device, host, double: map.precision == Precision::F64, land, room: Mutex::new(None) })
+        Ok(Self { device, host, double: map.precision == Precision::F64, room: Mutex::new(None) })
     }
 
     /// The device's side, for callers whose seeds are there.
     pub fn device(&self) -> &DeviceTracer {
         &self.device
-    }
-
-    /// Whether some velocity of the window is missing, so that seeds may lie on land.
-    pub fn meets_land(&self) -> bool {
-        self.land
     }
 
     fn on_device(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
