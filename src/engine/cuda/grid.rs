@@ -4,7 +4,6 @@ use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
 use super::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
 use crate::flow::{AxisMap, Boundary, FlowMap, Integrator, Interpolation};
-use crate::simd::Real;
 
 /// What a kernel for a window is launched with.
 #[derive(Debug)]

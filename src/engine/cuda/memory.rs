@@ -65,7 +65,7 @@ impl<T: DeviceRepr> Buffer<T> {
     pub(super) fn new(stream: &Arc<CudaStream>, budget: &Arc<Budget>, what: &str, len: usize) -> Result<Self, DeviceError> {
         // An empty buffer still has an address.
         let len = len.max(1);
-        let bytes = (len as u64).checked_mul(size_of::<T>() as u64).unwrap_or(u64::MAX);
+        let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         budget.take(what, bytes)?;
         // SAFETY: the memory is unset; whoever reads it has written it before (each kernel says what it writes).
         let slice = unsafe { stream.alloc(len) }.map_err(|error| {
