@@ -11,6 +11,7 @@ mod record;
 mod settings;
 mod setup;
 mod stop;
+mod training;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
