@@ -168,6 +168,11 @@ fn method(word: &str) -> Result<Method, String> {
         .map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
 }
 
+/// A number of seconds above 0.
+fn seconds(word: &str) -> Result<f64, String> {
+    word.parse().ok().filter(|s: &f64| s.is_finite() && *s > 0.0).ok_or_else(|| "accepted: a number above 0".to_owned())
+}
+
 /// Runs `work` on a pool of `--threads` threads.
 fn on_threads<T: Send>(common: &Common, work: impl FnOnce() -> T + Send) -> Result<T> {
     Ok(rayon::ThreadPoolBuilder::new().num_threads(common.threads).build()?.install(work))

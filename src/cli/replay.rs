@@ -34,6 +34,9 @@ pub struct Options {
     /// Checks each frame's stated error on N fresh points afterwards and records that too.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
+    /// Begins no further frame after N seconds of wall clock.
+    #[arg(long, value_name = "N", value_parser = super::seconds)]
+    seconds: Option<f64>,
     /// Writes the trained surrogate here at the end.
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
@@ -82,6 +85,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     }
     let run_options = RunOptions {
         verify_points: options.verify as usize,
+        seconds: options.seconds,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
         ..RunOptions::default()

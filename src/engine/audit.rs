@@ -78,10 +78,9 @@ pub fn trusted_error(residuals: &[Residual], strata: &Strata, gate: &Gate) -> Op
     TrustedError::of(&trusted, strata)
 }
 
-/// PSNR in decibels of the surrogate's log-stretch over the points of `residuals`; peak: the largest traced value. None where it has
-/// no finite value.
-pub fn psnr(residuals: &[Residual], traced: &Samples, strata: &Strata) -> Option<f64> {
-    let peak = traced.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max);
+/// PSNR in decibels of the surrogate's log-stretch over the points of `residuals`, for the largest traced value `peak`. None where
+/// either has no finite value.
+pub fn psnr(residuals: &[Residual], peak: f32, strata: &Strata) -> Option<f64> {
     let error = TrustedError::of(residuals, strata)?.log_stretch_rms;
     Some(20.0 * (f64::from(peak) / error).log10()).filter(|psnr| psnr.is_finite())
 }

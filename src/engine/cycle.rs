@@ -8,7 +8,7 @@ use super::audit;
 use super::feed::{Feed, Slide};
 use super::setup::{Plan, Setup, assemble};
 use super::stop::{Halt, Interruptible, heed};
-use super::training::{Threads, train};
+use super::training::{Threads, Until, train};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
 use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
@@ -25,6 +25,8 @@ use std::time::Instant;
 pub struct RunOptions {
     /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
     pub verify_points: usize,
+    /// Wall-clock seconds after which no further frame is begun.
+    pub seconds: Option<f64>,
     /// Worker threads; 0: all that the process may use.
     pub threads: usize,
     /// Where to write the trained surrogate at the end.
@@ -105,6 +107,9 @@ struct Cycle<'a> {
     report: &'a mut RunReport,
     /// Set from outside when the run should end.
     stop: &'a AtomicBool,
+    /// Largest log-stretch that audit points of this slide have met.
+    peak: f32,
+    began: Instant,
 }
 
 /// Where a frame stands in the run.
@@ -127,7 +132,7 @@ const WARMUP_PICTURES: u64 = 1 << 40;
 pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
     let mut report = RunReport::default();
     match drive(setup, options, sink, stop, &mut report) {
-        Ok(()) => {}
+        Ok(()) | Err(Halt::TimeIsUp) => {}
         Err(Halt::Stopped) => report.interrupted = true,
         Err(Halt::Failed(error)) => return Err(error),
     }
@@ -141,6 +146,7 @@ fn drive(
     stop: &AtomicBool,
     report: &mut RunReport,
 ) -> Result<(), Halt> {
+    let began = Instant::now();
     let Setup { plan, mut feed, slides, notes } = setup;
     let time = &plan.scene.time;
     let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
@@ -157,7 +163,7 @@ fn drive(
         Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
         None => plan.map.clone(),
     };
-    let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, stop, report)?;
+    let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
     let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| cycle.later_slides(&mut feed, &map, sink));
     // What was learned is kept whether or not the run was stopped.
     match ended {
@@ -173,6 +179,7 @@ impl<'a> Cycle<'a> {
         threads: Threads,
         tracer: &dyn Tracer,
         first: &Slide,
+        began: Instant,
         stop: &'a AtomicBool,
         report: &'a mut RunReport,
     ) -> Result<Self, Halt> {
@@ -222,6 +229,8 @@ impl<'a> Cycle<'a> {
             pictures: 0,
             report,
             stop,
+            peak: f32::NEG_INFINITY,
+            began,
         })
     }
 
@@ -282,6 +291,9 @@ impl<'a> Cycle<'a> {
             let frame = self.frame(tracer, slide, place, sink)?;
             sink(Event::Frame(frame));
             heed(self.stop)?;
+            if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
+                return Err(Halt::TimeIsUp);
+            }
         }
         Ok(())
     }
@@ -303,6 +315,7 @@ impl<'a> Cycle<'a> {
     /// again.
     fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let tracer = Interruptible::new(tracer, self.stop);
+        self.peak = f32::NEG_INFINITY;
         let resized = self.resized(&tracer)?;
         if let Some(live) = &mut self.live {
             if !resized {
@@ -412,15 +425,20 @@ impl<'a> Cycle<'a> {
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
-            let (renderer, trust, frame, seed) = (&mut self.renderer, &self.trust, self.frame, scene.seed);
-            let stop = self.stop;
+            let (renderer, trust, frame, seed, stop) = (&mut self.renderer, &self.trust, self.frame, scene.seed, self.stop);
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
                     match &threads.train {
-                        Some(pool) => Trainer::Beside(
-                            scope.spawn(move || pool.install(|| train(&mut **live, ring.samples(), settings, Some(rendered), stop))),
-                        ),
+                        Some([beside, all]) => Trainer::Beside(scope.spawn(move || {
+                            let learned = beside.install(|| train(&mut **live, ring.samples(), settings, Until::Rendered(rendered), stop));
+                            let left = settings.seconds_per_frame - learned.seconds;
+                            if settings.steps_per_frame.is_some() || left <= 0.0 {
+                                return learned;
+                            }
+                            // The picture is done: its threads are free.
+                            learned.and(all.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(left), stop)))
+                        })),
                         None => Trainer::After(live, ring),
                     }
                 });
@@ -472,9 +490,9 @@ impl<'a> Cycle<'a> {
                 rendered.store(true, Ordering::Release);
                 learned = match training {
                     Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
-                    Some(Trainer::After(live, ring)) => {
-                        Some(threads.render.install(|| train(&mut **live, ring.samples(), &scene.training, None, stop)))
-                    }
+                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| {
+                        train(&mut **live, ring.samples(), &scene.training, Until::Seconds(scene.training.seconds_per_frame), stop)
+                    })),
                     None => None,
                 };
             });
@@ -514,7 +532,8 @@ impl<'a> Cycle<'a> {
         if let (Some(front), Some(audited)) = (front.as_deref(), &work.residuals) {
             record.trusted_share = gate.share();
             record.trusted = audit::trusted_error(audited, &work.strata, &gate);
-            record.surrogate_psnr = audit::psnr(audited, &work.audit.samples, &work.strata).filter(|decibels| decibels.is_finite());
+            self.peak = work.audit.samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(self.peak, f32::max);
+            record.surrogate_psnr = audit::psnr(audited, self.peak, &work.strata);
             record.over_tolerance = if work.tally.over_budget > 0 {
                 // The surrogate answered where it is not trusted: the points there speak for that, and the frame is flagged whatever they say.
                 let untrusted: Vec<_> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
@@ -575,6 +594,7 @@ impl<'a> Cycle<'a> {
             audit: work.audit_seconds + auditing.elapsed().as_secs_f64(),
             train: train_seconds,
             total: start.elapsed().as_secs_f64(),
+            elapsed: self.began.elapsed().as_secs_f64(),
         };
         if let VelocitySource::Window(window) = &slide.velocity {
             self.report.window_bytes = self.report.window_bytes.max(window.bytes());

@@ -42,6 +42,7 @@ pub struct FrameRecord {
     pub trusted: Option<TrustedError>,
     /// PSNR in decibels of the surrogate alone over the whole domain, trusted or not, on the audit points; peak: their largest traced
     /// log-stretch. None for `reference`.
+    #[serde(default)]
     pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
     pub trusted_share: f64,
@@ -88,4 +89,7 @@ pub struct StageSeconds {
     pub train: f64,
     /// The frame, without `waiting` and `slide`.
     pub total: f64,
+    /// Since the run began, reading and preparing included.
+    #[serde(default)]
+    pub elapsed: f64,
 }

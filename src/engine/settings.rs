@@ -185,7 +185,7 @@ pub struct TrainingSettings {
 
 impl Default for TrainingSettings {
     fn default() -> Self {
-        Self { share: 0.5, seconds_per_frame: 1.0, steps_per_frame: None, ring: 1 << 20, resume: None }
+        Self { share: 0.5, seconds_per_frame: 1.0, steps_per_frame: None, ring: 1 << 22, resume: None }
     }
 }
 

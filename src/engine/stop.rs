@@ -9,6 +9,8 @@ use std::time::Instant;
 
 /// Why preparing did not come to its end.
 pub(super) enum Halt {
+    /// The run's own time is over.
+    TimeIsUp,
     /// Somebody asked for it.
     Stopped,
     /// It failed.

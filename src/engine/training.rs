@@ -9,7 +9,8 @@ use std::time::Instant;
 /// The pools of a run.
 pub(super) struct Threads {
     pub(super) render: rayon::ThreadPool,
-    pub(super) train: Option<rayon::ThreadPool>,
+    /// Trains while the frame is rendered, and the pool of all threads that goes on when it is.
+    pub(super) train: Option<[rayon::ThreadPool; 2]>,
 }
 
 impl Threads {
@@ -25,16 +26,26 @@ impl Threads {
             return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None });
         }
         let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
-        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pool(train, "ridgewatch-train")?) })
+        let pools = [pool(train, "ridgewatch-train")?, pool(all, "ridgewatch-all")?];
+        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools) })
     }
 }
 
-/// Trains in slices until the frame is rendered and the frame's share of training is done, or a stop is asked for.
+/// When a share of a frame's training ends, unless the number of steps is given.
+#[derive(Clone, Copy)]
+pub(super) enum Until<'a> {
+    /// When the frame is rendered.
+    Rendered(&'a AtomicBool),
+    /// After so many seconds.
+    Seconds(f64),
+}
+
+/// Trains in slices until the end is reached or the run is to stop.
 pub(super) fn train(
     live: &mut dyn Surrogate,
     samples: &Samples,
     settings: &TrainingSettings,
-    rendered: Option<&AtomicBool>,
+    until: Until<'_>,
     stop: &AtomicBool,
 ) -> Learned {
     const SLICE: f64 = 0.1;
@@ -48,11 +59,15 @@ pub(super) fn train(
             Some(steps) if sum.steps >= steps => break,
             Some(steps) => (f64::INFINITY, (steps - sum.steps).min(SLICE_STEPS)),
             None => {
-                let left = settings.seconds_per_frame - start.elapsed().as_secs_f64();
-                if left <= 0.0 && rendered.is_none_or(|done| done.load(Ordering::Acquire)) {
+                let left = match until {
+                    Until::Rendered(done) if done.load(Ordering::Acquire) => break,
+                    Until::Rendered(_) => SLICE,
+                    Until::Seconds(seconds) => seconds - start.elapsed().as_secs_f64(),
+                };
+                if left <= 0.0 {
                     break;
                 }
-                (if rendered.is_some() { SLICE } else { left.min(SLICE) }, u64::MAX)
+                (left.min(SLICE), u64::MAX)
             }
         };
         let slice = live.learn(samples, seconds, steps);

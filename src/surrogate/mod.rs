@@ -68,6 +68,24 @@ pub struct Learned {
     pub seconds: f64,
 }
 
+impl Learned {
+    /// Both together: counts and seconds add up, losses are averaged over their steps.
+    pub fn and(self, other: Learned) -> Learned {
+        let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.steps + l.lost_steps)));
+        let weight = (mine.1 + theirs.1) as f64;
+        let loss = mine.0 * mine.1 as f64 + theirs.0 * theirs.1 as f64;
+        Learned {
+            steps: self.steps + other.steps,
+            lost_steps: self.lost_steps + other.lost_steps,
+            samples: self.samples + other.samples,
+            loss: (weight > 0.0).then(|| loss / weight),
+            dropped: self.dropped + other.dropped,
+            rollbacks: self.rollbacks + other.rollbacks,
+            seconds: self.seconds + other.seconds,
+        }
+    }
+}
+
 /// Something that answers log-stretch queries and does not change: a surrogate, or what one was when it was frozen.
 pub trait Predict: Send + Sync {
     /// `table`, `network` or `residual`.
@@ -157,7 +175,7 @@ pub enum Kind {
 pub struct SurrogateSettings {
     /// Which kind.
     pub kind: Kind,
-    /// Nodes of the table along x, y, z (z ignored in two dimensions). None: the data's own nodes, at most 2^24 in all; for closed forms
+    /// Nodes of the table along x, y, z (z ignored in two dimensions). None: the data's own nodes, at most 2^21 in all; for closed forms
     /// 256 along the longest edge, or 128 below a network.
     pub table_nodes: Option<[usize; 3]>,
 }
@@ -170,8 +188,8 @@ impl Default for SurrogateSettings {
 
 /// Nodes along the longest edge of a table for which none are set, where no data say how many: alone, and below a network.
 const DEFAULT_NODES: [usize; 2] = [256, 128];
-/// Most nodes of a table that was given the data's own: 64 MiB of f32, and a minute of tracing where that is slow.
-const MOST_OWN_NODES: usize = 1 << 24;
+/// Most nodes of a table that was given the data's own: every slide traces them anew, which two cores do in some ten seconds.
+const MOST_OWN_NODES: usize = 1 << 21;
 /// Most nodes of a table: 4 GiB of f32.
 const MOST_NODES: usize = 1 << 30;
 
@@ -202,7 +220,7 @@ impl SurrogateSettings {
     }
 
     /// The same with the nodes of gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set; all axes are divided
-    /// alike where that would be more than 2^24 nodes.
+    /// alike where that would be more than 2^21 nodes.
     pub fn at_resolution_of(&self, shape: [usize; 3]) -> Self {
         let all: f64 = shape.iter().map(|&n| n as f64).product();
         let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
