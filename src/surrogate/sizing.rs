@@ -117,7 +117,7 @@ impl Sizing {
 }
 
 /// The settings at a size. A table starts with a quarter of the nodes that are set (or that the data have) and doubles them at every
-/// size, up to 2^24; the network starts small and ends at the scene's.
+/// size, up to those set or 2^21, whichever is more; the network starts small and ends at the scene's.
 fn at_size(
     settings: &SurrogateSettings,
     network: &NetworkSettings,
@@ -127,7 +127,7 @@ fn at_size(
 ) -> (SurrogateSettings, NetworkSettings) {
     let axes = dimensions.clamp(1, 3);
     let all: f64 = nodes[..axes].iter().map(|&n| n as f64).product();
-    let bound = (MOST_OWN_NODES as f64 / all).powf(1.0 / axes as f64);
+    let bound = (MOST_OWN_NODES as f64 / all).max(1.0).powf(1.0 / axes as f64);
     let growth = 2f64.powf((f64::from(size) - f64::from(PLAIN)) / axes as f64).min(bound);
     let mut sized = network.clone();
     sized.width = network.width.min(SMALLEST_WIDTH << size.div_ceil(2));
@@ -185,13 +185,13 @@ mod tests {
         assert_eq!((at(0).1.log2_table, at(0).1.width), (12, 16));
         assert_eq!((at(LARGEST).1.log2_table, at(LARGEST).1.width), (network.log2_table, network.width));
         let [x, y, _] = at_size(&SurrogateSettings::default(), &network, [4096, 2048, 2], 2, LARGEST).0.table_nodes.unwrap();
-        assert!(x * y <= MOST_OWN_NODES, "{x} x {y}");
+        assert_eq!([x, y], [4096, 2048], "beyond 2^21 nodes those that the scene sets are the most");
         let domain = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
         let most = |kind, width| {
             let network = NetworkSettings { width, log2_table: 14, ..NetworkSettings::default() };
             Sizing::new(&SurrogateSettings { kind, table_nodes: None }, &network, &domain).unwrap().most
         };
-        // 16 doubled twice, at every second size, and 2^12 entries doubled twice: nothing is tried that changes nothing.
-        assert_eq!((most(Kind::Network, 16), most(Kind::Network, 64), most(Kind::Table, 64)), (2, 3, 11));
+        // 2^12 entries are doubled twice; width 64 is reached at size 3; the plain table has 2^15 nodes. Nothing is tried that changes nothing.
+        assert_eq!((most(Kind::Network, 16), most(Kind::Network, 64), most(Kind::Table, 64)), (2, 3, PLAIN + MOST_OWN_NODES.ilog2() - 15));
     }
 }
