@@ -91,7 +91,7 @@ fn a_variable_that_the_file_lacks_points_at_its_line() {
     for part in ["scene.toml:5: `archive.u` is \"uo\"", "eddy.nc", "| u = \"uo\""] {
         assert!(said.contains(part), "{said:?} without {part:?}");
     }
-    let output = ridgewatch(&["inspect", &file.display().to_string(), "--set", "archive.v=vo"]);
+    let output = ridgewatch(&["ftle", &file.display().to_string(), "--set", "archive.v=vo"]);
     let said = String::from_utf8_lossy(&output.stderr);
     assert!(output.status.code() == Some(2) && said.contains("--set archive.v=vo: `archive.v`"), "{said}");
 }
@@ -158,4 +158,22 @@ fn adaptive_paths_have_no_number_of_steps() {
     succeeds(&[&["replay", &file, "--method", "reference", "--out", &run.display().to_string()][..], &SMALL, &set].concat());
     let records = records(&run);
     assert!(records.len() == 2 && records.iter().all(|record| record.integration_steps.is_none() && record.traced > 0));
+}
+
+#[test]
+fn a_size_left_to_the_measured_error_grows_and_says_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let set = ["--set", "network.size=auto", "--set", "surrogate.kind=table", "--set", "surrogate.table_nodes=[16, 8, 2]"];
+    succeeds(&[&["replay", &gyre(folder.path(), 24), "--out", &run.display().to_string()][..], &set].concat());
+    let summary: serde_json::Value = serde_json::from_slice(&std::fs::read(run.join("summary.json")).unwrap()).unwrap();
+    let sizes = summary["run"]["sizes"].as_array().unwrap();
+    // A quarter of 16 x 8 nodes cannot hold the double gyre's ridges within 0.03.
+    assert!(sizes.len() >= 2 && sizes.iter().all(|s| s.as_str().unwrap().contains("grow to size")), "{sizes:?}");
+    let records = records(&run);
+    let psnr = |record: &FrameRecord| record.surrogate_psnr.unwrap();
+    // Every doubling of the nodes lowers the error of linear interpolation; 3 dB are less than one of them.
+    assert!(psnr(&records[23]) > psnr(&records[0]) + 3.0, "{} against {} dB", psnr(&records[23]), psnr(&records[0]));
+    let output = ridgewatch(&["replay", &gyre(folder.path(), 1), "--resume", "w", "--set", "network.size=auto"]);
+    assert!(output.status.code() == Some(2) && String::from_utf8_lossy(&output.stderr).contains("network.size"));
 }

@@ -93,7 +93,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let Setup { plan, mut feed, notes, .. } = Setup::new(scene.settings()).map_err(faulty)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
-        super::render::check_folder(out)?;
+        super::check_folder(out)?;
     }
     let mut slide = None;
     for _ in 0..=options.slide {

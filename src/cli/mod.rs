@@ -8,7 +8,7 @@ pub mod messages;
 mod render;
 mod replay;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::engine::{Device, DeviceChoice, EngineError};
@@ -147,6 +147,14 @@ fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Result<
     if scene.surrogate.kind == Kind::Table {
         return refuse("a table is traced anew for every window and learns nothing; accepted with surrogate.kind network and residual");
     }
+    Ok(())
+}
+
+/// Fails before the work rather than after it.
+fn check_folder(out: &Path) -> Result<()> {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
     Ok(())
 }
 

@@ -1,11 +1,11 @@
 //! `ridgewatch render`.
 
-use super::{Common, Usage, check_learns, located, messages, print_json, print_text, scene};
+use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions, Setup};
 use ridgewatch::publish::write_exr;
 use ridgewatch::render::Method;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 /// Options of `render`.
@@ -90,13 +90,5 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         messages::note(warning);
     }
     print_text(format_args!("{}: {}", options.out.display(), super::replay::line(&frame.record)));
-    Ok(())
-}
-
-/// Fails before the work rather than after it.
-pub(super) fn check_folder(out: &Path) -> Result<()> {
-    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
     Ok(())
 }

@@ -73,7 +73,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
     let setup = Setup::new(scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
     let device = super::device(common, &scene)?;
     if let Some(checkpoint) = &options.checkpoint {
-        super::render::check_folder(checkpoint)?;
+        super::check_folder(checkpoint)?;
     }
     // Before anything is written: from here on a signal leaves a complete folder.
     let stop = Arc::new(AtomicBool::new(false));
@@ -188,6 +188,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,
         "surrogate_bytes": report.surrogate_bytes,
+        "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
         "time_resolution": report.time_resolution,
     }) else {

@@ -6,13 +6,14 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::{Feed, Slide};
-use super::settings::{Settings, TrainingSettings};
 use super::setup::{Plan, Setup, assemble};
 use super::stop::{Halt, Interruptible, heed};
+use super::training::{Threads, Until, train};
 use super::{Device, EngineError, Frame, FrameRecord, StageSeconds};
 use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer, Scene};
-use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
+use crate::surrogate::network::{Size, Target};
+use crate::surrogate::{Kind, Learned, Predict, Resize, SampleRing, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
 use crate::trust::{Gate, Strata, TrustMap};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -70,6 +71,8 @@ pub struct RunReport {
     pub integration_difference: Option<f64>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
+    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no size is tried in vain twice.
+    pub sizes: Vec<String>,
     /// Whether the snapshots are close enough in time; none for closed forms.
     pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
@@ -83,30 +86,6 @@ const KEEP_A_FRAME: usize = 4;
 /// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
 const RENDER_RESIDUALS: usize = 1 << 16;
 
-struct Threads {
-    render: rayon::ThreadPool,
-    /// Trains while the frame is rendered, and the pool of all threads that goes on when it is.
-    train: Option<[rayon::ThreadPool; 2]>,
-}
-
-impl Threads {
-    /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
-    fn new(threads: usize, scene: &Settings) -> Result<Self, EngineError> {
-        let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
-        let share = scene.training.share;
-        let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
-        let pool = |n: usize, name: &'static str| {
-            rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
-        };
-        if !learns || all == 1 || share == 0.0 {
-            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None });
-        }
-        let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
-        let pools = [pool(train, "ridgewatch-train")?, pool(all, "ridgewatch-all")?];
-        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools) })
-    }
-}
-
 /// The state that goes from frame to frame.
 struct Cycle<'a> {
     plan: &'a Plan,
@@ -116,6 +95,12 @@ struct Cycle<'a> {
     trust: TrustMap,
     ring: SampleRing,
     live: Option<Box<dyn Surrogate>>,
+    /// What it is built from, with the data's own nodes.
+    surrogate: SurrogateSettings,
+    /// Finds its size, with `size = "auto"`.
+    sizing: Option<Sizing>,
+    /// The size that the next frame should have.
+    resize: Option<Resize>,
     frame: u64,
     /// Points traced since the last frame to prepare the next.
     probed: u64,
@@ -213,10 +198,14 @@ impl<'a> Cycle<'a> {
         };
         let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
         let method = scene.render.method;
+        let mut sizing = None;
         let mut live = if method == Method::Reference {
             None
         } else {
-            Some(threads.render.install(|| crate::surrogate::build(&surrogate, &scene.network, &plan.domain, scene.seed, tracer))?)
+            if scene.network.size == Size::Auto {
+                sizing = Some(Sizing::new(&surrogate, &scene.network, &plan.domain)?);
+            }
+            Some(threads.render.install(|| build(plan, &surrogate, sizing.as_ref(), tracer))?)
         };
         heed(stop)?;
         if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
@@ -236,6 +225,9 @@ impl<'a> Cycle<'a> {
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
+            surrogate,
+            sizing,
+            resize: None,
             live,
             frame: 0,
             probed: 0,
@@ -299,6 +291,10 @@ impl<'a> Cycle<'a> {
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
             let place = Place { warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            if self.resized(&Interruptible::new(tracer, self.stop))? {
+                self.trust.reset();
+                self.probe(tracer, slide.index)?;
+            }
             let frame = self.frame(tracer, slide, place, sink)?;
             sink(Event::Frame(frame));
             heed(self.stop)?;
@@ -309,14 +305,30 @@ impl<'a> Cycle<'a> {
         Ok(())
     }
 
+    /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
+    fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
+        let Some(resize) = self.resize.take() else { return Ok(false) };
+        let built = self.threads.render.install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer));
+        heed(self.stop)?;
+        let live = built?;
+        let text = format!("frame {}: {} ({:.2} MB)", self.frame, resize.why, live.bytes() as f64 / 1e6);
+        tracing::info!("{text}");
+        self.report.sizes.push(text);
+        self.live = Some(live);
+        Ok(true)
+    }
+
     /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold, trust must be earned
     /// again.
     fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let tracer = Interruptible::new(tracer, self.stop);
         self.peak = f32::NEG_INFINITY;
+        let resized = self.resized(&tracer)?;
         if let Some(live) = &mut self.live {
-            self.threads.render.install(|| live.window_slid(&tracer));
-            heed(self.stop)?;
+            if !resized {
+                self.threads.render.install(|| live.window_slid(&tracer));
+                heed(self.stop)?;
+            }
             self.trust.window_slid();
             self.ring.mark_stale();
             let holding = self.threads.render.install(|| self.share_of_labels_that_hold(&tracer));
@@ -562,6 +574,11 @@ impl<'a> Cycle<'a> {
             let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
             self.trust.decay();
             self.trust.observe(audited, &work.strata, &rendered);
+            if let Some(sizing) = &mut self.sizing {
+                // Over the whole domain: where nothing is trusted, the size is what is to be blamed.
+                let everywhere = audit::trusted_error(audited, &work.strata, &Gate::uniform(true));
+                self.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, scene.trust.tolerance));
+            }
             self.ring.push(&work.samples);
             self.ring.push(&work.audit.samples);
         }
@@ -629,55 +646,17 @@ enum Trainer<'scope, 'b> {
     After(&'b mut Box<dyn Surrogate>, &'b SampleRing),
 }
 
-/// When a share of a frame's training ends, unless the number of steps is given.
-#[derive(Clone, Copy)]
-enum Until<'a> {
-    /// When the frame is rendered.
-    Rendered(&'a AtomicBool),
-    /// After so many seconds.
-    Seconds(f64),
-}
-
-/// Trains in slices until the end is reached or the run is to stop.
-fn train(live: &mut dyn Surrogate, samples: &Samples, settings: &TrainingSettings, until: Until<'_>, stop: &AtomicBool) -> Learned {
-    const SLICE: f64 = 0.1;
-    /// Steps of a slice where their number is given: wall clock must not decide anything then.
-    const SLICE_STEPS: u64 = 32;
-    let start = Instant::now();
-    let mut sum = Learned::default();
-    let mut losses = (0.0, 0.0);
-    while !stop.load(Ordering::Relaxed) {
-        let (seconds, steps) = match settings.steps_per_frame {
-            Some(steps) if sum.steps >= steps => break,
-            Some(steps) => (f64::INFINITY, (steps - sum.steps).min(SLICE_STEPS)),
-            None => {
-                let left = match until {
-                    Until::Rendered(done) if done.load(Ordering::Acquire) => break,
-                    Until::Rendered(_) => SLICE,
-                    Until::Seconds(seconds) => seconds - start.elapsed().as_secs_f64(),
-                };
-                if left <= 0.0 {
-                    break;
-                }
-                (left.min(SLICE), u64::MAX)
-            }
-        };
-        let slice = live.learn(samples, seconds, steps);
-        sum.dropped += slice.dropped;
-        sum.rollbacks += slice.rollbacks;
-        sum.lost_steps += slice.lost_steps;
-        if slice.steps == 0 {
-            break;
-        }
-        sum.steps += slice.steps;
-        sum.samples += slice.samples;
-        if let Some(loss) = slice.loss.filter(|loss| loss.is_finite()) {
-            losses = (losses.0 + loss * slice.steps as f64, losses.1 + slice.steps as f64);
-        }
-    }
-    sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
-    sum.seconds = start.elapsed().as_secs_f64();
-    sum
+/// The surrogate at its size.
+fn build(
+    plan: &Plan,
+    settings: &SurrogateSettings,
+    sizing: Option<&Sizing>,
+    tracer: &dyn Tracer,
+) -> Result<Box<dyn Surrogate>, SurrogateError> {
+    let scene = &plan.scene;
+    let plain = || (settings.clone(), scene.network.clone());
+    let (settings, network) = sizing.map_or_else(plain, |sizing| sizing.settings(settings, &scene.network));
+    crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)
 }
 
 /// Steps a path, unless each path chooses its own.

@@ -14,6 +14,7 @@ mod record;
 mod settings;
 mod setup;
 mod stop;
+mod training;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};

@@ -4,7 +4,10 @@ use crate::flow::{Direction, FlowSettings};
 use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, count, positive, require};
 use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
-use crate::surrogate::{SurrogateSettings, network::NetworkSettings};
+use crate::surrogate::{
+    SurrogateSettings,
+    network::{NetworkSettings, Size},
+};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
 
@@ -53,6 +56,10 @@ impl Settings {
         self.surrogate.check(&self.network)?;
         self.network.validate()?;
         self.training.check()?;
+        if self.network.size == Size::Auto && self.training.resume.is_some() {
+            let accepted = "\"fixed\", with training.resume (or --resume): a checkpoint has one size";
+            return Err(Refused::new("network.size", "is \"auto\"", accepted));
+        }
         check_trust(&self.trust)?;
         self.render.check()?;
         if let Some(camera) = &self.camera {

@@ -14,11 +14,13 @@ mod checkpoint;
 pub mod network;
 mod residual;
 mod ring;
+mod sizing;
 mod table;
 mod trainer;
 
 pub use residual::Residual;
 pub use ring::{KEEP_STALE, SampleRing};
+pub use sizing::{Resize, Sizing};
 pub use table::Table;
 
 /// Traced samples to learn from. Positions are unit coordinates ([`crate::field::Domain::to_unit`]).
@@ -228,7 +230,7 @@ impl SurrogateSettings {
     }
 
     /// Nodes of the table: those set, else 256 along the longest edge (128 below a network) and in proportion along the others.
-    fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
+    pub(crate) fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
         let dimensions = domain.dimensions.clamp(1, 3);
         self.check_nodes(dimensions)?;
         if let Some(nodes) = self.table_nodes {
