@@ -10,7 +10,7 @@ use ridgewatch::render::{
     TransferSettings,
 };
 use ridgewatch::surrogate::{Predict, Table};
-use ridgewatch::trust::{Residual, TrustMap, TrustSettings};
+use ridgewatch::trust::{Residual, Strata, TrustMap, TrustSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -246,7 +246,7 @@ fn the_gate_trusts_the_same_points() {
             Residual { point, optical: if point[0] + point[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
         })
         .collect();
-    map.observe(&residuals, &[]);
+    map.observe(&[], &Strata::even(map.shape(), 0), &residuals);
     let gate = map.gate();
     assert!(gate.share() > 0.1 && gate.share() < 0.9, "both kinds of cells: {}", gate.share());
     let mut random = uniform(3);

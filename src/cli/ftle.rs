@@ -104,10 +104,14 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let slide = slide.context("the source gave no slide")?;
     let device = super::device(common, &scene)?;
-    let report = on_threads(common, || compute(&plan, &slide, options, &device))?.map_err(|error| match error.downcast::<FlowError>() {
-        Ok(error) => located(&scene, error, FlowError::refused),
-        Err(error) => error,
-    })?;
+    let report =
+        on_threads(common, || compute(&plan, &slide, options, &device))?.map_err(|error| match error.downcast::<EngineError>() {
+            Ok(error) => located(&scene, error, EngineError::refused),
+            Err(error) => match error.downcast::<FlowError>() {
+                Ok(error) => located(&scene, error, FlowError::refused),
+                Err(error) => error,
+            },
+        })?;
     if common.json {
         return print_json(&report);
     }
