@@ -46,6 +46,7 @@ fn small_scene(folder: &Path, more: &str) -> String {
 fn bad_usage_is_status_2() {
     refused(&["replay"], 2, &["CONFIG | FILES"]);
     refused(&["dance"], 2, &["dance"]);
+    refused(&["replay", &config("saddle.toml"), "--threads", "99999999999"], 2, &["--threads", "0 to 1024"]);
     refused(&["render", &config("saddle.toml"), "--device", "tpu"], 2, &["--device tpu", "auto, cpu"]);
     refused(&["render", &config("saddle.toml"), "--method", "magic"], 2, &["reference, surrogate, neural, gated"]);
     refused(&["render", &config("saddle.toml"), "--out", "picture.tiff"], 2, &[".exr or .png"]);

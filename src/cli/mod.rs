@@ -35,8 +35,8 @@ pub struct Common {
     /// Where to trace: auto (a GPU where one is usable), cpu, or cuda:N.
     #[arg(long, global = true, default_value_t = DeviceChoice::Auto, value_name = "DEVICE")]
     pub device: DeviceChoice,
-    /// Worker threads; 0: as many as this process may use.
-    #[arg(long, global = true, default_value_t = 0, value_name = "N")]
+    /// Worker threads, at most 1024; 0: as many as this process may use.
+    #[arg(long, global = true, default_value_t = 0, value_name = "N", value_parser = threads)]
     pub threads: usize,
     /// Overrides one key of the scene, e.g. `--set render.samples=64`; may be repeated.
     #[arg(long = "set", global = true, value_name = "TABLE.KEY=VALUE")]
@@ -164,6 +164,11 @@ fn method(word: &str) -> Result<Method, String> {
     use serde::de::{IntoDeserializer, value::Error};
     Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word))
         .map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
+}
+
+/// A number of threads that a machine may have: each takes memory and a place in the system's table.
+fn threads(word: &str) -> Result<usize, String> {
+    word.parse().ok().filter(|n| *n <= 1024).ok_or_else(|| "accepted: a whole number from 0 to 1024".to_owned())
 }
 
 /// A number of seconds above 0.

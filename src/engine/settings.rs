@@ -224,6 +224,10 @@ fn check_trust(t: &TrustSettings) -> Result<(), Refused> {
             count("trust.cells", n, 1, 1024)?;
         }
         count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
+        // Every frame draws and traces this many points.
+        let a_cell = t.min_samples.ceil().max(t.audit_per_cell.max(t.audit_most_per_cell) as f64);
+        let points = a_cell * cells.iter().product::<usize>() as f64;
+        require(points <= f64::from(1 << 26), "trust.cells", points, "at most 2^26 points a frame (cells x samples a cell)")?;
     }
     Ok(())
 }
