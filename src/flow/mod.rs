@@ -16,6 +16,7 @@ mod resolution;
 mod rk4;
 mod sampler;
 mod sphere;
+mod sphere_levels;
 mod steps;
 mod stretch;
 mod tracer;
