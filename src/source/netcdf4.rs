@@ -14,7 +14,8 @@ pub(super) struct NetCdf4Store {
 }
 
 impl NetCdf4Store {
-    pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
+    /// Opens a file; none where it is HDF5 without the structure of NetCDF.
+    pub(super) fn open(path: &Path) -> Result<Option<(Header, Self)>, SourceError> {
         silence();
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
@@ -31,15 +32,29 @@ impl NetCdf4Store {
         // libnetcdf invents dimensions for HDF5 files that have none.
         let invented = |d: &Dimension| d.name.starts_with("phony_dim_");
         if header.variables.is_empty() || header.dimensions.iter().all(invented) {
-            return Err(SourceError::Hdf5 { path: path.into() });
+            return Ok(None);
         }
-        Ok((header, Self { file }))
+        Ok(Some((header, Self { file })))
     }
 
-    pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], total: usize, out: &mut Vec<f64>) -> Result<(), String> {
+    pub(super) fn read(
+        &self,
+        name: &str,
+        number: NumberType,
+        start: &[usize],
+        count: &[usize],
+        total: usize,
+        out: &mut Vec<f64>,
+    ) -> Result<(), String> {
         silence();
         let read = catch_unwind(AssertUnwindSafe(|| {
             let variable = self.file.variable(name).ok_or("it is gone")?;
+            if number == NumberType::Text {
+                // The library converts no characters to numbers.
+                let bytes = variable.get_raw_values((start, count)).map_err(|e| e.to_string())?;
+                out.extend(bytes.into_iter().map(f64::from));
+                return if out.len() == total { Ok(()) } else { Err("its text has another length than its header says".into()) };
+            }
             out.resize(total, 0.0);
             if count.is_empty() {
                 out[0] = variable.get_value::<f64, _>(..).map_err(|e| e.to_string())?;
@@ -53,7 +68,7 @@ impl NetCdf4Store {
 
 /// libhdf5 prints its error stack on standard error unless told otherwise, once in each thread, even where libnetcdf only asks
 /// whether an attribute is there.
-fn silence() {
+pub(super) fn silence() {
     thread_local!(static SILENCED: Cell<bool> = const { Cell::new(false) });
     if !SILENCED.replace(true) {
         hdf5_metno::silence_errors(true);
@@ -62,6 +77,7 @@ fn silence() {
 
 fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
     let mut header = Header::default();
+    header.attributes = attributes(file.attributes());
     for variable in file.variables() {
         let mut dimensions = Vec::new();
         for dimension in variable.dimensions() {
@@ -72,13 +88,7 @@ fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
             });
             dimensions.push(index);
         }
-        let mut attributes = Vec::new();
-        for attribute in variable.attributes() {
-            // An attribute of a user-defined type says nothing that is needed here.
-            if let Ok(value) = attribute.value() {
-                attributes.push((attribute.name().to_owned(), convert(value)));
-            }
-        }
+        let attributes = attributes(variable.attributes());
         let number = match variable.vartype() {
             NcVariableType::Int(IntType::I8) => NumberType::I8,
             NcVariableType::Int(IntType::U8) => NumberType::U8,
@@ -90,11 +100,17 @@ fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
             NcVariableType::Int(IntType::U64) => NumberType::U64,
             NcVariableType::Float(FloatType::F32) => NumberType::F32,
             NcVariableType::Float(FloatType::F64) => NumberType::F64,
+            NcVariableType::Char => NumberType::Text,
             _ => NumberType::Other,
         };
         header.variables.push(Variable { name: variable.name(), number, dimensions, attributes });
     }
     Ok(header)
+}
+
+fn attributes<'a>(found: impl Iterator<Item = netcdf::Attribute<'a>>) -> Vec<(String, Attribute)> {
+    // An attribute of a user-defined type says nothing that is needed here.
+    found.filter_map(|a| a.value().ok().map(|value| (a.name().to_owned(), convert(value)))).collect()
 }
 
 fn convert(value: AttributeValue) -> Attribute {
