@@ -1,10 +1,11 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
 # make test    the whole suite
+# make independent   real archives, and their FTLE against an integration in Python (SciPy, netCDF4, installed into .venv)
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-.PHONY: all demo test packages build check bench clean
+.PHONY: all demo test independent packages build check bench clean
 
 all: build
 
@@ -29,6 +30,15 @@ demo: build
 # One profile for everything: dependencies are built once, and numerics run optimised.
 test: packages
 	$(CARGO) test --release --workspace
+
+# Needs the data of RIDGEWATCH_DATA, by default ../shared/data, and says so where they are not there.
+independent: packages .venv/installed
+	RIDGEWATCH_DATA_REQUIRED=1 $(CARGO) test --release --test archive_real -- --nocapture
+
+.venv/installed:
+	python3 -m venv .venv
+	.venv/bin/pip install --quiet numpy scipy netCDF4
+	touch $@
 
 bench: packages
 	$(CARGO) bench

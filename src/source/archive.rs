@@ -69,9 +69,21 @@ impl NetCdfArchive {
         let mut entries: Vec<(f64, Place)> = Vec::new();
         let mut files = Vec::with_capacity(paths.len());
         let mut last_open = None;
+        let mut used: Option<Vec<String>> = None;
         for path in paths {
-            let container = Container::open(&path)?;
-            let layout = plan(&container, settings, first.as_ref().map(|f| &f.0))?;
+            let known = first.as_ref().map(|f| &f.0);
+            let mut container = Container::open_part(&path, used.as_deref())?;
+            let layout = match plan(&container, settings, known) {
+                // The part of the header that sufficed for the first file does not for this one.
+                Err(_) if used.is_some() => {
+                    container = Container::open(&path)?;
+                    plan(&container, settings, known)?
+                }
+                planned => planned?,
+            };
+            if used.is_none() && layout.resampling.is_none() {
+                used = Some(layout.used(&container.header));
+            }
             let index = files.len();
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
             entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
@@ -197,7 +209,8 @@ impl NetCdfArchive {
             // Closed before the next is opened.
             self.open = None;
             let path = &self.files[file].path;
-            let container = Container::open(path)?;
+            let names: Vec<String> = self.files[file].frames.iter().flatten().map(|c| c.name.clone()).collect();
+            let container = Container::open_part(path, self.resampling.is_none().then_some(&names[..]))?;
             for component in self.files[file].frames.iter().flatten() {
                 let found = container.header.find(&component.name).map(|v| &container.header.variables[v]);
                 if found.is_none_or(|v| container.header.shape(v) != component.shape) {

@@ -185,6 +185,11 @@ pub(crate) struct Container {
 impl Container {
     /// Opens a file and reads its header, nothing else.
     pub(crate) fn open(path: &Path) -> Result<Self, SourceError> {
+        Self::open_part(path, None)
+    }
+
+    /// The same, with the headers of the variables `only` where that saves time: others may lack.
+    pub(crate) fn open_part(path: &Path, only: Option<&[String]>) -> Result<Self, SourceError> {
         let failed = |cause| SourceError::Open { path: path.to_path_buf(), cause };
         let mut file = File::open(path).map_err(failed)?;
         let length = file.metadata().map_err(failed)?.len();
@@ -194,7 +199,7 @@ impl Container {
                 let (header, store) = ClassicStore::open(path, file, length, version)?;
                 (format, header, Store::Classic(store))
             }
-            Format::NetCdf4 | Format::Hdf5 => match NetCdf4Store::open(path)? {
+            Format::NetCdf4 | Format::Hdf5 => match NetCdf4Store::open(path, only)? {
                 Some((header, store)) => (Format::NetCdf4, header, Store::NetCdf4(store)),
                 None => {
                     let (header, store) = Hdf5Store::open(path)?;
@@ -219,16 +224,17 @@ impl Container {
         }
         let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
         if total as u64 > self.length.saturating_mul(LARGEST_SHRINKAGE).max(ALWAYS_ALLOWED) {
-            return Err(failed(format!("{total} values cannot come from a file of {} bytes: it is damaged or was never written", self.length)));
+            return Err(failed(format!(
+                "{total} values cannot come from a file of {} bytes: it is damaged or was never written",
+                self.length
+            )));
         }
         let mut values: Vec<f64> = Vec::new();
         values.try_reserve_exact(total).map_err(|_| failed(format!("no memory for {total} values")))?;
         if total > 0 {
             match &self.store {
                 Store::Classic(store) => store.read(variable, &shape, start, count, &mut values).map_err(|e| failed(e.to_string()))?,
-                Store::NetCdf4(store) => {
-                    store.read(&header.name, header.number, start, count, total, &mut values).map_err(failed)?
-                }
+                Store::NetCdf4(store) => store.read(&header.name, header.number, start, count, total, &mut values).map_err(failed)?,
                 Store::Hdf5(store) => store.read(&header.name, start, count, &mut values).map_err(failed)?,
             }
         }

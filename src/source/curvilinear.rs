@@ -290,14 +290,7 @@ impl Planner<'_> {
         let names = pairs[0].map(|i| self.header().variables[i].name.clone());
         self.notes.push(format!(
             "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
-            names[0],
-            names[1],
-            of_u.shape[0],
-            of_u.shape[1],
-            target.nodes[0],
-            target.nodes[1],
-            target.step[0],
-            target.step[1]
+            names[0], names[1], of_u.shape[0], of_u.shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
         ));
         let directions = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
         self.notes.push(format!("velocities run along {directions} ({why})"));

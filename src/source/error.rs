@@ -102,7 +102,7 @@ pub enum SourceError {
     },
     /// Components on different points.
     #[error(
-        "{}: `{first}` lies on ({first_dimensions}) but `{second}` on ({second_dimensions}): components on different points \
+        "{}: `{first}` lies on ({first_dimensions}) but `{second}` on ({second_dimensions}): staggered components \
          are read where they are WRF's (dimensions `..._stag`, with PH and PHB) or have longitudes and latitudes of their own",
         path.display()
     )]

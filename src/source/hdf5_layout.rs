@@ -92,13 +92,13 @@ impl Planner<'_> {
             let Some(place) = order.iter().position(|&o| o == letter) else { continue };
             axes.push(self.hdf5_axis(first, k, shape[place])?);
         }
-        let time = self.hdf5_times(&frames, &order)?;
         let mut components = Vec::new();
         for frame in &frames {
             let plans = frame.components.iter().take(axes.len());
             let plans = plans.map(|&(variable, part)| self.hdf5_component(variable, part, &order, &shape, &why));
             components.push(plans.collect::<Result<Vec<_>, _>>()?);
         }
+        let time = self.hdf5_times(&frames, &order)?;
         if components[0].len() < axes.len() {
             self.notes.push("no third component: motion along z is taken as 0".into());
         }
@@ -115,7 +115,8 @@ impl Planner<'_> {
         let s = self.settings;
         let variables = &self.header().variables;
         let whole = |found: Vec<(usize, Option<f64>)>, parts: usize, first: usize| -> Vec<Frame> {
-            let frame = |(i, number): (usize, Option<f64>)| Frame { components: (0..parts).map(|c| (i, Some(first + c))).collect(), number };
+            let frame =
+                |(i, number): (usize, Option<f64>)| Frame { components: (0..parts).map(|c| (i, Some(first + c))).collect(), number };
             found.into_iter().map(frame).collect()
         };
         if let Some(pattern) = &s.velocity {
@@ -190,8 +191,7 @@ impl Planner<'_> {
             let what = format!("`{key}` matches {} datasets of other numbers than the {} of `u`", list.len(), reference.len());
             return Err(self.misfit(list[0].0, what));
         }
-        let frame =
-            |i: usize| Frame { components: lists.iter().map(|l| (l.1[i].0, None)).collect(), number: reference[i] };
+        let frame = |i: usize| Frame { components: lists.iter().map(|l| (l.1[i].0, None)).collect(), number: reference[i] };
         Ok(((0..reference.len()).map(frame).collect(), "named by the settings".into()))
     }
 
@@ -232,7 +232,15 @@ impl Planner<'_> {
         let index = match named {
             Some(name) => match header.find(name) {
                 Some(i) if fits(&header.variables[i]) => Some(i),
-                Some(i) => return Err(self.misfit(i, format!("`{letter}` must name {nodes} numbers in one row, this one has shape {:?}", header.shape(&header.variables[i])))),
+                Some(i) => {
+                    return Err(self.misfit(
+                        i,
+                        format!(
+                            "`{letter}` must name {nodes} numbers in one row, this one has shape {:?}",
+                            header.shape(&header.variables[i])
+                        ),
+                    ));
+                }
                 None => return Err(self.not_found(letter, name)),
             },
             None => {
@@ -330,7 +338,9 @@ impl Planner<'_> {
             names.iter().find_map(|n| variable.numbers(n).first().copied().map(|t| (n.to_string(), t)))
         };
         let rows: Option<usize> = names.iter().find_map(|n| {
-            let fits = |v: &Variable| v.number.is_number() && header.shape(v).iter().product::<usize>() == expected && v.name.rsplit('/').next() == Some(n);
+            let fits = |v: &Variable| {
+                v.number.is_number() && header.shape(v).iter().product::<usize>() == expected && v.name.rsplit('/').next() == Some(n)
+            };
             header.find(n).filter(|&i| fits(&header.variables[i])).or_else(|| header.variables.iter().position(fits))
         });
         let of_file = names.iter().find_map(|n| match header.attributes.iter().find(|(name, _)| name == n) {
@@ -344,11 +354,21 @@ impl Planner<'_> {
             let units = variable.units().and_then(Unit::parse).filter(Unit::is_time);
             let values = self.file.read_all(index)?;
             let factor = units.map_or(1.0, |u| u.factor);
-            (variable.name.clone(), variable.units().unwrap_or_default().to_owned(), values.iter().map(|v| v * factor).collect::<Vec<_>>(), None)
+            (
+                variable.name.clone(),
+                variable.units().unwrap_or_default().to_owned(),
+                values.iter().map(|v| v * factor).collect::<Vec<_>>(),
+                None,
+            )
         } else if order.contains(&b't') {
             return Err(fault(format!("no dataset holds the {expected} times along the time axis; name it with `time`")));
         } else if let Some(owned) = owned {
-            (owned[0].0.clone(), String::new(), owned.iter().map(|o| o.1).collect(), Some(format!("times are attributes `{}` of the datasets", owned[0].0)))
+            (
+                owned[0].0.clone(),
+                String::new(),
+                owned.iter().map(|o| o.1).collect(),
+                Some(format!("times are attributes `{}` of the datasets", owned[0].0)),
+            )
         } else if let (Some((name, time)), 1) = (of_file, frames.len()) {
             (name.clone(), String::new(), vec![time], Some(format!("the time is the attribute `{name}` of the file")))
         } else if let Some(name) = &s.time {
@@ -360,7 +380,8 @@ impl Planner<'_> {
             let stem = self.path().file_stem().and_then(|n| n.to_str()).unwrap_or_default();
             let Some(number) = last_number(stem).filter(|_| frames.len() == 1) else {
                 return Err(fault(
-                    "neither a dataset, an attribute, a dataset's name nor the file's name tells the time; name it with `time = \"...\"`".into(),
+                    "neither a dataset, an attribute, a dataset's name nor the file's name tells the time; name it with `time = \"...\"`"
+                        .into(),
                 ));
             };
             let note = format!("the time is the last number in the file's name, times {step}; another step with `time_step`");
@@ -389,7 +410,8 @@ mod tests {
         assert_eq!(last_number("run3/step_2.5e"), Some(2.5));
         assert_eq!(last_number("none"), None);
         let named = |name: &str| Variable { name: name.into(), number: NumberType::F32, dimensions: vec![], attributes: vec![] };
-        let variables: Vec<Variable> = ["Velocity_0010", "Velocity_0002", "Velocity_", "Pressure_0001", "u"].into_iter().map(named).collect();
+        let variables: Vec<Variable> =
+            ["Velocity_0010", "Velocity_0002", "Velocity_", "Pressure_0001", "u"].into_iter().map(named).collect();
         assert_eq!(matching(&variables, "Velocity_*"), [(1, Some(2.0)), (0, Some(10.0))]);
         assert_eq!(matching(&variables, "u"), [(4, None)]);
         assert!(matching(&variables, "u*").is_empty());

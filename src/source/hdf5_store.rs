@@ -3,12 +3,13 @@
 
 use super::SourceError;
 use super::container::{Attribute, Dimension, Header, NumberType, Variable};
+use super::crash::Reading;
 use super::netcdf4::silence;
 use hdf5_metno::types::{FixedAscii, FixedUnicode, FloatSize, IntSize, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5_metno::{Group, Hyperslab, LinkType, SliceOrIndex};
 use ndarray::ArrayD;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Groups within groups, and datasets in all, that are looked at: more than any archive has, and a bound for a damaged one.
 const DEEPEST: usize = 8;
@@ -21,6 +22,7 @@ const LONGEST_TEXT: usize = 1024;
 /// An open HDF5 file.
 pub(super) struct Hdf5Store {
     file: hdf5_metno::File,
+    path: PathBuf,
 }
 
 impl Hdf5Store {
@@ -28,6 +30,7 @@ impl Hdf5Store {
     /// of one place and length.
     pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
         silence();
+        let _reading = Reading::of(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         let opened = catch_unwind(AssertUnwindSafe(|| -> hdf5_metno::Result<_> {
             let file = hdf5_metno::File::open(path)?;
@@ -36,7 +39,7 @@ impl Hdf5Store {
             Ok((header, file))
         }));
         match opened {
-            Ok(Ok((header, file))) => Ok((header, Self { file })),
+            Ok(Ok((header, file))) => Ok((header, Self { file, path: path.into() })),
             Ok(Err(error)) => Err(damaged(error.to_string())),
             Err(_) => Err(damaged("the HDF5 library failed on it".into())),
         }
@@ -45,6 +48,7 @@ impl Hdf5Store {
     /// Reads a hyperslab as `f64`.
     pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], out: &mut Vec<f64>) -> Result<(), String> {
         silence();
+        let _reading = Reading::of(&self.path);
         let read = catch_unwind(AssertUnwindSafe(|| -> hdf5_metno::Result<()> {
             let dataset = self.file.dataset(name)?;
             if count.is_empty() {
@@ -131,7 +135,9 @@ fn attribute(object: &hdf5_metno::Location, name: &str) -> Option<Attribute> {
     }
     let text = match descriptor {
         TypeDescriptor::FixedAscii(n) if n <= LONGEST_TEXT => attribute.read_raw::<FixedAscii<LONGEST_TEXT>>().ok()?.first()?.to_string(),
-        TypeDescriptor::FixedUnicode(n) if n <= LONGEST_TEXT => attribute.read_raw::<FixedUnicode<LONGEST_TEXT>>().ok()?.first()?.to_string(),
+        TypeDescriptor::FixedUnicode(n) if n <= LONGEST_TEXT => {
+            attribute.read_raw::<FixedUnicode<LONGEST_TEXT>>().ok()?.first()?.to_string()
+        }
         TypeDescriptor::VarLenAscii => attribute.read_raw::<VarLenAscii>().ok()?.first()?.to_string(),
         TypeDescriptor::VarLenUnicode => attribute.read_raw::<VarLenUnicode>().ok()?.first()?.to_string(),
         _ => return None,

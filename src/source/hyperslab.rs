@@ -17,12 +17,7 @@ pub(super) fn as_in_file(component: &ComponentPlan) -> Orders {
 }
 
 /// Reads one time of one component, x fastest.
-pub(super) fn read_component(
-    file: &Container,
-    component: &ComponentPlan,
-    orders: &Orders,
-    entry: usize,
-) -> Result<Vec<f32>, SourceError> {
+pub(super) fn read_component(file: &Container, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
     let [nx, ny, nz] = [0, 1, 2].map(|k| orders[k].len());
     let gone = || SourceError::Read { path: file.path.clone(), variable: component.name.clone(), what: "it is gone".into() };
     let variable = file.header.find(&component.name).ok_or_else(gone)?;

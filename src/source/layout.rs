@@ -8,12 +8,12 @@ use super::cf::packing::Packing;
 use super::cf::units::{Unit, VELOCITY_UNITS};
 use super::cf::velocity::{self, Candidate, Velocity};
 use super::container::{Container, Format, Header};
-use super::dimensions::Extent;
-use super::settings::{Metric, NetCdfSettings, VelocityUnit};
-use super::times::TimePlan;
 use super::curvilinear::Curvilinear;
+use super::dimensions::Extent;
 use super::poles::Poles;
+use super::settings::{Metric, NetCdfSettings, VelocityUnit};
 use super::staggered::Staggered;
+use super::times::TimePlan;
 use super::vertical::to_heights;
 use crate::field::{Axis, AxisFault};
 use std::path::Path;
@@ -73,6 +73,17 @@ pub(super) struct Layout {
     pub(super) resampling: Option<Arc<Resampling>>,
     /// Choices and conversions, in words.
     pub(super) notes: Vec<String>,
+}
+
+impl Layout {
+    /// Names of the variables that the plan rests on.
+    pub(super) fn used(&self, header: &Header) -> Vec<String> {
+        let named = |name: &str| header.find(name).is_some();
+        let mut names: Vec<String> = self.frames.iter().flatten().map(|c| c.name.clone()).collect();
+        names.extend(self.axes.iter().map(|a| a.axis.name().to_owned()).filter(|n| named(n)));
+        names.push(self.time.variable.clone());
+        names
+    }
 }
 
 /// How velocities come onto a grid whose nodes are not those of the file.
@@ -233,7 +244,8 @@ impl Planner<'_> {
 
     /// Whether some standard name promises geographic directions.
     fn geographic_winds(&self) -> bool {
-        let names = |v: &super::container::Variable| v.text("standard_name").is_some_and(|n| n == "eastward_wind" || n.starts_with("eastward_sea"));
+        let names =
+            |v: &super::container::Variable| v.text("standard_name").is_some_and(|n| n == "eastward_wind" || n.starts_with("eastward_sea"));
         self.header().variables.iter().any(names)
     }
 
@@ -304,10 +316,9 @@ impl Planner<'_> {
             (Some(Metric::Sphere), _) if !sphere => {
                 fault("sphere", "the axes are not longitude and latitude; accepted are index and cartesian")
             }
-            (Some(Metric::Sphere), _) if three && !measured => fault(
-                "sphere",
-                "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`",
-            ),
+            (Some(Metric::Sphere), _) if three && !measured => {
+                fault("sphere", "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`")
+            }
             (Some(metric), VelocityUnit::Cells) if metric != Metric::Index => {
                 fault(&format!("{metric:?}").to_lowercase(), "velocities in cells want `metric = \"index\"`")
             }
@@ -315,7 +326,8 @@ impl Planner<'_> {
             (None, VelocityUnit::Cells) => Ok(Metric::Index),
             (None, VelocityUnit::Si) if sphere && three && !measured => {
                 self.notes.push(
-                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere".into(),
+                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere"
+                        .into(),
                 );
                 Ok(Metric::Index)
             }
@@ -381,7 +393,12 @@ impl Planner<'_> {
         )
     }
 
-    pub(super) fn component(&mut self, candidate: &Candidate, roles: &[(usize, Role)], axis: Option<&AxisPlan>) -> Result<ComponentPlan, SourceError> {
+    pub(super) fn component(
+        &mut self,
+        candidate: &Candidate,
+        roles: &[(usize, Role)],
+        axis: Option<&AxisPlan>,
+    ) -> Result<ComponentPlan, SourceError> {
         let variable = &self.header().variables[candidate.variable];
         let component = candidate.component.name();
         let role = |d: &usize| roles.iter().find(|r| r.0 == *d).map_or(Role::Fixed(0), |r| r.1);

@@ -99,7 +99,8 @@ impl Mesh {
         let mut out = (vec![f32::NAN; nx * ny], vec![f32::NAN; nx * ny]);
         for j in 0..ny {
             for i in 0..nx {
-                let ends = (self.point(i.saturating_sub(1), j).or(self.point(i, j)), self.point((i + 1).min(nx - 1), j).or(self.point(i, j)));
+                let ends =
+                    (self.point(i.saturating_sub(1), j).or(self.point(i, j)), self.point((i + 1).min(nx - 1), j).or(self.point(i, j)));
                 let (Some(here), (Some(a), Some(b))) = (self.point(i, j), ends) else { continue };
                 let (a, b) = (vector(a[0], a[1]), vector(b[0], b[1]));
                 let along = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
@@ -129,10 +130,8 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
     if let Some(odd) = resolution.and_then(|r| r.into_iter().find(|r| !(*r > 0.0 && *r <= 45.0))) {
         return Err(format!("a `resolution` of {odd} degrees: accepted are numbers above 0, up to 45"));
     }
-    let known: Vec<[f64; 2]> = (0..mesh.longitude.len())
-        .map(|n| [mesh.longitude[n], mesh.latitude[n]])
-        .filter(|p| p.iter().all(|v| v.is_finite()))
-        .collect();
+    let known: Vec<[f64; 2]> =
+        (0..mesh.longitude.len()).map(|n| [mesh.longitude[n], mesh.latitude[n]]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
     let spacing = median(mesh.spacings(0)).zip(median(mesh.spacings(1)));
     let Some((along_x, along_y)) = spacing else { return Err("no two neighbouring points differ".into()) };
     let latitudes: Vec<f64> = known.iter().map(|p| p[1]).collect();
@@ -197,8 +196,11 @@ impl Target {
 impl Locator {
     pub(super) fn new(mesh: &Mesh, target: &Target) -> Self {
         let [nx, ny] = mesh.shape;
-        let mut this =
-            Self { shape: mesh.shape, cell: vec![NOWHERE; target.nodes[0] * target.nodes[1]], place: vec![[0.0; 2]; target.nodes[0] * target.nodes[1]] };
+        let mut this = Self {
+            shape: mesh.shape,
+            cell: vec![NOWHERE; target.nodes[0] * target.nodes[1]],
+            place: vec![[0.0; 2]; target.nodes[0] * target.nodes[1]],
+        };
         let spacing = median(mesh.spacings(0)).unwrap_or(0.0);
         let across = if mesh.goes_round(spacing) { nx } else { nx - 1 };
         for j in 0..ny - 1 {
@@ -248,7 +250,8 @@ impl Locator {
             if latitude > 0.0 { high[1] = 90.0 } else { low[1] = -90.0 }
         }
         let row = |l: f64| (l - target.first[1]) / target.step[1];
-        let rows = row(low[1]).ceil().max(0.0) as usize..=(row(high[1]).floor().max(-1.0) as i64).min(target.nodes[1] as i64 - 1).max(-1) as usize;
+        let rows =
+            row(low[1]).ceil().max(0.0) as usize..=(row(high[1]).floor().max(-1.0) as i64).min(target.nodes[1] as i64 - 1).max(-1) as usize;
         if row(high[1]) < 0.0 {
             return;
         }

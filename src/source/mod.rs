@@ -11,6 +11,7 @@ mod cf;
 mod classic;
 mod container;
 mod conversion;
+mod crash;
 mod curvilinear;
 mod dimensions;
 mod error;
@@ -33,6 +34,7 @@ mod times;
 mod vertical;
 
 pub use archive::NetCdfArchive;
+pub use crash::report_crashes;
 pub use error::SourceError;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use libraries::{hdf5_version, netcdf_version};

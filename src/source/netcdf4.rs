@@ -2,26 +2,30 @@
 
 use super::SourceError;
 use super::container::{Attribute, Dimension, Header, NumberType, Variable};
+use super::crash::Reading;
 use netcdf::AttributeValue;
 use netcdf::types::{FloatType, IntType, NcVariableType};
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// An open NetCDF-4 file.
 pub(super) struct NetCdf4Store {
     file: netcdf::File,
+    path: PathBuf,
 }
 
 impl NetCdf4Store {
-    /// Opens a file; none where it is HDF5 without the structure of NetCDF.
-    pub(super) fn open(path: &Path) -> Result<Option<(Header, Self)>, SourceError> {
+    /// Opens a file; none where it is HDF5 without the structure of NetCDF. `only` names the variables whose headers are wanted: those of
+    /// all others cost milliseconds a file.
+    pub(super) fn open(path: &Path, only: Option<&[String]>) -> Result<Option<(Header, Self)>, SourceError> {
         silence();
+        let _reading = Reading::of(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
         let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
             let file = netcdf::open(path)?;
-            let header = read_header(&file)?;
+            let header = read_header(&file, only)?;
             Ok((header, file))
         }));
         let (header, file) = match opened {
@@ -34,7 +38,7 @@ impl NetCdf4Store {
         if header.variables.is_empty() || header.dimensions.iter().all(invented) {
             return Ok(None);
         }
-        Ok(Some((header, Self { file })))
+        Ok(Some((header, Self { file, path: path.into() })))
     }
 
     pub(super) fn read(
@@ -47,6 +51,7 @@ impl NetCdf4Store {
         out: &mut Vec<f64>,
     ) -> Result<(), String> {
         silence();
+        let _reading = Reading::of(&self.path);
         let read = catch_unwind(AssertUnwindSafe(|| {
             let variable = self.file.variable(name).ok_or("it is gone")?;
             if number == NumberType::Text {
@@ -75,10 +80,14 @@ pub(super) fn silence() {
     }
 }
 
-fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
+fn read_header(file: &netcdf::File, only: Option<&[String]>) -> Result<Header, netcdf::Error> {
     let mut header = Header::default();
     header.attributes = attributes(file.attributes());
-    for variable in file.variables() {
+    let wanted: Vec<netcdf::Variable> = match only {
+        Some(names) => names.iter().filter_map(|name| file.variable(name)).collect(),
+        None => file.variables().collect(),
+    };
+    for variable in wanted {
         let mut dimensions = Vec::new();
         for dimension in variable.dimensions() {
             let found = Dimension { name: dimension.name(), len: dimension.len() };

@@ -11,14 +11,14 @@ pub(super) struct Poles {
 }
 
 impl Poles {
-    /// Adds the poles that lie less than a cell (and a rounding) beyond the ends of `latitude`, when longitudes go round.
+    /// Adds the poles that lie less than three quarters of a cell beyond the ends of `latitude`, when longitudes go round.
     pub(super) fn close(longitude: &AxisPlan, latitude: &mut AxisPlan) -> Result<Self, AxisFault> {
         let rows = latitude.axis.coordinates().to_vec();
         let count = rows.len();
         if longitude.axis.period().is_none() {
             return Ok(Self::default());
         }
-        let missing = |gap: f64, cell: f64| gap > 1e-6 * cell && gap < 1.01 * cell;
+        let missing = |gap: f64, cell: f64| gap > 1e-6 * cell && gap < 0.75 * cell;
         let south = missing(rows[0] + 90.0, rows[1] - rows[0]);
         let north = missing(90.0 - rows[count - 1], rows[count - 1] - rows[count - 2]);
         if south || north {

@@ -184,8 +184,7 @@ impl Staggered {
                 let at_full = |k: usize| here[1].of(|j| here[0].of(|i| full[(k * ny + j) * nx + i]));
                 let z = if which == 2 { at_full(k) } else { 0.5 * (at_full(k) + at_full(k + 1)) };
                 let on_grid = [0, 1].map(|a| Tap::at(place[a] * self.fineness as f64, nodes[a]));
-                let at_level =
-                    |l: usize| on_grid[1].of(|b| on_grid[0].of(|a| grid[which][(l * nodes[1] + b) * nodes[0] + a]));
+                let at_level = |l: usize| on_grid[1].of(|b| on_grid[0].of(|a| grid[which][(l * nodes[1] + b) * nodes[0] + a]));
                 let found = in_column(z, heights.len(), |l| heights[l], at_level);
                 if let Some(found) = found.filter(|f| f.is_finite() && value.is_finite()) {
                     wrong += f64::from(found - value).powi(2);

@@ -179,7 +179,8 @@ fn ecmwf(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
                 for k in 0..nz {
                     for latitude in coordinates[1] {
                         for longitude in coordinates[0] {
-                            let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
+                            let ((sin_lon, cos_lon), (sin_lat, cos_lat)) =
+                                (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
                             let p = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat];
                             let (v, w) = globe.velocity(p, level.axis.coordinates()[nz - 1 - k], time);
                             out[0].push((-sin_lon * v[0] + cos_lon * v[1]) as f32);
@@ -239,11 +240,8 @@ fn write_ecmwf(path: &Path, coordinates: &[&[f64]; 3], components: &[Vec<f32>], 
             (((high - low) / 65_532.0).max(f64::MIN_POSITIVE), (low + high) / 2.0)
         })
         .collect();
-    let described = [
-        ("u", "eastward_wind", "m s**-1"),
-        ("v", "northward_wind", "m s**-1"),
-        ("w", "lagrangian_tendency_of_air_pressure", "Pa s**-1"),
-    ];
+    let described =
+        [("u", "eastward_wind", "m s**-1"), ("v", "northward_wind", "m s**-1"), ("w", "lagrangian_tendency_of_air_pressure", "Pa s**-1")];
     for ((name, standard, units), (scale, offset)) in described.iter().zip(&packing) {
         let mut variable = file.add_variable::<i16>(name, &["time", "level", "latitude", "longitude"])?;
         variable.put_attribute("standard_name", *standard)?;

@@ -55,7 +55,8 @@ impl Planner<'_> {
         let expected = dimension.map_or(1, |e| header.dimensions[e.dimension].len);
         // WRF before version 3.8 puts the reference into the description only.
         let description = variable.text("description").filter(|d| TimeUnit::has_reference(d));
-        let units = variable.units().filter(|u| TimeUnit::has_reference(u)).or(description).or(variable.units()).unwrap_or_default().to_owned();
+        let units =
+            variable.units().filter(|u| TimeUnit::has_reference(u)).or(description).or(variable.units()).unwrap_or_default().to_owned();
         let calendar_name = variable.text("calendar").unwrap_or_default();
         let Some(calendar) = Calendar::parse(calendar_name) else {
             return Err(fault(format!("calendar `{calendar_name}` of `{name}` is unknown; accepted are {CALENDARS}")));
