@@ -1,11 +1,14 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
-# make test    the whole suite
-# make independent   real archives, and their FTLE against an integration in Python (SciPy, netCDF4, installed into .venv)
+# make test    the whole suite; what needs real archives runs where they are
+# make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-.PHONY: all demo test independent packages build check bench clean
+# The collection of real archives that tests/archive_real.rs reads.
+RIDGEWATCH_DATA ?= $(abspath ../shared/data)
+
+.PHONY: all demo test test-data packages build check bench clean
 
 all: build
 
@@ -30,10 +33,12 @@ demo: build
 # One profile for everything: dependencies are built once, and numerics run optimised.
 test: packages
 	$(CARGO) test --release --workspace
+	@if [ -d "$(RIDGEWATCH_DATA)" ]; then $(MAKE) --no-print-directory test-data; else \
+	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; fi
 
-# Needs the data of RIDGEWATCH_DATA, by default ../shared/data, and says so where they are not there.
-independent: packages .venv/installed
-	RIDGEWATCH_DATA_REQUIRED=1 $(CARGO) test --release --test archive_real -- --nocapture
+# With an independent integration in Python (SciPy, netCDF4) to hold the FTLE against.
+test-data: packages .venv/installed
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
 
 .venv/installed:
 	python3 -m venv .venv

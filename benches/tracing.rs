@@ -8,8 +8,7 @@ use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
 use ridgewatch::flow::{
-    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Order, Precision, Steps, Traced, Tracer,
-    VelocitySource, cpu_tracer, scalar_tracer, tracer_in_order,
+    Boundary, Extras, FlowMap, Integrator, Order, Precision, Traced, Tracer, VelocitySource, cpu_tracer, scalar_tracer, tracer_in_order,
 };
 use std::error::Error;
 use std::f64::consts::TAU;
@@ -19,17 +18,7 @@ use std::time::Instant;
 const ROUNDS: usize = 5;
 
 fn map(tau: f64, steps: usize, precision: Precision, boundary: Boundary) -> FlowMap {
-    FlowMap {
-        tau,
-        direction: Direction::Forward,
-        integrator: Integrator::Tangent,
-        precision,
-        steps: Steps::Fixed(steps),
-        gap: 1e-3,
-        boundary,
-        normalisation: Normalisation::Tau,
-        interpolation: Interpolation::Linear,
-    }
+    FlowMap { precision, gap: 1e-3, boundary, ..FlowMap::tangent(tau, steps) }
 }
 
 /// Uniform points in no order.

@@ -4,15 +4,15 @@
 //! are defined in that room; this file puts them together.
 
 mod error;
-mod sections;
-mod validate;
 
 pub use error::ConfigError;
-pub use sections::{DomainSettings, FlowSettings, SourceKind, SourceSettings, StepsSetting, TimeSettings, TimeSpan, TrainingSettings};
 
+use crate::engine::{Settings, TimeSettings, TrainingSettings};
+use crate::flow::FlowSettings;
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
-use crate::source::NetCdfSettings;
+use crate::setting::Refused;
+use crate::source::{DomainSettings, NetCdfSettings, SourceSettings};
 use crate::surrogate::{SurrogateSettings, network::NetworkSettings};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
@@ -65,22 +65,45 @@ pub struct SceneFile {
     /// Frames out.
     #[serde(default)]
     pub publish: PublishSettings,
+    /// Where all this was said.
+    #[serde(skip)]
+    origin: Origin,
+}
+
+/// Where a scene was said, so that a fault found later can be located.
+#[derive(Debug, Clone, PartialEq, Default)]
+struct Origin {
+    path: PathBuf,
+    text: String,
+    /// Keys set elsewhere, with the place to name, oldest first.
+    elsewhere: Vec<(String, String)>,
+}
+
+impl Origin {
+    fn new(path: &Path, text: &str, overrides: &[String]) -> Self {
+        let key = |given: &String| given.split('=').next().unwrap_or_default().trim().to_owned();
+        let elsewhere = overrides.iter().map(|given| (key(given), format!("--set {given}"))).collect();
+        Self { path: path.to_path_buf(), text: text.to_owned(), elsewhere }
+    }
+
+    fn sets(&self, key: &str) -> bool {
+        self.elsewhere.iter().any(|(set, _)| set == key)
+    }
 }
 
 impl SceneFile {
     /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
-    /// Paths in `archive.files` are relative to the scene file's folder.
+    /// Paths in `archive.files` and `training.resume` are relative to the scene file's folder.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
         let mut scene = Self::parse(path, &text, overrides)?;
         let folder = path.parent().unwrap_or(Path::new("."));
-        // Files named by `--set` are relative to where the command runs, as on any command line.
-        let given = overrides.iter().any(|o| o.trim_start().starts_with("archive.files"));
-        for file in scene.archive.files.iter_mut().filter(|_| !given) {
-            if file.is_relative() {
-                *file = folder.join(&*file);
-            }
+        // What is named by `--set` is relative to where the command runs, as on any command line.
+        let files = scene.archive.files.iter_mut().filter(|_| !scene.origin.sets("archive.files"));
+        let resume = scene.training.resume.iter_mut().filter(|_| !scene.origin.sets("training.resume"));
+        for file in files.chain(resume).filter(|file| file.is_relative()) {
+            *file = folder.join(&*file);
         }
         Ok(scene)
     }
@@ -88,8 +111,9 @@ impl SceneFile {
     /// Checks the text of a scene file; `path` appears in errors only.
     pub fn parse(path: &Path, text: &str, overrides: &[String]) -> Result<Self, ConfigError> {
         let plain: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(path, text, &e))?;
-        let scene = if overrides.is_empty() { plain } else { Self::overridden(&plain, overrides)? };
-        validate::check(&scene).map_err(|fault| fault.locate(path, text, overrides))?;
+        let mut scene = if overrides.is_empty() { plain } else { Self::overridden(&plain, overrides)? };
+        scene.origin = Origin::new(path, text, overrides);
+        scene.check()?;
         Ok(scene)
     }
 
@@ -102,8 +126,53 @@ impl SceneFile {
         if !overrides.is_empty() {
             scene = Self::overridden(&scene, overrides)?;
         }
-        validate::check(&scene).map_err(|fault| fault.locate(origin, "", overrides))?;
+        scene.origin = Origin::new(origin, "", overrides);
+        scene.check()?;
         Ok(scene)
+    }
+
+    /// What the cycle is told.
+    pub fn settings(&self) -> Settings {
+        let Self {
+            title,
+            seed,
+            source,
+            archive,
+            domain,
+            time,
+            flow,
+            surrogate,
+            network,
+            training,
+            trust,
+            render,
+            camera,
+            light,
+            transfer,
+            ..
+        } = self.clone();
+        Settings { title, seed, source, archive, domain, time, flow, surrogate, network, training, trust, render, camera, light, transfer }
+    }
+
+    /// Notes that a key was set by an option of the command line, which is named in its faults (`--spp 0`).
+    pub fn set_by(&mut self, key: &str, option: impl Into<String>) {
+        self.origin.elsewhere.push((key.to_owned(), option.into()));
+    }
+
+    /// Checks every room's settings.
+    ///
+    /// # Errors
+    /// The first fault, located.
+    pub fn check(&self) -> Result<(), ConfigError> {
+        self.settings().check().and_then(|()| self.publish.check()).map_err(|refused| self.locate(refused))
+    }
+
+    /// The place that set the key: the option or the `--set` that named it last, else the line of the file. Some faults are found only
+    /// when the source is open.
+    pub fn locate(&self, refused: Refused) -> ConfigError {
+        let Origin { path, text, elsewhere } = &self.origin;
+        let set = elsewhere.iter().rev().find(|(key, _)| *key == refused.key).map(|(_, place)| place.clone());
+        ConfigError::locate(refused, path, text, set)
     }
 
     /// The scene with `table.key=value` applied.

@@ -2,8 +2,10 @@
 //!
 //! The rooms, and the one way of the arrows (a room calls only those to its left):
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`], the command line. [`config`] puts the
-//! settings of all rooms together.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`] ← [`config`] ← the command line.
+//!
+//! Each room defines and checks its own settings, with the words of [`setting`]; [`config`] reads them from one scene file and finds the
+//! line of a fault. [`simd`] and [`setting`] lie below all rooms.
 //!
 //! One cycle: take the newest snapshots, slide the window, render with the weights of the previous cycle, test every traced
 //! sample against the surrogate (this feeds the trust map), then train on it.
@@ -14,6 +16,7 @@ pub mod field;
 pub mod flow;
 pub mod publish;
 pub mod render;
+pub mod setting;
 pub mod simd;
 pub mod source;
 pub mod surrogate;

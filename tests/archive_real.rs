@@ -1,6 +1,6 @@
-//! Real archives through the whole loop, or to the right error. Where they are not at hand (`RIDGEWATCH_DATA`, by default
-//! `../shared/data`) each test says so on standard error, and `RIDGEWATCH_DATA_REQUIRED=1` makes that a failure.
-#![allow(clippy::unwrap_used, clippy::print_stdout, clippy::print_stderr)] // Tests: a panic is the report.
+//! Real archives (`RIDGEWATCH_DATA`, by default `../shared/data`) through the whole loop, or to the right error, and against an integration
+//! by other tools: `make test-data`.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
 use ridgewatch::field::{Geometry, Window};
 use ridgewatch::flow::{
@@ -12,18 +12,13 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::Arc;
 
-/// A file of the collection.
-fn data(name: &str) -> Option<PathBuf> {
+/// A file of the collection, which must be there: `make test` leaves these tests out, and says so, where it is not.
+fn data(name: &str) -> PathBuf {
     let root =
         std::env::var_os("RIDGEWATCH_DATA").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
     let path = root.join(name);
-    if !path.exists() {
-        assert!(std::env::var_os("RIDGEWATCH_DATA_REQUIRED").is_none(), "{} is not there", path.display());
-        // Past the harness, which hides what passing tests print.
-        let _ = writeln!(std::io::stderr().lock(), "NOT TESTED: {} is not there (RIDGEWATCH_DATA)", path.display());
-        return None;
-    }
-    Some(path)
+    assert!(path.exists(), "{} is not there; set RIDGEWATCH_DATA to the folder of the collection", path.display());
+    path
 }
 
 /// Replays through the front door; the summary.
@@ -43,8 +38,9 @@ fn replay(arguments: &[&str]) -> serde_json::Value {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn globcurrent() {
-    let Some(folder) = data("globcurrent") else { return };
+    let folder = data("globcurrent");
     let mut archive = NetCdfArchive::open(&[folder.join("*.nc")], &NetCdfSettings::default()).unwrap();
     let grid = archive.grid().clone();
     assert_eq!((grid.shape(), archive.times().len()), ([81, 41, 1], 60));
@@ -62,8 +58,9 @@ fn globcurrent() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn era5_on_a_projected_grid() {
-    let Some(first) = data("era5_utm32_2025_05_01_00.nc") else { return };
+    let first = data("era5_utm32_2025_05_01_00.nc");
     let pattern = first.with_file_name("era5_utm32_*.nc");
     let mut archive = NetCdfArchive::open(std::slice::from_ref(&pattern), &NetCdfSettings::default()).unwrap();
     assert_eq!((archive.grid().shape(), archive.times().len()), ([17, 30, 37], 3));
@@ -77,8 +74,9 @@ fn era5_on_a_projected_grid() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn wrf_hurricane() {
-    let Some(file) = data("wrf_katrina_uvw_4t.nc") else { return };
+    let file = data("wrf_katrina_uvw_4t.nc");
     let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
     assert_eq!((archive.grid().shape(), archive.times().len()), ([95, 95, 28], 4));
     assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
@@ -92,12 +90,13 @@ fn wrf_hurricane() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn what_cannot_be_traced_says_why() {
     for (name, pieces) in [
         ("jhtdb_iso1024coarse_pressure_64.h5", &["Pressure_0001", "one component a point: it is a scalar"][..]),
         ("jhtdb_legacy_cutout_10x10.h5", &["`u01000`", "1 node(s) thick along z", "2 nodes or more"]),
     ] {
-        let Some(file) = data(name) else { continue };
+        let file = data(name);
         let message = NetCdfArchive::open(&[file], &NetCdfSettings::default()).err().unwrap().to_string();
         for piece in pieces.iter().chain([&name]) {
             assert!(message.contains(piece), "{message}");
@@ -106,14 +105,10 @@ fn what_cannot_be_traced_says_why() {
 }
 
 /// Our log-stretch at 50 seeds that live the whole tau, and that of tests/independent/ftle.py.
-fn independent(kind: &str, files: &[PathBuf], tau: f64) -> Option<(Vec<f64>, Vec<f64>)> {
+fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
     let python =
         std::env::var_os("RIDGEWATCH_PYTHON").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python"), PathBuf::from);
-    if !python.exists() {
-        assert!(std::env::var_os("RIDGEWATCH_DATA_REQUIRED").is_none(), "{} is not there", python.display());
-        let _ = writeln!(std::io::stderr().lock(), "NOT TESTED: {} is not there (make independent)", python.display());
-        return None;
-    }
+    assert!(python.exists(), "{} is not there: make test-data installs it", python.display());
     let mut archive = NetCdfArchive::open(files, &NetCdfSettings::default()).unwrap();
     let times = archive.times().to_vec();
     let mut window = Window::new(times[times.len() - 1] - times[0]);
@@ -159,7 +154,7 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> Option<(Vec<f64>, Vec
     let theirs: Vec<Option<f64>> = serde_json::from_slice(&output.stdout).unwrap();
     assert_eq!(theirs.len(), 50);
     let pairs = chosen.iter().zip(theirs).filter_map(|(&i, theirs)| theirs.map(|t| (out.log_stretch_f64[i], t)));
-    Some(pairs.unzip())
+    pairs.unzip()
 }
 
 /// Root mean square and median difference of the FTLE, per second, root mean square FTLE, correlation.
@@ -184,9 +179,10 @@ fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, 
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn era5_agrees_with_an_independent_integration() {
-    let Some(first) = data("era5_utm32_2025_05_01_00.nc") else { return };
-    let Some(pairs) = independent("era5", &[first.with_file_name("era5_utm32_*.nc")], 7200.0) else { return };
+    let first = data("era5_utm32_2025_05_01_00.nc");
+    let pairs = independent("era5", &[first.with_file_name("era5_utm32_*.nc")], 7200.0);
     assert!(pairs.0.len() >= 45, "few of the 50 may graze a missing cell with a neighbour");
     let (relative, correlation) = report("ERA5", 7200.0, &pairs);
     // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
@@ -194,9 +190,10 @@ fn era5_agrees_with_an_independent_integration() {
 }
 
 #[test]
+#[ignore = "needs real archives: make test-data"]
 fn wrf_agrees_with_an_independent_integration() {
-    let Some(file) = data("wrf_katrina_uvw_4t.nc") else { return };
-    let Some(pairs) = independent("wrf", &[file], 3600.0) else { return };
+    let file = data("wrf_katrina_uvw_4t.nc");
+    let pairs = independent("wrf", &[file], 3600.0);
     assert!(pairs.0.len() >= 45, "few of the 50 may graze the ground with a neighbour");
     let (relative, correlation) = report("WRF", 3600.0, &pairs);
     // Horizontally the same interpolant; vertically ours has fixed heights, theirs the levels of each column.

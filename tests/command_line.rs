@@ -64,9 +64,43 @@ fn bad_scenes_are_status_2_and_point_at_the_line() {
         2,
         &["scene.toml:", "`trust.tolerance` is -1", "above 0"],
     );
-    refused(&["replay", &small_scene(folder.path(), ""), "--set", "render.width=0"], 2, &["--set render.width=0", "from 1 to"]);
-    refused(&["replay", &small_scene(folder.path(), "[camera]\neye=[1,1,1]\nlook_at=[1,1,1]\nup=[0,1,0]\n")], 2, &["camera"]);
+    refused(&["replay", &small_scene(folder.path(), ""), "--set", "render.width=0"], 2, &["--set render.width=0", "1 to 16384"]);
+    refused(
+        &["replay", &small_scene(folder.path(), "[camera]\neye=[1,1,1]\nlook_at=[1,1,1]\nup=[0,1,0]\n")],
+        2,
+        &["scene.toml:", "`camera.look_at`"],
+    );
     refused(&["replay", &folder.path().join("none.toml").display().to_string()], 2, &["cannot read", "none.toml"]);
+}
+
+#[test]
+fn settings_that_only_the_data_show_to_be_wrong_are_status_2_and_point_at_the_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = |more: &str| small_scene(folder.path(), more);
+    // More than the f32 walk can resolve: 1e6 times the box's diagonal.
+    refused(
+        &["replay", &scene("[transfer]\nlow = 0\nhigh = 1\nextinction = 1e6\n")],
+        2,
+        &["scene.toml:", "`transfer.extinction`", "| extinction = 1e6"],
+    );
+    let gap = ["--set", "flow.integrator=differences", "--set", "flow.gap=1e-9"];
+    refused(&[&["ftle", &scene("")][..], &gap].concat(), 2, &["--set flow.gap=1e-9", "`flow.gap`", "at least"]);
+    refused(&["replay", &scene("[publish]\nendpoint = \"udp://x\"\n")], 2, &["scene.toml:", "`publish.endpoint`", "tcp://HOST:PORT"]);
+    refused(&["replay", &scene(""), "--publish", "udp://x"], 2, &["--publish udp://x", "`publish.endpoint`"]);
+    refused(&["render", &scene(""), "--spp", "0"], 2, &["--spp 0", "`render.samples`"]);
+}
+
+#[test]
+fn checkpoints_are_refused_where_nothing_learns() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    for option in ["--checkpoint", "--resume"] {
+        refused(&["replay", &scene, "--method", "reference", option, "w.safetensors"], 2, &[option, "no surrogate", "gated"]);
+        refused(&["replay", &scene, "--set", "surrogate.kind=table", option, "w.safetensors"], 2, &[option, "table", "residual"]);
+    }
+    refused(&["render", &scene, "--method", "reference", "--resume", "w.safetensors"], 2, &["--resume", "no surrogate"]);
+    let absent = folder.path().join("absent.safetensors").display().to_string();
+    refused(&["replay", &scene, "--resume", &absent], 1, &["absent.safetensors"]);
 }
 
 #[test]

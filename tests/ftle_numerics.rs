@@ -14,17 +14,7 @@ use std::f64::consts::TAU;
 use std::sync::Arc;
 
 fn map(tau: f64, steps: usize, precision: Precision) -> FlowMap {
-    FlowMap {
-        tau,
-        direction: Direction::Forward,
-        integrator: Integrator::Tangent,
-        precision,
-        steps: Steps::Fixed(steps),
-        gap: 1e-4,
-        boundary: Boundary::Unbounded,
-        normalisation: Normalisation::Tau,
-        interpolation: Interpolation::Linear,
-    }
+    FlowMap { precision, ..FlowMap::tangent(tau, steps) }
 }
 
 fn reference(tau: f64) -> FlowMap {

@@ -1,10 +1,10 @@
 //! `ridgewatch ftle`: the field on a grid, and how right it is.
 
-use super::{Common, Usage, messages, on_threads, print_json, print_text, scene};
+use super::{Common, Usage, located, messages, on_threads, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{Plan, Setup, Slide};
+use ridgewatch::engine::{EngineError, Plan, Setup, Slide};
 use ridgewatch::field::analytic::Analytic;
-use ridgewatch::flow::{Boundary, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -88,20 +88,25 @@ struct Convergence {
 
 /// Computes, checks and writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    let Setup { plan, mut feed, notes, .. } = Setup::new(scene(common, &options.paths)?)?;
+    let scene = scene(common, &options.paths)?;
+    let faulty = |error| located(&scene, error, EngineError::refused);
+    let Setup { plan, mut feed, notes, .. } = Setup::new(scene.settings()).map_err(faulty)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
-        super::render::check_folder(out)?;
+        super::check_folder(out)?;
     }
     let mut slide = None;
     for _ in 0..=options.slide {
-        slide = feed.next_slide()?;
+        slide = feed.next_slide().map_err(faulty)?;
         if slide.is_none() {
             bail!(Usage(format!("--slide {}: the source has fewer slides", options.slide)));
         }
     }
     let slide = slide.context("the source gave no slide")?;
-    let report = on_threads(common, || compute(&plan, &slide, options))??;
+    let report = on_threads(common, || compute(&plan, &slide, options))?.map_err(|error| match error.downcast::<FlowError>() {
+        Ok(error) => located(&scene, error, FlowError::refused),
+        Err(error) => error,
+    })?;
     if common.json {
         return print_json(&report);
     }
@@ -245,7 +250,9 @@ fn convergence(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Converg
 /// Writes under a temporary name first: nothing half-written is left under the final one.
 fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usize; 3], ftle: &[f64], lived: &[f32]) -> Result<()> {
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    let temporary = tempfile::Builder::new().prefix(".ridgewatch-").suffix(".nc").tempfile_in(folder)?.into_temp_path();
+    // A file like any other, by the umask; temporary ones are for their owner alone otherwise.
+    let mode = std::os::unix::fs::PermissionsExt::from_mode(0o666);
+    let temporary = tempfile::Builder::new().prefix(".ridgewatch-").suffix(".nc").permissions(mode).tempfile_in(folder)?.into_temp_path();
     {
         let mut file = netcdf::create(&temporary)?;
         let axes = &["x", "y", "z"][..plan.domain.dimensions];

@@ -1,8 +1,10 @@
 //! `ridgewatch inspect`.
 
-use super::{Common, Usage, print_json, print_text};
+use super::{Common, Usage, located, print_json, print_text};
 use anyhow::Result;
-use ridgewatch::config::{SceneFile, SourceKind, TimeSpan};
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::TimeSpan;
+use ridgewatch::source::{SourceError, SourceKind};
 use std::path::PathBuf;
 
 /// Options of `inspect`.
@@ -33,7 +35,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
             Some(value.ok_or_else(|| Usage(format!("--tau {text}: accepted: a number above 0, or words such as \"30 days\"")))?)
         }
     };
-    let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)?;
+    let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)
+        .map_err(|error| located(&scene, error, SourceError::refused))?;
     if common.json {
         return print_json(&inspection);
     }

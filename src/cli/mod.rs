@@ -9,11 +9,15 @@ mod render;
 mod replay;
 mod synthesize;
 
-use anyhow::{Result, bail};
+use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::engine::EngineError;
 use ridgewatch::publish::PublishError;
+use ridgewatch::render::Method;
+use ridgewatch::setting::Refused;
+use ridgewatch::source::SourceError;
+use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
 
 /// Shows the Lagrangian coherent structures of a flow simulation while it runs.
@@ -102,11 +106,9 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
     let configuration = error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || cause.is::<Usage>()
-            || matches!(cause.downcast_ref(), Some(PublishError::Setting { .. } | PublishError::Endpoint { .. }))
-            || matches!(
-                cause.downcast_ref(),
-                Some(EngineError::TauUnit | EngineError::NoDomain | EngineError::Render(_) | EngineError::Surrogate(_))
-            )
+            || cause.downcast_ref::<EngineError>().is_some_and(|error| error.refused().is_some())
+            || cause.downcast_ref::<PublishError>().is_some_and(|error| error.refused().is_some())
+            || cause.downcast_ref::<SourceError>().is_some_and(|error| error.refused().is_some())
     });
     if configuration { 2 } else { 1 }
 }
@@ -130,12 +132,49 @@ fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
     Ok(scene)
 }
 
+/// The scene's error with the place of the setting at fault, where it is one.
+fn located<E>(scene: &SceneFile, error: E, refused: impl FnOnce(&E) -> Option<Refused>) -> anyhow::Error
+where
+    E: std::error::Error + Send + Sync + 'static,
+{
+    match refused(&error) {
+        Some(refused) => scene.locate(refused).into(),
+        None => error.into(),
+    }
+}
+
+/// What a checkpoint option asks for must exist.
+fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    let refuse = |why: &str| bail!(Usage(format!("{option} {}: {why}", path.display())));
+    if scene.render.method == Method::Reference {
+        return refuse("method reference has no surrogate; accepted with methods surrogate and gated");
+    }
+    if scene.surrogate.kind == Kind::Table {
+        return refuse("a table is traced anew for every window and learns nothing; accepted with surrogate.kind network and residual");
+    }
+    Ok(())
+}
+
+/// Fails before the work rather than after it.
+fn check_folder(out: &Path) -> Result<()> {
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
+    Ok(())
+}
+
 /// A method by its name in scene files.
-fn method(word: &str) -> Result<ridgewatch::render::Method, String> {
+fn method(word: &str) -> Result<Method, String> {
     use serde::Deserialize;
     use serde::de::{IntoDeserializer, value::Error};
-    ridgewatch::render::Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word))
+    Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word))
         .map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
+}
+
+/// A number of seconds above 0.
+fn seconds(word: &str) -> Result<f64, String> {
+    word.parse().ok().filter(|s: &f64| s.is_finite() && *s > 0.0).ok_or_else(|| "accepted: a number above 0".to_owned())
 }
 
 /// Runs `work` on a pool of `--threads` threads.

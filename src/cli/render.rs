@@ -1,11 +1,11 @@
 //! `ridgewatch render`.
 
-use super::{Common, Usage, messages, print_json, print_text, scene};
+use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{self, Event, Frame, RunOptions, Setup};
+use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions, Setup};
 use ridgewatch::publish::write_exr;
 use ridgewatch::render::Method;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
 /// Options of `render`.
@@ -46,14 +46,18 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         bail!(Usage(format!("--out {}: accepted: a name that ends in .exr or .png", options.out.display())));
     }
     check_folder(&options.out)?;
-    if let Some(0) = options.spp {
-        bail!(Usage("--spp 0: accepted: 1 or more".into()));
-    }
     let warmup_samples = scene.render.samples;
-    scene.render.samples = options.spp.unwrap_or(scene.render.samples);
+    if let Some(samples) = options.spp {
+        scene.render.samples = samples;
+        scene.set_by("render.samples", format!("--spp {samples}"));
+    }
     scene.time.slides = Some(1);
     scene.time.frames_per_slide = 1;
-    scene.time.warmup_frames = options.warmup.unwrap_or(scene.time.warmup_frames);
+    if let Some(frames) = options.warmup {
+        scene.time.warmup_frames = frames;
+        scene.set_by("time.warmup_frames", format!("--warmup {frames}"));
+    }
+    check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let run_options = RunOptions {
         verify_points: options.verify as usize,
@@ -68,7 +72,10 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         Event::Progress(share) => bar.set_position((share * 100.0) as u64),
         Event::Frame(frame) => picture = Some(frame),
     };
-    engine::run(Setup::new(scene)?, &run_options, sink, &AtomicBool::new(false))?;
+    let setup = Setup::new(scene.settings());
+    setup
+        .and_then(|setup| engine::run(setup, &run_options, sink, &AtomicBool::new(false)))
+        .map_err(|error| located(&scene, error, EngineError::refused))?;
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {
@@ -82,13 +89,5 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         messages::note(warning);
     }
     print_text(format_args!("{}: {}", options.out.display(), super::replay::line(&frame.record)));
-    Ok(())
-}
-
-/// Fails before the work rather than after it.
-pub(super) fn check_folder(out: &Path) -> Result<()> {
-    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
-    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
     Ok(())
 }

@@ -1,10 +1,10 @@
 //! `ridgewatch replay`.
 
-use super::{Common, Usage, messages, print_json, print_text, scene};
+use super::{Common, Usage, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{self, Event, FrameRecord, RunOptions, RunReport, Setup};
-use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, RunFolder};
+use ridgewatch::engine::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, PublishError, RunFolder};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -34,6 +34,9 @@ pub struct Options {
     /// Checks each frame's stated error on N fresh points afterwards and records that too.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
+    /// Begins no further frame after N seconds of wall clock.
+    #[arg(long, value_name = "N", value_parser = super::seconds)]
+    seconds: Option<f64>,
     /// Writes the trained surrogate here at the end.
     #[arg(long, value_name = "FILE")]
     checkpoint: Option<PathBuf>,
@@ -54,7 +57,12 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         }
         scene.publish.keep = Some(keep);
     }
-    scene.publish.endpoint = options.publish.clone().or(scene.publish.endpoint);
+    if let Some(endpoint) = &options.publish {
+        scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
+        scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
+    }
+    check_learns(&scene, "--checkpoint", options.checkpoint.as_deref())?;
+    check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
@@ -62,21 +70,22 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 }
 
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
-    let setup = Setup::new(scene)?;
-    let scene = setup.plan.scene.clone();
+    let setup = Setup::new(scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
     if let Some(checkpoint) = &options.checkpoint {
-        super::render::check_folder(checkpoint)?;
+        super::check_folder(checkpoint)?;
     }
+    // Before anything is written: from here on a signal leaves a complete folder.
+    let stop = Arc::new(AtomicBool::new(false));
+    let signals = watch_signals(stop.clone()).map(tokio::spawn);
     // The socket first: a port in use must not cost the run that the folder holds.
-    let mut output = Output::start(&scene.publish, None)?;
+    let mut output = Output::start(&scene.publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
     output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }
-    let stop = Arc::new(AtomicBool::new(false));
-    let signals = tokio::spawn(watch_signals(stop.clone()));
     let run_options = RunOptions {
         verify_points: options.verify as usize,
+        seconds: options.seconds,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
         ..RunOptions::default()
@@ -88,7 +97,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         let run = || engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
         // A fault of ours must not cost the frames that are already made.
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
-        let result = result.and_then(|result| result.map_err(anyhow::Error::from));
+        let result = result.and_then(|result| result.map_err(|error| located(&scene, error, EngineError::refused)));
         bar.finish_and_clear();
         // Whatever happened, the frames made so far and their records are completed.
         let mut run = serde_json::Map::new();
@@ -102,7 +111,9 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         (result, last, output.finish(run))
     });
     let (result, last, summary) = worker.await.context("the cycle stopped unexpectedly")?;
-    signals.abort();
+    if let Some(signals) = signals {
+        signals.abort();
+    }
     let report = result?;
     if common.json {
         return print_json(&summary);
@@ -114,7 +125,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         "{} frames of {} slides; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps",
         report.frames,
         report.slides,
-        report.integration_steps,
+        report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
         report.surrogate_bytes as f64 / 1e6,
         report.train_steps
     ));
@@ -175,6 +186,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,
         "surrogate_bytes": report.surrogate_bytes,
+        "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
         "time_resolution": report.time_resolution,
     }) else {
@@ -183,19 +195,23 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
     map
 }
 
-/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process.
-async fn watch_signals(stop: Arc<AtomicBool>) {
+/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process. Both are caught from this call on.
+fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output = ()>> {
     use tokio::signal::unix::{SignalKind, signal};
     let (Ok(mut interrupt), Ok(mut terminate)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
         messages::note("cannot watch for signals: an interrupt will end the run at once");
-        return;
+        return None;
     };
-    loop {
-        let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
-        if stop.swap(true, Ordering::Relaxed) {
-            messages::note("stopped at once; what was not written yet is lost");
-            std::process::exit(status);
+    Some(async move {
+        loop {
+            let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
+            if stop.swap(true, Ordering::Relaxed) {
+                messages::note("stopped at once; what was not written yet is lost");
+                // SAFETY: ends the process and touches no memory of ours. Not `exit`, whose handlers wait for libraries that may be
+                // waiting for a disk.
+                unsafe { libc::_exit(status) }
+            }
+            messages::note("finishing the current frame; once more to stop at once");
         }
-        messages::note("finishing the current frame; once more to stop at once");
-    }
+    })
 }

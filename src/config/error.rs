@@ -1,5 +1,6 @@
 //! Errors that point at the line.
 
+use crate::setting::Refused;
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -55,33 +56,22 @@ fn excerpt(line: &Option<(usize, String)>) -> String {
 }
 
 impl ConfigError {
+    /// Finds the line of `text` that set the key, unless it was set at another place.
+    pub(super) fn locate(refused: Refused, path: &Path, text: &str, elsewhere: Option<String>) -> Self {
+        let Refused { key, found, accepted } = refused;
+        let line = if elsewhere.is_none() { span_of(text, &key).map(|at| line_at(text, at)) } else { None };
+        let place = match (elsewhere, &line) {
+            (Some(place), _) => place,
+            (None, Some((number, _))) => format!("{}:{number}", path.display()),
+            (None, None) => path.display().to_string(),
+        };
+        Self::Value { place, key, found, accepted, line }
+    }
+
     /// From a TOML error, with its line and, for an unknown key, the nearest known one.
     pub(super) fn from_toml(path: &Path, text: &str, error: &toml::de::Error) -> Self {
         let (line, excerpt) = line_at(text, error.span().map_or(0, |s| s.start));
         Self::Syntax { path: path.to_path_buf(), line, excerpt, message: with_suggestion(error.message()) }
-    }
-}
-
-/// A fault found after parsing, not yet located.
-#[derive(Debug)]
-pub(super) struct Fault {
-    pub key: String,
-    pub found: String,
-    pub accepted: String,
-}
-
-impl Fault {
-    /// Finds the line that set the key: the last `--set` that names it, else the file.
-    pub(super) fn locate(self, path: &Path, text: &str, overrides: &[String]) -> ConfigError {
-        let Fault { key, found, accepted } = self;
-        let set = overrides.iter().rev().find(|o| o.split('=').next().is_some_and(|k| k.trim() == key));
-        let line = if set.is_none() { span_of(text, &key).map(|at| line_at(text, at)) } else { None };
-        let place = match (set, &line) {
-            (Some(set), _) => format!("--set {set}"),
-            (None, Some((number, _))) => format!("{}:{number}", path.display()),
-            (None, None) => path.display().to_string(),
-        };
-        ConfigError::Value { place, key, found, accepted, line }
     }
 }
 

@@ -34,18 +34,9 @@ fn overrides_take_words_numbers_and_lists() {
     let set = ["flow.boundary=stop", "flow.steps=40", "domain.max=[4, 1, 1]", "time.tau=12.5"].map(str::to_owned);
     let scene = SceneFile::parse(Path::new("s"), GYRE, &set).unwrap();
     assert_eq!(scene.flow.boundary, Some(crate::flow::Boundary::Stop));
-    assert_eq!(scene.flow.steps, StepsSetting::Fixed(40));
+    assert_eq!(scene.flow.steps, crate::flow::StepsSetting::Fixed(40));
     assert_eq!(scene.domain.unwrap().max[0], 4.0);
     assert_eq!(scene.time.tau.unwrap().value(), Some(12.5));
-}
-
-#[test]
-fn spans_have_units() {
-    let words = |s: &str| TimeSpan::Words(s.to_owned()).value();
-    assert_eq!(words("30 days"), Some(30.0 * 86_400.0));
-    assert_eq!(words("1.5h"), Some(5400.0));
-    assert_eq!(words("3 fortnights"), None);
-    assert_eq!(words("days"), None);
 }
 
 #[test]
@@ -54,4 +45,72 @@ fn parameters_of_another_flow_are_refused() {
     assert!(said.contains("`source.rate` does not belong to kind DoubleGyre"), "{said}");
     assert!(error("[source]\nkind = \"saddle\"\n[time]\ntau = 1\n", &[]).contains("`domain` is missing"));
     assert!(error("[source]\nkind = \"archive\"\n", &[]).contains("`archive.files` is empty"));
+}
+
+/// A scene in which each section is there, and the line of `fault` in it.
+fn with_fault(section: &str, fault: &str) -> (String, usize) {
+    let mut text = String::from(GYRE);
+    let heading = format!("[{section}]\n");
+    if !text.contains(&heading) {
+        text += &heading;
+    }
+    let at = text.find(&heading).unwrap() + heading.len();
+    text.insert_str(at, &format!("{fault}\n"));
+    let line = text[..at].lines().count() + 1;
+    (text, line)
+}
+
+#[test]
+fn a_fault_in_any_section_points_at_its_line() {
+    let camera = "look_at = [1, 0.5, 0]\nup = [0, 1, 0]";
+    for (section, fault, key, found, accepted) in [
+        ("source", "epsilon = nan", "source.epsilon", "NaN", "a finite number"),
+        ("time", "stride = 0", "time.stride", "0", "from 1 to"),
+        ("flow", "gap = 0.0", "flow.gap", "0", "above 0"),
+        ("surrogate", "table_nodes = [1, 8, 8]", "surrogate.table_nodes", "[1, 8, 8]", "at least 2"),
+        ("network", "features = 3", "network.features", "3", "1, 2, 4 or 8"),
+        ("network", "growth = 0.5", "network.growth", "0.5", "1 to 4"),
+        ("network", "loss = \"published\"", "network.loss", "published", "mean_square"),
+        ("training", "share = 1.0", "training.share", "1", "not including, 1"),
+        ("trust", "min_samples = 1", "trust.min_samples", "1", "4 to 4096"),
+        ("render", "samples = 0", "render.samples", "0", "1 to 16777216"),
+        ("render", "tone_map = [1, 1, 0]", "render.tone_map", "0.0", "gamma above 0"),
+        ("camera", &format!("field_of_view = 200\neye = [1, 0.5, 2]\n{camera}"), "camera.field_of_view", "200", "below 180"),
+        ("light", "direction = [0, 0, 0]\nradiance = [1, 1, 1]", "light.direction", "0.0", "not zero"),
+        ("transfer", "extinction = -1", "transfer.extinction", "-1", "0 or above"),
+        ("transfer", "albedo = [[2.0], [0.5], [0.5]]", "transfer.albedo", "2.0", "values in [0, 1]"),
+        ("publish", "keep = 0", "publish.keep", "0", "at least 1"),
+        ("publish", "stall_seconds = 0", "publish.stall_seconds", "0", "0.1 to 3600"),
+    ] {
+        let (text, line) = with_fault(section, fault);
+        let said = error(&text, &[]);
+        assert!(said.starts_with(&format!("scene.toml:{line}: `{key}` ")), "{said}\n{text}");
+        let excerpt = fault.lines().next().unwrap();
+        assert!(said.contains(found) && said.contains(accepted) && said.ends_with(&format!("{line:>4} | {excerpt}")), "{said}");
+    }
+}
+
+#[test]
+fn a_fault_found_later_is_located_and_options_are_blamed_for_theirs() {
+    let text = format!("{GYRE}[flow]\ngap = 1e-12\n");
+    let mut scene = SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap();
+    let late = crate::flow::FlowError::OutOfRange { key: "gap", found: 1e-12, accepted: "more" }.refused().unwrap();
+    assert!(scene.locate(late.clone()).to_string().starts_with("scene.toml:9: `flow.gap` is 0.000000000001; accepted: more"));
+    scene.set_by("flow.gap", "--gap 1e-12");
+    assert!(scene.locate(late).to_string().starts_with("--gap 1e-12: `flow.gap`"));
+}
+
+#[test]
+fn paths_in_a_scene_are_relative_to_it_and_those_of_the_command_line_are_not() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("scene.toml");
+    std::fs::write(&path, "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[training]\nresume = \"w.safetensors\"\n").unwrap();
+    let scene = SceneFile::read(&path, &[]).unwrap();
+    assert_eq!(
+        (&scene.archive.files[0], scene.training.resume.as_ref().unwrap()),
+        (&folder.path().join("a.nc"), &folder.path().join("w.safetensors"))
+    );
+    let set = ["archive.files=b.nc".to_owned(), "training.resume=v.safetensors".to_owned()];
+    let scene = SceneFile::read(&path, &set).unwrap();
+    assert_eq!((scene.archive.files[0].to_str(), scene.training.resume.unwrap().to_str()), (Some("b.nc"), Some("v.safetensors")));
 }

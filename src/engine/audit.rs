@@ -5,18 +5,19 @@ use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
 use crate::surrogate::{Predict, Samples};
-use crate::trust::{Gate, Residual, TrustedError};
+use crate::trust::{Gate, Residual, Strata, TrustedError};
 
 /// Dimension that no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX;
 
-/// Stratified uniform points in the unit cube: `per_cell` in each of `cells`, jittered.
-pub fn stratified_points(cells: [usize; 3], per_cell: usize, seed: u64, stream: u64) -> Vec<[f32; 3]> {
+/// Uniform points in each cell of the unit cube, as many as `strata` says.
+pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3]> {
+    let cells = strata.shape;
     let key = [seed as u32, (seed >> 32) as u32];
-    let mut points = Vec::with_capacity(cells.iter().product::<usize>() * per_cell);
-    for cell in 0..cells.iter().product::<usize>() {
+    let mut points = Vec::with_capacity(strata.total());
+    for (cell, &count) in strata.drawn.iter().enumerate() {
         let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
-        for _ in 0..per_cell {
+        for _ in 0..count {
             // The last word keeps these draws apart from every pixel's.
             let words = philox([points.len() as u32, stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION], key);
             points.push(std::array::from_fn(|k| (index[k] as f32 + unit(words[k])) / cells[k] as f32));
@@ -71,10 +72,17 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
         .collect()
 }
 
-/// Error over the residuals whose points the gate trusts.
-pub fn trusted_error(residuals: &[Residual], gate: &Gate) -> Option<TrustedError> {
+/// Error over the residuals whose points the gate trusts; they were drawn as `strata` says.
+pub fn trusted_error(residuals: &[Residual], strata: &Strata, gate: &Gate) -> Option<TrustedError> {
     let trusted: Vec<Residual> = residuals.iter().copied().filter(|r| gate.trusts(r.point)).collect();
-    TrustedError::of(&trusted)
+    TrustedError::of(&trusted, strata)
+}
+
+/// PSNR in decibels of the surrogate's log-stretch over the points of `residuals`, for the largest traced value `peak`. None where
+/// either has no finite value.
+pub fn psnr(residuals: &[Residual], peak: f32, strata: &Strata) -> Option<f64> {
+    let error = TrustedError::of(residuals, strata)?.log_stretch_rms;
+    Some(20.0 * (f64::from(peak) / error).log10()).filter(|psnr| psnr.is_finite())
 }
 
 #[cfg(test)]
@@ -84,13 +92,13 @@ mod tests {
     #[test]
     fn every_cell_gets_its_points() {
         let cells = [4, 3, 1];
-        let points = stratified_points(cells, 5, 7, 9);
+        let points = stratified_points(&Strata::even(cells, 5), 7, 9);
         let mut count = [0; 12];
         for p in &points {
             assert!(p.iter().all(|u| (0.0..1.0).contains(u)));
             count[(p[1] * 3.0) as usize * 4 + (p[0] * 4.0) as usize] += 1;
         }
         assert_eq!(count, [5; 12]);
-        assert_ne!(points, stratified_points(cells, 5, 7, 10), "another frame draws other points");
+        assert_ne!(points, stratified_points(&Strata::even(cells, 5), 7, 10), "another frame draws other points");
     }
 }

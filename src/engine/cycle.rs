@@ -5,14 +5,16 @@
 
 use super::answers::Answers;
 use super::audit;
-use super::feed::Slide;
+use super::feed::{Feed, Slide};
 use super::setup::{Plan, Setup, assemble};
+use super::stop::{Halt, Interruptible, heed};
+use super::training::{Threads, Until, train};
 use super::{EngineError, Frame, FrameRecord, StageSeconds};
-use crate::config::{SceneFile, TrainingSettings};
 use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
 use crate::render::{Method, Renderer, Scene};
-use crate::surrogate::{Kind, Learned, Predict, SampleRing, Samples, Surrogate, network::Target};
-use crate::trust::{Gate, TrustMap};
+use crate::surrogate::network::{Size, Target};
+use crate::surrogate::{Kind, Learned, Predict, Resize, SampleRing, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
+use crate::trust::{Gate, Strata, TrustMap};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -23,6 +25,8 @@ use std::time::Instant;
 pub struct RunOptions {
     /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
     pub verify_points: usize,
+    /// Wall-clock seconds after which no further frame is begun.
+    pub seconds: Option<f64>,
     /// Worker threads; 0: all that the process may use.
     pub threads: usize,
     /// Where to write the trained surrogate at the end.
@@ -59,12 +63,14 @@ pub struct RunReport {
     pub waited: f64,
     /// Optimizer steps.
     pub train_steps: u64,
-    /// Runge-Kutta steps a path.
-    pub integration_steps: usize,
+    /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
+    pub integration_steps: Option<usize>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
     pub integration_difference: Option<f64>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
+    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no size is tried in vain twice.
+    pub sizes: Vec<String>,
     /// Whether the snapshots are close enough in time; none for closed forms.
     pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
@@ -78,28 +84,6 @@ const KEEP_A_FRAME: usize = 4;
 /// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
 const RENDER_RESIDUALS: usize = 1 << 16;
 
-struct Threads {
-    render: rayon::ThreadPool,
-    train: Option<rayon::ThreadPool>,
-}
-
-impl Threads {
-    /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
-    fn new(threads: usize, scene: &SceneFile) -> Result<Self, EngineError> {
-        let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
-        let share = scene.training.share;
-        let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
-        let pool = |n: usize, name: &'static str| {
-            rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
-        };
-        if !learns || all == 1 || share == 0.0 {
-            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None });
-        }
-        let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
-        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pool(train, "ridgewatch-train")?) })
-    }
-}
-
 /// The state that goes from frame to frame.
 struct Cycle<'a> {
     plan: &'a Plan,
@@ -109,12 +93,23 @@ struct Cycle<'a> {
     trust: TrustMap,
     ring: SampleRing,
     live: Option<Box<dyn Surrogate>>,
+    /// What it is built from, with the data's own nodes.
+    surrogate: SurrogateSettings,
+    /// Finds its size, with `size = "auto"`.
+    sizing: Option<Sizing>,
+    /// The size that the next frame should have.
+    resize: Option<Resize>,
     frame: u64,
     /// Points traced since the last frame to prepare the next.
     probed: u64,
     /// Frames that were no warm-up.
     pictures: u64,
-    report: RunReport,
+    report: &'a mut RunReport,
+    /// Set from outside when the run should end.
+    stop: &'a AtomicBool,
+    /// Largest log-stretch that audit points of this slide have met.
+    peak: f32,
+    began: Instant,
 }
 
 /// Where a frame stands in the run.
@@ -132,70 +127,92 @@ const PILOT_PICTURE: u64 = 1 << 41;
 /// Number of the first warm-up picture, far beyond all others.
 const WARMUP_PICTURES: u64 = 1 << 40;
 
-/// Runs the whole scene. `sink` gets every event; `stop` ends the run after the current frame.
+/// Runs the whole scene. `sink` gets every event. Setting `stop` ends the run after the current frame; where none is in progress
+/// (while the window fills, tables are traced, or cells are probed) within about a second.
 pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
+    let mut report = RunReport::default();
+    match drive(setup, options, sink, stop, &mut report) {
+        Ok(()) | Err(Halt::TimeIsUp) => {}
+        Err(Halt::Stopped) => report.interrupted = true,
+        Err(Halt::Failed(error)) => return Err(error),
+    }
+    Ok(report)
+}
+
+fn drive(
+    setup: Setup,
+    options: &RunOptions,
+    sink: &mut (dyn FnMut(Event) + Send),
+    stop: &AtomicBool,
+    report: &mut RunReport,
+) -> Result<(), Halt> {
+    let began = Instant::now();
     let Setup { plan, mut feed, slides, notes } = setup;
     let time = &plan.scene.time;
     let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
-    let mut slide = feed.next_slide()?.ok_or(EngineError::EndedEarly)?;
     let threads = Threads::new(options.threads, &plan.scene)?;
-    let mut prepared = Instant::now();
-    let mut tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    let first = feed.next_slide_unless(stop)?;
+    heed(stop)?;
+    let mut slide = first.ok_or(EngineError::EndedEarly)?;
+    let begun = Instant::now();
+    let tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    heed(stop)?;
     // The number of steps is settled once, on the first slide, so that frames compare.
-    let map = FlowMap { steps: Steps::Fixed(tracer.steps()), ..plan.map.clone() };
-    let mut cycle = Cycle::new(&plan, options, threads, &*tracer, &slide)?;
-    if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
-        slide.warnings.push(format!(
-            "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
-            chosen.steps, chosen.difference
-        ));
-    }
-    if let VelocitySource::Window(window) = &slide.velocity {
-        let resolution = cycle.threads.render.install(|| time_resolution(window, &map, slide.time))?;
-        if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
-            slide.warnings.push(format!(
-                "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
-                100.0 * change / resolution.ftle_rms
-            ));
-        }
-        cycle.report.time_resolution = Some(resolution);
-    }
-    cycle.pilot(&*tracer)?;
-    cycle.probe(&*tracer, slide.index);
-    loop {
-        let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
-        for number in 0..warmups + time.frames_per_slide {
-            let place = Place { warmup: number < warmups, preparing: if number == 0 { prepared.elapsed().as_secs_f64() } else { 0.0 } };
-            let frame = cycle.frame(&*tracer, &mut slide, place, sink)?;
-            sink(Event::Frame(frame));
-            if stop.load(Ordering::Relaxed) {
-                cycle.report.interrupted = true;
-                return cycle.finish();
-            }
-        }
-        let Some(next) = feed.next_slide()? else { return cycle.finish() };
-        slide = next;
-        prepared = Instant::now();
-        tracer = cpu_tracer(slide.velocity.clone(), &map, slide.time)?;
-        cycle.slid(&*tracer);
-        cycle.probe(&*tracer, slide.index);
+    let map = match fixed_steps(&*tracer) {
+        Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
+        None => plan.map.clone(),
+    };
+    let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
+    let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| cycle.later_slides(&mut feed, &map, sink));
+    // What was learned is kept whether or not the run was stopped.
+    match ended {
+        Err(Halt::Failed(error)) => Err(Halt::Failed(error)),
+        ended => cycle.finish().map_err(Halt::Failed).and(ended),
     }
 }
 
 impl<'a> Cycle<'a> {
-    fn new(plan: &'a Plan, options: &'a RunOptions, threads: Threads, tracer: &dyn Tracer, first: &Slide) -> Result<Self, EngineError> {
+    fn new(
+        plan: &'a Plan,
+        options: &'a RunOptions,
+        threads: Threads,
+        tracer: &dyn Tracer,
+        first: &Slide,
+        began: Instant,
+        stop: &'a AtomicBool,
+        report: &'a mut RunReport,
+    ) -> Result<Self, Halt> {
         let scene = &plan.scene;
-        let renderer = Renderer::new(threads.render.install(|| settled_scene(plan, tracer, first.time))?, &plan.domain, plan.map.tau)?;
+        let settled = threads.render.install(|| settled_scene(plan, tracer, first.time));
+        heed(stop)?;
+        let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
+        let surrogate = match &first.velocity {
+            VelocitySource::Window(window) => window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape())),
+            VelocitySource::Analytic(..) => None,
+        };
+        let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
         let method = scene.render.method;
+        let mut sizing = None;
         let mut live = if method == Method::Reference {
             None
         } else {
-            Some(threads.render.install(|| crate::surrogate::build(&scene.surrogate, &scene.network, &plan.domain, scene.seed, tracer))?)
+            if scene.network.size == Size::Auto {
+                sizing = Some(Sizing::new(&surrogate, &scene.network, &plan.domain)?);
+            }
+            Some(threads.render.install(|| build(plan, &surrogate, sizing.as_ref(), tracer))?)
         };
-        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live) {
+        heed(stop)?;
+        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
+            && surrogate.learns()
+        {
             surrogate.load(path)?;
+            // Its table is that of another window, for all that is known.
+            threads.render.install(|| surrogate.window_slid(tracer));
+            heed(stop)?;
         }
+        report.integration_steps = fixed_steps(tracer);
+        report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
         Ok(Self {
             plan,
             options,
@@ -203,67 +220,162 @@ impl<'a> Cycle<'a> {
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
+            surrogate,
+            sizing,
+            resize: None,
             live,
             frame: 0,
             probed: 0,
             pictures: 0,
-            report: RunReport {
-                integration_steps: tracer.steps(),
-                integration_difference: tracer.chosen().map(|c| c.difference),
-                ..RunReport::default()
-            },
+            report,
+            stop,
+            peak: f32::NEG_INFINITY,
+            began,
         })
+    }
+
+    /// Prepares the first slide, which was begun at `begun`, and renders its frames.
+    fn first_slide(
+        &mut self,
+        tracer: &dyn Tracer,
+        map: &FlowMap,
+        slide: &mut Slide,
+        begun: Instant,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<(), Halt> {
+        if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
+            slide.warnings.push(format!(
+                "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                chosen.steps, chosen.difference
+            ));
+        }
+        if let VelocitySource::Window(window) = &slide.velocity {
+            let resolution = self.threads.render.install(|| time_resolution(window, map, slide.time))?;
+            if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
+                slide.warnings.push(format!(
+                    "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
+                    100.0 * change / resolution.ftle_rms
+                ));
+            }
+            self.report.time_resolution = Some(resolution);
+        }
+        self.pilot(tracer)?;
+        self.probe(tracer, slide.index)?;
+        self.frames(tracer, slide, begun, sink)
+    }
+
+    /// Goes on until the source ends.
+    fn later_slides(&mut self, feed: &mut Feed, map: &FlowMap, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
+        loop {
+            let next = feed.next_slide_unless(self.stop)?;
+            heed(self.stop)?;
+            let Some(mut slide) = next else { return Ok(()) };
+            let begun = Instant::now();
+            let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
+            self.slid(&*tracer)?;
+            self.probe(&*tracer, slide.index)?;
+            self.frames(&*tracer, &mut slide, begun, sink)?;
+        }
+    }
+
+    /// The frames of one slide.
+    fn frames(&mut self, tracer: &dyn Tracer, slide: &mut Slide, begun: Instant, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
+        let time = &self.plan.scene.time;
+        let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
+        for number in 0..warmups + time.frames_per_slide {
+            let place = Place { warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            if self.resized(&Interruptible::new(tracer, self.stop))? {
+                self.trust.reset();
+                self.probe(tracer, slide.index)?;
+            }
+            let frame = self.frame(tracer, slide, place, sink)?;
+            sink(Event::Frame(frame));
+            heed(self.stop)?;
+            if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
+                return Err(Halt::TimeIsUp);
+            }
+        }
+        Ok(())
+    }
+
+    /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
+    fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
+        let Some(resize) = self.resize.take() else { return Ok(false) };
+        let built = self.threads.render.install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer));
+        heed(self.stop)?;
+        let live = built?;
+        let text = format!("frame {}: {} ({:.2} MB)", self.frame, resize.why, live.bytes() as f64 / 1e6);
+        tracing::info!("{text}");
+        self.report.sizes.push(text);
+        self.live = Some(live);
+        Ok(true)
     }
 
     /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold, trust must be earned
     /// again.
-    fn slid(&mut self, tracer: &dyn Tracer) {
+    fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
+        let tracer = Interruptible::new(tracer, self.stop);
+        self.peak = f32::NEG_INFINITY;
+        let resized = self.resized(&tracer)?;
         if let Some(live) = &mut self.live {
-            self.threads.render.install(|| live.window_slid(tracer));
+            if !resized {
+                self.threads.render.install(|| live.window_slid(&tracer));
+                heed(self.stop)?;
+            }
             self.trust.window_slid();
             self.ring.mark_stale();
-            let holding = self.threads.render.install(|| self.share_of_labels_that_hold(tracer));
+            let holding = self.threads.render.install(|| self.share_of_labels_that_hold(&tracer));
+            heed(self.stop)?;
             self.ring.revalidate(holding);
         }
         self.renderer.window_slid();
+        Ok(())
     }
 
     /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and held against the surrogate they earn
     /// trust without tracing a whole frame. They decide the gate, so they say nothing about the error that is stated; audit points do.
-    fn probe(&mut self, tracer: &dyn Tracer, slide: u64) {
+    fn probe(&mut self, tracer: &dyn Tracer, slide: u64) -> Result<(), Halt> {
         let scene = &self.plan.scene;
         let per_cell = scene.trust.min_samples.ceil() as usize;
-        let unit = audit::stratified_points(self.trust.shape(), per_cell, scene.seed, PROBE_STREAM + slide);
+        let strata = Strata::even(self.trust.shape(), per_cell as u32);
+        let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
         let flow_map = self.wants_flow_map();
-        let probe = self.threads.render.install(|| audit::trace(tracer, &unit, flow_map));
+        let interruptible = Interruptible::new(tracer, self.stop);
+        let probe = self.threads.render.install(|| audit::trace(&interruptible, &unit, flow_map));
+        heed(self.stop)?;
         let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
         self.renderer.observe(&points, &probe.samples.log_stretch);
         self.probed += probe.drawn as u64;
-        self.learn_of(tracer, &probe.samples, true);
+        self.learn_of(tracer, &probe.samples, Some(&strata));
+        Ok(())
     }
 
     /// A picture of one sample a pixel, by RK4 and for nobody's eyes: a renderer that has seen nothing walks with the largest majorant
     /// everywhere and makes several times the queries, so that the first frame had better not be its first.
-    fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), EngineError> {
+    fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let gate = Gate::uniform(false);
-        let mut answers =
-            Answers::new(tracer, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME).with_flow_map(self.wants_flow_map());
-        let renderer = &mut self.renderer;
-        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, &AtomicBool::new(false)))?;
+        let interruptible = Interruptible::new(tracer, self.stop);
+        let mut answers = Answers::new(&interruptible, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME)
+            .with_flow_map(self.wants_flow_map());
+        let (renderer, stop) = (&mut self.renderer, self.stop);
+        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, stop))?;
+        heed(stop)?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
-        self.learn_of(tracer, &samples, false);
+        self.learn_of(tracer, &samples, None);
         Ok(())
     }
 
-    /// Holds traced samples against the surrogate, then keeps them for training.
-    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, uniform: bool) {
+    /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.
+    fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, strata: Option<&Strata>) {
         let Some(live) = &self.live else { return };
         let front = live.freeze();
         let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
         let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
-        let (uniform, others) = if uniform { (&residuals[..], &[][..]) } else { (&[][..], &residuals[..]) };
-        self.trust.observe(uniform, others);
+        match strata {
+            Some(strata) => self.trust.observe(&residuals, strata, &[]),
+            None => self.trust.observe(&[], &Strata::even(self.trust.shape(), 0), &residuals),
+        }
         self.ring.push(samples);
     }
 
@@ -313,14 +425,20 @@ impl<'a> Cycle<'a> {
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
-            let (renderer, frame, seed) = (&mut self.renderer, self.frame, scene.seed);
+            let (renderer, trust, frame, seed, stop) = (&mut self.renderer, &self.trust, self.frame, scene.seed, self.stop);
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
                     match &threads.train {
-                        Some(pool) => Trainer::Beside(
-                            scope.spawn(move || pool.install(|| train(&mut **live, ring.samples(), settings, Some(rendered)))),
-                        ),
+                        Some([beside, all]) => Trainer::Beside(scope.spawn(move || {
+                            let learned = beside.install(|| train(&mut **live, ring.samples(), settings, Until::Rendered(rendered), stop));
+                            let left = settings.seconds_per_frame - learned.seconds;
+                            if settings.steps_per_frame.is_some() || left <= 0.0 {
+                                return learned;
+                            }
+                            // The picture is done: its threads are free.
+                            learned.and(all.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(left), stop)))
+                        })),
                         None => Trainer::After(live, ring),
                     }
                 });
@@ -345,11 +463,14 @@ impl<'a> Cycle<'a> {
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
-                    let per_cell = front.as_ref().map_or(1, |_| {
-                        let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
-                        per_cell.max(wanted.div_ceil(cells.iter().product()))
-                    });
-                    let unit = audit::stratified_points(cells, per_cell, seed, 2 * frame);
+                    let strata = match front {
+                        Some(_) => {
+                            let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
+                            trust.audit_strata(&gate, per_cell.max(wanted.div_ceil(cells.iter().product())))
+                        }
+                        None => Strata::even(cells, 1),
+                    };
+                    let unit = audit::stratified_points(&strata, seed, 2 * frame);
                     let audit = audit::trace(tracer, &unit, flow_map);
                     let residuals =
                         front.as_deref().map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
@@ -359,6 +480,7 @@ impl<'a> Cycle<'a> {
                         tally,
                         samples,
                         audit,
+                        strata,
                         residuals,
                         render_seconds,
                         audit_seconds: auditing.elapsed().as_secs_f64(),
@@ -368,9 +490,9 @@ impl<'a> Cycle<'a> {
                 rendered.store(true, Ordering::Release);
                 learned = match training {
                     Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
-                    Some(Trainer::After(live, ring)) => {
-                        Some(threads.render.install(|| train(&mut **live, ring.samples(), &scene.training, None)))
-                    }
+                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| {
+                        train(&mut **live, ring.samples(), &scene.training, Until::Seconds(scene.training.seconds_per_frame), stop)
+                    })),
                     None => None,
                 };
             });
@@ -398,7 +520,7 @@ impl<'a> Cycle<'a> {
             missing: work.tally.missing,
             over_budget: work.tally.over_budget,
             traced_share: work.tally.traced as f64 / (work.tally.queries - work.tally.missing).max(1) as f64,
-            integration_steps: tracer.steps() as u64,
+            integration_steps: fixed_steps(tracer).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
             probed: std::mem::take(&mut self.probed),
             audited: work.audit.samples.len() as u64,
@@ -409,11 +531,16 @@ impl<'a> Cycle<'a> {
         };
         if let (Some(front), Some(audited)) = (front.as_deref(), &work.residuals) {
             record.trusted_share = gate.share();
-            record.trusted = audit::trusted_error(audited, &gate);
+            record.trusted = audit::trusted_error(audited, &work.strata, &gate);
+            self.peak = work.audit.samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(self.peak, f32::max);
+            record.surrogate_psnr = audit::psnr(audited, self.peak, &work.strata);
             record.over_tolerance = if work.tally.over_budget > 0 {
                 // The surrogate answered where it is not trusted: the points there speak for that, and the frame is flagged whatever they say.
                 let untrusted: Vec<_> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
-                Some(crate::trust::TrustedError::of(&untrusted).map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)))
+                Some(
+                    crate::trust::TrustedError::of(&untrusted, &work.strata)
+                        .map_or(0.0, |e| (e.optical_rms - scene.trust.tolerance).max(0.0)),
+                )
             } else {
                 record.trusted.map(|e| e.optical_rms - scene.trust.tolerance).filter(|over| *over > 0.0)
             };
@@ -425,16 +552,25 @@ impl<'a> Cycle<'a> {
             }
             if self.options.verify_points > 0 {
                 let per_cell = self.options.verify_points.div_ceil(cells.iter().product());
-                let unit = audit::stratified_points(cells, per_cell, scene.seed, 2 * self.frame + 1);
-                record.verified = self.threads.render.install(|| {
-                    let fresh = audit::trace(tracer, &unit, false);
-                    audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &gate)
+                let strata = Strata::even(cells, per_cell as u32);
+                let unit = audit::stratified_points(&strata, scene.seed, 2 * self.frame + 1);
+                let interruptible = Interruptible::new(tracer, self.stop);
+                let verified = self.threads.render.install(|| {
+                    let fresh = audit::trace(&interruptible, &unit, false);
+                    audit::trusted_error(&audit::residuals(front, &fresh.samples, transfer, tracer.tau()), &strata, &gate)
                 });
+                // Cut short by a stop it would stand on the points that come first.
+                record.verified = verified.filter(|_| !self.stop.load(Ordering::Relaxed));
             }
             let some = every(&work.samples, work.samples.len().div_ceil(RENDER_RESIDUALS).max(1));
             let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
             self.trust.decay();
-            self.trust.observe(audited, &rendered);
+            self.trust.observe(audited, &work.strata, &rendered);
+            if let Some(sizing) = &mut self.sizing {
+                // Over the whole domain: where nothing is trusted, the size is what is to be blamed.
+                let everywhere = audit::trusted_error(audited, &work.strata, &Gate::uniform(true));
+                self.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, scene.trust.tolerance));
+            }
             self.ring.push(&work.samples);
             self.ring.push(&work.audit.samples);
         }
@@ -458,6 +594,7 @@ impl<'a> Cycle<'a> {
             audit: work.audit_seconds + auditing.elapsed().as_secs_f64(),
             train: train_seconds,
             total: start.elapsed().as_secs_f64(),
+            elapsed: self.began.elapsed().as_secs_f64(),
         };
         if let VelocitySource::Window(window) = &slide.velocity {
             self.report.window_bytes = self.report.window_bytes.max(window.bytes());
@@ -470,12 +607,12 @@ impl<'a> Cycle<'a> {
         Ok(Frame { record: Arc::new(record), film: Arc::new(work.film), tone_map: scene.render.tone_map })
     }
 
-    fn finish(mut self) -> Result<RunReport, EngineError> {
+    fn finish(&mut self) -> Result<(), EngineError> {
         if let (Some(path), Some(live)) = (&self.options.checkpoint, &self.live) {
             live.save(path)?;
         }
         self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
-        Ok(self.report)
+        Ok(())
     }
 }
 
@@ -486,6 +623,7 @@ struct Rendered {
     tally: super::answers::Tally,
     samples: Samples,
     audit: audit::Audit,
+    strata: Strata,
     residuals: Option<Vec<crate::trust::Residual>>,
     render_seconds: f64,
     audit_seconds: f64,
@@ -496,35 +634,22 @@ enum Trainer<'scope, 'b> {
     After(&'b mut Box<dyn Surrogate>, &'b SampleRing),
 }
 
-/// Trains in slices until the frame is rendered and the frame's share of training is done.
-fn train(live: &mut dyn Surrogate, samples: &Samples, settings: &TrainingSettings, rendered: Option<&AtomicBool>) -> Learned {
-    if let Some(steps) = settings.steps_per_frame {
-        return live.learn(samples, f64::INFINITY, steps);
-    }
-    const SLICE: f64 = 0.1;
-    let start = Instant::now();
-    let mut sum = Learned::default();
-    let mut losses = (0.0, 0.0);
-    loop {
-        let left = settings.seconds_per_frame - start.elapsed().as_secs_f64();
-        if left <= 0.0 && rendered.is_none_or(|done| done.load(Ordering::Acquire)) {
-            break;
-        }
-        let slice = live.learn(samples, if rendered.is_some() { SLICE } else { left.min(SLICE) }, u64::MAX);
-        if slice.steps == 0 {
-            break;
-        }
-        sum.steps += slice.steps;
-        sum.samples += slice.samples;
-        sum.dropped += slice.dropped;
-        sum.rollbacks += slice.rollbacks;
-        if let Some(loss) = slice.loss {
-            losses = (losses.0 + loss * slice.steps as f64, losses.1 + slice.steps as f64);
-        }
-    }
-    sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
-    sum.seconds = start.elapsed().as_secs_f64();
-    sum
+/// The surrogate at its size.
+fn build(
+    plan: &Plan,
+    settings: &SurrogateSettings,
+    sizing: Option<&Sizing>,
+    tracer: &dyn Tracer,
+) -> Result<Box<dyn Surrogate>, SurrogateError> {
+    let scene = &plan.scene;
+    let plain = || (settings.clone(), scene.network.clone());
+    let (settings, network) = sizing.map_or_else(plain, |sizing| sizing.settings(settings, &scene.network));
+    crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)
+}
+
+/// Steps a path, unless each path chooses its own.
+fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+    Some(tracer.steps()).filter(|steps| *steps > 0)
 }
 
 fn every(samples: &Samples, stride: usize) -> Samples {
@@ -543,7 +668,7 @@ fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, E
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
-        let unit = audit::stratified_points([PROBES, PROBES, z], 1, file.seed, u64::MAX);
+        let unit = audit::stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
         let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
         let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {

@@ -2,6 +2,7 @@
 
 use crate::flow::FlowError;
 use crate::render::RenderError;
+use crate::setting::Refused;
 use crate::source::SourceError;
 use crate::surrogate::{CheckpointError, SurrogateError};
 use thiserror::Error;
@@ -9,6 +10,9 @@ use thiserror::Error;
 /// Why a run could not start or go on.
 #[derive(Debug, Error)]
 pub enum EngineError {
+    /// A setting.
+    #[error(transparent)]
+    Setting(#[from] Refused),
     /// The source.
     #[error(transparent)]
     Source(#[from] SourceError),
@@ -24,14 +28,6 @@ pub enum EngineError {
     /// A checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// A closed form without a box.
-    #[error("a closed form needs [domain] with min and max")]
-    NoDomain,
-    /// "30 days" where time has no seconds.
-    #[error(
-        "time.tau has a unit, but the source's time is not in seconds (with the index metric it counts snapshots): give a plain number"
-    )]
-    TauUnit,
     /// A synthetic grid.
     #[error(transparent)]
     Axis(#[from] crate::field::AxisFault),
@@ -49,4 +45,18 @@ pub enum EngineError {
     /// The thread pool.
     #[error("cannot start worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
+}
+
+impl EngineError {
+    /// The setting at fault, where it is one.
+    pub fn refused(&self) -> Option<Refused> {
+        match self {
+            EngineError::Setting(refused) => Some(refused.clone()),
+            EngineError::Source(error) => error.refused(),
+            EngineError::Flow(error) => error.refused(),
+            EngineError::Render(error) => Some(error.clone().into()),
+            EngineError::Surrogate(error) => Some(error.clone().into()),
+            _ => None,
+        }
+    }
 }

@@ -1,14 +1,20 @@
 //! One velocity after another: the slides of the window.
 
-use super::EngineError;
-use crate::config::{SceneFile, SourceKind, SourceSettings};
+use super::{EngineError, Settings};
 use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
-use crate::source::{DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, read_ahead};
+use crate::setting::Refused;
+use crate::source::{
+    DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
+};
 use std::sync::Arc;
-use std::time::Instant;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// How often a wait for a snapshot looks up for a request to stop.
+const LOOK_UP: Duration = Duration::from_millis(100);
 
 /// One position of the window.
 pub struct Slide {
@@ -89,7 +95,7 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
 }
 
 /// A gridded source, opened.
-pub fn open_snapshots(scene: &SceneFile) -> Result<Box<dyn SnapshotSource>, EngineError> {
+pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, EngineError> {
     let source = &scene.source;
     if source.kind == SourceKind::Archive {
         return Ok(Box::new(NetCdfArchive::open(&scene.archive.files, &scene.archive)?));
@@ -108,21 +114,21 @@ pub fn open_snapshots(scene: &SceneFile) -> Result<Box<dyn SnapshotSource>, Engi
     Ok(Box::new(MemorySource::new("synthetic turbulence", grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?))
 }
 
+/// A closed form without a box.
+pub(super) fn no_domain() -> EngineError {
+    Refused::new("domain", "is missing", "[domain] with min and max, since a closed form has no grid").into()
+}
+
 /// Seed of the standard turbulence (design: 0 for development).
 const TURBULENCE_SEED: u64 = 0;
 
 impl Feed {
     /// The feed of a scene whose |tau| is known.
-    pub fn open(
-        scene: &SceneFile,
-        snapshots: Option<Box<dyn SnapshotSource>>,
-        tau: f64,
-        direction: Direction,
-    ) -> Result<Self, EngineError> {
+    pub fn open(scene: &Settings, snapshots: Option<Box<dyn SnapshotSource>>, tau: f64, direction: Direction) -> Result<Self, EngineError> {
         let slides = scene.time.slides.map(|n| n as u64);
         match (closed_form(&scene.source), snapshots) {
             (Some(flow), _) => {
-                let box_ = scene.domain.as_ref().ok_or(EngineError::NoDomain)?;
+                let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
                 let domain = Domain { min: box_.min, max: box_.max, dimensions: flow.dimensions() };
                 Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
             }
@@ -143,12 +149,17 @@ impl Feed {
                     warnings: Vec::new(),
                 })
             }
-            (None, None) => Err(EngineError::NoDomain),
+            (None, None) => Err(no_domain()),
         }
     }
 
     /// The next slide; none when the source has ended.
     pub fn next_slide(&mut self) -> Result<Option<Slide>, EngineError> {
+        self.next_slide_unless(&AtomicBool::new(false))
+    }
+
+    /// The same; also none when `stop` is set, which is looked at while snapshots are waited for.
+    pub fn next_slide_unless(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
         match self {
             Feed::Closed { flow, domain, start, step, given, slides } => {
                 if *given == *slides {
@@ -171,7 +182,16 @@ impl Feed {
                 }
                 let start = Instant::now();
                 while !(window.is_full() && (*given == 0 || *taken >= *stride)) {
-                    let Some(snapshot) = reader.next() else { return Ok(None) };
+                    let snapshot = loop {
+                        if stop.load(Ordering::Relaxed) {
+                            return Ok(None);
+                        }
+                        match reader.next_within(LOOK_UP) {
+                            Ok(Some(snapshot)) => break snapshot,
+                            Ok(None) => return Ok(None),
+                            Err(StillReading) => {}
+                        }
+                    };
                     let newest = window.newest();
                     match window.push(snapshot?) {
                         Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
@@ -186,7 +206,7 @@ impl Feed {
                     Direction::Forward => window.oldest(),
                     Direction::Backward => window.newest(),
                 };
-                let time = ends.unwrap_or(f64::NAN);
+                let time = ends.ok_or(EngineError::EndedEarly)?;
                 Ok(Some(Slide {
                     index: *given - 1,
                     time,

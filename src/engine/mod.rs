@@ -1,6 +1,6 @@
 //! The work on a device, and the cycle that drives it.
 //!
-//! In: a scene. Out: frames with their records. Calls every room but `publish`.
+//! In: [`Settings`]. Out: frames with their records. Calls `field`, `source`, `flow`, `surrogate`, `trust` and `render`.
 
 mod answers;
 mod audit;
@@ -8,7 +8,10 @@ mod cycle;
 mod error;
 mod feed;
 mod record;
+mod settings;
 mod setup;
+mod stop;
+mod training;
 
 pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
@@ -17,6 +20,7 @@ pub use cycle::{Event, RunOptions, RunReport, run};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};
+pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
 
 /// A finished frame on its way out.

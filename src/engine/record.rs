@@ -3,7 +3,7 @@
 use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
 
-/// One frame's figures. Shares are in [0, 1]; residuals of `optical` kind have no unit, those of `log_stretch` kind neither.
+/// One frame's figures, all of them finite: what is not known is none (`null`), never a number that is none. Shares are in [0, 1]; residuals of `optical` kind have no unit, those of `log_stretch` kind neither.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 pub struct FrameRecord {
     /// Frame number in this run, from 0.
@@ -40,12 +40,16 @@ pub struct FrameRecord {
     pub over_tolerance: Option<f64>,
     /// Error measured on audit points of the trusted region; none when nothing is trusted.
     pub trusted: Option<TrustedError>,
+    /// PSNR in decibels of the surrogate alone over the whole domain, trusted or not, on the audit points; peak: their largest traced
+    /// log-stretch. None for `reference`.
+    #[serde(default)]
+    pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
     pub trusted_share: f64,
     /// The same error measured on fresh points with the same weights after the frame (`--verify`).
     pub verified: Option<TrustedError>,
-    /// Runge-Kutta steps a path.
-    pub integration_steps: u64,
+    /// Runge-Kutta steps a path; none where each path chooses its own (Dormand-Prince).
+    pub integration_steps: Option<u64>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it: the error of "the truth" itself.
     pub integration_difference: Option<f64>,
     /// Points traced before this frame to open the gate and to tighten the majorants (first frame of a slide).
@@ -85,4 +89,7 @@ pub struct StageSeconds {
     pub train: f64,
     /// The frame, without `waiting` and `slide`.
     pub total: f64,
+    /// Since the run began, reading and preparing included.
+    #[serde(default)]
+    pub elapsed: f64,
 }

@@ -1,17 +1,19 @@
 //! From a scene file to everything a run needs, checked before any work is done.
 
-use super::EngineError;
-use super::feed::{Feed, closed_form, open_snapshots};
-use crate::config::{SceneFile, SourceKind, StepsSetting};
+use super::feed::{Feed, closed_form, no_domain, open_snapshots};
+use super::{EngineError, Settings};
 use crate::field::Domain;
-use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps};
-use crate::render::{Renderer, Scene};
+use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
+use crate::render::{Method, Renderer, Scene};
+use crate::setting::Refused;
+use crate::source::SourceKind;
+use crate::surrogate::Kind;
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// The file.
-    pub scene: SceneFile,
+    /// What was asked for.
+    pub scene: Settings,
     /// The flow map, but for its start time.
     pub map: FlowMap,
     /// Where seeds lie.
@@ -32,7 +34,8 @@ pub struct Setup {
 
 impl Setup {
     /// Opens the source and settles what the scene leaves open.
-    pub fn new(scene: SceneFile) -> Result<Self, EngineError> {
+    pub fn new(scene: Settings) -> Result<Self, EngineError> {
+        scene.check()?;
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
@@ -42,16 +45,17 @@ impl Setup {
         let tau = match (&scene.time.tau, &snapshots) {
             (Some(tau), source) => {
                 if tau.has_unit() && source.as_ref().is_some_and(|s| s.describe().time_unit != "s") {
-                    return Err(EngineError::TauUnit);
+                    let found = "has a unit, but the source's time is not in seconds (with the index metric it counts snapshots)";
+                    return Err(Refused::new("time.tau", found, "a plain number").into());
                 }
-                tau.value().ok_or(EngineError::TauUnit)?
+                tau.value().ok_or_else(|| Refused::new("time.tau", format_args!("is {tau:?}"), "a number, or words such as \"30 days\""))?
             }
             (None, Some(source)) => {
                 let tau = source.default_tau()?;
                 notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
                 tau
             }
-            (None, None) => return Err(EngineError::TauUnit),
+            (None, None) => return Err(Refused::new("time.tau", "is missing", "a number above 0").into()),
         };
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
             SourceKind::Archive => Boundary::Stop,
@@ -75,9 +79,13 @@ impl Setup {
         let domain = match (&closed, &scene.domain, &snapshots) {
             (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },
             (_, _, Some(source)) => source.grid().domain(),
-            _ => return Err(EngineError::NoDomain),
+            _ => return Err(no_domain()),
         };
         check_picture(&scene, &domain, tau)?;
+        scene.surrogate.check_nodes(domain.dimensions)?;
+        if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
+            notes.push("training.resume is not read: neither method reference nor a table goes on from a checkpoint".to_owned());
+        }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let feed = Feed::open(&scene, snapshots, tau, direction)?;
         let slides = feed.expected_slides(times.as_deref(), tau);
@@ -86,7 +94,7 @@ impl Setup {
 }
 
 /// Refuses a camera, light or transfer function before anything is read, rendered or written.
-fn check_picture(scene: &SceneFile, domain: &Domain, tau: f64) -> Result<(), EngineError> {
+fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), EngineError> {
     let mut picture = assemble(scene, domain);
     // What is left open is scaled later, to values that are accepted.
     picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);
@@ -95,6 +103,6 @@ fn check_picture(scene: &SceneFile, domain: &Domain, tau: f64) -> Result<(), Eng
 }
 
 /// The picture's scene, its transfer function as far as the file gives it.
-pub(super) fn assemble(scene: &SceneFile, domain: &Domain) -> Scene {
+pub(super) fn assemble(scene: &Settings, domain: &Domain) -> Scene {
     Scene::assemble(domain, scene.camera.clone(), scene.light.clone(), scene.transfer.clone(), scene.render.clone(), scene.seed)
 }

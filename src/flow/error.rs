@@ -1,6 +1,7 @@
 //! Why a flow map cannot be traced.
 
 use super::{Boundary, Precision};
+use crate::setting::Refused;
 use thiserror::Error;
 
 /// Why no tracer was made.
@@ -93,4 +94,40 @@ pub enum FlowError {
         /// Difference asked for.
         tolerance: f64,
     },
+}
+
+impl FlowError {
+    /// The setting at fault, where it is one.
+    pub fn refused(&self) -> Option<Refused> {
+        Some(match self {
+            FlowError::OutOfRange { key, found, accepted } => {
+                let key = match *key {
+                    "tau" => "time.tau".to_owned(),
+                    "t0" => "time.start".to_owned(),
+                    "steps.tolerance" => "flow.tolerance".to_owned(),
+                    other => format!("flow.{other}"),
+                };
+                Refused::new(key, format_args!("is {found}"), *accepted)
+            }
+            FlowError::NotOnGrids { boundary } => {
+                Refused::new("flow.boundary", format_args!("is {boundary:?}"), "stop, clamp, periodic or zero on gridded velocity")
+            }
+            FlowError::GapVanishes { gap, precision, coordinate, least } => Refused::new(
+                "flow.gap",
+                format_args!("is {gap}, which vanishes in {precision:?} beside coordinates of {coordinate}"),
+                format!("at least {least}, or flow.precision = \"f64\""),
+            ),
+            FlowError::SphereAxes { axes } => Refused::new(
+                "archive.metric",
+                format_args!("is sphere, for a grid of {axes} axes"),
+                "sphere for longitude and latitude alone (archive.level picks one level); index or cartesian otherwise",
+            ),
+            FlowError::StepsNotFound { steps, reached, tolerance } => Refused::new(
+                "flow.tolerance",
+                format_args!("is {tolerance}, but {steps} steps still differ from twice as many by {reached:.2e}"),
+                "a larger tolerance, flow.precision = \"f64\", or flow.steps as a number",
+            ),
+            _ => return None,
+        })
+    }
 }

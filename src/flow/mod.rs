@@ -15,8 +15,10 @@ mod grid_flow;
 mod resolution;
 mod rk4;
 mod sampler;
+mod settings;
 mod sphere;
 mod sphere_levels;
+mod stencil;
 mod steps;
 mod stretch;
 mod tracer;
@@ -26,6 +28,7 @@ mod voids;
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 pub use error::FlowError;
 pub use resolution::{TimeResolution, time_resolution};
+pub use settings::{FlowSettings, StepsSetting};
 pub use steps::Chosen;
 pub use tracer::Order;
 
@@ -148,6 +151,23 @@ pub struct FlowMap {
     pub normalisation: Normalisation,
     /// Interpolation of gridded velocity.
     pub interpolation: Interpolation,
+}
+
+impl FlowMap {
+    /// The production path with so many steps over `tau`: forward, tangent flow in single precision, unbounded, linear interpolation.
+    pub fn tangent(tau: f64, steps: usize) -> Self {
+        Self {
+            tau,
+            direction: Direction::Forward,
+            integrator: Integrator::Tangent,
+            precision: Precision::F32,
+            steps: Steps::Fixed(steps),
+            gap: 1e-4,
+            boundary: Boundary::Unbounded,
+            normalisation: Normalisation::Tau,
+            interpolation: Interpolation::Linear,
+        }
+    }
 }
 
 /// The velocity that is integrated.

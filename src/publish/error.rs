@@ -1,5 +1,6 @@
 //! What can go wrong before a run starts. During a run nothing here is an error: it is a warning and a count.
 
+use crate::setting::Refused;
 use std::{io, path::PathBuf};
 use thiserror::Error;
 
@@ -7,15 +8,8 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum PublishError {
     /// A setting out of its range.
-    #[error("publish.{key} = {found}: accepted is {accepted}")]
-    Setting {
-        /// The key.
-        key: &'static str,
-        /// Its value.
-        found: String,
-        /// What is accepted.
-        accepted: &'static str,
-    },
+    #[error(transparent)]
+    Setting(#[from] Refused),
     /// An endpoint that cannot be understood.
     #[error("endpoint `{endpoint}`: {problem}; accepted is tcp://HOST:PORT (port 0 takes a free one) or `none`")]
     Endpoint {
@@ -78,4 +72,19 @@ pub enum PublishError {
         /// What is wrong.
         problem: String,
     },
+}
+
+impl PublishError {
+    /// The setting at fault, where it is one.
+    pub fn refused(&self) -> Option<Refused> {
+        match self {
+            PublishError::Setting(refused) => Some(refused.clone()),
+            PublishError::Endpoint { endpoint, problem } => Some(Refused::new(
+                "publish.endpoint",
+                format_args!("is \"{endpoint}\": {problem}"),
+                "tcp://HOST:PORT (port 0 takes a free one) or \"none\"",
+            )),
+            _ => None,
+        }
+    }
 }

@@ -1,6 +1,6 @@
 //! The thread that writes the run folder, behind a short queue.
 
-use super::{FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
+use super::{ExrFrames, FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
 use crate::engine::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -168,7 +168,7 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
         };
         let appended = folder.append_record(record);
         let pictured = match &job {
-            Job::Whole(frame) if settings.exr || settings.preview => Some(folder.write_pictures(frame, settings)),
+            Job::Whole(frame) if settings.exr != ExrFrames::None || settings.preview => Some(folder.write_pictures(frame, settings)),
             _ => None,
         };
 
@@ -187,6 +187,7 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
                 statistics.pictures_written += 1;
                 statistics.bytes_written += written.bytes;
                 statistics.pictures_removed += written.removed;
+                statistics.exr_replaced += u64::from(written.replaced);
             }
             Some(Err(error)) => {
                 statistics.pictures_failed += 1;
@@ -218,7 +219,7 @@ mod tests {
 
     fn frame(number: u64, edge: usize) -> Frame {
         let film = Film { width: edge, height: edge, rgba: vec![[0.5; 4]; edge * edge], ..Default::default() };
-        let record = FrameRecord { frame: number, ..Default::default() };
+        let record = FrameRecord { frame: number, slide: number, ..Default::default() };
         Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
     }
 

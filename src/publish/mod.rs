@@ -23,6 +23,6 @@ pub use message::{FRAME_TOPIC, FrameHeader, PROTOCOL, RECORD_TOPIC};
 pub use output::Output;
 pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};
-pub use settings::{DEFAULT_ENDPOINT, Payload, PublishSettings, WhenFull};
+pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, PublishSettings, WhenFull};
 pub use summary::{FileStatistics, Summary, Totals, peak_memory_bytes};
 pub use zmq::{PublishStatistics, Publisher};

@@ -1,6 +1,6 @@
 //! The run folder: `frames/frame_000000.exr` and `.png`, `records.jsonl`, `summary.json`.
 
-use super::{PublishError, PublishSettings, encode_exr, png};
+use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
 use crate::engine::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
@@ -43,8 +43,15 @@ pub struct RunFolder {
 
 #[derive(Debug)]
 struct Kept {
-    files: Vec<PathBuf>,
-    bytes: u64,
+    slide: u64,
+    /// With their sizes in bytes.
+    files: Vec<(PathBuf, u64)>,
+}
+
+impl Kept {
+    fn bytes(&self) -> u64 {
+        self.files.iter().map(|(_, bytes)| bytes).sum()
+    }
 }
 
 /// What writing a frame's pictures did.
@@ -54,6 +61,8 @@ pub struct Written {
     pub bytes: u64,
     /// Older frames whose pictures were deleted for it.
     pub removed: u64,
+    /// Whether it replaces the EXR of an older frame of its slide.
+    pub replaced: bool,
 }
 
 impl RunFolder {
@@ -115,9 +124,9 @@ impl RunFolder {
     /// On an error none of this frame's pictures stays.
     pub fn write_pictures(&mut self, frame: &Frame, settings: &PublishSettings) -> io::Result<Written> {
         let name = format!("frame_{:06}", frame.record.frame);
-        let mut new = Kept { files: Vec::new(), bytes: 0 };
+        let mut new = Kept { slide: frame.record.slide, files: Vec::new() };
         let outcome = (|| {
-            if settings.exr {
+            if settings.exr != ExrFrames::None {
                 let bytes = encode_exr(&frame.film, Some(&frame.record)).map_err(io::Error::other)?;
                 self.write_picture(&mut new, &format!("{name}.exr"), &bytes)?;
             }
@@ -128,20 +137,34 @@ impl RunFolder {
             Ok(())
         })();
         if let Err(error) = outcome {
-            remove(&new);
+            remove(&new.files);
             return Err(error);
         }
-        let bytes = new.bytes;
+        let replaced = settings.exr == ExrFrames::Slide && self.remove_exr_of_slide(new.slide);
+        let bytes = new.bytes();
         self.kept_bytes += bytes;
         self.kept.push_back(new);
-        Ok(Written { bytes, removed: self.make_room(settings) })
+        Ok(Written { bytes, removed: self.make_room(settings), replaced })
+    }
+
+    /// Deletes the EXR of the newest frame that is there, if it is of this slide; its preview stays.
+    fn remove_exr_of_slide(&mut self, slide: u64) -> bool {
+        let Some(last) = self.kept.back_mut().filter(|last| last.slide == slide) else { return false };
+        let is_exr = |file: &(PathBuf, u64)| file.0.extension().is_some_and(|extension| extension == "exr");
+        let Some(at) = last.files.iter().position(is_exr) else { return false };
+        let exr = last.files.remove(at);
+        self.kept_bytes -= exr.1;
+        remove(&[exr]);
+        if last.files.is_empty() {
+            self.kept.pop_back();
+        }
+        true
     }
 
     fn write_picture(&self, new: &mut Kept, name: &str, bytes: &[u8]) -> io::Result<()> {
         let path = self.path.join(FRAMES).join(name);
         write_whole(&path, bytes)?;
-        new.bytes += bytes.len() as u64;
-        new.files.push(path);
+        new.files.push((path, bytes.len() as u64));
         Ok(())
     }
 
@@ -151,8 +174,8 @@ impl RunFolder {
         let mut removed = 0;
         while self.kept.len() > 1 && (self.kept.len() > most || self.kept_bytes > most_bytes) {
             let Some(oldest) = self.kept.pop_front() else { break };
-            remove(&oldest);
-            self.kept_bytes -= oldest.bytes;
+            remove(&oldest.files);
+            self.kept_bytes -= oldest.bytes();
             removed += 1;
         }
         removed
@@ -167,8 +190,8 @@ impl RunFolder {
 }
 
 /// Removes a frame's pictures. A file that somebody else removed before is no trouble; any other is worth a word.
-fn remove(kept: &Kept) {
-    for file in &kept.files {
+fn remove(files: &[(PathBuf, u64)]) {
+    for (file, _) in files {
         match fs::remove_file(file) {
             Err(error) if error.kind() != io::ErrorKind::NotFound => {
                 tracing::warn!("{}: cannot be removed: {error}", file.display());
@@ -205,7 +228,7 @@ mod tests {
 
     fn frame(number: u64) -> Frame {
         let film = Film { width: 4, height: 2, rgba: vec![[number as f32, 0.5, 0.25, 1.0]; 8], ..Default::default() };
-        let record = FrameRecord { frame: number, ..Default::default() };
+        let record = FrameRecord { frame: number, slide: number, ..Default::default() };
         Frame { record: Arc::new(record), film: Arc::new(film), tone_map: [1.0, 0.5, 1.0] }
     }
 
@@ -230,6 +253,32 @@ mod tests {
         assert_eq!(written.removed, 2);
         assert_eq!(names(folder.path()), ["frame_000004.exr", "frame_000004.png"], "the newest stays though it is over the cap");
         assert_eq!(run.kept_bytes(), written.bytes);
+    }
+
+    #[test]
+    fn each_slide_keeps_the_exr_of_its_newest_frame() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        let of_slide = |number: u64, slide: u64| Frame {
+            record: Arc::new(FrameRecord { frame: number, slide, ..Default::default() }),
+            ..frame(number)
+        };
+        let mut write = |number, slide, settings: &PublishSettings| run.write_pictures(&of_slide(number, slide), settings).unwrap();
+        let settings = PublishSettings::default();
+        let replaced: Vec<bool> = [(0, 0), (1, 0), (2, 0), (3, 1)].map(|(n, slide)| write(n, slide, &settings).replaced).into();
+        assert_eq!(replaced, [false, true, true, false]);
+        let pngs = ["frame_000000.png", "frame_000001.png"];
+        assert_eq!(
+            names(folder.path()),
+            [&pngs[..], &["frame_000002.exr", "frame_000002.png", "frame_000003.exr", "frame_000003.png"]].concat()
+        );
+        let every = PublishSettings { exr: ExrFrames::Every, preview: false, ..Default::default() };
+        assert!(!write(4, 1, &every).replaced && !write(5, 1, &every).replaced);
+        let none = PublishSettings { exr: ExrFrames::None, ..Default::default() };
+        write(6, 1, &none);
+        assert_eq!(names(folder.path())[6..], ["frame_000004.exr", "frame_000005.exr", "frame_000006.png"]);
+        let there: u64 = fs::read_dir(folder.path().join(FRAMES)).unwrap().map(|e| e.unwrap().metadata().unwrap().len()).sum();
+        assert_eq!(run.kept_bytes(), there);
     }
 
     #[test]

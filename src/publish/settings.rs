@@ -1,6 +1,6 @@
 //! `[publish]` of a scene file.
 
-use super::PublishError;
+use crate::setting::{Refused, count, require};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
 /// Where frames go unless told otherwise: this machine only.
@@ -32,6 +32,18 @@ impl Payload {
     }
 }
 
+/// Which frames leave an EXR in the run folder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum ExrFrames {
+    /// One for each slide of the window: that of its newest frame, which replaces that of the frame before.
+    Slide,
+    /// All.
+    Every,
+    /// None.
+    None,
+}
+
 /// What happens to a frame when the disk is slower than the cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
@@ -61,8 +73,8 @@ pub struct PublishSettings {
     pub keep_bytes: Option<u64>,
     /// Whether a PNG of each frame is written.
     pub preview: bool,
-    /// Whether an EXR of each frame is written.
-    pub exr: bool,
+    /// Of which frames an EXR is written.
+    pub exr: ExrFrames,
     /// What happens when the disk is slower than the cycle.
     pub when_full: WhenFull,
 }
@@ -77,7 +89,7 @@ impl Default for PublishSettings {
             keep: None,
             keep_bytes: None,
             preview: true,
-            exr: true,
+            exr: ExrFrames::Slide,
             when_full: WhenFull::Wait,
         }
     }
@@ -85,18 +97,10 @@ impl Default for PublishSettings {
 
 impl PublishSettings {
     /// Checks ranges that the types do not.
-    pub fn check(&self) -> Result<(), PublishError> {
-        let setting = |key, found: String, accepted| Err(PublishError::Setting { key, found, accepted });
-        if !(1..=64).contains(&self.frames_in_flight) {
-            return setting("frames_in_flight", self.frames_in_flight.to_string(), "1 to 64");
-        }
-        if !(0.1..=3600.0).contains(&self.stall_seconds) {
-            return setting("stall_seconds", self.stall_seconds.to_string(), "0.1 to 3600");
-        }
-        if self.keep == Some(0) {
-            return setting("keep", "0".to_owned(), "at least 1, or no key to keep all frames");
-        }
-        Ok(())
+    pub fn check(&self) -> Result<(), Refused> {
+        count("publish.frames_in_flight", self.frames_in_flight, 1, 64)?;
+        require((0.1..=3600.0).contains(&self.stall_seconds), "publish.stall_seconds", self.stall_seconds, "a number from 0.1 to 3600")?;
+        require(self.keep != Some(0), "publish.keep", 0, "at least 1, or no key to keep all frames")
     }
 }
 

@@ -79,6 +79,8 @@ pub struct FileStatistics {
     pub pictures_failed: u64,
     /// Frames whose pictures were deleted later, by `keep` or `keep_bytes`.
     pub pictures_removed: u64,
+    /// EXR files deleted because a later frame of their slide has one (`exr = "slide"`).
+    pub exr_replaced: u64,
     /// Bytes of pictures written.
     pub bytes_written: u64,
     /// Bytes of pictures that are still there.

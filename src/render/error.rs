@@ -1,5 +1,6 @@
 //! What can be wrong with a scene.
 
+use crate::setting::Refused;
 use thiserror::Error;
 
 /// Why a scene cannot be rendered, or two films cannot be merged.
@@ -33,6 +34,18 @@ pub enum RenderError {
         /// Largest end.
         limit: u32,
     },
+}
+
+impl From<RenderError> for Refused {
+    fn from(error: RenderError) -> Self {
+        match error {
+            RenderError::Invalid { key, found, accepted } => Self::new(key, format_args!("is {found}"), accepted),
+            RenderError::Samples { end, limit, .. } => Self::new("render.samples", format_args!("is {end}"), format!("at most {limit}")),
+            RenderError::FilmSize { found, expected } => {
+                Self::new("render.width", format_args!("gives {found:?}"), format!("{expected:?}"))
+            }
+        }
+    }
 }
 
 /// Refuses unless `holds`.

@@ -4,15 +4,6 @@ use super::error::{RenderError, require};
 use super::{CameraSettings, LightSettings, RenderSettings, TransferSettings, overview_scale};
 use crate::field::Domain;
 
-/// Largest picture edge, in pixels.
-const MAX_EDGE: usize = 16_384;
-/// Largest number of pixels: a film of them takes 3 GB.
-const MAX_PIXELS: usize = 1 << 26;
-/// Largest number of samples a pixel in one call.
-const MAX_SAMPLES: usize = 1 << 24;
-/// Largest number of majorant cells along one axis.
-const MAX_CELLS: usize = 1024;
-
 /// A scene to render. Camera, light and extinction are in scene units: domain coordinates times `scale`.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Scene {
@@ -59,7 +50,7 @@ impl Scene {
 
     /// Width over height of the picture.
     pub(super) fn aspect(&self) -> f64 {
-        self.settings.width as f64 / self.settings.height as f64
+        self.settings.aspect()
     }
 
     /// Shortest edge of the box, in scene units.
@@ -76,24 +67,7 @@ impl Scene {
 
     /// Checks what camera, light and transfer function do not check themselves.
     pub(super) fn check(&self, domain: &Domain) -> Result<(), RenderError> {
-        let settings = &self.settings;
-        let size = "1 to 16384 pixels";
-        require((1..=MAX_EDGE).contains(&settings.width), "render.width", settings.width, size)?;
-        require((1..=MAX_EDGE).contains(&settings.height), "render.height", settings.height, size)?;
-        let pixels = settings.width * settings.height;
-        require(pixels <= MAX_PIXELS, "render.width", settings.width, "at most 67108864 pixels in all")?;
-        require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
-        let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
-        require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
-        require(colour(settings.missing), "render.missing", settings.missing, "three finite numbers, 0 or above")?;
-        let [contrast, brightness, gamma] = settings.tone_map;
-        let tone_map = "[contrast, brightness, gamma]: finite numbers, gamma above 0";
-        require(contrast.is_finite() && brightness.is_finite(), "render.tone_map", settings.tone_map, tone_map)?;
-        require(gamma.is_finite() && gamma > 0.0, "render.tone_map", settings.tone_map, tone_map)?;
-        if let Some(cells) = settings.majorant_cells {
-            require(cells.iter().all(|n| (1..=MAX_CELLS).contains(n)), "render.majorant_cells", cells, "1 to 1024 cells along each axis")?;
-            require(cells.iter().product::<usize>() <= 1 << 24, "render.majorant_cells", cells, "at most 16777216 cells in all")?;
-        }
+        self.settings.check()?;
         let finite = domain.min.iter().chain(&domain.max).all(|v| v.is_finite());
         require(finite && domain.extent().iter().all(|e| *e > 0.0), "domain", (domain.min, domain.max), "finite corners, max above min")?;
         require(self.scale.iter().all(|s| s.is_finite() && *s > 0.0), "scene scale", self.scale, "three finite numbers above 0")

@@ -1,6 +1,16 @@
 //! The tables of a scene file that belong to this room.
 
+use super::error::{RenderError, require};
 use serde::{Deserialize, Deserializer, Serialize};
+
+/// Largest picture edge, in pixels.
+const MAX_EDGE: usize = 16_384;
+/// Largest number of pixels: a film of them takes 3 GB.
+const MAX_PIXELS: usize = 1 << 26;
+/// Largest number of samples a pixel in one call.
+const MAX_SAMPLES: usize = 1 << 24;
+/// Largest number of majorant cells along one axis.
+const MAX_CELLS: usize = 1024;
 
 /// Which answers a picture is made of.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -120,5 +130,35 @@ impl Default for RenderSettings {
             majorant_cells: None,
             tone_map: [1.85, 0.75, 1.4],
         }
+    }
+}
+
+impl RenderSettings {
+    /// Width over height.
+    pub fn aspect(&self) -> f64 {
+        self.width as f64 / self.height as f64
+    }
+
+    /// Checks every range.
+    pub fn check(&self) -> Result<(), RenderError> {
+        let settings = self;
+        let size = "1 to 16384 pixels";
+        require((1..=MAX_EDGE).contains(&settings.width), "render.width", settings.width, size)?;
+        require((1..=MAX_EDGE).contains(&settings.height), "render.height", settings.height, size)?;
+        let pixels = settings.width * settings.height;
+        require(pixels <= MAX_PIXELS, "render.width", settings.width, "at most 67108864 pixels in all")?;
+        require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
+        let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
+        require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
+        require(colour(settings.missing), "render.missing", settings.missing, "three finite numbers, 0 or above")?;
+        let [contrast, brightness, gamma] = settings.tone_map;
+        let tone_map = "[contrast, brightness, gamma]: finite numbers, gamma above 0";
+        require(contrast.is_finite() && brightness.is_finite(), "render.tone_map", settings.tone_map, tone_map)?;
+        require(gamma.is_finite() && gamma > 0.0, "render.tone_map", settings.tone_map, tone_map)?;
+        if let Some(cells) = settings.majorant_cells {
+            require(cells.iter().all(|n| (1..=MAX_CELLS).contains(n)), "render.majorant_cells", cells, "1 to 1024 cells along each axis")?;
+            require(cells.iter().product::<usize>() <= 1 << 24, "render.majorant_cells", cells, "at most 16777216 cells in all")?;
+        }
+        Ok(())
     }
 }

@@ -1,6 +1,7 @@
 //! What can be wrong with an archive, in words that name the file, the variable, what was found and what is accepted.
 
 use crate::field::AxisFault;
+use crate::setting::Refused;
 use std::path::PathBuf;
 use thiserror::Error;
 
@@ -222,4 +223,21 @@ pub enum SourceError {
         /// What is known about it.
         what: String,
     },
+}
+
+impl SourceError {
+    /// The setting at fault, where it is one.
+    pub fn refused(&self) -> Option<Refused> {
+        let qualified =
+            |key: &str| if key == "tau" { "time.tau".to_owned() } else { format!("archive.{}", key.trim_start_matches("archive.")) };
+        Some(match self {
+            SourceError::Setting { key, found, accepted } => Refused::new(qualified(key), format_args!("is {found}"), accepted),
+            SourceError::VariableNotFound { path, key, variable, nearest, present } => Refused::new(
+                qualified(key),
+                format_args!("is \"{variable}\", which names no variable of {}{nearest}", path.display()),
+                format!("one of {present}"),
+            ),
+            _ => return None,
+        })
+    }
 }

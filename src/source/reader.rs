@@ -5,7 +5,7 @@ use crate::field::Snapshot;
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{Receiver, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
 /// Snapshots that wait in the channel unless asked otherwise.
@@ -22,6 +22,10 @@ pub struct ReadAhead {
     failed: Option<SourceError>,
     ended: bool,
 }
+
+/// The next snapshot was not read within the time given.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StillReading;
 
 /// Starts reading snapshots `range` (clipped to those there are) on a thread named `ridgewatch-io`. At most `capacity`
 /// snapshots (at least one) wait; one more is in the thread's hands. A snapshot that cannot be read gives an error in its place, and
@@ -62,6 +66,34 @@ impl ReadAhead {
         Duration::from_nanos(self.reading_nanoseconds.load(Ordering::Relaxed))
     }
 
+    /// The next snapshot, none at the end; waits for it so long at most.
+    ///
+    /// # Errors
+    /// It is still being read: ask again.
+    pub fn next_within(&mut self, limit: Duration) -> Result<Option<Result<Arc<Snapshot>, SourceError>>, StillReading> {
+        if self.remaining() == 0 {
+            return Ok(None);
+        }
+        if let Some(error) = self.failed.take() {
+            self.ended = true;
+            return Ok(Some(Err(error)));
+        }
+        let begin = Instant::now();
+        let received = self.receiver.recv_timeout(limit);
+        self.waited += begin.elapsed();
+        match received {
+            Ok(snapshot) => {
+                self.given += 1;
+                Ok(Some(snapshot))
+            }
+            Err(RecvTimeoutError::Timeout) => Err(StillReading),
+            Err(RecvTimeoutError::Disconnected) => {
+                self.ended = true;
+                Ok(Some(Err(SourceError::ReaderStopped { index: self.given, count: self.count, what: "it panicked".into() })))
+            }
+        }
+    }
+
     /// Snapshots still to come.
     pub fn remaining(&self) -> usize {
         if self.ended { 0 } else { self.count - self.given }
@@ -73,24 +105,10 @@ impl Iterator for ReadAhead {
 
     /// The next snapshot; waits until it is read.
     fn next(&mut self) -> Option<Self::Item> {
-        if self.remaining() == 0 {
-            return None;
-        }
-        if let Some(error) = self.failed.take() {
-            self.ended = true;
-            return Some(Err(error));
-        }
-        let begin = Instant::now();
-        let received = self.receiver.recv();
-        self.waited += begin.elapsed();
-        match received {
-            Ok(snapshot) => {
-                self.given += 1;
-                Some(snapshot)
-            }
-            Err(_) => {
-                self.ended = true;
-                Some(Err(SourceError::ReaderStopped { index: self.given, count: self.count, what: "it panicked".into() }))
+        loop {
+            // Any limit will do: waiting goes on.
+            if let Ok(next) = self.next_within(Duration::from_secs(3600)) {
+                return next;
             }
         }
     }

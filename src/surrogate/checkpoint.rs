@@ -8,6 +8,7 @@ use super::CheckpointError;
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
 use std::io::{Read, Write};
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -77,7 +78,8 @@ impl<'a> Checkpoint<'a> {
         header.extend(std::iter::repeat_n(' ', header.len().next_multiple_of(8) - header.len()));
         let io = |source| CheckpointError::Io { path: path.into(), source };
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        let mut file = tempfile::NamedTempFile::new_in(folder).map_err(io)?;
+        // A file like any other, by the umask; temporary ones are for their owner alone otherwise.
+        let mut file = tempfile::Builder::new().permissions(std::fs::Permissions::from_mode(0o666)).tempfile_in(folder).map_err(io)?;
         let mut out = std::io::BufWriter::new(file.as_file_mut());
         let mut write = || -> std::io::Result<()> {
             out.write_all(&(header.len() as u64).to_le_bytes())?;

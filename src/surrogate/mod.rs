@@ -4,6 +4,7 @@
 
 use crate::field::Domain;
 use crate::flow::Tracer;
+use crate::setting::Refused;
 use network::NetworkSettings;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
@@ -13,11 +14,13 @@ mod checkpoint;
 pub mod network;
 mod residual;
 mod ring;
+mod sizing;
 mod table;
 mod trainer;
 
 pub use residual::Residual;
 pub use ring::{KEEP_STALE, SampleRing};
+pub use sizing::{Resize, Sizing};
 pub use table::Table;
 
 /// Traced samples to learn from. Positions are unit coordinates ([`crate::field::Domain::to_unit`]).
@@ -48,11 +51,14 @@ impl Samples {
 /// What one call of [`Surrogate::learn`] did.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
-    /// Optimizer steps taken.
+    /// Optimizer steps taken, without those lost by roll-backs.
     pub steps: u64,
+    /// Optimizer steps taken and lost by roll-backs.
+    #[serde(default)]
+    pub lost_steps: u64,
     /// Samples used, with repetition.
     pub samples: u64,
-    /// Mean training loss over these steps (none when no step was taken).
+    /// Mean training loss over the steps taken, lost ones included (none when no step was taken).
     pub loss: Option<f64>,
     /// Non-finite samples dropped.
     pub dropped: u64,
@@ -60,6 +66,24 @@ pub struct Learned {
     pub rollbacks: u64,
     /// Wall-clock seconds.
     pub seconds: f64,
+}
+
+impl Learned {
+    /// Both together: counts and seconds add up, losses are averaged over their steps.
+    pub fn and(self, other: Learned) -> Learned {
+        let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.steps + l.lost_steps)));
+        let weight = (mine.1 + theirs.1) as f64;
+        let loss = mine.0 * mine.1 as f64 + theirs.0 * theirs.1 as f64;
+        Learned {
+            steps: self.steps + other.steps,
+            lost_steps: self.lost_steps + other.lost_steps,
+            samples: self.samples + other.samples,
+            loss: (weight > 0.0).then(|| loss / weight),
+            dropped: self.dropped + other.dropped,
+            rollbacks: self.rollbacks + other.rollbacks,
+            seconds: self.seconds + other.seconds,
+        }
+    }
 }
 
 /// Something that answers log-stretch queries and does not change: a surrogate, or what one was when it was frozen.
@@ -89,7 +113,7 @@ pub trait Surrogate: Predict {
 }
 
 /// Why a surrogate cannot be built.
-#[derive(Debug, thiserror::Error)]
+#[derive(Debug, Clone, thiserror::Error)]
 pub enum SurrogateError {
     /// A setting out of range.
     #[error("setting {key} = {found} is not accepted; accepted: {accepted}")]
@@ -101,6 +125,13 @@ pub enum SurrogateError {
         /// What is accepted.
         accepted: String,
     },
+}
+
+impl From<SurrogateError> for Refused {
+    fn from(error: SurrogateError) -> Self {
+        let SurrogateError::Setting { key, found, accepted } = error;
+        Self::new(key, format_args!("is {found}"), accepted)
+    }
 }
 
 /// Why a checkpoint was not written or read.
@@ -144,7 +175,8 @@ pub enum Kind {
 pub struct SurrogateSettings {
     /// Which kind.
     pub kind: Kind,
-    /// Nodes of the table along x, y, z (z ignored in two dimensions). None: the data's own nodes, or 256 along the longest edge.
+    /// Nodes of the table along x, y, z (z ignored in two dimensions). None: the data's own nodes, at most 2^21 in all; for closed forms
+    /// 256 along the longest edge, or 128 below a network.
     pub table_nodes: Option<[usize; 3]>,
 }
 
@@ -154,10 +186,62 @@ impl Default for SurrogateSettings {
     }
 }
 
-/// Nodes along the longest edge of a table for which none are set.
-const DEFAULT_NODES: usize = 256;
+/// Nodes along the longest edge of a table for which none are set, where no data say how many: alone, and below a network.
+const DEFAULT_NODES: [usize; 2] = [256, 128];
+/// Most nodes of a table that was given the data's own: every slide traces them anew, which two cores do in some ten seconds.
+const MOST_OWN_NODES: usize = 1 << 21;
 /// Most nodes of a table: 4 GiB of f32.
 const MOST_NODES: usize = 1 << 30;
+
+impl SurrogateSettings {
+    /// Checks what does not depend on the domain.
+    pub fn check(&self, network: &NetworkSettings) -> Result<(), SurrogateError> {
+        if self.table_nodes.is_some() {
+            // No flow varies along fewer than two axes; the third is looked at when the domain is known.
+            self.check_nodes(2)?;
+        }
+        if self.kind == Kind::Residual { Residual::check(network) } else { Ok(()) }
+    }
+
+    /// Checks the nodes along as many axes as the flow varies along.
+    pub fn check_nodes(&self, dimensions: usize) -> Result<(), SurrogateError> {
+        let Some(nodes) = self.table_nodes else { return Ok(()) };
+        let refuse = |accepted: &str| {
+            Err(SurrogateError::Setting { key: "surrogate.table_nodes".into(), found: format!("{nodes:?}"), accepted: accepted.into() })
+        };
+        let active = &nodes[..dimensions.clamp(1, 3)];
+        if active.iter().any(|&n| n < 2) {
+            return refuse("at least 2 along every axis that the flow varies along");
+        }
+        if active.iter().try_fold(1_usize, |product, &n| product.checked_mul(n)).is_none_or(|n| n > MOST_NODES) {
+            return refuse("at most 2^30 in all");
+        }
+        Ok(())
+    }
+
+    /// The same with the nodes of gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set; all axes are divided
+    /// alike where that would be more than 2^21 nodes.
+    pub fn at_resolution_of(&self, shape: [usize; 3]) -> Self {
+        let all: f64 = shape.iter().map(|&n| n as f64).product();
+        let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
+        let share = (MOST_OWN_NODES as f64 / all).min(1.0).powf(1.0 / axes as f64);
+        let own = shape.map(|n| ((n as f64 * share) as usize).max(2));
+        Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
+    }
+
+    /// Nodes of the table: those set, else 256 along the longest edge (128 below a network) and in proportion along the others.
+    pub(crate) fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
+        let dimensions = domain.dimensions.clamp(1, 3);
+        self.check_nodes(dimensions)?;
+        if let Some(nodes) = self.table_nodes {
+            return Ok(nodes);
+        }
+        let longest = DEFAULT_NODES[usize::from(self.kind == Kind::Residual)];
+        let extent = domain.extent();
+        let most = extent[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+        Ok(std::array::from_fn(|axis| ((extent[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
+    }
+}
 
 /// Builds the surrogate that the settings ask for; tables are traced at once. `seed` draws the network's first weights and its batches.
 pub fn build(
@@ -168,31 +252,10 @@ pub fn build(
     tracer: &dyn Tracer,
 ) -> Result<Box<dyn Surrogate>, SurrogateError> {
     Ok(match settings.kind {
-        Kind::Table => Box::new(Table::trace(tracer, nodes(settings, domain, DEFAULT_NODES)?)),
+        Kind::Table => Box::new(Table::trace(tracer, settings.nodes(domain)?)),
         Kind::Network => Box::new(Network { trainer: Trainer::new(network, domain, tracer.tau(), seed, false)? }),
-        // Half as fine as the table alone would be: the network is there for the rest.
-        Kind::Residual => Box::new(Residual::new(network, nodes(settings, domain, DEFAULT_NODES / 2)?, seed, tracer)?),
+        Kind::Residual => Box::new(Residual::new(network, settings.nodes(domain)?, seed, tracer)?),
     })
-}
-
-/// Nodes that were set, or `longest` along the longest active edge and in proportion along the others.
-fn nodes(settings: &SurrogateSettings, domain: &Domain, longest: usize) -> Result<[usize; 3], SurrogateError> {
-    let refuse = |nodes: [usize; 3], accepted: &str| {
-        Err(SurrogateError::Setting { key: "surrogate.table_nodes".into(), found: format!("{nodes:?}"), accepted: accepted.into() })
-    };
-    if let Some(nodes) = settings.table_nodes {
-        let active = &nodes[..domain.dimensions.clamp(1, 3)];
-        if active.iter().any(|&n| n < 2) {
-            return refuse(nodes, "at least 2 along every axis that the flow varies along");
-        }
-        if active.iter().try_fold(1_usize, |product, &n| product.checked_mul(n)).is_none_or(|n| n > MOST_NODES) {
-            return refuse(nodes, "at most 2^30 in all");
-        }
-        return Ok(nodes);
-    }
-    let extent = domain.extent();
-    let most = extent[..domain.dimensions.clamp(1, 3)].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
-    Ok(std::array::from_fn(|axis| ((extent[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
 }
 
 /// The network alone.
@@ -240,5 +303,21 @@ impl Surrogate for Network {
     fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError> {
         let checkpoint = checkpoint::Checkpoint::read(path, "network")?;
         self.trainer.restored(&checkpoint)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_table_has_the_datas_own_nodes_up_to_a_bound() {
+        let open = SurrogateSettings::default();
+        assert_eq!(open.at_resolution_of([81, 41, 1]).table_nodes, Some([81, 41, 2]));
+        let set = SurrogateSettings { table_nodes: Some([5, 6, 7]), ..open.clone() };
+        assert_eq!(set.at_resolution_of([81, 41, 1]), set);
+        let [x, y, z] = open.at_resolution_of([3000, 1500, 100]).table_nodes.unwrap();
+        assert!(x * y * z <= MOST_OWN_NODES && x * y * z > MOST_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
+        assert!(x.abs_diff(2 * y) <= 2, "{x} x {y}: all axes are divided alike");
     }
 }

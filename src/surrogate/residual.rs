@@ -28,6 +28,13 @@ pub struct Residual {
 impl Residual {
     /// Traces the table with `nodes` along x, y, z. The network must have the target `ftle` and the mean-square loss: nothing else adds up.
     pub fn new(network: &NetworkSettings, nodes: [usize; 3], seed: u64, tracer: &dyn Tracer) -> Result<Self, SurrogateError> {
+        Self::check(network)?;
+        let trainer = Trainer::new(network, tracer.domain(), tracer.tau(), seed, true)?;
+        Ok(Self { table: Table::trace(tracer, nodes), trainer, shrinkage: 0.0, slid: false })
+    }
+
+    /// Refuses targets and losses for which table and network do not add up.
+    pub(super) fn check(network: &NetworkSettings) -> Result<(), SurrogateError> {
         let refuse = |key: &str, found: String, accepted: &str| {
             Err(SurrogateError::Setting { key: key.into(), found, accepted: format!("{accepted} (surrogate.kind = \"residual\")") })
         };
@@ -37,8 +44,7 @@ impl Residual {
         if network.loss != super::network::Loss::MeanSquare {
             return refuse("network.loss", "published".into(), "mean_square");
         }
-        let trainer = Trainer::new(network, tracer.domain(), tracer.tau(), seed, true)?;
-        Ok(Self { table: Table::trace(tracer, nodes), trainer, shrinkage: 0.0, slid: false })
+        Ok(())
     }
 
     /// The table below.

@@ -17,8 +17,8 @@ const TRACE_AT_ONCE: usize = 1 << 20;
 pub struct Table {
     nodes: [usize; 3],
     dimensions: usize,
-    /// x fastest.
-    values: Vec<f32>,
+    /// x fastest. Shared with frozen copies; a slide writes into a place of its own.
+    values: Arc<Vec<f32>>,
     not_finite: usize,
 }
 
@@ -27,7 +27,7 @@ impl Table {
     pub fn trace(tracer: &dyn Tracer, nodes: [usize; 3]) -> Self {
         let dimensions = tracer.domain().dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut table = Self { nodes, dimensions, values: vec![0.0; nodes.iter().product()], not_finite: 0 };
+        let mut table = Self { nodes, dimensions, values: Arc::new(vec![0.0; nodes.iter().product()]), not_finite: 0 };
         table.retrace(tracer);
         table
     }
@@ -42,7 +42,11 @@ impl Table {
         };
         let mut traced = Traced::default();
         self.not_finite = 0;
-        for (part, values) in self.values.chunks_mut(TRACE_AT_ONCE).enumerate() {
+        if Arc::get_mut(&mut self.values).is_none() {
+            // A frame still renders with the old values, none of which is needed here.
+            self.values = Arc::new(vec![0.0; self.values.len()]);
+        }
+        for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
             let first = part * TRACE_AT_ONCE;
             let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| tracer.domain().from_unit(unit(first + i))).collect();
             tracer.trace(&seeds, Extras::default(), &mut traced);
@@ -109,14 +113,14 @@ impl Table {
     pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
         checkpoint.note("table.nodes", format!("{:?}", self.nodes));
         checkpoint.note("table.not_finite", self.not_finite.to_string());
-        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], &self.values));
+        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], self.values.as_slice()));
     }
 
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
         let values = checkpoint.values("table.values", self.values.len())?;
         let not_finite = checkpoint.number("table.not_finite")?;
-        Ok(Self { values, not_finite, ..self.clone() })
+        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values: Arc::new(values), not_finite })
     }
 }
 
@@ -225,6 +229,23 @@ mod tests {
         table.predict(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]], &mut out);
         // The tracer sees the slab's middle: z = 0.5 adds 2. NaN is clamped like a point below the domain.
         assert_eq!(out, [4.75, 4.75, 5.0, 3.0]);
+    }
+
+    #[test]
+    fn a_frozen_table_shares_its_values_until_the_window_slides() {
+        let domain = Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0));
+        let mut table = Table::trace(&Plane(domain.clone(), -1.0), [3, 3, 1]);
+        let frozen = table.clone();
+        assert!(std::ptr::eq(frozen.values(), table.values()), "nothing is copied");
+        let before = frozen.values().to_vec();
+        // The new window has no value in the left half.
+        table.retrace(&Plane(domain, 0.4));
+        assert_eq!(frozen.values(), before, "what a frame renders with stays");
+        assert_eq!((table.values()[0], table.values()[8]), (0.0, before[8]));
+        let own = table.values().as_ptr();
+        drop(frozen);
+        table.window_slid(&Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0));
+        assert_eq!(table.values().as_ptr(), own, "with nobody else looking it is written in place");
     }
 
     #[test]

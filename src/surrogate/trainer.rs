@@ -182,7 +182,8 @@ impl Trainer {
         // Few samples need no large batch; they would only be drawn many times over.
         let count = self.settings.batch.min(usable.max(256));
         let mut fused = self.fused.take().unwrap_or_else(|| Fused::new(&self.model, &self.objective, self.settings.batch));
-        let (mut losses, mut first_of_call) = (0.0, None::<f64>);
+        let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
+        let began = self.model.steps() as u64;
         while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
             let steps = self.model.steps() as u64;
             // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
@@ -227,22 +228,27 @@ impl Trainer {
             if diverged {
                 learned.rollbacks += 1;
                 // The moments are part of what diverged; so the steps since the last copy are lost.
+                let reached = steps + taken;
                 self.roll_back();
+                let kept = self.model.steps() as u64;
+                learned.lost_steps += reached.saturating_sub(kept);
+                learned.steps = kept.saturating_sub(began);
+                (losses, counted) = (losses + sum, counted + taken);
                 if self.progress.caution < LEAST_CAUTION {
                     break;
                 }
                 continue;
             }
             learned.steps += taken;
-            losses += sum;
+            (losses, counted) = (losses + sum, counted + taken);
         }
         self.fused = Some(fused);
         if self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY {
             self.average = Average { tables: self.model.tables(), layers: self.model.layers() };
         }
         self.predictor = Predictor::new(&self.model.shape, &self.average.layers);
-        learned.samples = learned.steps * count as u64;
-        learned.loss = (learned.steps > 0).then(|| losses / learned.steps as f64);
+        learned.samples = counted * count as u64;
+        learned.loss = (counted > 0).then(|| losses / counted as f64);
         learned.seconds = start.elapsed().as_secs_f64();
         learned
     }

@@ -41,6 +41,15 @@ pub struct Gate {
     trusted: Vec<bool>,
 }
 
+/// How many points were drawn in each cell, uniformly inside it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Strata {
+    /// Cells along x, y and z of the unit cube.
+    pub shape: [usize; 3],
+    /// Points drawn in each cell, x fastest.
+    pub drawn: Vec<u32>,
+}
+
 /// One-sided 95 % quantile of the normal distribution.
 const Z95: f64 = 1.645;
 /// What a frame leaves of the older frames' sums: the weights change, so old residuals lose their meaning.
@@ -87,10 +96,12 @@ impl TrustMap {
         }
     }
 
-    /// Takes residuals in: those of `uniform` points, from which drift is read off, and those of points drawn otherwise.
-    pub fn observe(&mut self, uniform: &[Residual], others: &[Residual]) {
+    /// Takes residuals in: those of points drawn over the whole domain as `strata` says, from which drift is read off, and those of
+    /// points drawn otherwise.
+    pub fn observe(&mut self, uniform: &[Residual], strata: &Strata, others: &[Residual]) {
         if !uniform.is_empty() {
-            let mean = uniform.iter().map(|r| f64::from(r.optical).powi(2)).sum::<f64>() / uniform.len() as f64;
+            let whole = uniform.iter().map(|r| strata.weight(r.point)).sum::<f64>();
+            let mean = uniform.iter().map(|r| strata.weight(r.point) * f64::from(r.optical).powi(2)).sum::<f64>() / whole;
             if self.just_slid
                 && let Some(before) = self.before_slide.filter(|b| *b > 0.0)
             {
@@ -142,11 +153,64 @@ impl TrustMap {
         Some(mean + Z95 * (variance / n).sqrt())
     }
 
+    /// How many audit points each cell gets, from what earlier frames have seen: `least` everywhere, and in trusted cells as many more,
+    /// in proportion to the spread of the squared residual there (Neyman 1934), as bring the standard error of the stated root mean
+    /// square to the setting's share of it, within the setting's bound.
+    pub fn audit_strata(&self, gate: &Gate, least: usize) -> Strata {
+        let mut strata = Strata::even(self.shape, least as u32);
+        let trusted = || self.cells.iter().zip(&gate.trusted).filter(|(_, trusted)| **trusted).map(|(cell, _)| cell);
+        let cells = trusted().count();
+        let weight: f64 = trusted().map(|c| c.weight).sum();
+        if cells == 0 || weight == 0.0 || gate.shape != self.shape {
+            return strata;
+        }
+        // One pseudo-sample a cell, like the whole trusted region: a cell that has shown nothing yet may still hold something.
+        let prior = [trusted().map(|c| c.optical_square).sum::<f64>() / weight, trusted().map(|c| c.optical_fourth).sum::<f64>() / weight];
+        let mean = |cell: &Cell| (cell.optical_square + prior[0]) / (cell.weight + 1.0);
+        let spread = |cell: &Cell| ((cell.optical_fourth + prior[1]) / (cell.weight + 1.0) - mean(cell).powi(2)).max(0.0).sqrt();
+        let mean_square = trusted().map(mean).sum::<f64>() / cells as f64;
+        let spreads = trusted().map(spread).sum::<f64>();
+        if mean_square <= 0.0 || spreads <= 0.0 {
+            return strata;
+        }
+        // The relative error of a root is half of that of the square.
+        let needed = (spreads / cells as f64 / (2.0 * self.settings.audit_precision * mean_square)).powi(2);
+        let more = needed.min((self.settings.audit_most_per_cell.saturating_sub(least) * cells) as f64);
+        for ((drawn, cell), trusted) in strata.drawn.iter_mut().zip(&self.cells).zip(&gate.trusted) {
+            if *trusted {
+                *drawn += (more * spread(cell) / spreads).round() as u32;
+            }
+        }
+        strata
+    }
+
     /// The gate for the next frame.
     pub fn gate(&self) -> Gate {
         let limit = self.settings.tolerance.powi(2);
         let trusted = self.cells.iter().map(|cell| self.upper_bound(cell).is_some_and(|bound| bound <= limit)).collect();
         Gate { shape: self.shape, trusted }
+    }
+}
+
+impl Strata {
+    /// As many points in every cell.
+    pub fn even(shape: [usize; 3], per_cell: u32) -> Self {
+        Self { shape, drawn: vec![per_cell; shape.iter().product()] }
+    }
+
+    /// Points in all.
+    pub fn total(&self) -> usize {
+        self.drawn.iter().map(|&n| n as usize).sum()
+    }
+
+    /// The cell of a unit point.
+    pub(super) fn cell(&self, point: [f32; 3]) -> usize {
+        cell_of(self.shape, point)
+    }
+
+    /// What one drawn point stands for, in cells.
+    pub(super) fn weight(&self, point: [f32; 3]) -> f64 {
+        1.0 / f64::from(self.drawn[self.cell(point)].max(1))
     }
 }
 
@@ -183,7 +247,8 @@ mod tests {
             residuals.extend((0..per_cell).map(|_| Residual { point, optical, log_stretch: 0.0 }));
         }
         map.decay();
-        map.observe(&residuals, &[]);
+        let strata = Strata::even(map.shape(), per_cell as u32);
+        map.observe(&residuals, &strata, &[]);
     }
 
     #[test]
@@ -213,7 +278,12 @@ mod tests {
         filled(&mut map, 0.01, 64);
         let bad = [0.51, 0.51, 0.0];
         map.decay();
-        map.observe(&[], &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>());
+        let strata = Strata::even(map.shape(), 0);
+        map.observe(
+            &[],
+            &strata,
+            &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>(),
+        );
         let gate = map.gate();
         assert!(!gate.trusts(bad));
         assert!(gate.trusts([0.45, 0.51, 0.0]));
@@ -241,5 +311,26 @@ mod tests {
         }
         map.window_slid();
         assert_eq!(map.gate().share(), 0.0, "400-fold growth was seen at the last slide; 0.002 would become 0.04");
+    }
+
+    #[test]
+    fn audits_go_where_the_error_is_spread() {
+        let settings = TrustSettings { audit_most_per_cell: 32, ..TrustSettings::default() };
+        let mut map = TrustMap::new(&settings, &domain());
+        filled(&mut map, 0.001, 64);
+        let ridge = [0.51, 0.51, 0.0];
+        let some: Vec<Residual> =
+            (0..200).map(|i| Residual { point: ridge, optical: if i % 20 == 0 { 0.05 } else { 0.001 }, log_stretch: 0.0 }).collect();
+        map.observe(&[], &Strata::even(map.shape(), 0), &some);
+        let gate = map.gate();
+        assert!(gate.trusts(ridge));
+        let strata = map.audit_strata(&gate, 8);
+        let here = strata.drawn[strata.cell(ridge)];
+        assert!(strata.drawn.iter().all(|&n| n >= 8));
+        let elsewhere = *strata.drawn.iter().enumerate().filter(|(c, _)| *c != strata.cell(ridge)).map(|(_, n)| n).max().unwrap();
+        assert!(here > 3 * elsewhere, "{here} against {elsewhere}");
+        // Rounding may add half a point a cell.
+        assert!(strata.total() <= 512 * 32 + 256, "{} points", strata.total());
+        assert_eq!(map.audit_strata(&Gate::uniform(false), 8), Strata::even(map.shape(), 8), "nothing is trusted: nothing is stated");
     }
 }

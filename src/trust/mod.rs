@@ -7,7 +7,7 @@ mod error;
 mod map;
 
 pub use error::TrustedError;
-pub use map::{Gate, Residual, TrustMap};
+pub use map::{Gate, Residual, Strata, TrustMap};
 
 use serde::{Deserialize, Serialize};
 
@@ -25,6 +25,10 @@ pub struct TrustSettings {
     pub audit_share: f64,
     /// Audit points a frame and cell at least: enough that a trusted cell keeps its trust by audits alone.
     pub audit_per_cell: usize,
+    /// Standard error of the stated error, as a share of it, up to which trusted cells get more audit points.
+    pub audit_precision: f64,
+    /// Audit points a frame and cell on average at most (unless `audit_share` asks for more).
+    pub audit_most_per_cell: usize,
     /// Factor on every cell's mean square residual when the window slides, at least; the growth measured at the last slide counts
     /// where it is larger.
     pub slide_inflation: f64,
@@ -41,6 +45,8 @@ impl Default for TrustSettings {
             min_samples: 16.0,
             audit_share: 0.01,
             audit_per_cell: 8,
+            audit_precision: 0.1,
+            audit_most_per_cell: 32,
             slide_inflation: 4.0,
             trace_budget: None,
         }

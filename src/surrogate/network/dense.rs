@@ -67,6 +67,25 @@ impl Packed {
     }
 }
 
+/// `X[M rows] * panel`, over `depth` inputs, for the first eight columns of a panel whose others are padding.
+///
+/// # Safety
+/// As for [`product`].
+#[inline(always)]
+unsafe fn half_product<const M: usize>(x: *const f32, stride: usize, depth: usize, panel: *const f32) -> [f32x8; M] {
+    let mut sums = [f32x8::splat(0.0); M];
+    for k in 0..depth {
+        // SAFETY: k < depth, so both reads lie inside what the caller promised.
+        unsafe {
+            let low = load(panel.add(k * PANEL));
+            for (m, sum) in sums.iter_mut().enumerate() {
+                *sum = f32x8::splat(*x.add(m * stride + k)).mul_add(low, *sum);
+            }
+        }
+    }
+    sums
+}
+
 /// `init + X[M rows] * panel`, over `depth` inputs.
 ///
 /// # Safety
@@ -104,10 +123,11 @@ pub(super) fn forward(layer: &Packed, x: &[f32], x_stride: usize, y: &mut [f32],
                 let weights = layer.forward.as_ptr().add(column * depth);
                 let bias = layer.forward.as_ptr().add(biases + column);
                 let init = if row < primal { [load(bias), load(bias.add(8))] } else { [zero; 2] };
+                let value_row = row % primal;
                 let sums = product::<BLOCK>(x.as_ptr().add(row * x_stride), x_stride, depth, weights, init);
                 for (m, sum) in sums.into_iter().enumerate() {
                     let out = y.as_mut_ptr().add((row + m) * y_stride + column);
-                    let value = y.as_ptr().add(((row + m) % primal) * y_stride + column);
+                    let value = y.as_ptr().add((value_row + m) * y_stride + column);
                     for (half, sum) in sum.into_iter().enumerate() {
                         // `max(0, sum)` in this order lets NaN through, so that a diverged network is seen and not painted black.
                         let passed = if row < primal { zero.fast_max(sum) } else { load(value.add(8 * half)).simd_gt(zero) & sum };
@@ -141,13 +161,21 @@ pub(super) fn input_gradient(
             // SAFETY: the asserts above bound every buffer.
             unsafe {
                 let weights = layer.backward.as_ptr().add(column * depth);
-                let sums = product::<BLOCK>(dz.as_ptr().add(row * dz_stride), dz_stride, depth, weights, [zero; 2]);
+                let dz = dz.as_ptr().add(row * dz_stride);
+                if layer.inputs - column <= PANEL / 2 && active.is_none() {
+                    for (m, sum) in half_product::<BLOCK>(dz, dz_stride, depth, weights).into_iter().enumerate() {
+                        store(dx.as_mut_ptr().add((row + m) * dx_stride + column), sum);
+                    }
+                    continue;
+                }
+                let sums = product::<BLOCK>(dz, dz_stride, depth, weights, [zero; 2]);
+                let value_row = row % primal;
                 for (m, sum) in sums.into_iter().enumerate() {
                     let out = dx.as_mut_ptr().add((row + m) * dx_stride + column);
                     for (half, sum) in sum.into_iter().enumerate() {
                         let kept = match active {
                             Some(a) => {
-                                let value = load(a.as_ptr().add(((row + m) % primal) * dx_stride + column + 8 * half));
+                                let value = load(a.as_ptr().add((value_row + m) * dx_stride + column + 8 * half));
                                 value.simd_gt(zero) & sum
                             }
                             None => sum,

@@ -60,10 +60,22 @@ pub enum Loss {
     Published,
 }
 
+/// Who decides how large the surrogate is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Size {
+    /// The scene.
+    Fixed,
+    /// The measured error, from small to at most what the scene says ([`crate::surrogate::Sizing`]).
+    Auto,
+}
+
 /// `[network]` of a scene file.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct NetworkSettings {
+    /// Whether `width`, `log2_table` and the nodes of a table are taken as they are, or found by the error that is measured.
+    pub size: Size,
     /// Encoding of the position.
     pub encoding: Encoding,
     /// Hash-grid levels.
@@ -104,6 +116,7 @@ pub struct NetworkSettings {
 impl Default for NetworkSettings {
     fn default() -> Self {
         Self {
+            size: Size::Fixed,
             encoding: Encoding::HashGrid,
             levels: 6,
             features: 4,

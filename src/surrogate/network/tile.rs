@@ -6,6 +6,7 @@ use super::dense::{self, BLOCK, Packed, packed_len};
 use super::encode::{self, Corners};
 use super::lanes::{Aligned, lanes};
 use rayon::prelude::*;
+use wide::f32x8;
 
 /// Values an output row is padded to.
 pub(super) const OUT: usize = 4;
@@ -179,7 +180,7 @@ impl Scratch {
             for row in (0..rows).step_by(BLOCK) {
                 // Six rows side by side hide the latency of each other's sums.
                 let x: [&[f32]; BLOCK] = std::array::from_fn(|m| &last[(row + m) * stride..][..len]);
-                let mut sums = [wide::f32x8::splat(0.0); BLOCK];
+                let mut sums = [f32x8::splat(0.0); BLOCK];
                 for k in (0..len).step_by(8) {
                     let w = lanes(&w[k..]);
                     for (sum, x) in sums.iter_mut().zip(x) {
@@ -218,21 +219,28 @@ impl Scratch {
         // The output layer: rank-one updates, row by row.
         let active = &self.activations[hidden - 1];
         let (head, biases) = gradient[layout.head..layout.len].split_at_mut(OUT * len);
-        for row in 0..rows {
-            let x = &active[row * stride..][..len];
-            let mask = &active[(row % primal) * stride..][..len];
-            let dx = &mut current[row * stride..][..len];
-            dx.fill(0.0);
+        for row in (0..rows).step_by(BLOCK) {
+            // Groups are whole blocks: the block's value rows are together.
+            let value = row % primal;
             for output in 0..shape.outputs() {
-                let d = self.d_outputs[row * OUT + output];
+                let d: [f32; BLOCK] = std::array::from_fn(|m| self.d_outputs[(row + m) * OUT + output]);
+                if row < primal {
+                    biases[output] += d.iter().sum::<f32>();
+                }
                 let w = &weights.head[output * len..][..len];
                 let dw = &mut head[output * len..][..len];
-                for k in 0..len {
-                    dw[k] = d.mul_add(x[k], dw[k]);
-                    dx[k] = d.mul_add(if mask[k] > 0.0 { w[k] } else { 0.0 }, dx[k]);
-                }
-                if row < primal {
-                    biases[output] += d;
+                // Six rows side by side share one reading and writing of the gradient.
+                for k in (0..len).step_by(8) {
+                    let (weight, mut sum) = (lanes(&w[k..]), lanes(&dw[k..]));
+                    for (m, &d) in d.iter().enumerate() {
+                        let d = f32x8::splat(d);
+                        sum = d.mul_add(lanes(&active[(row + m) * stride + k..]), sum);
+                        let mask = lanes(&active[(value + m) * stride + k..]).simd_gt(f32x8::splat(0.0));
+                        let dx = &mut current[(row + m) * stride + k..][..8];
+                        let before = if output == 0 { f32x8::splat(0.0) } else { lanes(dx) };
+                        dx.copy_from_slice(&d.mul_add(mask & weight, before).to_array());
+                    }
+                    dw[k..k + 8].copy_from_slice(&sum.to_array());
                 }
             }
         }

@@ -1,0 +1,243 @@
+//! What a run is told: `[time]` and `[training]`, and the settings of all rooms that the cycle calls.
+
+use crate::flow::{Direction, FlowSettings};
+use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
+use crate::setting::{Refused, count, positive, require};
+use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
+use crate::surrogate::{
+    SurrogateSettings,
+    network::{NetworkSettings, Size},
+};
+use crate::trust::TrustSettings;
+use serde::{Deserialize, Serialize};
+
+/// Everything that decides what a run computes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// A line for people.
+    pub title: String,
+    /// Seed of every random number.
+    pub seed: u64,
+    /// Where velocity comes from.
+    pub source: SourceSettings,
+    /// Which files, variables and metric, for archives.
+    pub archive: NetCdfSettings,
+    /// The box in which seeds lie; needed by closed forms.
+    pub domain: Option<DomainSettings>,
+    /// Integration time, direction and the slides of the window.
+    pub time: TimeSettings,
+    /// Integration.
+    pub flow: FlowSettings,
+    /// Which surrogate.
+    pub surrogate: SurrogateSettings,
+    /// Its network.
+    pub network: NetworkSettings,
+    /// How much training a frame gets.
+    pub training: TrainingSettings,
+    /// When the surrogate is believed.
+    pub trust: TrustSettings,
+    /// The picture.
+    pub render: RenderSettings,
+    /// View; none: an overview of the domain.
+    pub camera: Option<CameraSettings>,
+    /// Light; none: from above, over the shoulder.
+    pub light: Option<LightSettings>,
+    /// Extinction and albedo; none: scaled to the first frame's FTLE.
+    pub transfer: Option<TransferSettings>,
+}
+
+impl Settings {
+    /// Checks all that can be checked before the source is opened.
+    pub fn check(&self) -> Result<(), Refused> {
+        let kind = self.source.kind;
+        self.source.check(self.domain.as_ref(), &self.archive)?;
+        self.time.check(kind)?;
+        self.flow.check(matches!(kind, SourceKind::Archive | SourceKind::Turbulence))?;
+        self.surrogate.check(&self.network)?;
+        self.network.validate()?;
+        self.training.check()?;
+        if self.network.size == Size::Auto && self.training.resume.is_some() {
+            let accepted = "\"fixed\", with training.resume (or --resume): a checkpoint has one size";
+            return Err(Refused::new("network.size", "is \"auto\"", accepted));
+        }
+        check_trust(&self.trust)?;
+        self.render.check()?;
+        if let Some(camera) = &self.camera {
+            Camera::new(camera, self.render.aspect())?;
+        }
+        if let Some(light) = &self.light {
+            Light::new(light)?;
+        }
+        if let Some(transfer) = &self.transfer {
+            // What is left open is scaled later, to values that are accepted, and so is the length that extinction is measured in.
+            Transfer::new(&transfer.scaled_to(&[0.0, 1.0]), 1.0)?;
+        }
+        Ok(())
+    }
+}
+
+/// A number in the source's time unit, or words such as `"30 days"` where that unit is the second.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(untagged)]
+pub enum TimeSpan {
+    /// In time units of the source.
+    Number(f64),
+    /// With a unit.
+    Words(String),
+}
+
+impl TimeSpan {
+    /// The span in seconds where it has a unit; the plain number otherwise. None where the words make no sense.
+    pub fn value(&self) -> Option<f64> {
+        let words = match self {
+            TimeSpan::Number(n) => return Some(*n),
+            TimeSpan::Words(words) => words.trim(),
+        };
+        let split = words.find(|c: char| c.is_ascii_alphabetic() && c != 'e' && c != 'E')?;
+        let (number, unit) = words.split_at(split);
+        let factor = match unit.trim().trim_end_matches('s') {
+            "" | "sec" | "second" => 1.0,
+            "min" | "minute" => 60.0,
+            "h" | "hr" | "hour" => 3600.0,
+            "d" | "day" => 86_400.0,
+            "week" => 604_800.0,
+            _ => return None,
+        };
+        number.trim().parse::<f64>().ok().map(|n| n * factor)
+    }
+
+    /// Whether the span names a unit.
+    pub fn has_unit(&self) -> bool {
+        matches!(self, TimeSpan::Words(_))
+    }
+}
+
+/// `[time]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TimeSettings {
+    /// |tau|; none: half of the archive's span, at least two intervals (closed forms need it).
+    pub tau: Option<TimeSpan>,
+    /// Forward or backward; none: backward for archives, forward for closed forms.
+    pub direction: Option<Direction>,
+    /// Closed forms: seed time of the first slide.
+    pub start: f64,
+    /// Closed forms: how far the seed time moves from slide to slide.
+    pub step: f64,
+    /// Closed forms: number of slides. Archives: an upper bound; none: as many as the archive gives.
+    pub slides: Option<usize>,
+    /// Archives: snapshots that the window moves from slide to slide.
+    pub stride: usize,
+    /// Frames rendered at each slide.
+    pub frames_per_slide: usize,
+    /// Further frames at the first slide, in which the surrogate is trained up.
+    pub warmup_frames: usize,
+}
+
+impl Default for TimeSettings {
+    fn default() -> Self {
+        Self { tau: None, direction: None, start: 0.0, step: 1.0, slides: None, stride: 1, frames_per_slide: 1, warmup_frames: 0 }
+    }
+}
+
+impl TimeSettings {
+    /// Checks ranges; closed forms need tau, in plain numbers.
+    pub fn check(&self, kind: SourceKind) -> Result<(), Refused> {
+        let time = self;
+        let refuse = |key: &str, found: &str, accepted: &str| Err(Refused::new(key, found, accepted));
+        match &time.tau {
+            Some(tau) => {
+                let accepted = "a number above 0 in the source's time unit, or words such as \"30 days\", \"36 h\", \"90 min\"";
+                require(tau.value().is_some_and(|v| v.is_finite() && v > 0.0), "time.tau", tau, accepted)?;
+                if tau.has_unit() && kind != SourceKind::Archive {
+                    refuse("time.tau", "has a unit", "a plain number: the time of a closed form has no unit")?;
+                }
+            }
+            None if kind != SourceKind::Archive => refuse("time.tau", "is missing", "a number above 0")?,
+            None => {}
+        }
+        require(time.start.is_finite(), "time.start", time.start, "a finite number")?;
+        require(time.step.is_finite(), "time.step", time.step, "a finite number")?;
+        if let Some(slides) = time.slides {
+            count("time.slides", slides, 1, 10_000_000)?;
+        }
+        count("time.stride", time.stride, 1, 1_000_000)?;
+        count("time.frames_per_slide", time.frames_per_slide, 1, 1_000_000)?;
+        count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)
+    }
+}
+
+/// `[training]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct TrainingSettings {
+    /// Share of the threads that train while the others render (at least one thread each; with a single thread they take turns).
+    pub share: f64,
+    /// Wall-clock seconds of training that every frame gets at least: the next frame waits for them.
+    pub seconds_per_frame: f64,
+    /// Exactly so many optimizer steps a frame instead: slower, but the same on every run.
+    pub steps_per_frame: Option<u64>,
+    /// Samples that the ring holds.
+    pub ring: usize,
+    /// Checkpoint to go on from.
+    pub resume: Option<std::path::PathBuf>,
+}
+
+impl Default for TrainingSettings {
+    fn default() -> Self {
+        Self { share: 0.5, seconds_per_frame: 1.0, steps_per_frame: None, ring: 1 << 22, resume: None }
+    }
+}
+
+impl TrainingSettings {
+    /// Checks ranges.
+    pub fn check(&self) -> Result<(), Refused> {
+        let t = self;
+        require((0.0..1.0).contains(&t.share), "training.share", t.share, "a number from 0 up to, not including, 1")?;
+        require(
+            t.seconds_per_frame.is_finite() && t.seconds_per_frame >= 0.0,
+            "training.seconds_per_frame",
+            t.seconds_per_frame,
+            "0 or a number above",
+        )?;
+        require(t.seconds_per_frame <= 86_400.0, "training.seconds_per_frame", t.seconds_per_frame, "at most 86400 (a day)")?;
+        if let Some(steps) = t.steps_per_frame {
+            require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
+        }
+        count("training.ring", t.ring, 1024, 1 << 28)
+    }
+}
+
+fn check_trust(t: &TrustSettings) -> Result<(), Refused> {
+    positive("trust.tolerance", t.tolerance)?;
+    require((0.01..=1.0).contains(&t.audit_share), "trust.audit_share", t.audit_share, "a number from 0.01 to 1")?;
+    count("trust.audit_per_cell", t.audit_per_cell, 1, 4096)?;
+    count("trust.audit_most_per_cell", t.audit_most_per_cell, 1, 65_536)?;
+    require((0.001..=1.0).contains(&t.audit_precision), "trust.audit_precision", t.audit_precision, "a number from 0.001 to 1")?;
+    require((4.0..=4096.0).contains(&t.min_samples), "trust.min_samples", t.min_samples, "a number from 4 to 4096")?;
+    require(t.slide_inflation.is_finite() && t.slide_inflation >= 1.0, "trust.slide_inflation", t.slide_inflation, "a number from 1 up")?;
+    if let Some(seconds) = t.trace_budget {
+        positive("trust.trace_budget", seconds)?;
+    }
+    if let Some(cells) = t.cells {
+        for n in cells {
+            count("trust.cells", n, 1, 1024)?;
+        }
+        count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn spans_have_units() {
+        let words = |s: &str| TimeSpan::Words(s.to_owned()).value();
+        assert_eq!(words("30 days"), Some(30.0 * 86_400.0));
+        assert_eq!(words("1.5h"), Some(5400.0));
+        assert_eq!(words("3 fortnights"), None);
+        assert_eq!(words("days"), None);
+    }
+}

@@ -1,0 +1,37 @@
+//! A value of the scene file that is not accepted. Every room checks its own settings with these; [`crate::config`] finds the line.
+
+use std::fmt::{Debug, Display};
+
+/// What is wrong with which setting.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("`{key}` {found}; accepted: {accepted}")]
+pub struct Refused {
+    /// Dotted key in the scene file, e.g. `render.width`.
+    pub key: String,
+    /// What was found, with a verb: `is -1`.
+    pub found: String,
+    /// What is accepted.
+    pub accepted: String,
+}
+
+impl Refused {
+    /// Puts the three together.
+    pub fn new(key: impl Into<String>, found: impl Display, accepted: impl Into<String>) -> Self {
+        Self { key: key.into(), found: found.to_string(), accepted: accepted.into() }
+    }
+}
+
+/// Refuses unless `holds`.
+pub(crate) fn require(holds: bool, key: &str, value: impl Debug, accepted: &str) -> Result<(), Refused> {
+    if holds { Ok(()) } else { Err(Refused::new(key, format_args!("is {value:?}"), accepted)) }
+}
+
+/// Refuses what is not a finite number above 0.
+pub(crate) fn positive(key: &str, value: f64) -> Result<(), Refused> {
+    require(value.is_finite() && value > 0.0, key, value, "a number above 0")
+}
+
+/// Refuses what is not from `low` to `high`.
+pub(crate) fn count(key: &str, value: usize, low: usize, high: usize) -> Result<(), Refused> {
+    require((low..=high).contains(&value), key, value, &format!("a whole number from {low} to {high}"))
+}

@@ -1,0 +1,81 @@
+//! What the records of a run say about its own error, held against what was measured afterwards; and what a slide does to trust.
+
+#![allow(clippy::unwrap_used)]
+
+use ridgewatch::engine::FrameRecord;
+use std::process::Command;
+
+/// Fixed numbers of training steps and fixed seeds: the run is the same on every machine but for rounding.
+const SCENE: &str = "
+[source]
+kind = \"double_gyre\"
+[domain]
+min = [0, 0, 0]
+max = [2, 1, 0.2]
+[time]
+tau = 5
+step = 0.1
+slides = 4
+frames_per_slide = 5
+[flow]
+steps = 50
+[render]
+width = 32
+height = 16
+samples = 4
+[training]
+steps_per_frame = 100
+[network]
+batch = 2048
+[surrogate]
+kind = \"network\"
+";
+
+fn records() -> Vec<FrameRecord> {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene.toml");
+    std::fs::write(&scene, SCENE).unwrap();
+    let out = folder.path().join("run");
+    let output = Command::new(env!("CARGO_BIN_EXE_ridgewatch"))
+        .args(["replay", scene.to_str().unwrap(), "--verify", "100000", "--out", out.to_str().unwrap()])
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let lines = std::fs::read_to_string(out.join("records.jsonl")).unwrap();
+    lines.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+}
+
+#[test]
+fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
+    let records = records();
+    let pairs: Vec<_> = records.iter().filter_map(|r| Some((r.trusted?, r.verified?))).collect();
+    assert!(pairs.len() >= 20, "{} of {} frames state an error", pairs.len(), records.len());
+    // The bounds are those of the promise: 20 % in root mean square over frames, and the interval holds in 90 % of the frames.
+    let relative = |(stated, verified): &(ridgewatch::trust::TrustedError, _)| -> f64 {
+        let verified: &ridgewatch::trust::TrustedError = verified;
+        stated.optical_rms / verified.optical_rms - 1.0
+    };
+    let rms = (pairs.iter().map(|pair| relative(pair).powi(2)).sum::<f64>() / pairs.len() as f64).sqrt();
+    assert!(rms <= 0.2, "stated and verified error differ by {:.1} %", 100.0 * rms);
+    let holds = |(stated, verified): &&(ridgewatch::trust::TrustedError, ridgewatch::trust::TrustedError)| {
+        let [low, high] = stated.optical_rms_interval;
+        (low..=high).contains(&verified.optical_rms)
+    };
+    let held = pairs.iter().filter(holds).count();
+    assert!(held as f64 >= 0.9 * pairs.len() as f64, "the interval holds the truth in {held} of {} frames", pairs.len());
+
+    let of_slide = |slide: u64| records.iter().filter(move |r| r.slide == slide);
+    for slide in 1..4 {
+        let before = of_slide(slide - 1).next_back().unwrap();
+        let (first, last) = (of_slide(slide).next().unwrap(), of_slide(slide).next_back().unwrap());
+        assert!(first.trusted_share < before.trusted_share, "slide {slide} costs trust");
+        assert!(last.trusted_share > first.trusted_share, "slide {slide}: trust is earned again");
+    }
+    // The traced share follows.
+    let share = |record: Option<&FrameRecord>| record.unwrap().traced_share;
+    let before = share(of_slide(1).next_back());
+    let (first, last) = (share(of_slide(2).next()), share(of_slide(2).next_back()));
+    assert!(first > before && last < first, "traced share {before:.3}, then {first:.3}, {last:.3}");
+    // The surrogate's own PSNR over the whole domain is a learning curve.
+    assert!(records.last().unwrap().surrogate_psnr.unwrap() > records[0].surrogate_psnr.unwrap() + 10.0);
+}
