@@ -31,13 +31,21 @@ enum End {
     Refused,
     /// The library crashed, and the file was named.
     Crashed,
-    /// It looped until it was ended.
+    /// The library looped, and was given up.
+    GivenUp,
+    /// It did not end by itself.
     Hung,
 }
 
 fn inspect(file: &Path) -> End {
     let command = format!("ulimit -v {MEMORY}; exec {} inspect {}", env!("CARGO_BIN_EXE_ridgewatch"), file.display());
-    let mut child = Command::new("sh").args(["-c", &command]).stdout(Stdio::null()).stderr(Stdio::piped()).spawn().unwrap();
+    let mut child = Command::new("sh")
+        .args(["-c", &command])
+        .env("RIDGEWATCH_OPENING_LIMIT", "5")
+        .stdout(Stdio::null())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
     let begin = Instant::now();
     let status = loop {
         if let Some(status) = child.try_wait().unwrap() {
@@ -55,6 +63,9 @@ fn inspect(file: &Path) -> End {
     match status.code() {
         Some(0) => End::Answered,
         Some(1) => {
+            if said.contains("was not opened within 5 s") {
+                return End::GivenUp;
+            }
             assert!(said.contains("mutant"), "names the file: {said}");
             if said.contains("crashed") { End::Crashed } else { End::Refused }
         }
@@ -97,7 +108,7 @@ fn mutated_files_end_in_an_answer_or_a_message() {
             std::fs::write(&file, &bytes).unwrap();
             let end = inspect(&file);
             *ends.entry(end).or_insert(0u64) += 1;
-            if matches!(end, End::Hung | End::Crashed)
+            if matches!(end, End::Hung | End::Crashed | End::GivenUp)
                 && let Some(keep) = std::env::var_os("RIDGEWATCH_KEEP_MUTANTS")
             {
                 std::fs::copy(&file, Path::new(&keep).join(format!("{end:?}_{}_{mutant}", ends[&end]))).unwrap();

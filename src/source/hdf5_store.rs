@@ -30,7 +30,7 @@ impl Hdf5Store {
     /// of one place and length.
     pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
         silence();
-        let _reading = Reading::of(path);
+        let _reading = Reading::opening(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         let opened = catch_unwind(AssertUnwindSafe(|| -> hdf5_metno::Result<_> {
             let file = hdf5_metno::File::open(path)?;

@@ -20,7 +20,7 @@ impl NetCdf4Store {
     /// all others cost milliseconds a file.
     pub(super) fn open(path: &Path, only: Option<&[String]>) -> Result<Option<(Header, Self)>, SourceError> {
         silence();
-        let _reading = Reading::of(path);
+        let _reading = Reading::opening(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
         let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
