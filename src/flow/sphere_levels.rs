@@ -139,9 +139,7 @@ impl<L: Gather> Velocity<L, 4, 3> for LayeredSphereFlow<L::Real> {
         let p = direction(x);
         let inverse = L::one() / dot(&p, &p).sqrt();
         let p: [L; 3] = array(|i| p[i] * inverse);
-        for i in 0..3 {
-            x[i] = p[i];
-        }
+        x[..3].copy_from_slice(&p);
         for c in 0..3 {
             let outward = dot(&p, &array(|i| m[i][c]));
             for i in 0..3 {

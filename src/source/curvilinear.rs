@@ -102,7 +102,7 @@ impl Planner<'_> {
             })
         };
         let dims = &header.variables[u[0]].dimensions;
-        if dims[dims.len() - 2..].iter().any(|d| own(d)) {
+        if dims[dims.len() - 2..].iter().any(own) {
             return Ok(None);
         }
         let mut pairs = vec![u];

@@ -89,7 +89,7 @@ impl Layout {
 /// How velocities come onto a grid whose nodes are not those of the file.
 #[derive(Debug)]
 pub(super) enum Resampling {
-    Staggered(Staggered),
+    Staggered(Box<Staggered>),
     Curvilinear(Curvilinear),
 }
 
@@ -210,7 +210,7 @@ impl Planner<'_> {
     }
 
     /// Turns levels into heights and closes the poles, where the metric wants it; gathers the notes of all axes.
-    pub(super) fn finish_axes(&mut self, axes: &mut Vec<AxisPlan>, metric: Metric) -> Result<(Vec<f64>, Poles), SourceError> {
+    pub(super) fn finish_axes(&mut self, axes: &mut [AxisPlan], metric: Metric) -> Result<(Vec<f64>, Poles), SourceError> {
         let fault = |fault| SourceError::Axis { path: self.path().into(), fault };
         let mut vertical = Vec::new();
         if metric != Metric::Index

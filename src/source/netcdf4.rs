@@ -81,8 +81,7 @@ pub(super) fn silence() {
 }
 
 fn read_header(file: &netcdf::File, only: Option<&[String]>) -> Result<Header, netcdf::Error> {
-    let mut header = Header::default();
-    header.attributes = attributes(file.attributes());
+    let mut header = Header { attributes: attributes(file.attributes()), ..Header::default() };
     let wanted: Vec<netcdf::Variable> = match only {
         Some(names) => names.iter().filter_map(|name| file.variable(name)).collect(),
         None => file.variables().collect(),

@@ -340,7 +340,7 @@ impl Planner<'_> {
             poles,
             time,
             metric: Metric::Cartesian,
-            resampling: Some(Arc::new(Resampling::Staggered(staggered))),
+            resampling: Some(Arc::new(Resampling::Staggered(Box::new(staggered)))),
             notes: self.notes,
         })
     }

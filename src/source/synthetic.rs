@@ -175,7 +175,7 @@ fn ecmwf(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
         let mut components: Vec<Vec<f32>> = match settings.shape {
             SyntheticShape::Globe => {
                 // Directions of the nodes; levels descend in height.
-                let mut out = vec![Vec::with_capacity(nx * ny * nz); 3];
+                let mut out: Vec<Vec<f32>> = (0..3).map(|_| Vec::with_capacity(nx * ny * nz)).collect();
                 for k in 0..nz {
                     for latitude in coordinates[1] {
                         for longitude in coordinates[0] {
