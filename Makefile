@@ -1,14 +1,19 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
-# make test    the whole suite; what needs real archives runs where they are
+# make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/); what needs real archives runs where they are
 # make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
+# make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them
 CARGO ?= cargo
-PACKAGES := pkg-config libhdf5-dev libnetcdf-dev
+PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
+PYTHON ?= python3
+# The compiler of the GPU kernels, for the test that they compile; of the CUDA version that cudarc is bound to.
+NVRTC := target/nvrtc
+NVRTC_VERSION := 13.0.88
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
 # The collection of real archives that tests/archive_real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
-.PHONY: all demo test test-data packages build check bench clean
+.PHONY: all demo test test-data packages build check bench gpu-check clean
 
 all: build
 
@@ -31,8 +36,9 @@ demo: build
 	@echo "pictures: out/demo/frames/*.png   figures: out/demo/records.jsonl, out/demo/summary.json"
 
 # One profile for everything: dependencies are built once, and numerics run optimised.
-test: packages
+test: packages $(NVRTC)/done
 	$(CARGO) test --release --workspace
+	LD_LIBRARY_PATH="$(CURDIR)/$(NVRTC)/nvidia/cu13/lib:$$LD_LIBRARY_PATH" $(CARGO) test --release --test kernels_compile -- --ignored
 	@if [ -d "$(RIDGEWATCH_DATA)" ]; then $(MAKE) --no-print-directory test-data; else \
 	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; fi
 
@@ -44,6 +50,15 @@ test-data: packages .venv/installed
 	python3 -m venv .venv
 	.venv/bin/pip install --quiet numpy scipy netCDF4
 	touch $@
+
+$(NVRTC)/done:
+	$(PYTHON) -m pip install -q --no-deps --target $(NVRTC) nvidia-cuda-nvrtc==$(NVRTC_VERSION)
+	touch $@
+
+# The second step is for the machine with the GPU: what travels is .gpu/check, and its `run` needs nothing else.
+gpu-check: packages
+	scripts/gpu-check-prepare .gpu/check
+	@if nvidia-smi >/dev/null 2>&1; then OUT=out/gpu-check .gpu/check/run; else echo "no GPU here: take .gpu/check to one and start .gpu/check/run"; fi
 
 bench: packages
 	$(CARGO) bench

@@ -7,7 +7,7 @@ mod error;
 
 pub use error::ConfigError;
 
-use crate::engine::{Settings, TimeSettings, TrainingSettings};
+use crate::engine::{DeviceSettings, Settings, TimeSettings, TrainingSettings};
 use crate::flow::FlowSettings;
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
@@ -65,6 +65,9 @@ pub struct SceneFile {
     /// Frames out.
     #[serde(default)]
     pub publish: PublishSettings,
+    /// How a GPU is used.
+    #[serde(default)]
+    pub device: DeviceSettings,
     /// Where all this was said.
     #[serde(skip)]
     origin: Origin,
@@ -164,7 +167,11 @@ impl SceneFile {
     /// # Errors
     /// The first fault, located.
     pub fn check(&self) -> Result<(), ConfigError> {
-        self.settings().check().and_then(|()| self.publish.check()).map_err(|refused| self.locate(refused))
+        self.settings()
+            .check()
+            .and_then(|()| self.publish.check())
+            .and_then(|()| self.device.check())
+            .map_err(|refused| self.locate(refused))
     }
 
     /// The place that set the key: the option or the `--set` that named it last, else the line of the file. Some faults are found only

@@ -30,11 +30,12 @@ struct Gpu {
 
 /// Looks and tells.
 pub fn run(common: &Common) -> Result<()> {
+    let gpu = gpu();
     let diagnosis = Diagnosis {
         version: env!("CARGO_PKG_VERSION"),
-        device: "cpu".into(),
+        device: if gpu.usable { "cuda:0".into() } else { "cpu".into() },
         cpu: cpu(),
-        gpu: gpu(),
+        gpu,
         netcdf: ridgewatch::source::netcdf_version(),
         hdf5: ridgewatch::source::hdf5_version(),
     };
@@ -43,7 +44,7 @@ pub fn run(common: &Common) -> Result<()> {
     }
     let Cpu { threads, built_for, has_avx2_and_fma } = diagnosis.cpu;
     print_text(format_args!("ridgewatch {}", diagnosis.version));
-    print_text(format_args!("computes on  cpu"));
+    print_text(format_args!("computes on  {}", diagnosis.device));
     print_text(format_args!(
         "cpu          {threads} threads; built for {built_for}; AVX2 and FMA {}",
         if has_avx2_and_fma { "present" } else { "absent" }
@@ -71,25 +72,21 @@ fn cpu() -> Cpu {
 
 #[cfg(feature = "cuda")]
 fn gpu() -> Gpu {
-    use cudarc::driver::{result, sys};
-    let unusable = |why: String| Gpu { usable: false, found: Vec::new(), why_not: Some(why) };
-    // SAFETY: only looks the driver library up; asked first because cudarc panics where it is absent.
-    if !unsafe { sys::is_culib_present() } {
-        return unusable("no NVIDIA driver library (libcuda) is found".into());
-    }
-    if let Err(error) = result::init() {
-        return unusable(format!("the driver does not start: {error}"));
-    }
-    let count = match result::device::get_count() {
-        Ok(0) => return unusable("the driver finds no device".into()),
-        Ok(count) => count,
-        Err(error) => return unusable(format!("the driver cannot count devices: {error}")),
+    use ridgewatch::engine::cuda::{Gpu as Opened, GpuSettings, probe};
+    let found = match probe() {
+        Ok(found) => found,
+        Err(why) => return Gpu { usable: false, found: Vec::new(), why_not: Some(why.to_string()) },
     };
-    let found = (0..count)
-        .filter_map(|n| result::device::get(n).ok())
-        .map(|device| result::device::get_name(device).unwrap_or_else(|error| format!("unnamed: {error}")))
-        .collect();
-    Gpu { usable: false, found, why_not: Some("this version computes on the CPU only".into()) }
+    let names = found.iter().map(|d| format!("cuda:{} {}", d.ordinal, d.name)).collect();
+    match Opened::open(0, &GpuSettings::default()) {
+        Ok(gpu) => {
+            let (_, cap) = gpu.memory();
+            let (major, minor) = gpu.capability();
+            let more = format!("driver for CUDA {}, compute capability {major}.{minor}, {} MiB to be used", gpu.driver(), cap >> 20);
+            Gpu { usable: true, found: [names, vec![more]].concat(), why_not: None }
+        }
+        Err(why) => Gpu { usable: false, found: names, why_not: Some(why.to_string()) },
+    }
 }
 
 #[cfg(not(feature = "cuda"))]

@@ -2,7 +2,7 @@
 
 use super::{Common, Usage, located, messages, on_threads, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{EngineError, Plan, Setup, Slide};
+use ridgewatch::engine::{Device, EngineError, Plan, Setup, Slide};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
 use serde::Serialize;
@@ -103,10 +103,15 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }
     }
     let slide = slide.context("the source gave no slide")?;
-    let report = on_threads(common, || compute(&plan, &slide, options))?.map_err(|error| match error.downcast::<FlowError>() {
-        Ok(error) => located(&scene, error, FlowError::refused),
-        Err(error) => error,
-    })?;
+    let device = super::device(common, &scene)?;
+    let report =
+        on_threads(common, || compute(&plan, &slide, options, &device))?.map_err(|error| match error.downcast::<EngineError>() {
+            Ok(error) => located(&scene, error, EngineError::refused),
+            Err(error) => match error.downcast::<FlowError>() {
+                Ok(error) => located(&scene, error, FlowError::refused),
+                Err(error) => error,
+            },
+        })?;
     if common.json {
         return print_json(&report);
     }
@@ -114,8 +119,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     Ok(())
 }
 
-fn compute(plan: &Plan, slide: &Slide, options: &Options) -> Result<Report> {
-    let tracer = cpu_tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Result<Report> {
+    let (tracer, told) = device.tracer(slide.velocity.clone(), &plan.map, slide.time)?;
+    told.iter().for_each(messages::note);
     let mut grid = options.grid.0;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}

@@ -12,7 +12,7 @@ mod synthesize;
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
-use ridgewatch::engine::EngineError;
+use ridgewatch::engine::{Device, DeviceChoice, EngineError};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
 use ridgewatch::setting::Refused;
@@ -33,9 +33,9 @@ pub struct Arguments {
 /// Options that every command has.
 #[derive(Debug, Args)]
 pub struct Common {
-    /// Where to compute: auto, cpu, or cuda:N.
-    #[arg(long, global = true, default_value = "auto", value_name = "DEVICE")]
-    pub device: String,
+    /// Where to trace: auto (a GPU where one is usable), cpu, or cuda:N.
+    #[arg(long, global = true, default_value_t = DeviceChoice::Auto, value_name = "DEVICE")]
+    pub device: DeviceChoice,
     /// Worker threads; 0: as many as this process may use.
     #[arg(long, global = true, default_value_t = 0, value_name = "N")]
     pub threads: usize,
@@ -74,7 +74,6 @@ enum Command {
 /// Runs a command.
 pub fn run(arguments: Arguments) -> Result<()> {
     let common = arguments.common;
-    check_device(&common.device)?;
     match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
         Command::Render(options) => render::run(&common, options),
@@ -91,14 +90,13 @@ pub fn run(arguments: Arguments) -> Result<()> {
 #[error("{0}")]
 pub struct Usage(pub String);
 
-fn check_device(device: &str) -> Result<()> {
-    match device {
-        "auto" | "cpu" => Ok(()),
-        _ if device.strip_prefix("cuda:").is_some_and(|n| n.parse::<u32>().is_ok()) => {
-            bail!(Usage(format!("--device {device}: this version computes on the CPU only; accepted: auto, cpu")))
-        }
-        _ => bail!(Usage(format!("--device {device}: accepted: auto, cpu"))),
+/// The device that was asked for, opened; why `auto` came to the CPU is told with `--verbose`.
+fn device(common: &Common, scene: &SceneFile) -> Result<Device> {
+    let device = Device::open(common.device, &scene.device)?;
+    if let Device::Cpu { why: Some(why) } = &device {
+        tracing::info!("on the CPU: {why}");
     }
+    Ok(device)
 }
 
 /// 2 for usage and config errors, 1 for everything else.

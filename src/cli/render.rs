@@ -63,6 +63,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         verify_points: options.verify as usize,
         threads: common.threads,
         warmup_samples: Some(warmup_samples),
+        device: super::device(common, &scene)?,
         ..RunOptions::default()
     };
     let bar = messages::progress(Some(100));

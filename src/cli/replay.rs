@@ -71,6 +71,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
 
 async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
     let setup = Setup::new(scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
+    let device = super::device(common, &scene)?;
     if let Some(checkpoint) = &options.checkpoint {
         super::check_folder(checkpoint)?;
     }
@@ -88,6 +89,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         seconds: options.seconds,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
+        device,
         ..RunOptions::default()
     };
     // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.

@@ -77,6 +77,19 @@ impl<'a> Answers<'a> {
         self
     }
 
+    /// Whether every query is traced and none is kept, so that whoever traces may also walk.
+    pub(super) fn only_traces(&self) -> bool {
+        self.surrogate.is_none() && self.keep <= 1
+    }
+
+    /// Takes in the figures of a frame whose queries were answered without this.
+    pub(super) fn answered_elsewhere(&mut self, stats: &crate::render::RenderStats) {
+        self.tally.queries += stats.queries;
+        self.tally.traced += stats.traced;
+        self.tally.missing += stats.missing;
+        self.tally.trace_seconds += stats.evaluate_seconds;
+    }
+
     fn domain(&self) -> &'a Domain {
         self.tracer.domain()
     }

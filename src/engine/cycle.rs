@@ -6,11 +6,12 @@
 use super::answers::Answers;
 use super::audit;
 use super::feed::{Feed, Slide};
+use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup, assemble};
 use super::stop::{Halt, Interruptible, heed};
 use super::training::{Threads, Until, train};
-use super::{EngineError, Frame, FrameRecord, StageSeconds};
-use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, cpu_tracer, time_resolution};
+use super::{Device, EngineError, Frame, FrameRecord, StageSeconds};
+use crate::flow::{Extras, FlowMap, Steps, TimeResolution, Traced, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::network::{Size, Target};
 use crate::surrogate::{Kind, Learned, Predict, Resize, SampleRing, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
@@ -33,6 +34,8 @@ pub struct RunOptions {
     pub checkpoint: Option<PathBuf>,
     /// Samples a pixel of warm-up frames; none: the scene's.
     pub warmup_samples: Option<usize>,
+    /// What traces.
+    pub device: Device,
 }
 
 /// What a run tells while it goes.
@@ -89,6 +92,7 @@ struct Cycle<'a> {
     plan: &'a Plan,
     options: &'a RunOptions,
     threads: Threads,
+    frames: Box<dyn FrameRenderer>,
     renderer: Renderer,
     trust: TrustMap,
     ring: SampleRing,
@@ -104,6 +108,8 @@ struct Cycle<'a> {
     probed: u64,
     /// Frames that were no warm-up.
     pictures: u64,
+    /// Whether a lost device was told of.
+    told_of_failure: bool,
     report: &'a mut RunReport,
     /// Set from outside when the run should end.
     stop: &'a AtomicBool,
@@ -156,7 +162,8 @@ fn drive(
     heed(stop)?;
     let mut slide = first.ok_or(EngineError::EndedEarly)?;
     let begun = Instant::now();
-    let tracer = threads.render.install(|| cpu_tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    let (tracer, told) = threads.render.install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    slide.warnings.extend(told);
     heed(stop)?;
     // The number of steps is settled once, on the first slide, so that frames compare.
     let map = match fixed_steps(&*tracer) {
@@ -217,6 +224,7 @@ impl<'a> Cycle<'a> {
             plan,
             options,
             threads,
+            frames: frame_renderer(&options.device),
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring: SampleRing::new(scene.training.ring),
@@ -227,6 +235,7 @@ impl<'a> Cycle<'a> {
             frame: 0,
             probed: 0,
             pictures: 0,
+            told_of_failure: false,
             report,
             stop,
             peak: f32::NEG_INFINITY,
@@ -271,7 +280,8 @@ impl<'a> Cycle<'a> {
             heed(self.stop)?;
             let Some(mut slide) = next else { return Ok(()) };
             let begun = Instant::now();
-            let tracer = cpu_tracer(slide.velocity.clone(), map, slide.time)?;
+            let (tracer, told) = self.options.device.tracer(slide.velocity.clone(), map, slide.time)?;
+            slide.warnings.extend(told);
             self.slid(&*tracer)?;
             self.probe(&*tracer, slide.index)?;
             self.frames(&*tracer, &mut slide, begun, sink)?;
@@ -355,10 +365,10 @@ impl<'a> Cycle<'a> {
     fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let gate = Gate::uniform(false);
         let interruptible = Interruptible::new(tracer, self.stop);
-        let mut answers = Answers::new(&interruptible, None, &gate, None, self.plan.scene.training.ring / KEEP_A_FRAME)
-            .with_flow_map(self.wants_flow_map());
-        let (renderer, stop) = (&mut self.renderer, self.stop);
-        self.threads.render.install(|| renderer.render(PILOT_PICTURE, &mut answers, 1, None, stop))?;
+        let keep = if self.live.is_some() { self.plan.scene.training.ring / KEEP_A_FRAME } else { 0 };
+        let mut answers = Answers::new(&interruptible, None, &gate, None, keep).with_flow_map(self.wants_flow_map());
+        let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
+        self.threads.render.install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
         heed(stop)?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
@@ -426,6 +436,7 @@ impl<'a> Cycle<'a> {
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
             let (renderer, trust, frame, seed, stop) = (&mut self.renderer, &self.trust, self.frame, scene.seed, self.stop);
+            let frames = &mut self.frames;
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
@@ -458,8 +469,15 @@ impl<'a> Cycle<'a> {
                         }
                     };
                     let walk = Instant::now();
-                    let (film, stats) =
-                        renderer.render(picture, &mut answers, samples_per_pixel, Some(&report), &AtomicBool::new(false))?;
+                    let (film, stats) = frames.render(
+                        renderer,
+                        picture,
+                        samples_per_pixel,
+                        tracer,
+                        &mut answers,
+                        Some(&report),
+                        &AtomicBool::new(false),
+                    )?;
                     let render_seconds = walk.elapsed().as_secs_f64();
                     let (tally, samples) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
@@ -512,6 +530,7 @@ impl<'a> Cycle<'a> {
                 Method::Surrogate => "surrogate".into(),
                 Method::Gated => "gated".into(),
             },
+            device: self.options.device.name(),
             surrogate: front.as_ref().map(|s| s.name().to_owned()),
             size: [work.film.width, work.film.height],
             samples_per_pixel,
@@ -526,6 +545,7 @@ impl<'a> Cycle<'a> {
             audited: work.audit.samples.len() as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
+            traced_ahead: work.stats.ahead,
             warnings: std::mem::take(&mut slide.warnings),
             ..FrameRecord::default()
         };
@@ -573,6 +593,10 @@ impl<'a> Cycle<'a> {
             }
             self.ring.push(&work.samples);
             self.ring.push(&work.audit.samples);
+        }
+        self.options.device.check()?;
+        if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
+            record.warnings.push(format!("the GPU is lost, the CPU goes on: {failure}"));
         }
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {

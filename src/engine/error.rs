@@ -28,6 +28,14 @@ pub enum EngineError {
     /// A checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
+    /// The GPU that was asked for.
+    #[cfg(feature = "cuda")]
+    #[error(transparent)]
+    Device(Box<super::cuda::DeviceError>),
+    /// A GPU was asked for.
+    #[cfg(not(feature = "cuda"))]
+    #[error("built without the feature `cuda`; accepted: --device auto, cpu")]
+    NoCuda,
     /// A synthetic grid.
     #[error(transparent)]
     Axis(#[from] crate::field::AxisFault),

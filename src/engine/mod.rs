@@ -4,9 +4,13 @@
 
 mod answers;
 mod audit;
+#[cfg(feature = "cuda")]
+pub mod cuda;
 mod cycle;
+mod device;
 mod error;
 mod feed;
+mod frames;
 mod record;
 mod settings;
 mod setup;
@@ -17,6 +21,7 @@ pub use crate::trust::TrustedError;
 pub use answers::{Answers, Tally};
 pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
+pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;
 pub use feed::{Feed, Slide};
 pub use record::{FrameRecord, StageSeconds};

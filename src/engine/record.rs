@@ -20,6 +20,9 @@ pub struct FrameRecord {
     pub direction: String,
     /// `reference`, `surrogate` or `gated`.
     pub method: String,
+    /// What traced: `cpu`, or `cuda:N` with the device's name.
+    #[serde(default)]
+    pub device: String,
     /// `table`, `network` or `residual`; none for `reference`.
     pub surrogate: Option<String>,
     /// Pixels across and down.
@@ -64,6 +67,9 @@ pub struct FrameRecord {
     pub training: Option<crate::surrogate::Learned>,
     /// Samples in the ring.
     pub ring: u64,
+    /// Points that a GPU traced ahead of flights that ended before them: work, but no queries, and not among `traced`.
+    #[serde(default)]
+    pub traced_ahead: u64,
     /// Wall-clock seconds of each stage.
     pub seconds: StageSeconds,
     /// Warnings that arose since the last frame, in words.

@@ -40,6 +40,19 @@ struct Table<R> {
     density: R,
 }
 
+/// The table of an uneven axis, for other devices.
+#[cfg_attr(not(feature = "cuda"), allow(dead_code))]
+pub(crate) struct TableView<'a, R> {
+    /// Node positions, with the image of the first one where the axis is periodic.
+    pub positions: &'a [R],
+    /// 1 / length of each cell.
+    pub inverse: &'a [R],
+    /// The cell in which each of evenly spaced intervals begins.
+    pub begins: &'a [u32],
+    /// Intervals in a unit of length.
+    pub density: R,
+}
+
 /// Intervals a cell in [`Table::begins`]: more make the scan shorter.
 const INTERVALS: usize = 4;
 
@@ -73,6 +86,23 @@ impl<R: Real> AxisMap<R> {
             high: R::from_f64(cells as f64),
             wrap,
             table: (!even).then(|| Table::new(axis, first, spacing)),
+        }
+    }
+
+    /// After which length states repeat.
+    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
+    pub(crate) fn wrap_length(&self) -> Option<R> {
+        self.wrap
+    }
+
+    /// The table of an uneven axis.
+    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
+    pub(crate) fn table(&self) -> Option<TableView<'_, R>> {
+        match &self.table {
+            Some(table) => {
+                Some(TableView { positions: &table.positions, inverse: &table.inverse, begins: &table.begins, density: table.density })
+            }
+            None => None,
         }
     }
 

@@ -26,6 +26,8 @@ mod velocity;
 mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
+#[cfg(feature = "cuda")]
+pub(crate) use axis_map::AxisMap;
 pub use error::FlowError;
 pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};
@@ -219,6 +221,10 @@ pub trait Tracer: Send + Sync {
     /// have velocity everywhere.
     fn is_void(&self, _seed: [f32; 3]) -> bool {
         false
+    }
+    /// The tracer itself, for an engine that knows its own ones again; none for others.
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        None
     }
     /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);

@@ -2,6 +2,7 @@
 
 use super::CameraSettings;
 use super::error::{RenderError, require, require_finite};
+use super::parameters::CameraParameters;
 use super::space::{cross, dot, length, scaled, subtract};
 use crate::field::Domain;
 
@@ -95,6 +96,11 @@ impl Camera {
             up: scaled(up, half_height),
             orthographic: settings.orthographic,
         })
+    }
+
+    pub(super) fn parameters(&self) -> CameraParameters {
+        let Self { eye, forward, right, up, orthographic } = *self;
+        CameraParameters { eye, forward, right, up, orthographic: i32::from(orthographic), pad: 0 }
     }
 
     /// Origin and unit direction of the ray through a point of the film: `x` from -1 (left) to 1, `y` from -1 (bottom) to 1.

@@ -43,6 +43,18 @@ impl Film {
         }
     }
 
+    /// The same with its memory in place: the pages of a fresh large film come one by one as they are first written, which takes longer than
+    /// the picture's copy.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn resident(width: usize, height: usize) -> Self {
+        let mut film = Self::new(width, height);
+        film.rgba.fill(std::hint::black_box([0.0; 4]));
+        for layer in [&mut film.traced, &mut film.samples, &mut film.missing, &mut film.queries] {
+            layer.fill(std::hint::black_box(0.0));
+        }
+        film
+    }
+
     /// Tone-mapped 8-bit RGB with `((c - 0.5) * contrast + brightness)^(1/gamma)`.
     pub fn tone_mapped(&self, [contrast, brightness, gamma]: [f64; 3]) -> Vec<u8> {
         let map = |c: f32| {

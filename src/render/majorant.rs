@@ -5,6 +5,7 @@
 //! numbers. Cells keep the largest FTLE, not extinction, so that another transfer function re-derives them without a query.
 
 use super::Transfer;
+use super::parameters::SeenInCells;
 use crate::field::Domain;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
 
@@ -143,6 +144,26 @@ impl MajorantGrid {
         if !watch.missing.load(Relaxed) {
             watch.missing.store(true, Relaxed);
         }
+    }
+
+    /// Which cells may hold missing values.
+    pub(super) fn may_miss_all(&self) -> &[bool] {
+        &self.may_miss
+    }
+
+    /// Notes what an engine saw in all cells, as if each value had been observed here. False, and nothing noted, when it saw another grid.
+    #[must_use]
+    pub(super) fn absorb(&self, seen: &SeenInCells) -> bool {
+        let cells = self.watch.len();
+        if [seen.count.len(), seen.highest.len(), seen.missing.len()] != [cells; 3] {
+            return false;
+        }
+        for (i, watch) in self.watch.iter().enumerate() {
+            watch.count.fetch_add(seen.count[i], Relaxed);
+            watch.highest.fetch_max(seen.highest[i], Relaxed);
+            watch.missing.fetch_or(seen.missing[i] != 0, Relaxed);
+        }
+        true
     }
 
     /// Puts what the frames so far have seen into force.

@@ -3,6 +3,7 @@
 use super::error::{RenderError, require};
 use super::film::Film;
 use super::majorant::MajorantGrid;
+use super::parameters::{FrameParameters, FrameSetup, SeenInCells};
 use super::rng::FrameRandom;
 use super::space::SceneBox;
 use super::tracking::FrameScene;
@@ -32,6 +33,8 @@ pub struct RenderStats {
     pub missing: u64,
     /// Queries whose extinction exceeded the majorant in force.
     pub majorant_exceeded: u64,
+    /// Points that were answered besides, ahead of flights that ended before them.
+    pub ahead: u64,
     /// Calls of [`LogStretch::evaluate`].
     pub waves: u64,
     /// Wall-clock seconds of walking, accepting and summing.
@@ -152,6 +155,46 @@ impl Renderer {
         self.render_samples(frame, 0..end, answers, progress, stop)
     }
 
+    /// Checks the range of samples and, when the frame is a new one, puts into force what the frames before have seen.
+    fn begin(&mut self, frame: u64, samples: &Range<u32>) -> Result<(), RenderError> {
+        const LIMIT: u32 = 1 << 24;
+        if samples.end > LIMIT || samples.start >= samples.end {
+            return Err(RenderError::Samples { first: samples.start, end: samples.end, limit: LIMIT });
+        }
+        if self.last_frame != Some(frame) {
+            self.majorants.commit(&self.transfer);
+        }
+        self.last_frame = Some(frame);
+        Ok(())
+    }
+
+    /// What an engine needs that tracks the paths of these samples itself; it hands what it saw to [`Self::absorb`].
+    pub fn set_up(&mut self, frame: u64, samples: Range<u32>) -> Result<FrameSetup<'_>, RenderError> {
+        self.begin(frame, &samples)?;
+        let settings = &self.scene.settings;
+        let colours = [settings.background, settings.missing].map(|colour| colour.map(|c| c as f32));
+        Ok(FrameSetup {
+            parameters: FrameParameters::new(
+                &self.camera,
+                &self.light,
+                &self.transfer,
+                &self.space,
+                &FrameRandom::new(self.scene.seed, frame),
+                [settings.width, settings.height],
+                colours,
+                self.per_tau,
+            ),
+            majorants: self.majorants.majorants(),
+            may_miss: self.majorants.may_miss_all(),
+        })
+    }
+
+    /// Takes in what an engine saw while it tracked a frame; takes effect with the next. False when it is not of this grid.
+    #[must_use]
+    pub fn absorb(&self, seen: &SeenInCells) -> bool {
+        self.majorants.absorb(seen)
+    }
+
     /// Renders a range of a frame's samples, to be merged with others by [`Film::accumulate`]: later passes, or other ranks. All
     /// ranges of a frame see the same majorants; what they observe takes effect when another frame begins.
     pub fn render_samples(
@@ -162,15 +205,7 @@ impl Renderer {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), RenderError> {
-        const LIMIT: u32 = 1 << 24;
-        if samples.end > LIMIT || samples.start >= samples.end {
-            return Err(RenderError::Samples { first: samples.start, end: samples.end, limit: LIMIT });
-        }
-        if self.last_frame != Some(frame) {
-            self.majorants.commit(&self.transfer);
-        }
-        self.last_frame = Some(frame);
-
+        self.begin(frame, &samples)?;
         let settings = &self.scene.settings;
         let scene = FrameScene {
             camera: &self.camera,

@@ -43,6 +43,11 @@ impl FrameRandom {
         Self { key: [seed as u32, ((seed >> 32) as u32).wrapping_add((frame >> 32) as u32)], frame: frame as u32 }
     }
 
+    /// Key and frame number of the counter.
+    pub(super) fn parts(&self) -> ([u32; 2], u32) {
+        (self.key, self.frame)
+    }
+
     /// Four random words. `dimension` numbers the decisions along one path.
     #[inline]
     pub fn words(&self, pixel: u32, sample: u32, dimension: u32) -> [u32; 4] {

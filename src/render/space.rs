@@ -1,6 +1,7 @@
 //! Three frames of reference: the domain (data coordinates), the scene (lengths, in which camera, light and extinction live), and
 //! the grid (majorant cells).
 
+use super::parameters::BoxParameters;
 use crate::field::Domain;
 
 /// A factor per axis from domain to scene coordinates, for views that the program chooses itself: the longest edge becomes 1 and x
@@ -57,6 +58,12 @@ impl SceneBox {
             cell_extent: std::array::from_fn(|k| extent[k] / cells[k] as f64),
             cells,
         }
+    }
+
+    pub(super) fn parameters(&self) -> BoxParameters {
+        let Self { min, max, domain_min, inward_min, inward_max, cell_edge, cell_extent, cells } = *self;
+        let cells = cells.map(|n| n as i32);
+        BoxParameters { min, max, domain_min, cell_edge, cell_extent, inward_min, inward_max, cells, pad: 0 }
     }
 
     pub(super) fn cells(&self) -> [usize; 3] {

@@ -90,6 +90,11 @@ impl Transfer {
         Ok(Self { low: low as f32, per_range: 1.0 / range, extinction_max: extinction as f32, albedo })
     }
 
+    /// Low, 1 / (high - low), largest extinction, albedo coefficients.
+    pub(super) fn parts(&self) -> (f32, f32, f32, &[Vec<f32>; 3]) {
+        (self.low, self.per_range, self.extinction_max, &self.albedo)
+    }
+
     /// saturate((FTLE - low) / (high - low)), in [0, 1]: the normalised extinction, in which optical residuals are measured. NaN
     /// stays NaN.
     #[inline]

@@ -225,6 +225,16 @@ impl Gate {
         self.trusted[cell_of(self.shape, point)]
     }
 
+    /// Cells along x, y and z.
+    pub fn shape(&self) -> [usize; 3] {
+        self.shape
+    }
+
+    /// Which cells are trusted, x fastest.
+    pub fn cells(&self) -> &[bool] {
+        &self.trusted
+    }
+
     /// Trusted share of the domain's volume.
     pub fn share(&self) -> f64 {
         self.trusted.iter().filter(|t| **t).count() as f64 / self.trusted.len() as f64

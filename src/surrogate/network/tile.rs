@@ -12,7 +12,7 @@ use wide::f32x8;
 pub(super) const OUT: usize = 4;
 
 /// Most samples of a tile.
-pub(super) const MOST_SAMPLES: usize = 16 * BLOCK;
+pub(super) const MOST_SAMPLES: usize = 8 * BLOCK;
 
 /// Packed weights of all layers.
 pub(super) struct Weights {
@@ -106,8 +106,8 @@ pub(super) struct Scratch {
 impl Scratch {
     pub(super) fn new(shape: &Architecture, derivatives: bool, training: bool) -> Self {
         let groups = if derivatives { 1 + shape.dimensions() } else { 1 };
-        // 96 rows of 64 f32 are 24 KiB; wider networks get fewer rows so that two rows of layers stay in L2.
-        let rows = if shape.widest() > 128 { MOST_SAMPLES / 2 } else { MOST_SAMPLES };
+        // 48 rows of 64 f32 are 12 KiB: what a layer reads and writes fits the first cache level.
+        let rows = MOST_SAMPLES;
         let samples = (rows / groups / BLOCK).max(1) * BLOCK;
         let rows = samples * groups;
         let hidden = shape.layers.len() - 1;

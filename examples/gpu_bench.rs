@@ -1,0 +1,381 @@
+//! What the GPU traces in a second, and what bounds it: the table of docs/performance.md. Times are medians of device time between events;
+//! seeds and results stay on the device; every batch is sorted anew, and the sort counts. `cargo run --release --example gpu_bench [quick]`
+
+// It talks to its user on standard output.
+#![allow(clippy::print_stdout)]
+
+#[cfg(not(feature = "cuda"))]
+fn main() {
+    println!("built without the feature `cuda`");
+}
+
+#[cfg(feature = "cuda")]
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    bench::run(std::env::args().any(|a| a == "quick"))
+}
+
+#[cfg(feature = "cuda")]
+mod bench {
+    use ridgewatch::engine::Storage;
+    use ridgewatch::engine::cuda::{
+        Buffer, CudaTracer, DeviceError, DeviceTable, DeviceTracer, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
+    };
+    use ridgewatch::field::analytic::Analytic;
+    use ridgewatch::field::turbulence::Turbulence;
+    use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
+    use ridgewatch::flow::{
+        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
+    };
+    use std::error::Error;
+    use std::f64::consts::TAU;
+    use std::sync::Arc;
+    use std::time::Instant;
+
+    const SHAPE: [usize; 3] = [600, 192, 192];
+    const SNAPSHOTS: usize = 12;
+    const ROUNDS: usize = 7;
+    const M: f64 = 1e6;
+
+    type Outcome<T> = Result<T, Box<dyn Error>>;
+
+    fn map(tau: f64, steps: usize, integrator: Integrator, precision: Precision, gap: f64, boundary: Boundary) -> FlowMap {
+        FlowMap {
+            tau,
+            direction: Direction::Forward,
+            integrator,
+            precision,
+            steps: Steps::Fixed(steps),
+            gap,
+            boundary,
+            normalisation: Normalisation::Tau,
+            interpolation: Interpolation::Linear,
+        }
+    }
+
+    fn turbulent(steps: usize) -> FlowMap {
+        map(SNAPSHOTS as f64 - 1.0, steps, Integrator::Tangent, Precision::F32, 0.05, Boundary::Clamp)
+    }
+
+    /// Uniform points in no order.
+    fn scattered(domain: &Domain, count: usize, seed: u64) -> Vec<[f32; 3]> {
+        let mut state = 0x2545_f491_4f6c_dd1du64 ^ (seed << 17);
+        let mut uniform = || {
+            state ^= state << 13;
+            state ^= state >> 7;
+            state ^= state << 17;
+            (state >> 40) as f32 / (1u32 << 24) as f32
+        };
+        (0..count).map(|_| domain.from_unit([uniform(), uniform(), uniform()])).collect()
+    }
+
+    /// Seeds and results on the device.
+    struct Batch {
+        seeds: Buffer<[f32; 3]>,
+        stretch: Buffer<f32>,
+        lived: Buffer<f32>,
+        count: usize,
+    }
+
+    impl Batch {
+        fn new(gpu: &Gpu, points: &[[f32; 3]]) -> Result<Self, DeviceError> {
+            let count = points.len();
+            let mut stretch = gpu.alloc("results", count)?;
+            stretch.fill_bytes(0xff)?;
+            let mut lived = gpu.alloc("results", count)?;
+            lived.fill_bytes(0xff)?;
+            Ok(Self { seeds: gpu.upload("seeds", points)?, stretch, lived, count })
+        }
+
+        /// Median milliseconds of a trace of the first `count` seeds.
+        fn time(&self, tracer: &DeviceTracer, count: usize) -> Outcome<f64> {
+            let gpu = tracer.gpu();
+            let out = Outputs { log_stretch: self.stretch.address(), lived: self.lived.address(), ..Outputs::default() };
+            let mut times = Vec::new();
+            for round in 0..=ROUNDS {
+                let begin = gpu.mark()?;
+                // SAFETY: all buffers hold `self.count` entries, at least `count`.
+                unsafe { tracer.trace(self.seeds.address(), count.min(self.count), &out)? };
+                let end = gpu.mark()?;
+                let milliseconds = f64::from(gpu.milliseconds(&begin, &end)?);
+                // The first round warms up.
+                if round > 0 {
+                    times.push(milliseconds);
+                }
+                // Long ones vary little.
+                if milliseconds > 400.0 && round > 1 {
+                    break;
+                }
+            }
+            times.sort_by(f64::total_cmp);
+            Ok(times[times.len() / 2])
+        }
+
+        fn stretches(&self) -> Outcome<Vec<f32>> {
+            let mut out = vec![0.0; self.count];
+            self.stretch.read(&mut out)?;
+            Ok(out)
+        }
+
+        fn mean_lived(&self, count: usize) -> Outcome<f64> {
+            let mut out = vec![0.0; count];
+            self.lived.read(&mut out)?;
+            Ok(out.iter().map(|&l| f64::from(l)).sum::<f64>() / count as f64)
+        }
+    }
+
+    struct Bench {
+        gpu: Arc<Gpu>,
+        store: SnapshotStore,
+        /// Arithmetic instructions the device issues in a second, all lanes: 4 warps a multiprocessor and cycle at the top clock.
+        issue: f64,
+        /// Bytes a second of a large copy on the device.
+        copy: f64,
+    }
+
+    impl Bench {
+        fn tracer(&self, source: &VelocitySource, map: &FlowMap, tuning: Tuning) -> Outcome<DeviceTracer> {
+            let Steps::Fixed(steps) = map.steps else { return Err("a number of steps".into()) };
+            Ok(DeviceTracer::new(&self.store, &self.gpu, source, map, 0.0, steps, tuning)?)
+        }
+
+        fn tables(&self, name: &str, source: &VelocitySource, domain: &Domain) -> Outcome<()> {
+            let fine = CudaTracer::new(
+                &self.store,
+                &self.gpu,
+                source.clone(),
+                &FlowMap { precision: Precision::F64, ..turbulent(880) },
+                0.0,
+                Tuning::default(),
+            )?;
+            let points = scattered(domain, 1 << 18, 77);
+            let mut truth = Traced::default();
+            fine.trace(&points, Extras::default(), &mut truth);
+            let peak = truth.log_stretch_f64.iter().copied().fold(0.0, f64::max);
+            let psnr = |found: &[f32]| {
+                let squares: f64 = found.iter().zip(&truth.log_stretch_f64).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum();
+                10.0 * (peak * peak / (squares / found.len() as f64)).log10()
+            };
+            println!("\n### Steps and their error, {name}: PSNR against 880 steps in f64 on 2^18 points\n");
+            println!("| steps | storage | PSNR, dB |\n|---|---|---|");
+            let held = Batch::new(&self.gpu, &points)?;
+            for (steps, storage) in [(6, Storage::F32), (11, Storage::F32), (22, Storage::F32), (22, Storage::F16), (110, Storage::F32)] {
+                let tracer = self.tracer(source, &turbulent(steps), Tuning { storage, ..Tuning::default() })?;
+                held.time(&tracer, points.len())?;
+                println!("| {steps} | {storage:?} | {:.1} |", psnr(&held.stretches()?));
+            }
+            println!("\n### Tables, {name}, 22 steps\n");
+            println!(
+                "| nodes | traced in, s | M nodes/s | PSNR, dB | lookups in a random order, G/s | coherent lookups, G/s |\n|---|---|---|---|---|---|"
+            );
+            let tracer = self.tracer(source, &turbulent(22), Tuning::default())?;
+            for factor in [1, 2] {
+                let nodes = SHAPE.map(|n| factor * (n - 1) + 1);
+                let mut table = DeviceTable::trace(&tracer, domain, nodes)?;
+                let mut seconds = Vec::new();
+                for _ in 0..3 {
+                    self.gpu.synchronize()?;
+                    let begun = Instant::now();
+                    table.retrace(&tracer)?;
+                    seconds.push(begun.elapsed().as_secs_f64());
+                }
+                seconds.sort_by(f64::total_cmp);
+                let unit: Vec<[f32; 3]> = points.iter().map(|&p| domain.to_unit(p)).collect();
+                let asked = self.gpu.upload("points", &unit)?;
+                let answers = self.gpu.alloc::<f32>("answers", unit.len())?;
+                // SAFETY: both buffers hold an entry a point.
+                unsafe { table.predict(asked.address(), unit.len(), answers.address())? };
+                let mut found = vec![0.0; unit.len()];
+                answers.read(&mut found)?;
+                // Random points, and runs of 32 neighbours a fifth of a cell apart, as along rays of a picture.
+                let many = 1usize << 24;
+                let random = scattered(&Domain::cuboid([0.0; 3], [1.0; 3]), many, 5);
+                let coherent: Vec<[f32; 3]> = (0..many)
+                    .map(|i| {
+                        let (p, lane) = (random[i / 32], (i % 32) as f32);
+                        std::array::from_fn(|k| p[k] + lane * [0.2, 0.1, 0.05][k] / SHAPE[k] as f32)
+                    })
+                    .collect();
+                let rate = |points: &[[f32; 3]]| -> Outcome<f64> {
+                    let asked = self.gpu.upload("points", points)?;
+                    let answers = self.gpu.alloc::<f32>("answers", points.len())?;
+                    let mut times = Vec::new();
+                    for _ in 0..ROUNDS {
+                        let begin = self.gpu.mark()?;
+                        // SAFETY: both buffers hold an entry a point.
+                        unsafe { table.predict(asked.address(), points.len(), answers.address())? };
+                        times.push(f64::from(self.gpu.milliseconds(&begin, &self.gpu.mark()?)?));
+                    }
+                    times.sort_by(f64::total_cmp);
+                    Ok(points.len() as f64 / times[ROUNDS / 2] / 1e6)
+                };
+                let all = nodes.iter().product::<usize>() as f64;
+                println!(
+                    "| {nodes:?} | {:.4} | {:.0} | {:.1} | {:.1} | {:.1} |",
+                    seconds[1],
+                    all / seconds[1] / M,
+                    psnr(&found),
+                    rate(&random)?,
+                    rate(&coherent)?
+                );
+            }
+            Ok(())
+        }
+
+        fn turbulence(&self, name: &str, flow: &Turbulence, quick: bool) -> Outcome<()> {
+            let grid = Turbulence::grid(SHAPE)?;
+            let begun = Instant::now();
+            let window = Arc::new(flow.window(&grid, SNAPSHOTS)?);
+            let made = begun.elapsed().as_secs_f64();
+            let source = VelocitySource::Window(window);
+            let domain = grid.domain();
+            let begun = Instant::now();
+            let first = self.tracer(&source, &turbulent(22), Tuning::default())?;
+            self.gpu.transfer().synchronize()?;
+            let (registers, local) = first.resources()?;
+            println!(
+                "\n## {name} turbulence, {SHAPE:?} x {SNAPSHOTS}, tau 11 (made on the CPU in {made:.1} s; brought over and kernels ready in {:.2} s; \
+                 {registers} registers, {local} bytes of local memory a thread)\n",
+                begun.elapsed().as_secs_f64()
+            );
+            let points = scattered(&domain, 1 << 24, 1);
+            let batch = Batch::new(&self.gpu, &points)?;
+            println!("| seeds | steps | kernel | M samples/s | ms | share of the floor (operations, bytes) |\n|---|---|---|---|---|---|");
+            let random = Tuning { sorted: false, keep: false, ..Tuning::default() };
+            let plain = Tuning { keep: false, ..Tuning::default() };
+            let half = Tuning { storage: Storage::F16, ..Tuning::default() };
+            let kinds = [
+                ("cell kept, sorted", Tuning::default()),
+                ("plain, sorted", plain),
+                ("plain, as they come", random),
+                ("cell kept, sorted, f16", half),
+            ];
+            let sizes: &[u32] = if quick { &[23] } else { &[18, 21, 23, 24] };
+            for (kind, tuning) in kinds {
+                for steps in [6, 11, 22, 110] {
+                    let tracer = self.tracer(&source, &turbulent(steps), tuning)?;
+                    for &size in sizes {
+                        let count = 1usize << size;
+                        if size == 24 && (!tuning.sorted || steps == 110) {
+                            continue;
+                        }
+                        let ms = batch.time(&tracer, count)?;
+                        // Operations of a stage (multiply-adds count once; see docs/performance.md), and the window read once.
+                        let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue * 1e3;
+                        let storage = if tuning.storage == Storage::F16 { 8.0 } else { 16.0 };
+                        // Small batches do not touch it all: 16 nodes a seed and interval at most.
+                        let window = SHAPE.iter().product::<usize>() * SNAPSHOTS;
+                        let nodes = window.min(16 * (SNAPSHOTS - 1) * count) as f64;
+                        let bytes = (storage * nodes + 20.0 * count as f64) / self.copy * 1e3;
+                        println!(
+                            "| 2^{size} | {steps} | {kind} | {:.0} | {ms:.2} | {:.0} %, {:.0} % |",
+                            count as f64 / ms / 1e3,
+                            100.0 * operations / ms,
+                            100.0 * bytes / ms
+                        );
+                    }
+                }
+            }
+            println!("\nMean share of steps completed: {:.3}", batch.mean_lived(1 << 20)?);
+
+            println!("\n### Tangent against six-particle differences, {name}, 22 steps, sorted\n");
+            println!("| integrator | precision | seeds | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|");
+            let count = 1 << 21;
+            let tangent = batch.time(&self.tracer(&source, &turbulent(22), Tuning::default())?, count)?;
+            println!("| tangent | f32 | 2^21 | {:.0} | 1 |", count as f64 / tangent / 1e3);
+            for (integrator, precision, gap, keep) in [
+                (Integrator::Tangent, Precision::F64, 1e-4, false),
+                (Integrator::Differences, Precision::F32, 0.05, true),
+                (Integrator::Differences, Precision::F32, 0.05, false),
+                (Integrator::Differences, Precision::F64, 1e-4, false),
+            ] {
+                let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
+                let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, ..Tuning::default() })?, count)?;
+                let kept = if keep { ", cell kept" } else { "" };
+                println!("| {integrator:?}{kept} | {precision:?} | 2^21 | {:.0} | {:.2} |", count as f64 / ms / 1e3, ms / tangent);
+            }
+            let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
+            let count = 1 << 18;
+            let slow = batch.time(&self.tracer(&source, &published, random)?, count)? / count as f64;
+            let fast = batch.time(&self.tracer(&source, &turbulent(22), Tuning::default())?, 1 << 23)? / (1 << 23) as f64;
+            let eleven = batch.time(&self.tracer(&source, &turbulent(11), Tuning::default())?, 1 << 23)? / (1 << 23) as f64;
+            println!(
+                "\nThe published way (six particles, order as they come, 110 steps, f64, gap 1e-6): {:.2} M/s; tangent in f32, sorted: {:.0} times with 22 steps, {:.0} times with 11",
+                1e-3 / slow,
+                slow / fast,
+                slow / eleven
+            );
+            self.tables(name, &source, &domain)
+        }
+
+        fn gyre(&self) -> Outcome<()> {
+            let plane = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
+            let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TAU / 10.0 };
+            let source = VelocitySource::Analytic(flow.clone(), plane.clone());
+            let batch = Batch::new(&self.gpu, &scattered(&plane, 1 << 24, 3))?;
+            println!("\n## Double gyre, tau 10, 100 steps, 2^24 seeds\n");
+            println!("| integrator | precision | M samples/s | registers |\n|---|---|---|---|");
+            for (integrator, precision, gap) in [
+                (Integrator::Tangent, Precision::F32, 1e-4),
+                (Integrator::Tangent, Precision::F64, 1e-4),
+                (Integrator::Differences, Precision::F32, 1e-3),
+                (Integrator::Differences, Precision::F64, 1e-5),
+            ] {
+                let tracer = self.tracer(&source, &map(10.0, 100, integrator, precision, gap, Boundary::Unbounded), Tuning::default())?;
+                let ms = batch.time(&tracer, batch.count)?;
+                println!("| {integrator:?} | {precision:?} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
+            }
+            // The same flow on a grid, interpolated by cubics.
+            let axis = |name: &str, length: f64, nodes: usize| Axis::uniform(name, "", 0.0, length, nodes);
+            let grid =
+                Arc::new(Grid { axes: vec![axis("x", 2.0, 401)?, axis("y", 1.0, 201)?], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+            let mut window = Window::new(10.0);
+            for t in 0..=20 {
+                window.push(Arc::new(flow.snapshot(f64::from(t) * 0.5, &grid)))?;
+            }
+            let source = VelocitySource::Window(Arc::new(window));
+            for interpolation in [Interpolation::Linear, Interpolation::Cubic] {
+                for keep in [true, false] {
+                    let settings = map(10.0, 100, Integrator::Tangent, Precision::F32, 1e-4, Boundary::Clamp);
+                    let tracer = self.tracer(&source, &FlowMap { interpolation, ..settings }, Tuning { keep, ..Tuning::default() })?;
+                    let ms = batch.time(&tracer, 1 << 22)?;
+                    println!(
+                        "| on a grid 401x201x21, {interpolation:?}, {} | F32 | {:.0} | {} |",
+                        if keep { "cell kept" } else { "plain" },
+                        (1 << 22) as f64 / ms / 1e3,
+                        tracer.resources()?.0
+                    );
+                }
+            }
+            Ok(())
+        }
+    }
+
+    /// Arithmetic instructions of one stage of the tangent in three dimensions: interpolation with derivatives 90, location 18, gradient times
+    /// tangent 27, stage points and sums 48.
+    const STAGE_OPERATIONS: f64 = 183.0;
+
+    pub fn run(quick: bool) -> Outcome<()> {
+        let begun = Instant::now();
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        println!("Device: {}, driver for CUDA {}, opened in {:.2} s", gpu.name(), gpu.driver(), begun.elapsed().as_secs_f64());
+        let clock = gpu.top_clock_hz()?;
+        let issue = f64::from(gpu.multiprocessors()) * 128.0 * clock;
+        let copy = gpu.copy_rate(1 << 30)?;
+        println!(
+            "{} multiprocessors at up to {:.0} MHz: {:.1} T instructions/s over all lanes; a copy of 1 GiB on the device moves {:.2} TB/s, read and written",
+            gpu.multiprocessors(),
+            clock / M,
+            issue / 1e12,
+            copy / 1e12
+        );
+        let bench = Bench { store: SnapshotStore::new(&gpu), gpu, issue, copy };
+        bench.gyre()?;
+        bench.turbulence("Easy", &Turbulence::easy(SHAPE, 0), quick)?;
+        if !quick {
+            bench.turbulence("Hard", &Turbulence::hard(SHAPE, 0), true)?;
+        }
+        let (used, cap) = bench.gpu.memory();
+        println!("\nDevice memory held at the end: {} of {} MiB", used >> 20, cap >> 20);
+        Ok(())
+    }
+}

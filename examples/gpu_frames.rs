@@ -1,0 +1,157 @@
+//! Frames of the standard easy turbulence on a GPU, every query traced: frames a second, where the time goes, what 64 accumulated frames
+//! are worth, what a new snapshot costs. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
+
+use ridgewatch::engine::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, Traced, Tuning};
+use ridgewatch::field::Window;
+use ridgewatch::field::turbulence::Turbulence;
+use ridgewatch::flow::{
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
+};
+use ridgewatch::publish::compare_films;
+use ridgewatch::render::{Film, RenderSettings, Renderer, Scene, TransferSettings};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+static NEVER: AtomicBool = AtomicBool::new(false);
+const TAU: f64 = 11.0;
+
+fn map(steps: usize) -> FlowMap {
+    FlowMap {
+        tau: TAU,
+        direction: Direction::Forward,
+        integrator: Integrator::Tangent,
+        precision: Precision::F32,
+        steps: Steps::Fixed(steps),
+        gap: 1e-4,
+        boundary: Boundary::Clamp,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
+    }
+}
+
+/// The scene that a bare file of this field would get, at this size.
+fn scene(tracer: &dyn Tracer, width: usize, height: usize, seed: u64) -> Scene {
+    let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
+    let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
+    let seeds: Vec<[f32; 3]> = unit.map(|u| tracer.domain().from_unit(u)).collect();
+    let mut probes = ridgewatch::flow::Traced::default();
+    tracer.trace(&seeds, Extras::default(), &mut probes);
+    let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / TAU as f32).collect();
+    let settings = RenderSettings { width, height, ..RenderSettings::default() };
+    let mut scene = Scene::assemble(tracer.domain(), None, None, None, settings, seed);
+    scene.transfer = TransferSettings::default().scaled_to(&ftle);
+    scene
+}
+
+/// A renderer whose majorants have settled.
+fn settled(device: &mut GpuRenderer, tracer: &CudaTracer, scene: Scene) -> Renderer {
+    let mut renderer = Renderer::new(scene, tracer.domain(), TAU).unwrap();
+    for frame in 0..6 {
+        device.render_samples(&mut renderer, 1 << 40 | frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
+    }
+    renderer
+}
+
+fn main() {
+    let given: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
+    let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
+    let (width, height) = (value(0, 1920), value(1, 1080));
+    let shape = [value(2, 600), value(3, 192), value(4, 192)];
+
+    let began = Instant::now();
+    let Ok(gpu) = Gpu::open(0, &GpuSettings::default()) else { return println!("no GPU: nothing is measured") };
+    let mut device = GpuRenderer::new(&gpu).unwrap();
+    println!("{}, driver {}; opened with rendering kernels after {:.2} s", gpu.name(), gpu.driver(), began.elapsed().as_secs_f64());
+
+    let began = Instant::now();
+    let grid = Turbulence::grid(shape).unwrap();
+    let turbulence = Turbulence::easy(shape, 0);
+    let mut window: Window = turbulence.window(&grid, 12).unwrap();
+    let next = Arc::new(turbulence.snapshot(12.0, &grid));
+    println!("easy turbulence {shape:?}, 12 snapshots, made on the CPU in {:.1} s", began.elapsed().as_secs_f64());
+
+    let store = SnapshotStore::new(&gpu);
+    let source = VelocitySource::Window(Arc::new(window.clone()));
+    let began = Instant::now();
+    drop(CudaTracer::new(&store, &gpu, source.clone(), &map(22), 0.0, Tuning::default()).unwrap());
+    gpu.synchronize().unwrap();
+    println!("window on the device and tracing kernels ready after {:.2} s", began.elapsed().as_secs_f64());
+
+    println!("{width}x{height}, one sample a pixel, reference; milliseconds of device time a frame, median of 9 by wall clock");
+    println!("steps ahead | frame (wall) start advance sort+trace film | waves queries ahead M/s | frames/s");
+    let mut frame_seconds = 0.0;
+    for (steps, camera, shadow) in
+        [(22, 1, 1), (22, 2, 4), (22, 4, 8), (22, 8, 8), (22, 2, 16), (22, 8, 32), (11, 4, 8), (44, 4, 8), (110, 4, 8)]
+    {
+        let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps), 0.0, Tuning::default()).unwrap();
+        device = device.with_look_ahead(LookAhead { camera, shadow });
+        let mut renderer = settled(&mut device, &tracer, scene(&tracer, width, height, 0));
+        let mut frames: Vec<(f64, Timeline, u64)> = (0..9)
+            .map(|frame| {
+                let began = Instant::now();
+                let (_, stats) = device.render_samples(&mut renderer, frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
+                (began.elapsed().as_secs_f64(), device.timeline(), stats.queries)
+            })
+            .collect();
+        frames.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let (wall, t, queries) = frames[4];
+        println!(
+            "{steps:4} {camera:2},{shadow:2} | {:6.1} {:6.2} {:6.2} {:7.2} {:5.2} | {:4} {:9} {:5.1} % {:6.0} | {:.1}",
+            1e3 * wall,
+            1e3 * t.start,
+            1e3 * t.advance,
+            1e3 * t.answer,
+            1e3 * t.film,
+            t.waves,
+            queries,
+            100.0 * (t.points as f64 / queries as f64 - 1.0),
+            1e-6 * t.points as f64 / t.answer,
+            1.0 / wall
+        );
+        if (steps, camera) == (22, 4) {
+            frame_seconds = wall;
+        }
+    }
+
+    // What frames are worth, at a quarter of the edge.
+    let (w, h) = (width / 4, height / 4);
+    let tracer = CudaTracer::new(&store, &gpu, source, &map(22), 0.0, Tuning::default()).unwrap();
+    device = device.with_look_ahead(LookAhead { camera: 4, shadow: 8 });
+    let mut renderer = settled(&mut device, &tracer, scene(&tracer, w, h, 0));
+    let tone_map = renderer.scene().settings.tone_map;
+    let mut reference = settled(&mut device, &tracer, scene(&tracer, w, h, 77));
+    let began = Instant::now();
+    let (truth, stats) = device.render_samples(&mut reference, 0, 0..4096, &Traced(tracer.device()), None, &NEVER).unwrap();
+    let seconds = began.elapsed().as_secs_f64();
+    println!("{w}x{h}: 4,096 samples in {seconds:.1} s ({:.0} M queries/s)", 1e-6 * stats.queries as f64 / seconds);
+    let mut sum = Film::new(w, h);
+    let began = Instant::now();
+    for frame in 0..64 {
+        let (film, _) = device.render_samples(&mut renderer, frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
+        sum.accumulate(&film).unwrap();
+    }
+    let psnr = compare_films(&sum, &truth, tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
+    println!("{w}x{h}: 64 frames of one sample, accumulated, in {:.2} s: {psnr:.1} dB", began.elapsed().as_secs_f64());
+
+    // A slide: one more snapshot, brought over and taken into the window, then a frame.
+    let _ = window.push(next).unwrap();
+    let mut renderer = settled(&mut device, &tracer, scene(&tracer, width, height, 0));
+    let before = gpu.memory().0;
+    let began = Instant::now();
+    let slid = CudaTracer::new(&store, &gpu, VelocitySource::Window(Arc::new(window)), &map(22), 1.0, Tuning::default()).unwrap();
+    let seconds = began.elapsed().as_secs_f64();
+    renderer.window_slid();
+    device.render_samples(&mut renderer, 1, 0..1, &Traced(slid.device()), None, &NEVER).unwrap();
+    println!(
+        "a new snapshot: {:.1} ms until the tracer of the slid window stands, {:.1} ms with the first frame on it (a frame: {:.1} ms); \
+         memory {} MiB before, {} MiB after",
+        1e3 * seconds,
+        1e3 * began.elapsed().as_secs_f64(),
+        1e3 * frame_seconds,
+        before >> 20,
+        gpu.memory().0 >> 20
+    );
+}

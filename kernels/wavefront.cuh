@@ -1,0 +1,173 @@
+// The wavefront: slots of flights that advance together, wave by wave.
+//
+// Slot g * pixels + p runs the g-th part of the samples of pixel p, one after the other, and adds them to sums of its own. So the
+// order in which a pixel's samples are summed depends on the picture's size and sample count alone, never on scheduling, and memory
+// is bounded whatever the number of samples. A wave's step takes the answers at the pending collisions, ends and starts paths, flies
+// on, and queues the next collisions.
+#pragma once
+#include "tracking.cuh"
+
+namespace rw {
+
+constexpr uint32_t NONE = 0xFFFFFFFFu;
+
+// A run of pixels and a range of samples, divided into parts that run side by side.
+struct Band {
+    uint32_t first_pixel;
+    uint32_t pixels;
+    uint32_t parts;
+    uint32_t first_sample;
+    uint32_t samples;
+    uint32_t pad;
+};
+
+RW_FN uint32_t part_start(const Band& band, uint32_t part) {
+    return band.first_sample + (uint32_t)((uint64_t)band.samples * part / band.parts);
+}
+
+// State of the slots, one array a group of fields that are read together.
+struct Slots {
+    Four* place;       // origin, t
+    Four* way;         // direction, end
+    Four* colour;      // radiance, weight
+    Words4* progress;   // sample, dimension and (in the upper two bits) stage, queries, traced
+    Two* seen;        // weight and weighted FTLE of the scattering event
+    uint32_t* first;        // first pending collision in the queue
+    double* sums;      // PIXEL_SUM_FIELDS arrays of `count` sums
+    uint32_t count;
+    uint32_t pad;
+};
+
+// The pending collisions, in any order; those of one flight are linked from near to far. Answers belong to the collisions of the wave
+// before, whose records are read while new ones are written.
+struct Queue {
+    float* points;                // domain coordinates, three a collision
+    Four* hits;                   // t, majorant, cell, next
+    uint32_t* length;
+    const Four* answered;         // records that the answers belong to
+    const float* log_stretch;     // NaN: no value there
+    const unsigned char* traced;  // whether RK4 answered
+};
+
+RW_FN void load_flight(const Slots& slots, const Band& band, uint32_t slot, Flight& flight) {
+    const Four place = slots.place[slot], way = slots.way[slot], colour = slots.colour[slot];
+    const Words4 progress = slots.progress[slot];
+    const Two seen = slots.seen[slot];
+    flight.origin[0] = place.x, flight.origin[1] = place.y, flight.origin[2] = place.z, flight.t = place.w;
+    flight.direction[0] = way.x, flight.direction[1] = way.y, flight.direction[2] = way.z, flight.end = way.w;
+    flight.path.radiance[0] = colour.x, flight.path.radiance[1] = colour.y, flight.path.radiance[2] = colour.z;
+    flight.weight = colour.w;
+    flight.pixel = band.first_pixel + slot % band.pixels;
+    flight.sample = progress.x;
+    flight.dimension = progress.y & 0x3FFFFFFFu;
+    flight.stage = progress.y >> 30;
+    flight.path.queries = progress.z;
+    flight.path.traced = progress.w;
+    flight.path.scattered = seen.x;
+    flight.path.ftle = seen.y;
+    flight.path.missing = 0.0f;
+}
+
+RW_FN void store_flight(const Slots& slots, uint32_t slot, const Flight& flight) {
+    slots.place[slot] = {flight.origin[0], flight.origin[1], flight.origin[2], flight.t};
+    slots.way[slot] = {flight.direction[0], flight.direction[1], flight.direction[2], flight.end};
+    slots.colour[slot] = {flight.path.radiance[0], flight.path.radiance[1], flight.path.radiance[2], flight.weight};
+    slots.progress[slot] = {flight.sample, flight.dimension | flight.stage << 30, flight.path.queries, flight.path.traced};
+    slots.seen[slot] = {flight.path.scattered, flight.path.ftle};
+}
+
+RW_FN void load_sum(const Slots& slots, uint32_t slot, PixelSum& sum) {
+    const double* at = slots.sums + slot;
+    const size_t pitch = slots.count;
+    sum.samples = at[0];
+    for (int k = 0; k < 4; ++k) sum.rgba[k] = at[(1 + k) * pitch];
+    sum.ftle = at[5 * pitch], sum.missing = at[6 * pitch], sum.luminance = at[7 * pitch];
+    sum.deviations = at[8 * pitch], sum.queries = at[9 * pitch], sum.traced = at[10 * pitch];
+}
+
+RW_FN void store_sum(const Slots& slots, uint32_t slot, const PixelSum& sum) {
+    double* at = slots.sums + slot;
+    const size_t pitch = slots.count;
+    at[0] = sum.samples;
+    for (int k = 0; k < 4; ++k) at[(1 + k) * pitch] = sum.rgba[k];
+    at[5 * pitch] = sum.ftle, at[6 * pitch] = sum.missing, at[7 * pitch] = sum.luminance;
+    at[8 * pitch] = sum.deviations, at[9 * pitch] = sum.queries, at[10 * pitch] = sum.traced;
+}
+
+// Puts the flight's pending collision and up to `ahead` - 1 that follow it, should it go on, into the queue.
+RW_FN void enqueue(const FrameScene& scene, const MajorantGrid& grid, const Queue& queue, const Flight& flight, Hit hit, uint32_t ahead,
+                          uint32_t& first) {
+    uint32_t drawn = flight.dimension - 1;
+    uint32_t at = reserve(queue.length);
+    first = at;
+    for (uint32_t k = 1;; ++k) {
+        float cell[3], point[3];
+        flight_point(flight, hit.t, cell);
+        domain_point(scene.box, cell, point);
+        for (int a = 0; a < 3; ++a) queue.points[3 * (size_t)at + a] = point[a];
+        Hit following;
+        const bool more = k < ahead && look_ahead(scene, grid, flight, drawn, hit, following);
+        const uint32_t next = more ? reserve(queue.length) : NONE;
+        queue.hits[at] = {hit.t, hit.majorant, bits_float(hit.cell), bits_float(next)};
+        if (!more) return;
+        at = next;
+        hit = following;
+        drawn += 1;
+    }
+}
+
+// One slot's part of a wave; false when the slot has no more work. `fresh` slots have no path yet.
+RW_FN bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watch& watch, const Band& band, const Slots& slots,
+                          const Queue& queue, uint32_t slot, bool fresh, uint32_t ahead_camera, uint32_t ahead_shadow, Counts& counts) {
+    const uint32_t end = part_start(band, slot / band.pixels + 1);
+    Flight flight = {};
+    Hit hit = {0.0f, 0.0f, 0u};
+    PixelSum sum = {0.0, {0.0, 0.0, 0.0, 0.0}, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
+    bool summed = fresh, flying = false;
+    if (fresh) {
+        flight.pixel = band.first_pixel + slot % band.pixels;
+        flight.sample = part_start(band, slot / band.pixels);
+        flying = flight.sample < end && start(scene, grid, flight.pixel, flight.sample, flight, hit);
+    } else {
+        load_flight(slots, band, slot, flight);
+        uint32_t at = slots.first[slot];
+        Verdict verdict;
+        for (;;) {
+            const Four record = queue.answered[at];
+            const Answer answer = {queue.log_stretch[at], queue.traced[at] != 0};
+            verdict = resolve(scene, flight, Hit{record.x, record.y, float_bits(record.z)}, answer, watch, counts);
+            const uint32_t next = float_bits(record.w);
+            if (verdict != NULL_COLLISION || next == NONE) break;
+            at = next;
+            flight.dimension += 1;
+        }
+        flying = verdict != ENDED && fly(scene, grid, flight, hit);
+    }
+    while (!flying && flight.sample < end) {
+        if (!summed) load_sum(slots, slot, sum);
+        summed = true;
+        add_path(sum, flight.path);
+        counts.paths += 1;
+        flight.sample += 1;
+        if (flight.sample < end) flying = start(scene, grid, flight.pixel, flight.sample, flight, hit);
+    }
+    if (summed) store_sum(slots, slot, sum);
+    if (!flying) return false;
+    store_flight(slots, slot, flight);
+    enqueue(scene, grid, queue, flight, hit, flight.stage == SHADOW ? ahead_shadow : ahead_camera, slots.first[slot]);
+    return true;
+}
+
+// A pixel of the band: its parts merged in order.
+RW_FN PixelValue finished(const Band& band, const Slots& slots, uint32_t pixel) {
+    PixelSum sum;
+    load_sum(slots, pixel, sum);
+    for (uint32_t part = 1; part < band.parts; ++part) {
+        PixelSum other;
+        load_sum(slots, part * band.pixels + pixel, other);
+        merge(sum, other);
+    }
+    return pixel_value(sum);
+}
+
+}  // namespace rw

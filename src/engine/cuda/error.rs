@@ -1,0 +1,140 @@
+//! Why a GPU cannot be used, or no longer.
+
+use cudarc::driver::result::DriverError;
+use thiserror::Error;
+
+/// Why a GPU cannot be used, or no longer.
+#[derive(Debug, Clone, PartialEq, Error)]
+pub enum DeviceError {
+    /// No libcuda.
+    #[error("no NVIDIA driver library (libcuda) is found")]
+    NoDriver,
+    /// The library is there but does not start.
+    #[error("the NVIDIA driver does not start: {reason}")]
+    DriverStart {
+        /// What it says.
+        reason: String,
+    },
+    /// CUDA version of the driver is below the oldest one supported.
+    #[error("the NVIDIA driver supports CUDA {}.{}; {}.{} or later is needed", found / 1000, found % 1000 / 10, needed / 1000, needed % 1000 / 10)]
+    DriverTooOld {
+        /// 1000 * major + 10 * minor.
+        found: i32,
+        /// The same.
+        needed: i32,
+    },
+    /// The driver sees no device.
+    #[error("the NVIDIA driver finds no device")]
+    NoDevice,
+    /// A device of this number does not exist.
+    #[error("there is no device cuda:{asked}; the driver finds {present}")]
+    NoSuchDevice {
+        /// Number asked for.
+        asked: u32,
+        /// Devices found.
+        present: u32,
+    },
+    /// No NVRTC.
+    #[error("no NVRTC library (libnvrtc, part of the CUDA toolkit) is found; kernels are compiled by it at start")]
+    NoNvrtc,
+    /// Older than what the kernels are written for.
+    #[error("cuda:{device} has compute capability {}.{}; 7.0 or later is needed", capability.0, capability.1)]
+    TooOld {
+        /// Its number.
+        device: u32,
+        /// (major, minor).
+        capability: (i32, i32),
+    },
+    /// A kernel did not compile.
+    #[error("kernel source `{source_name}` does not compile for {arch}: {log}")]
+    Compile {
+        /// File.
+        source_name: String,
+        /// sm_XX.
+        arch: String,
+        /// The compiler's log, or its error.
+        log: String,
+    },
+    /// A driver call failed.
+    #[error("{doing}: {reason}")]
+    Driver {
+        /// What was being done.
+        doing: &'static str,
+        /// What the driver says.
+        reason: String,
+        /// Whether the device answers nothing any more (a fault in a kernel, a reset, a lost card).
+        lost: bool,
+    },
+    /// The memory cap, or the device's memory, would be exceeded.
+    #[error("{what} needs {} MiB on the device; {} of {} MiB that may be used are taken ({cap_from})", needed >> 20, used >> 20, cap >> 20)]
+    OutOfMemory {
+        /// For what.
+        what: String,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes taken by ridgewatch.
+        used: u64,
+        /// Bytes that it may take.
+        cap: u64,
+        /// Where the cap comes from.
+        cap_from: &'static str,
+    },
+    /// The velocity window does not fit.
+    #[error(
+        "the window of {snapshots} snapshots of {nodes:?} nodes needs {} MiB on the device in {storage}; {} MiB are left. Ways out: \
+         storage f16 ({} MiB), a region of interest, a coarser grid, a shorter tau (fewer snapshots), or a larger memory cap",
+        needed >> 20, left >> 20, needed_f16 >> 20
+    )]
+    WindowTooLarge {
+        /// Snapshots.
+        snapshots: usize,
+        /// Nodes along x, y, z.
+        nodes: [usize; 3],
+        /// `f32` or `f16`.
+        storage: &'static str,
+        /// Bytes needed.
+        needed: u64,
+        /// Bytes needed with f16 storage.
+        needed_f16: u64,
+        /// Bytes left.
+        left: u64,
+    },
+    /// Not on the GPU.
+    #[error("not on the GPU: {what}")]
+    Unsupported {
+        /// What.
+        what: String,
+    },
+}
+
+impl DeviceError {
+    /// A failed driver call.
+    pub fn driver(doing: &'static str) -> impl Fn(DriverError) -> Self {
+        use cudarc::driver::sys::CUresult as R;
+        move |error| Self::Driver {
+            doing,
+            reason: error.error_string().map_or_else(|_| format!("{:?}", error.0), |text| text.to_string_lossy().into_owned()),
+            lost: matches!(
+                error.0,
+                R::CUDA_ERROR_ILLEGAL_ADDRESS
+                    | R::CUDA_ERROR_LAUNCH_FAILED
+                    | R::CUDA_ERROR_LAUNCH_TIMEOUT
+                    | R::CUDA_ERROR_ECC_UNCORRECTABLE
+                    | R::CUDA_ERROR_HARDWARE_STACK_ERROR
+                    | R::CUDA_ERROR_ILLEGAL_INSTRUCTION
+                    | R::CUDA_ERROR_MISALIGNED_ADDRESS
+                    | R::CUDA_ERROR_INVALID_PC
+                    | R::CUDA_ERROR_CONTEXT_IS_DESTROYED
+                    | R::CUDA_ERROR_DEVICE_UNAVAILABLE
+                    | R::CUDA_ERROR_NO_DEVICE
+                    | R::CUDA_ERROR_DEINITIALIZED
+                    | R::CUDA_ERROR_UNKNOWN
+            ),
+        }
+    }
+
+    /// Whether the device answers nothing any more.
+    pub fn is_lost(&self) -> bool {
+        matches!(self, Self::Driver { lost: true, .. })
+    }
+}

@@ -1,0 +1,370 @@
+//! The kernels' numerics, compiled as host C++ with the very macros and arguments of a launch, against the Rust reference in f64. No GPU.
+
+use super::grid::{GridArguments, Nodes};
+use super::layout::{DeviceReal, Outputs, Verdict, words};
+use super::trace::{closed_data, closed_defines, closed_stages, verdict};
+use super::{DeviceError, Storage};
+use crate::field::analytic::Analytic;
+use crate::field::turbulence::Turbulence;
+use crate::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use crate::flow::{
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
+};
+use std::collections::hash_map::RandomState;
+use std::ffi::c_void;
+use std::hash::{BuildHasher, Hasher};
+use std::path::Path;
+use std::process::Command;
+use std::sync::Arc;
+
+type HostTrace = unsafe extern "C" fn(*const c_void, *const c_void, *const c_void, f64, *const Verdict, *const f32, u32, *const Outputs);
+
+/// Compiles `kernels/host.cpp` with these macros.
+fn library(folder: &Path, defines: &[String]) -> libloading::Library {
+    let kernels = concat!(env!("CARGO_MANIFEST_DIR"), "/kernels");
+    let out = folder.join("kernel.so");
+    let mut command = Command::new("g++");
+    command.args(["-std=c++17", "-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-I", kernels, "-o"]);
+    command.arg(&out).args(defines.iter().map(|d| format!("-D{d}"))).arg(format!("{kernels}/host.cpp"));
+    let done = command.output().expect("g++ is installed (`make packages` sees to it)");
+    assert!(done.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&done.stderr));
+    // SAFETY: the library has no initialisers.
+    unsafe { libloading::Library::new(&out) }.unwrap()
+}
+
+/// Runs the kernel's code on the host. Outputs are poisoned before.
+fn host(source: &VelocitySource, map: &FlowMap, t0: f64, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+    match map.precision {
+        Precision::F32 => host_in::<f32>(source, map, t0, storage, seeds),
+        Precision::F64 => host_in::<f64>(source, map, t0, storage, seeds),
+    }
+}
+
+fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+    let Steps::Fixed(steps) = map.steps else { panic!("fixed steps") };
+    let to = t0 + map.direction.sign() * map.tau;
+    // Memory that stays where it is until the end; eight-byte words, so that it is aligned.
+    let mut memory: Vec<Box<[u64]>> = Vec::new();
+    let mut put = |bytes: &[u8]| -> Result<u64, DeviceError> {
+        let mut block = vec![0u64; bytes.len().div_ceil(8) + 1].into_boxed_slice();
+        // SAFETY: the block is at least as long.
+        unsafe { std::ptr::copy_nonoverlapping(bytes.as_ptr(), block.as_mut_ptr().cast(), bytes.len()) };
+        memory.push(block);
+        Ok(memory.last().unwrap().as_ptr() as u64)
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let (data, times, mut defines) = match source {
+        VelocitySource::Analytic(flow, domain) => {
+            let (stages, form) = closed_stages::<R>(flow, t0, to, steps);
+            let mut defines = closed_defines::<R>(map, form);
+            defines.push("RW_CLOSED=1".into());
+            (words(&closed_data::<R>(domain, map.boundary)), put(&stages).unwrap(), defines)
+        }
+        VelocitySource::Window(window) => {
+            let grid = window.grid().unwrap().clone();
+            let addresses =
+                window.snapshots().map(|s| if storage == Storage::F32 { s.nodes.as_ptr() as u64 } else { put(&halves(s)).unwrap() });
+            let nodes = Nodes {
+                addresses: addresses.collect(),
+                storage,
+                scale: if storage == Storage::F16 { HALF_SCALE } else { 1.0 },
+                missing: window.snapshots().any(|s| s.missing() > 0),
+            };
+            let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
+            let arguments = GridArguments::new::<R>(&mut put, &nodes, &times, &grid, map, (t0, to), steps, true).unwrap();
+            (arguments.data, arguments.steps, arguments.defines)
+        }
+    };
+    defines.sort();
+    let library = library(folder.path(), &defines);
+    let n = seeds.len();
+    let mut out = Traced {
+        log_stretch: vec![f32::NAN; n],
+        log_stretch_f64: vec![f64::NAN; n],
+        lived: vec![f32::NAN; n],
+        arrival: vec![[f32::NAN; 3]; n],
+        jacobian: vec![[f32::NAN; 9]; n],
+    };
+    let outputs = Outputs {
+        log_stretch: out.log_stretch.as_mut_ptr() as u64,
+        log_stretch_f64: out.log_stretch_f64.as_mut_ptr() as u64,
+        lived: out.lived.as_mut_ptr() as u64,
+        arrival: out.arrival.as_mut_ptr() as u64,
+        jacobian: out.jacobian.as_mut_ptr() as u64,
+    };
+    let step = R::from_f64((to - t0) / steps as f64);
+    // SAFETY: the function has this signature; all memory is live and as large as it presumes.
+    unsafe {
+        let trace: libloading::Symbol<HostTrace> = library.get(b"host_trace").unwrap();
+        let step = (&raw const step).cast();
+        trace(data.as_ptr().cast(), times as *const c_void, step, map.gap, &verdict(map, steps), seeds.as_ptr().cast(), n as u32, &outputs);
+    }
+    out
+}
+
+/// Power of two by which half-precision velocities are multiplied here.
+const HALF_SCALE: f32 = 1.0 / 256.0;
+
+/// Nodes as `window.cu` encodes them, by rounding of our own.
+fn halves(snapshot: &Snapshot) -> Vec<u8> {
+    let half = |x: f32| -> u16 {
+        if x.is_nan() {
+            return 0x7e00;
+        }
+        let a = x.abs();
+        let exponent = if a < 2f32.powi(-14) { -14 } else { (a.to_bits() >> 23) as i32 - 127 };
+        let steps = (a / 2f32.powi(exponent - 10)).round_ties_even() as u16;
+        let magnitude = if a < 2f32.powi(-14) { steps } else { (((exponent + 15) as u16) << 10) + (steps - 1024) };
+        magnitude | if x < 0.0 { 0x8000 } else { 0 }
+    };
+    let node = |n: &[f32; 4]| [half(n[0] / HALF_SCALE), half(n[1] / HALF_SCALE), half(n[2] / HALF_SCALE), half(n[3])];
+    snapshot.nodes.iter().flat_map(node).flat_map(u16::to_le_bytes).collect()
+}
+
+/// Other points in every run.
+fn fresh(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
+    let state = RandomState::new();
+    let uniform = |i: usize| {
+        let mut hasher = state.build_hasher();
+        hasher.write_usize(i);
+        (hasher.finish() >> 40) as f32 / (1u32 << 24) as f32
+    };
+    (0..count).map(|i| domain.from_unit([uniform(3 * i), uniform(3 * i + 1), uniform(3 * i + 2)])).collect()
+}
+
+fn cpu(source: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Traced {
+    let mut out = Traced::default();
+    cpu_tracer(source.clone(), map, t0).unwrap().trace(seeds, Extras { arrival: true, jacobian: true }, &mut out);
+    out
+}
+
+fn map(tau: f64, steps: usize) -> FlowMap {
+    FlowMap {
+        tau,
+        direction: Direction::Forward,
+        integrator: Integrator::Tangent,
+        precision: Precision::F64,
+        steps: Steps::Fixed(steps),
+        gap: 1e-4,
+        boundary: Boundary::Unbounded,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
+    }
+}
+
+/// Paths that the CPU and the kernel judge differently at an edge, as a share: rounding decides them.
+const UNDECIDED: f64 = 0.005;
+
+/// Both precisions of the kernel's code against the CPU in f64.
+fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
+    let domain = match source {
+        VelocitySource::Analytic(_, domain) => domain.clone(),
+        VelocitySource::Window(window) => window.grid().unwrap().domain(),
+    };
+    let seeds = fresh(&domain, 600);
+    let exact = cpu(source, map, t0, &seeds);
+    let double = host(source, map, t0, Storage::F32, &seeds);
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    let mut died = 0;
+    for &i in &same {
+        let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
+        // Rounding of 1e-16 a step, amplified by the stretch along the path (e^s below 1e4 here) and, near cell faces, by a jump of the
+        // gradient across them. Central differences divide it by the gap.
+        let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
+        assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{name}: seed {:?}: {a} {b}", seeds[i]);
+        died += usize::from(exact.lived[i] < 1.0);
+        for k in 0..3 {
+            let (a, b) = (exact.arrival[i][k], double.arrival[i][k]);
+            // Both are rounded to single precision.
+            assert!((a - b).abs() <= 4.0 * f32::EPSILON * a.abs().max(1.0), "{name}: arrival {a} {b}");
+        }
+        let largest = exact.jacobian[i].iter().fold(0f32, |m, x| m.max(x.abs()));
+        for k in 0..9 {
+            let (a, b) = (exact.jacobian[i][k], double.jacobian[i][k]);
+            assert!((a - b).abs() <= 1e-5f32.max(tolerance as f32) * largest.max(1.0), "{name}: jacobian {k}: {a} {b}");
+        }
+    }
+    if matches!(map.boundary, Boundary::Stop | Boundary::Zero) {
+        assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
+    }
+    if map.integrator == Integrator::Differences {
+        return;
+    }
+    // Single precision: as far from the exact result as the CPU's single precision, give or take the order of rounding.
+    let single = FlowMap { precision: Precision::F32, ..map.clone() };
+    let (ours, theirs) = (host(source, &single, t0, Storage::F32, &seeds), cpu(source, &single, t0, &seeds));
+    let error = |found: &Traced| {
+        let mut errors: Vec<f64> = same.iter().map(|&i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).abs()).collect();
+        errors.sort_by(f64::total_cmp);
+        // The worst percent are paths along a cell face or an edge, where rounding decides which side counts.
+        errors[errors.len() * 99 / 100]
+    };
+    let (ours, theirs) = (error(&ours), error(&theirs));
+    assert!(ours < 3.0 * theirs + 2e-6, "{name}: single precision is off by {ours:e}, the CPU's by {theirs:e}");
+}
+
+#[test]
+fn closed_forms() {
+    let plane = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
+    let cube = Domain::cuboid([0.0; 3], [6.0; 3]);
+    let gyre =
+        |domain: &Domain| VelocitySource::Analytic(Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: 0.6 }, domain.clone());
+    let abc = VelocitySource::Analytic(Analytic::Abc { a: 3f64.sqrt(), b: 2f64.sqrt(), c: 1.0, growth: 0.5 }, cube);
+    check("double gyre", &gyre(&plane), &map(10.0, 40), 0.3);
+    let inner = Domain::slab([0.4, 0.2], [1.7, 0.9], (0.0, 1.0));
+    check(
+        "double gyre that stops",
+        &gyre(&inner),
+        &FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) },
+        0.3,
+    );
+    check(
+        "double gyre with zeros",
+        &gyre(&inner),
+        &FlowMap { boundary: Boundary::Zero, direction: Direction::Backward, ..map(5.0, 40) },
+        0.3,
+    );
+    check("double gyre clamped", &gyre(&inner), &FlowMap { boundary: Boundary::Clamp, ..map(5.0, 40) }, 0.3);
+    check("double gyre by differences", &gyre(&plane), &FlowMap { integrator: Integrator::Differences, ..map(10.0, 40) }, 0.3);
+    check("ABC", &abc, &FlowMap { boundary: Boundary::Unbounded, ..map(2.0, 30) }, 0.0);
+    for flow in [Analytic::Saddle { rate: 0.7 }, Analytic::Rotation { omega: 0.7 }, Analytic::Shear { rate: 0.7 }] {
+        check("linear", &VelocitySource::Analytic(flow, plane.clone()), &map(4.0, 20), 0.0);
+    }
+}
+
+/// Uneven axes of a given shape.
+fn uneven(shape: &[usize]) -> Vec<Axis> {
+    let coordinate = |k: usize, i: usize| 0.7 * i as f64 + 0.2 * (1.3 * i as f64 + k as f64).sin() - 1.0;
+    shape
+        .iter()
+        .enumerate()
+        .map(|(k, &n)| Axis::new(["x", "y", "z"][k], "m", (0..n).map(|i| coordinate(k, i)).collect()).unwrap())
+        .collect()
+}
+
+/// Smooth velocities of size `speed` at the nodes, at uneven times; with `hole`, a corner of the grid is missing in the later snapshots.
+fn smooth(grid: &Arc<Grid>, speed: f32, hole: bool) -> VelocitySource {
+    let mut window = Window::new(3.2);
+    let [nx, ny, nz] = grid.shape();
+    for (s, time) in [0.0, 0.9, 2.0, 2.7, 3.5].into_iter().enumerate() {
+        let value = |i: usize, c: usize| {
+            let (x, y, z) = ((i % nx) as f32 / nx as f32, (i / nx % ny) as f32 / ny as f32, (i / nx / ny) as f32 / nz as f32);
+            let turn = std::f32::consts::TAU * (x + [2.0, 1.0, 3.0][c] * y + [1.0, 2.0, 1.0][c] * z) + 0.5 * time as f32 + c as f32;
+            if hole && s > 0 && x > 0.7 && y > 0.6 { f32::NAN } else { speed * turn.sin() }
+        };
+        let component = |c: usize| (0..grid.nodes()).map(|i| value(i, c)).collect::<Vec<_>>();
+        let w = if grid.dimensions() == 3 { component(2) } else { Vec::new() };
+        window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &component(0), &component(1), &w))).unwrap();
+    }
+    VelocitySource::Window(Arc::new(window))
+}
+
+fn cartesian(axes: Vec<Axis>) -> Arc<Grid> {
+    Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) })
+}
+
+#[test]
+fn windows_in_the_plane() {
+    let even = || vec![Axis::uniform("x", "", 0.0, 9.0, 19).unwrap(), Axis::uniform("y", "", 1.0, 5.0, 13).unwrap()];
+    let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
+    let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
+    check("linear", &smooth(&cartesian(even()), 0.6, false), &stop, 0.1);
+    check("cubic", &smooth(&cartesian(even()), 0.6, false), &cubic, 0.1);
+    check(
+        "cubic, uneven",
+        &smooth(&cartesian(uneven(&[19, 13])), 0.6, false),
+        &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
+        0.1,
+    );
+    check("cubic, holes", &smooth(&cartesian(even()), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    let mut around = even();
+    around[0] = around[0].clone().with_period(9.5);
+    check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);
+    let backward = FlowMap { direction: Direction::Backward, boundary: Boundary::Periodic, ..stop.clone() };
+    check("linear, periodic, backward", &smooth(&cartesian(even()), 0.6, false), &backward, 3.4);
+}
+
+#[test]
+fn windows_in_space() {
+    let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
+    let even = || ["x", "y", "z"].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
+    check("linear", &smooth(&cartesian(even()), 0.5, false), &stop, 0.1);
+    check("linear, holes", &smooth(&cartesian(even()), 0.5, true), &stop, 0.1);
+    check("linear, uneven", &smooth(&cartesian(uneven(&[11, 9, 8])), 0.5, false), &stop, 0.1);
+    check(
+        "cubic, uneven",
+        &smooth(&cartesian(uneven(&[11, 9, 8])), 0.5, false),
+        &FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() },
+        0.1,
+    );
+    let mut around = even();
+    around[1] = around[1].clone().with_period(5.5);
+    check("linear, around", &smooth(&cartesian(around), 0.5, false), &stop, 0.1);
+    check("differences", &smooth(&cartesian(even()), 0.5, false), &FlowMap { integrator: Integrator::Differences, ..stop.clone() }, 0.1);
+    // Unit spacing: no factor between stored and used velocities.
+    let turbulence = Turbulence::easy([40, 24, 24], 5);
+    let grid = Turbulence::grid([40, 24, 24]).unwrap();
+    let window = Arc::new(turbulence.window(&grid, 6).unwrap());
+    check("turbulence", &VelocitySource::Window(window), &FlowMap { boundary: Boundary::Clamp, ..map(5.0, 10) }, 0.0);
+}
+
+#[test]
+fn windows_on_the_sphere() {
+    let lon = Axis::uniform("lon", "", -180.0, 170.0, 36).unwrap().with_period(360.0);
+    let lat = Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap();
+    let globe = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
+    // A particle at a pole, where the grid's cells meet, would be decided by rounding: Clamp lets all live.
+    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
+    check("globe, cubic", &smooth(&globe, 1.0, false), &around, 0.1);
+    let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
+    let lat = Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap();
+    let region = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    check("region, linear, holes", &smooth(&region, 0.8, true), &stop, 3.4);
+    check("region, differences", &smooth(&region, 0.8, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);
+}
+
+#[test]
+fn half_precision_windows() {
+    let even = ["x", "y", "z"].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
+    let source = smooth(&cartesian(even), 0.5, true);
+    let VelocitySource::Window(window) = &source else { panic!("a window") };
+    // The same field, rounded to half precision on the way: what is left is the arithmetic.
+    let mut rounded = Window::new(3.2);
+    for snapshot in window.snapshots() {
+        let round = |x: f32| if x.is_nan() { x } else { round_to_half(x / HALF_SCALE) * HALF_SCALE };
+        let nodes = snapshot.nodes.iter().map(|n| n.map(round)).collect();
+        rounded.push(Arc::new(Snapshot { time: snapshot.time, grid: snapshot.grid.clone(), nodes })).unwrap();
+    }
+    let map = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
+    let seeds = fresh(&window.grid().unwrap().domain(), 500);
+    let exact = cpu(&VelocitySource::Window(Arc::new(rounded)), &map, 0.1, &seeds);
+    let found = host(&source, &map, 0.1, Storage::F16, &seeds);
+    let odd = (0..seeds.len()).filter(|&i| (exact.log_stretch_f64[i] - found.log_stretch_f64[i]).abs() > 2e-9).count();
+    assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{odd} of {} differ", seeds.len());
+}
+
+/// Rounds to 11 bits (the test's velocities are neither subnormal nor too large in half precision).
+fn round_to_half(x: f32) -> f32 {
+    let spacing = 2f32.powi((x.abs().max(2f32.powi(-14)).to_bits() >> 23) as i32 - 127 - 10);
+    (x / spacing).round_ties_even() * spacing
+}
+
+#[test]
+fn halves_round_to_nearest() {
+    let folder = tempfile::tempdir().unwrap();
+    let defines = ["RW_CLOSED=1", "RW_REAL=float", "RW_FORM=0", "RW_BOUNDARY=3", "RW_DIFFERENCES=0"].map(String::from);
+    let library = library(folder.path(), &defines);
+    // SAFETY: the function has this signature.
+    let half: libloading::Symbol<unsafe extern "C" fn(f32) -> f32> = unsafe { library.get(b"host_half") }.unwrap();
+    // SAFETY: as above.
+    let half = |x: f32| unsafe { half(x) };
+    for (x, expected) in [(1.0, 1.0), (-0.5, -0.5), (65504.0, 65504.0), (1e6, f32::INFINITY), (5.96e-8, 5.960_464_5e-8), (1e-9, 0.0)] {
+        assert_eq!(half(x), expected, "{x}");
+    }
+    // Between 1 and 1 + 2^-10, ties go to the even one.
+    assert_eq!(half(1.0 + 2f32.powi(-11)), 1.0);
+    assert_eq!(half(1.0 + 3.0 * 2f32.powi(-11)), 1.0 + 2.0 * 2f32.powi(-10));
+    assert!(half(f32::NAN).is_nan());
+}

@@ -1,0 +1,36 @@
+//! The GPU engine: device, window ring, sorted tracing and tables on CUDA.
+//!
+//! In: a velocity source, a flow map and seeds, on the host (as a [`crate::flow::Tracer`]) or on the device. Out: what the CPU's tracer
+//! gives. Kernels are in `kernels/`, compiled at start for the device found. Everything here returns [`DeviceError`]; nothing panics where
+//! libraries or devices are missing.
+
+pub mod compile;
+mod device;
+mod error;
+mod grid;
+#[cfg(test)]
+mod host_parity;
+mod launch;
+mod layout;
+mod memory;
+mod pinned;
+mod render;
+mod render_memory;
+mod sort;
+mod table;
+mod trace;
+mod tracer;
+mod window;
+
+pub use super::device::Storage;
+pub use device::{FoundDevice, Gpu, GpuSettings, probe};
+pub use error::DeviceError;
+pub use launch::{launch, threads};
+pub use layout::Outputs;
+pub use memory::{Budget, Buffer};
+pub use render::{DeviceAnswers, GpuRenderer, LookAhead, Timeline, Traced};
+pub use sort::{SortCells, Sorter};
+pub use table::DeviceTable;
+pub use trace::{DeviceTracer, Tuning};
+pub use tracer::{CudaTracer, CudaTracerError};
+pub use window::{DeviceSnapshot, DeviceWindow, SnapshotStore};

@@ -1,0 +1,121 @@
+//! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
+
+use super::layout::{Outputs, TableFrame};
+use super::sort::{MOST, Sorter};
+use super::trace::DeviceTracer;
+use super::{Buffer, DeviceError, Gpu, launch, threads};
+use crate::field::Domain;
+use cudarc::driver::{CudaFunction, PushKernelArg};
+use std::sync::Arc;
+
+/// Log-stretch at nodes i / (n - 1) of the unit domain, x fastest.
+#[derive(Debug)]
+pub struct DeviceTable {
+    gpu: Arc<Gpu>,
+    frame: TableFrame,
+    values: Buffer<f32>,
+    not_finite: usize,
+    bricks: CudaFunction,
+    mend: CudaFunction,
+    lookup: CudaFunction,
+    /// Memory for seeds of one part of the sweep.
+    scratch: Sorter,
+}
+
+/// Nodes of a brick's edge in `table_bricks`.
+const EDGE: usize = 8;
+
+impl DeviceTable {
+    /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
+    ///
+    /// # Errors
+    /// A table that does not fit, or has more nodes than 32 bits can count.
+    pub fn trace(tracer: &DeviceTracer, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
+        let gpu = tracer.gpu();
+        let dimensions = domain.dimensions.clamp(2, 3);
+        let nodes: [usize; 3] = std::array::from_fn(|k| if k < dimensions { nodes[k].max(2) } else { 1 });
+        let all = nodes.iter().try_fold(1usize, |all, n| all.checked_mul(*n)).filter(|all| *all < u32::MAX as usize);
+        let Some(all) = all else { return Err(DeviceError::Unsupported { what: format!("a table of {nodes:?} nodes") }) };
+        let kernel = |name| gpu.kernel("table.cu", &[], name);
+        let mut table = Self {
+            gpu: gpu.clone(),
+            frame: TableFrame { nodes: nodes.map(|n| n as i32), dimensions: dimensions as i32, min: domain.min, extent: domain.extent() },
+            values: gpu.alloc("a table", all)?,
+            not_finite: 0,
+            bricks: kernel("table_bricks")?,
+            mend: kernel("table_mend")?,
+            lookup: kernel("table_lookup")?,
+            scratch: Sorter::new(gpu)?,
+        };
+        table.retrace(tracer)?;
+        Ok(table)
+    }
+
+    /// Traces every node anew, after the window has slid. Waits for the result.
+    pub fn retrace(&mut self, tracer: &DeviceTracer) -> Result<(), DeviceError> {
+        let nodes = self.frame.nodes.map(|n| n as usize);
+        let [bricks_x, bricks_y, bricks_z] = nodes.map(|n| n.div_ceil(EDGE));
+        let in_brick = if self.frame.dimensions == 3 { EDGE * EDGE * EDGE } else { EDGE * EDGE };
+        let all = bricks_x * bricks_y * bricks_z * in_brick;
+        let stream = self.gpu.work().clone();
+        let out = Outputs { log_stretch: self.values.address(), ..Outputs::default() };
+        let (x, y) = (bricks_x as u32, bricks_y as u32);
+        for first in (0..all).step_by(MOST) {
+            let count = (all - first).min(MOST);
+            let seeds = self.scratch.buffer(count)?;
+            let (from, n) = (first as u64, count as u32);
+            // SAFETY: arguments as declared in table.cu; `seeds` has room for `count` entries, and `values` for every node.
+            unsafe {
+                let mut call = stream.launch_builder(&self.bricks);
+                launch(call.arg(&self.frame).arg(&x).arg(&y).arg(&from).arg(&n).arg(&seeds), threads(count, 256))?;
+                tracer.in_sequence(seeds, count, &out)?;
+            }
+        }
+        let values = self.values.len() as u64;
+        let odd = self.gpu.upload("a counter", &[0u32])?;
+        let (address, counter) = (self.values.address(), odd.address());
+        // SAFETY: arguments as declared in table.cu.
+        unsafe {
+            launch(stream.launch_builder(&self.mend).arg(&address).arg(&values).arg(&counter), threads(self.values.len(), 256))?;
+        }
+        let mut count = [0u32];
+        odd.read(&mut count)?;
+        self.not_finite = count[0] as usize;
+        Ok(())
+    }
+
+    /// Nodes along x, y, z.
+    pub fn nodes(&self) -> [usize; 3] {
+        self.frame.nodes.map(|n| n as usize)
+    }
+    /// Nodes whose trace was not finite; they hold 0.
+    pub fn not_finite(&self) -> usize {
+        self.not_finite
+    }
+    /// Address of the values.
+    pub fn address(&self) -> u64 {
+        self.values.address()
+    }
+    /// The values.
+    pub fn values(&self) -> Result<Vec<f32>, DeviceError> {
+        let mut out = vec![0.0; self.values.len()];
+        self.values.read(&mut out)?;
+        Ok(out)
+    }
+
+    /// Interpolates at `count` points, 3 f32 each in unit coordinates (clamped) at the address `points`, into f32 at `out`.
+    ///
+    /// # Safety
+    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    pub unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+        if count == 0 {
+            return Ok(());
+        }
+        let (values, n) = (self.values.address(), count as u32);
+        let stream = self.gpu.work();
+        let mut call = stream.launch_builder(&self.lookup);
+        call.arg(&self.frame).arg(&values).arg(&points).arg(&n).arg(&out);
+        // SAFETY: the caller's, and the arguments are as declared in table.cu.
+        unsafe { launch(&mut call, threads(count, 256)) }
+    }
+}

@@ -1,0 +1,290 @@
+//! Tracing on the device: from addresses of seeds to addresses of results, sorted by cell where velocities are read from memory.
+
+use super::grid::GridArguments;
+use super::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
+use super::sort::{MOST, SortCells, Sorter};
+use super::window::DeviceWindow;
+use super::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
+use crate::field::Domain;
+use crate::field::analytic::{Analytic, ClosedForm, Form};
+use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
+use crate::simd::Real;
+use cudarc::driver::{CudaFunction, PushKernelArg};
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// In which order seeds are traced, and how velocities are read: for measurements.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Tuning {
+    /// How the window is held.
+    pub storage: Storage,
+    /// Whether batches are sorted by cell.
+    pub sorted: bool,
+    /// Whether the current cell stays in registers; otherwise every stage reads its corners (the plain kernel).
+    pub keep: bool,
+}
+
+impl Default for Tuning {
+    fn default() -> Self {
+        Self { storage: Storage::F32, sorted: true, keep: true }
+    }
+}
+
+/// Batches below this are not worth sorting.
+const SORT_FROM: usize = 1 << 12;
+
+/// One flow map on the device, ready for seeds.
+#[derive(Debug)]
+pub struct DeviceTracer {
+    gpu: Arc<Gpu>,
+    plain: CudaFunction,
+    sorted: CudaFunction,
+    block: u32,
+    data: Words,
+    /// Address of the steps (windows) or the stage constants (closed forms).
+    times: u64,
+    step: [u64; 1],
+    gap: f64,
+    verdict: Verdict,
+    cells: Option<SortCells>,
+    sorter: Mutex<Option<Sorter>>,
+    // Memory that the kernels read.
+    window: Option<DeviceWindow>,
+    _memory: Vec<Buffer<u8>>,
+}
+
+impl DeviceTracer {
+    /// For seeds at `t0`, with this many steps. What [`crate::flow::cpu_tracer`] refuses is not checked again.
+    ///
+    /// # Errors
+    /// The adaptive integrator; a window that does not fit; kernels that do not compile.
+    pub fn new(
+        store: &SnapshotStore,
+        gpu: &Arc<Gpu>,
+        source: &VelocitySource,
+        map: &FlowMap,
+        t0: f64,
+        steps: usize,
+        tuning: Tuning,
+    ) -> Result<Self, DeviceError> {
+        if map.integrator == Integrator::DormandPrince {
+            return Err(DeviceError::Unsupported { what: "the adaptive reference integrator; it runs on the CPU".into() });
+        }
+        match map.precision {
+            Precision::F32 => Self::of_real::<f32>(store, gpu, source, map, t0, steps, tuning),
+            Precision::F64 => Self::of_real::<f64>(store, gpu, source, map, t0, steps, tuning),
+        }
+    }
+
+    fn of_real<R: DeviceReal>(
+        store: &SnapshotStore,
+        gpu: &Arc<Gpu>,
+        source: &VelocitySource,
+        map: &FlowMap,
+        t0: f64,
+        steps: usize,
+        tuning: Tuning,
+    ) -> Result<Self, DeviceError> {
+        let to = t0 + map.direction.sign() * map.tau;
+        let verdict = verdict(map, steps);
+        let mut step = [0u64; 1];
+        step[0] = words(&R::from_f64((to - t0) / steps as f64))[0];
+        match source {
+            VelocitySource::Analytic(flow, domain) => {
+                let (stages, form) = closed_stages::<R>(flow, t0, to, steps);
+                let defines = closed_defines::<R>(map, form);
+                let stages = gpu.upload("the stages of a closed form", &stages)?;
+                Ok(Self {
+                    plain: gpu.kernel("trace_closed.cu", &defines, "trace")?,
+                    sorted: gpu.kernel("trace_closed.cu", &defines, "trace_sorted")?,
+                    block: 256,
+                    data: words(&closed_data::<R>(domain, map.boundary)),
+                    times: stages.address(),
+                    step,
+                    gap: map.gap,
+                    verdict,
+                    cells: None,
+                    sorter: Mutex::new(None),
+                    window: None,
+                    _memory: vec![stages],
+                    gpu: gpu.clone(),
+                })
+            }
+            VelocitySource::Window(window) => {
+                let grid = window.grid().ok_or_else(|| DeviceError::Unsupported { what: "an empty window".into() })?.clone();
+                let held = store.window(window, tuning.storage)?;
+                let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
+                let mut memory = Vec::new();
+                let mut put = |bytes: &[u8]| {
+                    let buffer = gpu.upload("a flow map", bytes)?;
+                    let address = buffer.address();
+                    memory.push(buffer);
+                    Ok(address)
+                };
+                let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, tuning.keep)?;
+                let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
+                Ok(Self {
+                    plain: kernel("trace")?,
+                    sorted: kernel("trace_sorted")?,
+                    block: 128,
+                    data: arguments.data,
+                    times: arguments.steps,
+                    step,
+                    gap: map.gap,
+                    verdict,
+                    cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
+                    sorter: Mutex::new(None),
+                    window: Some(held),
+                    _memory: memory,
+                    gpu: gpu.clone(),
+                })
+            }
+        }
+    }
+
+    /// Whether some velocity of the window is missing, so that seeds may lie on land.
+    pub fn meets_land(&self) -> bool {
+        self.window.as_ref().is_some_and(|window| window.nodes().missing)
+    }
+
+    /// The device.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
+    }
+
+    /// Registers a thread and bytes of local memory a thread of the kernel in use.
+    pub fn resources(&self) -> Result<(i32, i32), DeviceError> {
+        let doing = DeviceError::driver("asking for a kernel's resources");
+        let kernel = if self.cells.is_some() { &self.sorted } else { &self.plain };
+        Ok((kernel.num_regs().map_err(&doing)?, kernel.local_size_bytes().map_err(&doing)?))
+    }
+
+    /// Traces `count` seeds on the device: `seeds` is the address of 3 f32 each, in domain coordinates; results go to `out` in the order of
+    /// the seeds. Returns as soon as the work is queued on the work stream.
+    ///
+    /// # Safety
+    /// The memory at these addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    pub unsafe fn trace(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+        let Some(cells) = self.cells.as_ref().filter(|_| count >= SORT_FROM) else {
+            // SAFETY: the caller's.
+            return unsafe { self.in_given_order(seeds, count, out) };
+        };
+        let mut sorter = self.sorter.lock().unwrap_or_else(PoisonError::into_inner);
+        if sorter.is_none() {
+            *sorter = Some(Sorter::new(&self.gpu)?);
+        }
+        let Some(sorter) = sorter.as_mut() else { return Err(DeviceError::Unsupported { what: "sorting".into() }) };
+        for first in (0..count).step_by(MOST) {
+            let part = (count - first).min(MOST);
+            // SAFETY: the caller's; the sorted points are read by the launch behind it on the same stream.
+            unsafe {
+                let sorted = sorter.sort(seeds + 12 * first as u64, part, cells)?;
+                self.launch(&self.sorted, sorted, part, &shifted(out, first))?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Traces `count` seeds that are in a good order already: `{x, y, z, index as bits}`; results go to their index, and index 0xffffffff
+    /// is no seed.
+    ///
+    /// # Safety
+    /// As for [`Self::trace`], with room for every index.
+    pub(super) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+        // SAFETY: the caller's.
+        unsafe { self.launch(&self.sorted, sorted, count, out) }
+    }
+
+    /// # Safety
+    /// As for [`Self::trace`].
+    unsafe fn in_given_order(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+        for first in (0..count).step_by(MOST) {
+            // SAFETY: the caller's.
+            unsafe { self.launch(&self.plain, seeds + 12 * first as u64, (count - first).min(MOST), &shifted(out, first))? };
+        }
+        Ok(())
+    }
+
+    /// # Safety
+    /// `seeds` is what the kernel reads, for `count` seeds; `out` has room.
+    unsafe fn launch(&self, kernel: &CudaFunction, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+        if count == 0 {
+            return Ok(());
+        }
+        let n = count as u32;
+        let mut call = self.gpu.work().launch_builder(kernel);
+        call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.verdict).arg(&seeds).arg(&n).arg(out);
+        // SAFETY: the caller's; all that the data points to is held by `self`.
+        unsafe { launch(&mut call, threads(count, self.block)) }
+    }
+}
+
+/// The same outputs from entry `first` on.
+fn shifted(out: &Outputs, first: usize) -> Outputs {
+    let by = |address: u64, bytes: usize| if address == 0 { 0 } else { address + (first * bytes) as u64 };
+    Outputs {
+        log_stretch: by(out.log_stretch, 4),
+        log_stretch_f64: by(out.log_stretch_f64, 8),
+        lived: by(out.lived, 4),
+        arrival: by(out.arrival, 12),
+        jacobian: by(out.jacobian, 36),
+    }
+}
+
+/// Macros of `trace_closed.cu`.
+pub(super) fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8) -> Vec<String> {
+    vec![
+        format!("RW_REAL={}", R::NAME),
+        format!("RW_FORM={form}"),
+        format!("RW_BOUNDARY={}", boundary_number(map.boundary)),
+        format!("RW_DIFFERENCES={}", u8::from(map.integrator == Integrator::Differences)),
+    ]
+}
+
+/// What `give` does with a path.
+pub(super) fn verdict(map: &FlowMap, steps: usize) -> Verdict {
+    Verdict {
+        zero_where_left: i32::from(map.boundary == Boundary::Zero),
+        by_lived: i32::from(map.normalisation == Normalisation::Lived),
+        steps: steps as i32,
+    }
+}
+
+/// `Boundary` of `closed.cuh`.
+fn boundary_number(boundary: Boundary) -> u8 {
+    match boundary {
+        Boundary::Stop => 0,
+        Boundary::Clamp => 1,
+        Boundary::Periodic => 2,
+        Boundary::Unbounded => 3,
+        Boundary::Zero => 4,
+    }
+}
+
+pub(super) fn closed_data<R: Real>(domain: &Domain, boundary: Boundary) -> ClosedData<R> {
+    let (low, high) = (domain.min.map(R::from_f64), domain.max.map(R::from_f64));
+    let (inner_low, inner_high) = match boundary {
+        Boundary::Zero => (low.map(R::above), high.map(R::below)),
+        _ => (low, high),
+    };
+    ClosedData { low: inner_low, high: inner_high, box_low: low, box_high: high }
+}
+
+/// Constants of every stage as bytes, and the number of the form in `closed.cuh`.
+pub(super) fn closed_stages<R: Real>(flow: &Analytic, from: f64, to: f64, steps: usize) -> (Vec<u8>, u8) {
+    fn of<R: Real, F: ClosedForm<D>, const D: usize>(form: F, from: f64, to: f64, steps: usize) -> Vec<u8> {
+        let halves = 2 * steps;
+        let mut bytes = Vec::new();
+        for i in 0..=halves {
+            for constant in form.constants(from + (to - from) * (i as f64 / halves as f64)) {
+                let constant = R::from_f64(constant);
+                bytes.extend_from_slice(&words(&constant)[0].to_le_bytes()[..size_of::<R>()]);
+            }
+        }
+        bytes
+    }
+    match flow.form() {
+        Form::DoubleGyre(form) => (of::<R, _, 2>(form, from, to, steps), 0),
+        Form::Abc(form) => (of::<R, _, 3>(form, from, to, steps), 1),
+        Form::Linear(form) => (of::<R, _, 2>(form, from, to, steps), 2),
+    }
+}

@@ -1,0 +1,160 @@
+//! The tracer that the engine uses: seeds on the host in, results on the host out.
+
+use super::layout::Outputs;
+use super::trace::{DeviceTracer, Tuning};
+use super::{Buffer, DeviceError, Gpu, SnapshotStore};
+use crate::field::Domain;
+use crate::flow::{Chosen, Extras, FlowError, FlowMap, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
+use std::sync::{Arc, Mutex, PoisonError};
+use thiserror::Error;
+
+/// Seeds that go over at once: bounds the memory of a call.
+const BATCH: usize = 1 << 22;
+
+/// Why no tracer was made.
+#[derive(Debug, Error)]
+pub enum CudaTracerError {
+    /// The flow map is refused, on any device.
+    #[error(transparent)]
+    Flow(#[from] FlowError),
+    /// The device.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+}
+
+/// A flow map on the GPU, with the CPU's tracer behind it: the latter checks the settings, chooses the number of steps and goes on when
+/// the device is lost.
+pub struct CudaTracer {
+    device: DeviceTracer,
+    host: Box<dyn Tracer>,
+    double: bool,
+    /// One call at a time.
+    room: Mutex<Option<Room>>,
+}
+
+/// Memory for one batch.
+struct Room {
+    capacity: usize,
+    extras: Extras,
+    seeds: Buffer<[f32; 3]>,
+    log_stretch: Buffer<f32>,
+    lived: Buffer<f32>,
+    double: Option<Buffer<f64>>,
+    arrival: Option<Buffer<[f32; 3]>>,
+    jacobian: Option<Buffer<[f32; 9]>>,
+}
+
+impl CudaTracer {
+    /// For seeds at `t0`.
+    ///
+    /// # Errors
+    /// What the CPU's tracer refuses, and what the device cannot do.
+    pub fn new(
+        store: &SnapshotStore,
+        gpu: &Arc<Gpu>,
+        source: VelocitySource,
+        map: &FlowMap,
+        t0: f64,
+        tuning: Tuning,
+    ) -> Result<Self, CudaTracerError> {
+        let host = cpu_tracer(source.clone(), map, t0)?;
+        let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
+        Ok(Self { device, host, double: map.precision == Precision::F64, room: Mutex::new(None) })
+    }
+
+    /// The device's side, for callers whose seeds are there.
+    pub fn device(&self) -> &DeviceTracer {
+        &self.device
+    }
+
+    fn on_device(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+        let gpu = self.device.gpu();
+        let mut room = self.room.lock().unwrap_or_else(PoisonError::into_inner);
+        let most = seeds.len().min(BATCH);
+        let fits = |r: &Room| r.capacity >= most && (r.extras.arrival || !extras.arrival) && (r.extras.jacobian || !extras.jacobian);
+        if !room.as_ref().is_some_and(fits) {
+            // The old one goes first, so that both never need memory together.
+            *room = None;
+            let capacity = most.next_power_of_two().max(1 << 12);
+            let what = "a batch of seeds";
+            *room = Some(Room {
+                capacity,
+                extras,
+                seeds: gpu.alloc(what, capacity)?,
+                log_stretch: gpu.alloc(what, capacity)?,
+                lived: gpu.alloc(what, capacity)?,
+                double: self.double.then(|| gpu.alloc(what, capacity)).transpose()?,
+                arrival: extras.arrival.then(|| gpu.alloc(what, capacity)).transpose()?,
+                jacobian: extras.jacobian.then(|| gpu.alloc(what, capacity)).transpose()?,
+            });
+        }
+        let Some(room) = room.as_mut() else { return Ok(()) };
+        for start in (0..seeds.len()).step_by(BATCH) {
+            let part = start..(start + BATCH).min(seeds.len());
+            room.seeds.write(&seeds[part.clone()])?;
+            let arrival = room.arrival.as_ref().filter(|_| extras.arrival);
+            let jacobian = room.jacobian.as_ref().filter(|_| extras.jacobian);
+            let addresses = Outputs {
+                log_stretch: room.log_stretch.address(),
+                log_stretch_f64: room.double.as_ref().map_or(0, Buffer::address),
+                lived: room.lived.address(),
+                arrival: arrival.map_or(0, Buffer::address),
+                jacobian: jacobian.map_or(0, Buffer::address),
+            };
+            // SAFETY: every buffer holds `capacity` entries, at least as many as the part, and reading them below waits for the stream.
+            unsafe { self.device.trace(room.seeds.address(), part.len(), &addresses)? };
+            room.log_stretch.read(&mut out.log_stretch[part.clone()])?;
+            room.lived.read(&mut out.lived[part.clone()])?;
+            if let Some(buffer) = &room.double {
+                buffer.read(&mut out.log_stretch_f64[part.clone()])?;
+            }
+            if let Some(buffer) = arrival {
+                buffer.read(&mut out.arrival[part.clone()])?;
+            }
+            if let Some(buffer) = jacobian {
+                buffer.read(&mut out.jacobian[part])?;
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Tracer for CudaTracer {
+    fn domain(&self) -> &Domain {
+        self.host.domain()
+    }
+    fn tau(&self) -> f64 {
+        self.host.tau()
+    }
+    fn steps(&self) -> usize {
+        self.host.steps()
+    }
+    fn chosen(&self) -> Option<Chosen> {
+        self.host.chosen()
+    }
+    fn is_void(&self, seed: [f32; 3]) -> bool {
+        self.host.is_void(seed)
+    }
+
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        Some(self)
+    }
+
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+        let gpu = self.device.gpu();
+        if gpu.failure().is_none() {
+            let wanted = |yes: bool| if yes { seeds.len() } else { 0 };
+            out.log_stretch.resize(seeds.len(), 0.0);
+            out.lived.resize(seeds.len(), 0.0);
+            out.log_stretch_f64.resize(wanted(self.double), 0.0);
+            out.arrival.resize(wanted(extras.arrival), [0.0; 3]);
+            out.jacobian.resize(wanted(extras.jacobian), [0.0; 9]);
+            match self.on_device(seeds, extras, out) {
+                Ok(()) => return,
+                // The cycle asks for the failure after each frame and records it.
+                Err(error) => gpu.fail(error),
+            }
+        }
+        self.host.trace(seeds, extras, out);
+    }
+}

@@ -1,0 +1,263 @@
+//! Where to compute: what `--device` says, what it comes to on this machine, and the tracers there.
+
+use super::EngineError;
+#[cfg(feature = "cuda")]
+use super::cuda::{CudaTracer, CudaTracerError, DeviceError, Gpu, GpuSettings, SnapshotStore, Tuning};
+use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use crate::setting::{Refused, require};
+use serde::{Deserialize, Serialize};
+use std::fmt;
+use std::str::FromStr;
+#[cfg(feature = "cuda")]
+use std::sync::Arc;
+use thiserror::Error;
+
+/// What was asked for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum DeviceChoice {
+    /// The first usable GPU, otherwise the CPU.
+    #[default]
+    Auto,
+    /// The CPU.
+    Cpu,
+    /// This CUDA device, or an error.
+    Cuda(u32),
+}
+
+/// A device by no name.
+#[derive(Debug, Clone, PartialEq, Eq, Error)]
+#[error("--device {found}: accepted: auto, cpu, cuda:N")]
+pub struct UnknownDevice {
+    /// What was given.
+    pub found: String,
+}
+
+impl FromStr for DeviceChoice {
+    type Err = UnknownDevice;
+    fn from_str(text: &str) -> Result<Self, UnknownDevice> {
+        match text {
+            "auto" => Ok(Self::Auto),
+            "cpu" => Ok(Self::Cpu),
+            _ => text
+                .strip_prefix("cuda:")
+                .and_then(|n| n.parse().ok())
+                .map(Self::Cuda)
+                .ok_or_else(|| UnknownDevice { found: text.to_owned() }),
+        }
+    }
+}
+
+impl fmt::Display for DeviceChoice {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Auto => write!(f, "auto"),
+            Self::Cpu => write!(f, "cpu"),
+            Self::Cuda(n) => write!(f, "cuda:{n}"),
+        }
+    }
+}
+
+/// How node velocities are held on a GPU.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Storage {
+    /// 16 bytes a node.
+    #[default]
+    F32,
+    /// 8 bytes a node: velocities are rounded to 11 bits.
+    F16,
+}
+
+/// What happens when a GPU answers nothing any more.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum WhenLost {
+    /// The run goes on there, at a lower rate, and says so.
+    #[default]
+    Cpu,
+    /// The run ends with an error.
+    Stop,
+}
+
+/// `[device]`: how a GPU is used, where one is.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct DeviceSettings {
+    /// How the velocity window is held.
+    pub storage: Storage,
+    /// Most device memory that is taken, MiB; none: nine tenths of what is free at start.
+    pub memory_mib: Option<u64>,
+    /// What happens when the device is lost.
+    pub when_lost: WhenLost,
+    /// Lowest stream priority, for life beside a solver.
+    pub polite: bool,
+}
+
+impl DeviceSettings {
+    /// Checks ranges.
+    pub fn check(&self) -> Result<(), Refused> {
+        let fits = self.memory_mib.is_none_or(|mib| (1..=1 << 24).contains(&mib));
+        require(fits, "device.memory_mib", self.memory_mib, "a whole number from 1 to 16777216")
+    }
+}
+
+/// A device, opened.
+#[derive(Debug, Clone)]
+pub enum Device {
+    /// The CPU, with the reason why no GPU is used; none where the CPU was asked for.
+    Cpu {
+        /// In words.
+        why: Option<String>,
+    },
+    /// A GPU.
+    #[cfg(feature = "cuda")]
+    Cuda {
+        /// The device.
+        gpu: Arc<Gpu>,
+        /// What is there of the velocity.
+        snapshots: Arc<SnapshotStore>,
+        /// How it is used.
+        settings: DeviceSettings,
+        /// Whether the CPU does what this device cannot.
+        may_fall_back: bool,
+    },
+}
+
+impl Default for Device {
+    fn default() -> Self {
+        Self::CPU
+    }
+}
+
+impl Device {
+    /// The CPU, by choice.
+    pub const CPU: Self = Self::Cpu { why: None };
+
+    /// Opens what was asked for. `auto` never fails.
+    ///
+    /// # Errors
+    /// `cuda:N` that cannot be used.
+    #[cfg(feature = "cuda")]
+    pub fn open(choice: DeviceChoice, settings: &DeviceSettings) -> Result<Self, EngineError> {
+        let ordinal = match choice {
+            DeviceChoice::Cpu => return Ok(Self::CPU),
+            DeviceChoice::Auto => 0,
+            DeviceChoice::Cuda(n) => n,
+        };
+        let wanted = GpuSettings { memory_cap: settings.memory_mib.map(|mib| mib << 20), cache: None, polite: settings.polite };
+        match Gpu::open(ordinal, &wanted) {
+            Ok(gpu) => {
+                let snapshots = Arc::new(SnapshotStore::new(&gpu));
+                Ok(Self::Cuda { gpu, snapshots, settings: settings.clone(), may_fall_back: choice == DeviceChoice::Auto })
+            }
+            Err(why) if choice == DeviceChoice::Auto => Ok(Self::Cpu { why: Some(why.to_string()) }),
+            Err(why) => Err(why.into()),
+        }
+    }
+
+    /// Opens what was asked for. `auto` never fails.
+    ///
+    /// # Errors
+    /// `cuda:N`, since this build has no GPU engine.
+    #[cfg(not(feature = "cuda"))]
+    pub fn open(choice: DeviceChoice, _: &DeviceSettings) -> Result<Self, EngineError> {
+        match choice {
+            DeviceChoice::Cpu => Ok(Self::CPU),
+            DeviceChoice::Auto => Ok(Self::Cpu { why: Some("built without the feature `cuda`".into()) }),
+            DeviceChoice::Cuda(_) => Err(EngineError::NoCuda),
+        }
+    }
+
+    /// For records: `cpu` or `cuda:0 NVIDIA H200`.
+    pub fn name(&self) -> String {
+        match self {
+            Self::Cpu { .. } => "cpu".into(),
+            #[cfg(feature = "cuda")]
+            Self::Cuda { gpu, .. } if gpu.failure().is_some() => "cpu".into(),
+            #[cfg(feature = "cuda")]
+            Self::Cuda { gpu, .. } => format!("cuda:{} {}", gpu.ordinal(), gpu.name()),
+        }
+    }
+
+    /// What work on the device failed with, in words, since which the CPU does it.
+    pub fn failure(&self) -> Option<String> {
+        match self {
+            Self::Cpu { .. } => None,
+            #[cfg(feature = "cuda")]
+            Self::Cuda { gpu, .. } => gpu.failure().map(|error| error.to_string()),
+        }
+    }
+
+    /// Ends a run whose device is lost, where that is wanted.
+    ///
+    /// # Errors
+    /// What the device failed with.
+    pub fn check(&self) -> Result<(), EngineError> {
+        match self {
+            #[cfg(feature = "cuda")]
+            Self::Cuda { gpu, settings, .. } if settings.when_lost == WhenLost::Stop => gpu.failure().map_or(Ok(()), |e| Err(e.into())),
+            _ => Ok(()),
+        }
+    }
+
+    /// A tracer for seeds at `t0`, and what should be told about it.
+    ///
+    /// # Errors
+    /// What [`cpu_tracer`] refuses; what a GPU that was asked for by name cannot do.
+    pub fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
+        match self {
+            #[cfg(feature = "cuda")]
+            Self::Cuda { gpu, snapshots, settings, may_fall_back } if gpu.failure().is_none() => {
+                let tuning = Tuning { storage: settings.storage, ..Tuning::default() };
+                match CudaTracer::new(snapshots, gpu, source.clone(), map, t0, tuning) {
+                    Ok(tracer) => Ok((Box::new(tracer), None)),
+                    Err(CudaTracerError::Flow(error)) => Err(error.into()),
+                    Err(CudaTracerError::Device(error)) => {
+                        let lost = error.is_lost();
+                        if lost {
+                            gpu.fail(error.clone());
+                            self.check()?;
+                        }
+                        if !(lost || *may_fall_back) {
+                            return Err(error.into());
+                        }
+                        Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
+                    }
+                }
+            }
+            _ => Ok((cpu_tracer(source, map, t0)?, None)),
+        }
+    }
+}
+
+#[cfg(feature = "cuda")]
+impl From<DeviceError> for EngineError {
+    fn from(error: DeviceError) -> Self {
+        EngineError::Device(Box::new(error))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn choices_are_read_and_written() {
+        for text in ["auto", "cpu", "cuda:0", "cuda:3"] {
+            assert_eq!(text.parse::<DeviceChoice>().unwrap().to_string(), text);
+        }
+        for text in ["gpu", "cuda", "cuda:", "cuda:-1", "cuda:x"] {
+            assert!(text.parse::<DeviceChoice>().unwrap_err().to_string().contains(text));
+        }
+    }
+
+    #[test]
+    fn auto_always_opens() {
+        let device = Device::open(DeviceChoice::Auto, &DeviceSettings::default()).unwrap();
+        if let Device::Cpu { why } = &device {
+            assert!(why.is_some(), "the reason is told");
+            assert!(Device::open(DeviceChoice::Cuda(0), &DeviceSettings::default()).is_err());
+        }
+        assert_eq!(device.failure(), None);
+    }
+}

@@ -1,0 +1,19 @@
+//! What runs on a GPU, against the f64 reference on the CPU. Every test needs a device and is ignored elsewhere; `make gpu-check` runs
+//! them where one is. Inputs are other ones in every run, outputs are poisoned before.
+
+#![cfg(feature = "cuda")]
+// Helpers of a test may unwrap, and figures are printed for the record.
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+#[path = "gpu/device.rs"]
+mod device;
+#[path = "gpu/render.rs"]
+mod render;
+#[path = "gpu/scenes.rs"]
+mod scenes;
+#[path = "gpu/table.rs"]
+mod table;
+#[path = "gpu/trace.rs"]
+mod trace;
+#[path = "gpu/window.rs"]
+mod window;

@@ -1,0 +1,147 @@
+//! Tracing kernels against the CPU in f64.
+
+use super::scenes::*;
+use ridgewatch::engine::cuda::{Storage, Tuning};
+use ridgewatch::field::Domain;
+use ridgewatch::field::analytic::Analytic;
+use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource};
+
+/// Paths that the CPU and the kernel judge differently at an edge, as a share: rounding decides them.
+const UNDECIDED: f64 = 0.002;
+/// More than a batch that is sorted, and no multiple of a block.
+const SEEDS: usize = 20_011;
+
+/// Error that all but the worst percent stay below: those are paths along a cell face or an edge, where rounding decides which side counts.
+fn most(exact: &Traced, found: &Traced, same: &[usize]) -> f64 {
+    let mut errors: Vec<f64> = same.iter().map(|&i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).abs()).collect();
+    errors.sort_by(f64::total_cmp);
+    errors[errors.len() * 99 / 100]
+}
+
+fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
+    let seeds = fresh(&domain(source), SEEDS);
+    let exact = on_cpu(source, map, t0, &seeds);
+    let double = on_gpu(source, map, t0, Tuning::default(), &seeds);
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    // Rounding of 1e-16 a step, amplified along the path; where a path runs along a cell face, rounding decides which of two gradients
+    // counts: a few such paths are let go. Central differences divide rounding by the gap.
+    let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
+    let odd = same.iter().filter(|&&i| {
+        let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
+        let largest = exact.jacobian[i].iter().fold(1f32, |m, x| m.max(x.abs()));
+        let close = |a: f32, b: f32, size: f32| (a - b).abs() <= 1e-5f32.max(tolerance as f32) * size;
+        let arrived = (0..3).all(|k| close(exact.arrival[i][k], double.arrival[i][k], exact.arrival[i][k].abs().max(1.0)));
+        let jacobian = (0..9).all(|k| close(exact.jacobian[i][k], double.jacobian[i][k], largest));
+        !((a - b).abs() < tolerance * a.abs().max(1.0) && arrived && jacobian)
+    });
+    let odd = odd.count();
+    assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{name}: {odd} of {} differ from the CPU", seeds.len());
+    let died = exact.lived.iter().filter(|l| **l < 1.0).count();
+    if matches!(map.boundary, Boundary::Stop | Boundary::Zero) {
+        assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
+    }
+    // Every variant of the kernel in single precision: no worse than the CPU's single precision, but for the order of rounding.
+    let single =
+        FlowMap { precision: Precision::F32, gap: if map.integrator == Integrator::Differences { 1e-2 } else { map.gap }, ..map.clone() };
+    let wide = FlowMap { precision: Precision::F64, ..single.clone() };
+    let exact = on_cpu(source, &wide, t0, &seeds);
+    let theirs = on_cpu(source, &single, t0, &seeds);
+    for (sorted, keep) in [(true, true), (true, false), (false, true), (false, false)] {
+        let found = on_gpu(source, &single, t0, Tuning { storage: Storage::F32, sorted, keep }, &seeds);
+        let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - found.lived[i]).abs() < 1e-6).collect();
+        // Single precision decides more paths the other way: a step's rounding is 1e-7 of the domain.
+        assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} lived alike", alike.len(), seeds.len());
+        assert!(found.log_stretch.iter().all(|s| !s.is_nan()), "{name}: something was not written");
+        let (ours, theirs) = (most(&exact, &found, &alike), most(&exact, &theirs, &alike));
+        println!(
+            "{name}, sorted {sorted}, keep {keep}: single precision off by {ours:.1e}, the CPU's by {theirs:.1e}; {odd} odd, {died} stopped"
+        );
+        assert!(ours < 3.0 * theirs + 2e-6, "{name}: single precision is off by {ours:e}, the CPU's by {theirs:e}");
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn closed_forms() {
+    let plane = || gyre([0.0, 0.0], [2.0, 1.0]);
+    let inner = || gyre([0.4, 0.2], [1.7, 0.9]);
+    check("double gyre", &plane(), &map(10.0, 40), 0.3);
+    let stop = FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) };
+    check("double gyre that stops", &inner(), &stop, 0.3);
+    let zero = FlowMap { boundary: Boundary::Zero, direction: Direction::Backward, ..map(5.0, 40) };
+    check("double gyre with zeros", &inner(), &zero, 0.3);
+    check("double gyre clamped", &inner(), &FlowMap { boundary: Boundary::Clamp, ..map(5.0, 40) }, 0.3);
+    check("double gyre by differences", &plane(), &FlowMap { integrator: Integrator::Differences, ..map(10.0, 40) }, 0.3);
+    let abc = Analytic::Abc { a: 3f64.sqrt(), b: 2f64.sqrt(), c: 1.0, growth: 0.5 };
+    check("ABC", &VelocitySource::Analytic(abc, Domain::cuboid([0.0; 3], [6.0; 3])), &map(2.0, 30), 0.0);
+    for flow in [Analytic::Saddle { rate: 0.7 }, Analytic::Rotation { omega: 0.7 }, Analytic::Shear { rate: 0.7 }] {
+        check("linear", &VelocitySource::Analytic(flow, domain(&plane())), &map(4.0, 20), 0.0);
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn windows_in_the_plane() {
+    let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
+    let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
+    let grid = || cartesian(even(&[19, 13]));
+    check("linear", &smooth(&grid(), 0.6, false), &stop, 0.1);
+    check("cubic", &smooth(&grid(), 0.6, false), &cubic, 0.1);
+    check(
+        "cubic, uneven",
+        &smooth(&cartesian(uneven(&[19, 13])), 0.6, false),
+        &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
+        0.1,
+    );
+    check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    let mut around = even(&[19, 13]);
+    around[0] = around[0].clone().with_period(11.0);
+    check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);
+    let backward = FlowMap { direction: Direction::Backward, boundary: Boundary::Periodic, ..stop };
+    check("linear, periodic, backward", &smooth(&grid(), 0.6, false), &backward, 3.4);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn windows_in_space() {
+    let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
+    let grid = || cartesian(even(&[11, 12, 10]));
+    check("linear", &smooth(&grid(), 0.5, false), &stop, 0.1);
+    check("linear, holes", &smooth(&grid(), 0.5, true), &stop, 0.1);
+    check("linear, uneven", &smooth(&cartesian(uneven(&[11, 9, 8])), 0.5, false), &stop, 0.1);
+    let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
+    check("cubic, uneven", &smooth(&cartesian(uneven(&[11, 9, 8])), 0.5, false), &cubic, 0.1);
+    let mut around = even(&[11, 12, 10]);
+    around[1] = around[1].clone().with_period(7.5);
+    check("linear, around", &smooth(&cartesian(around), 0.5, false), &stop, 0.1);
+    check("differences", &smooth(&grid(), 0.5, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 0.1);
+    check("turbulence", &turbulence([40, 24, 24], 6), &FlowMap { boundary: Boundary::Clamp, ..map(5.0, 10) }, 0.0);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn windows_on_the_sphere() {
+    // A particle at a pole, where the grid's cells meet, would be decided by rounding: Clamp lets all live.
+    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
+    check("globe, cubic", &smooth(&sphere((-180.0, 170.0, 36), (-90.0, 90.0, 37), true), 1.0, false), &around, 0.1);
+    let region = || sphere((-30.0, 10.0, 21), (20.0, 60.0, 21), false);
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    check("region, linear, holes", &smooth(&region(), 0.8, true), &stop, 3.4);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn batches_of_every_size_are_written_whole() {
+    let source = turbulence([24, 16, 16], 4);
+    let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 6) };
+    for count in [1, 2, 127, 4095, 4096, 4097, 100_003] {
+        let seeds = fresh(&domain(&source), count);
+        let sorted = on_gpu(&source, &map, 0.0, Tuning::default(), &seeds);
+        let given = on_gpu(&source, &map, 0.0, Tuning { sorted: false, ..Tuning::default() }, &seeds);
+        assert!(sorted.log_stretch.iter().all(|s| s.is_finite()), "{count} seeds: something was not written");
+        assert_eq!(sorted.log_stretch, given.log_stretch, "{count} seeds: the order of tracing changes nothing");
+        assert_eq!(sorted.jacobian, given.jacobian, "{count} seeds");
+    }
+    assert!(on_gpu(&source, &map, 0.0, Tuning::default(), &[]).log_stretch.is_empty());
+}

@@ -1,0 +1,107 @@
+//! Snapshots on the device.
+
+use super::scenes::*;
+use ridgewatch::engine::cuda::{CudaTracer, CudaTracerError, DeviceError, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
+use ridgewatch::field::Window;
+use ridgewatch::flow::{Boundary, Extras, FlowMap, Precision, Traced, Tracer, VelocitySource};
+use std::sync::Arc;
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_slide_brings_only_what_is_new() {
+    // A handle of its own, so that no other test's memory counts.
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+    let store = SnapshotStore::new(&gpu);
+    let grid = cartesian(even(&[40, 30, 20]));
+    let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 12) };
+    let mut window = Window::new(3.0);
+    for time in 0..4 {
+        window.push(snapshot(&grid, f64::from(time), 0.5, false)).unwrap();
+    }
+    let mut taken = None;
+    let mut before: Option<(CudaTracer, Traced, Vec<[f32; 3]>)> = None;
+    for slide in 0..12u32 {
+        let source = VelocitySource::Window(Arc::new(window.clone()));
+        let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, f64::from(slide), Tuning::default()).unwrap();
+        assert_eq!(store.brought(), 4 + u64::from(slide));
+        let seeds = fresh(&grid.domain(), 5000);
+        let mut out = Traced::default();
+        tracer.trace(&seeds, Extras::default(), &mut out);
+        let exact = on_cpu(&source, &map, f64::from(slide), &seeds);
+        let odd = (0..seeds.len()).filter(|&i| (out.log_stretch_f64[i] - exact.log_stretch_f64[i]).abs() > 2e-9).count();
+        // Paths along a cell face, as in trace.rs.
+        assert!(odd <= 10, "slide {slide}: {odd} differ");
+        // A tracer of the window before still answers as it did: its snapshots are not overwritten.
+        if let Some((old, answered, asked)) = &before {
+            let mut again = Traced::default();
+            old.trace(asked, Extras::default(), &mut again);
+            assert_eq!(again.log_stretch_f64, answered.log_stretch_f64);
+        }
+        before = Some((tracer, out, seeds));
+        if slide >= 2 {
+            let used = gpu.memory().0;
+            assert_eq!(*taken.get_or_insert(used), used, "memory is flat from slide to slide");
+        }
+        window.push(snapshot(&grid, f64::from(slide + 4), 0.5, false)).unwrap();
+    }
+    assert_eq!(gpu.failure(), None);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn half_precision_is_as_good_as_its_rounding() {
+    let source = turbulence([48, 32, 32], 6);
+    let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(5.0, 20) };
+    let seeds = fresh(&domain(&source), 20_000);
+    let exact = on_cpu(&source, &FlowMap { precision: Precision::F64, ..map.clone() }, 0.0, &seeds);
+    let rms = |found: &Traced| {
+        let squares = (0..seeds.len()).map(|i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).powi(2)).sum::<f64>();
+        (squares / seeds.len() as f64).sqrt()
+    };
+    let half = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, ..Tuning::default() }, &seeds));
+    let plain = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, keep: false, sorted: false }, &seeds));
+    println!("half precision: root mean square error of the log-stretch {half:.1e}");
+    // Velocities are off by 2^-12 of themselves, their differences between nodes by some 1e-3; errors of single nodes average out along a
+    // path. Log-stretches here are about 1.
+    assert!(half < 5e-3 && half > 1e-6 && (plain - half).abs() < 0.1 * half, "{half} {plain}");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_window_that_grows_beyond_half_precision_is_encoded_anew() {
+    let (gpu, grid) = (gpu(), cartesian(even(&[16, 16, 16])));
+    let store = SnapshotStore::new(&gpu);
+    let tuning = Tuning { storage: Storage::F16, ..Tuning::default() };
+    let map = FlowMap { boundary: Boundary::Clamp, ..map(1.0, 1) };
+    let mut window = Window::new(1.0);
+    window.push(snapshot(&grid, 0.0, 1e-3, false)).unwrap();
+    window.push(snapshot(&grid, 1.0, 1e-3, false)).unwrap();
+    CudaTracer::new(&store, &gpu, VelocitySource::Window(Arc::new(window.clone())), &map, 0.0, tuning).unwrap();
+    window.push(snapshot(&grid, 2.0, 1.0, false)).unwrap();
+    let source = VelocitySource::Window(Arc::new(window));
+    let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, 1.0, tuning).unwrap();
+    assert_eq!(store.brought(), 4, "the snapshot that is still needed came over again");
+    let seeds = fresh(&grid.domain(), 5000);
+    let (mut out, exact) = (Traced::default(), on_cpu(&source, &map, 1.0, &seeds));
+    tracer.trace(&seeds, Extras::default(), &mut out);
+    let mut errors: Vec<f64> = (0..seeds.len()).map(|i| (out.log_stretch_f64[i] - exact.log_stretch_f64[i]).abs()).collect();
+    errors.sort_by(f64::total_cmp);
+    // Had the larger velocities been cut off at the range of half precision, this would be of order 1. In the worst percent, rounded
+    // velocities take a stage across a cell face, where the gradient jumps.
+    let most = errors[errors.len() * 99 / 100];
+    assert!(most < 2e-2, "{most}");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_window_that_does_not_fit_is_refused_with_the_way_out() {
+    let settings = GpuSettings { memory_cap: Some(3 << 20), ..GpuSettings::default() };
+    let gpu = Gpu::open(0, &settings).unwrap();
+    let source = turbulence([40, 40, 40], 4);
+    let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 6) };
+    let refused = CudaTracer::new(&SnapshotStore::new(&gpu), &gpu, source, &map, 0.0, Tuning::default()).err().unwrap();
+    let CudaTracerError::Device(error) = refused else { panic!("{refused}") };
+    assert!(matches!(&error, DeviceError::WindowTooLarge { needed: 4_096_000, needed_f16: 2_048_000, .. }), "{error:?}");
+    assert!(error.to_string().contains("f16") && error.to_string().contains("region of interest"), "{error}");
+    assert_eq!(gpu.memory().0, 0, "nothing is kept of it");
+}

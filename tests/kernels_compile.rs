@@ -1,0 +1,68 @@
+//! Every kernel compiles for both architectures, in the variants that stand for all. Needs NVRTC, but no GPU: `make test` fetches it and
+//! runs this; a plain `cargo test` shows it as ignored.
+
+#![cfg(feature = "cuda")]
+#![allow(clippy::unwrap_used)]
+
+use ridgewatch::engine::cuda::compile::{Request, SOURCES};
+
+/// Macros in which the gridded kernel is compiled here.
+fn grid(changes: &[(&str, &str)]) -> Vec<String> {
+    let usual = [
+        ("REAL", "float"),
+        ("AXES", "3"),
+        ("SPHERE", "0"),
+        ("STORAGE", "0"),
+        ("CUBIC", "0"),
+        ("MARKS", "0"),
+        ("KEEP", "1"),
+        ("SCALED", "0"),
+        ("EVEN", "7"),
+        ("WRAP", "0"),
+        ("SEAM", "0"),
+        ("DIFFERENCES", "0"),
+    ];
+    let value = |name: &str, usual: &str| changes.iter().find(|(n, _)| *n == name).map_or(usual.to_owned(), |(_, v)| (*v).to_owned());
+    usual.iter().map(|(name, usual)| format!("RW_{name}={}", value(name, usual))).collect()
+}
+
+fn variants(source: &str) -> Vec<Vec<String>> {
+    match source {
+        "trace_closed.cu" => ["0", "1", "2"]
+            .iter()
+            .zip(["float", "double", "float"])
+            .map(|(form, real)| [("REAL", real), ("FORM", *form), ("BOUNDARY", "1"), ("DIFFERENCES", "0")])
+            .map(|defines| defines.map(|(name, value)| format!("RW_{name}={value}")).to_vec())
+            .collect(),
+        "trace_grid.cu" => vec![
+            grid(&[]),
+            grid(&[("STORAGE", "1"), ("MARKS", "1"), ("SCALED", "1"), ("EVEN", "5"), ("WRAP", "2"), ("SEAM", "2")]),
+            grid(&[("REAL", "double"), ("KEEP", "0"), ("DIFFERENCES", "1")]),
+            grid(&[("AXES", "2"), ("CUBIC", "1"), ("EVEN", "3")]),
+            grid(&[("CUBIC", "1")]),
+            grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
+        ],
+        _ => vec![Vec::new()],
+    }
+}
+
+#[test]
+#[ignore = "needs NVRTC (`make test` fetches it)"]
+fn for_both_architectures() {
+    for (source, _) in SOURCES {
+        for defines in variants(source) {
+            for capability in [(8, 0), (9, 0)] {
+                let cubin = Request::new(source, capability, &defines).unwrap().compile().unwrap_or_else(|error| panic!("{error}"));
+                assert!(cubin.starts_with(b"\x7fELF"), "{source} {defines:?}: machine code");
+            }
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs NVRTC (`make test` fetches it)"]
+fn what_does_not_compile_is_told_with_the_log() {
+    let request = Request::new("trace_closed.cu", (9, 0), &["RW_REAL=nonsense".into(), "RW_FORM=0".into()]).unwrap();
+    let error = request.compile().unwrap_err().to_string();
+    assert!(error.contains("trace_closed.cu") && error.contains("nonsense"), "{error}");
+}
