@@ -10,7 +10,7 @@ NVRTC := target/nvrtc
 NVRTC_VERSION := 13.0.88
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-# The collection of real archives that tests/netcdf_real.rs reads.
+# The collection of real archives that tests/archive_real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
 .PHONY: all demo test test-data packages build check bench gpu-check clean
@@ -42,8 +42,14 @@ test: packages $(NVRTC)/done
 	@if [ -d "$(RIDGEWATCH_DATA)" ]; then $(MAKE) --no-print-directory test-data; else \
 	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; fi
 
-test-data: packages
-	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test netcdf_real -- --ignored
+# With an independent integration in Python (SciPy, netCDF4) to hold the FTLE against.
+test-data: packages .venv/installed
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
+
+.venv/installed:
+	python3 -m venv .venv
+	.venv/bin/pip install --quiet numpy scipy netCDF4
+	touch $@
 
 $(NVRTC)/done:
 	$(PYTHON) -m pip install -q --no-deps --target $(NVRTC) nvidia-cuda-nvrtc==$(NVRTC_VERSION)

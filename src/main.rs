@@ -14,6 +14,7 @@ fn main() -> ExitCode {
             return if error.print().is_ok() && !failed { ExitCode::SUCCESS } else { ExitCode::from(2) };
         }
     };
+    ridgewatch::source::report_crashes();
     cli::messages::start(arguments.common.verbose);
     match cli::run(arguments) {
         Ok(()) => ExitCode::SUCCESS,

@@ -177,13 +177,20 @@ fn dimensions_in_odd_order() {
         let file = fixture.write(&dir.path().join("odd.nc"));
         let mut archive = open(std::slice::from_ref(&file));
         assert_eq!(archive.grid().shape(), [nx, ny, nz]);
-        assert_eq!(archive.grid().axes[2].coordinates(), [10_000.0, 50_000.0, 100_000.0]);
+        // Pressures become heights.
+        let heights = [1000.0f64, 500.0, 100.0].map(|p| 7000.0 * (1000.0 / p).ln());
+        for (found, expected) in archive.grid().axes[2].coordinates().iter().zip(heights) {
+            assert!((found - expected).abs() < 1e-9, "rounding only");
+        }
         let snapshot = archive.read(1).unwrap();
         for (i, node) in snapshot.nodes.iter().enumerate() {
-            // Both y and the levels descend in the file.
-            let (x, y, z) = (i % nx, ny - 1 - i / nx % ny, nz - 1 - i / (nx * ny));
+            // y descends in the file; pressures do too, heights do not.
+            let (x, y, z) = (i % nx, ny - 1 - i / nx % ny, i / (nx * ny));
             let expected = (1000 * z + 100 + 10 * y + x) as f32;
-            assert_eq!(node[..3], [expected, expected, expected * 100.0], "node {i}");
+            let upward = f64::from(expected) * 100.0 * -7000.0 / [1000.0, 500.0, 100.0].map(|p| p * 100.0)[z];
+            assert_eq!(node[..2], [expected, expected], "node {i}");
+            // Two roundings to f32.
+            assert!((f64::from(node[2]) / upward - 1.0).abs() < 2e-7, "node {i}: {} {upward}", node[2]);
         }
         // One level makes it two-dimensional.
         let settings = NetCdfSettings { level: Some(500.0), ..NetCdfSettings::default() };
@@ -231,35 +238,78 @@ fn index_metric_counts_cells_and_snapshots() {
     assert_eq!(cells.read(1).unwrap().nodes[7][..2], [10.0, 5.0]);
 }
 
-#[test]
-fn longitude_latitude_and_levels_fall_to_the_index_metric() {
-    let dir = tempdir().unwrap();
-    let fixture = Fixture::new(NETCDF4, &[("time", 2), ("level", 3), ("lat", 2), ("lon", 4)])
+/// Winds on longitude, latitude and a level axis of this unit.
+fn levels(unit: &str, values: &[f64]) -> Fixture {
+    let nz = values.len();
+    let mut fixture = Fixture::new(NETCDF4, &[("time", 2), ("level", nz), ("lat", 3), ("lon", 4)])
         .axis("lon", "degrees_east", &[0.0, 90.0, 180.0, 270.0])
-        .axis("lat", "degrees_north", &[10.0, 0.0])
-        .axis("level", "hPa", &[100.0, 500.0, 1000.0])
-        .axis("time", "hours since 2000-01-01", &[0.0, 1.0])
-        .variable("u", &["time", "level", "lat", "lon"], Data::F32(vec![1.0; 48]))
-        .with("standard_name", "eastward_wind")
-        .with("units", "m s-1")
-        .variable("v", &["time", "level", "lat", "lon"], Data::F32(vec![1.0; 48]))
-        .with("standard_name", "northward_wind")
-        .with("units", "m s-1")
-        .variable("w", &["time", "level", "lat", "lon"], Data::F32(vec![2.0; 48]))
-        .with("standard_name", "lagrangian_tendency_of_air_pressure")
-        .with("units", "Pa s-1");
-    let file = fixture.write(&dir.path().join("levels.nc"));
-    let mut archive = open(std::slice::from_ref(&file));
-    assert_eq!((archive.metric(), archive.grid().dimensions()), (Metric::Index, 3));
-    assert_eq!(archive.grid().axes[0].period(), Some(4.0));
+        .axis("lat", "degrees_north", &[60.0, 0.0, -60.0])
+        .axis("level", unit, values)
+        .axis("time", "hours since 2000-01-01", &[0.0, 1.0]);
+    let winds = [("u", "eastward_wind", 1.0), ("v", "northward_wind", 1.0), ("w", "lagrangian_tendency_of_air_pressure", 2.0)];
+    for (name, standard, value) in winds {
+        fixture = fixture.variable(name, &["time", "level", "lat", "lon"], Data::F32(vec![value; 2 * nz * 12]));
+        fixture = fixture.with("standard_name", standard).with("units", if name == "w" { "Pa s-1" } else { "m s-1" });
+    }
+    fixture
+}
+
+#[test]
+fn pressure_levels_on_the_sphere_become_heights() {
+    let dir = tempdir().unwrap();
+    let height = |hpa: f64| 7000.0 * (1000.0 / hpa).ln();
+    // In any order.
+    for (name, values) in [("up.nc", [1000.0, 500.0, 100.0]), ("down.nc", [100.0, 500.0, 1000.0])] {
+        let file = levels("hPa", &values).write(&dir.path().join(name));
+        let mut archive = open(std::slice::from_ref(&file));
+        assert_eq!((archive.metric(), archive.grid().dimensions()), (Metric::Sphere, 3));
+        let grid = archive.grid().clone();
+        assert!(matches!(grid.geometry, Geometry::Sphere { .. }));
+        for (found, hpa) in grid.axes[2].coordinates().iter().zip([1000.0, 500.0, 100.0]) {
+            assert!((found - height(hpa)).abs() < 1e-9, "rounding only");
+        }
+        // The poles lie a cell beyond the last rows: they become rows.
+        assert_eq!(grid.axes[1].coordinates(), [-90.0, -60.0, 0.0, 60.0, 90.0]);
+        let snapshot = archive.read(0).unwrap();
+        assert_eq!(snapshot.missing(), 0);
+        for (k, hpa) in [1000.0, 500.0, 100.0].into_iter().enumerate() {
+            // The mark of a known node is its vertical velocity, m/s.
+            let upward = f64::from(snapshot.nodes[k * 20 + 4][3]);
+            assert!((upward / (-7000.0 * 2.0 / (hpa * 100.0)) - 1.0).abs() < 1e-6, "{upward}");
+        }
+        // Eastward 1 and northward 1 all around have no mean at a pole.
+        assert!(snapshot.nodes[..4].iter().all(|n| n[..3].iter().all(|v| v.abs() < 1e-6)));
+    }
+    let file = levels("hPa", &[1000.0, 500.0]).write(&dir.path().join("scaled.nc"));
+    let settings = NetCdfSettings { vertical_scale: Some(100.0), ..NetCdfSettings::default() };
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    assert!((archive.grid().axes[2].last() - 100.0 * height(500.0)).abs() < 1e-6);
+    assert!((f64::from(archive.read(0).unwrap().nodes[4][3]) / (-7000.0 * 2.0 / 1e5 * 100.0) - 1.0).abs() < 1e-6);
+    assert!(archive.describe().notes.iter().any(|n| n.contains("`vertical_scale`")));
+    // One level makes it two-dimensional.
+    let settings = NetCdfSettings { level: Some(500.0), ..NetCdfSettings::default() };
+    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().grid().dimensions(), 2);
+}
+
+#[test]
+fn the_index_metric_of_levels() {
+    let dir = tempdir().unwrap();
+    let file = levels("hPa", &[100.0, 500.0, 1000.0]).write(&dir.path().join("levels.nc"));
+    let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    assert_eq!((archive.grid().axes[0].period(), archive.grid().shape()), (Some(4.0), [4, 3, 3]));
     // 2 Pa/s for an hour, in cells of 400, 450 and 500 hPa.
-    let w: Vec<f32> = archive.read(0).unwrap().nodes.iter().step_by(8).map(|n| n[2]).collect();
+    let w: Vec<f32> = archive.read(0).unwrap().nodes.iter().step_by(12).map(|n| n[2]).collect();
     assert_eq!(w, [7200.0 / 40_000.0, 7200.0 / 45_000.0, 7200.0 / 50_000.0]);
-    let settings = NetCdfSettings { metric: Some(Metric::Sphere), ..NetCdfSettings::default() };
-    let message = NetCdfArchive::open(std::slice::from_ref(&file), &settings).err().unwrap().to_string();
+    let settings = NetCdfSettings { periodic: Some("none".into()), ..settings };
+    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().grid().axes[0].period(), None);
+    // Levels without a unit have no height.
+    let bare = levels("level", &[1.0, 2.0, 3.0]).write(&dir.path().join("bare.nc"));
+    let settings = NetCdfSettings { w: Some("none".into()), ..NetCdfSettings::default() };
+    assert_eq!(NetCdfArchive::open(std::slice::from_ref(&bare), &settings).unwrap().metric(), Metric::Index);
+    let settings = NetCdfSettings { metric: Some(Metric::Sphere), ..settings };
+    let message = NetCdfArchive::open(&[bare], &settings).err().unwrap().to_string();
     assert!(message.contains("level = ..."), "{message}");
-    let settings = NetCdfSettings { level: Some(500.0), ..settings };
-    assert!(matches!(NetCdfArchive::open(&[file], &settings).unwrap().grid().geometry, Geometry::Sphere { .. }));
 }
 
 #[test]

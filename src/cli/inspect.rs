@@ -4,13 +4,13 @@ use super::{Common, Usage, located, print_json, print_text};
 use anyhow::Result;
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::TimeSpan;
-use ridgewatch::source::SourceError;
+use ridgewatch::source::{SourceError, SourceKind};
 use std::path::PathBuf;
 
 /// Options of `inspect`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// Data files or globs.
+    /// Data files or globs, or a scene file (.toml) of kind archive.
     #[arg(required = true)]
     files: Vec<PathBuf>,
     /// Integration time that the window's memory is stated for, in seconds or with a unit, e.g. "30 days"; default: half of the span.
@@ -20,7 +20,13 @@ pub struct Options {
 
 /// Inspects.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
-    let scene = SceneFile::for_archive(options.files.clone(), &common.overrides)?;
+    let scene = match &options.files[..] {
+        [one] if one.extension().is_some_and(|e| e == "toml") => SceneFile::read(one, &common.overrides)?,
+        files => SceneFile::for_archive(files.to_vec(), &common.overrides)?,
+    };
+    if scene.source.kind != SourceKind::Archive {
+        return Err(Usage(format!("the scene's source is {:?}; inspect looks at archives", scene.source.kind)).into());
+    }
     let tau = match &options.tau {
         None => None,
         Some(text) => {

@@ -7,6 +7,7 @@ mod inspect;
 pub mod messages;
 mod render;
 mod replay;
+mod synthesize;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
@@ -64,6 +65,8 @@ enum Command {
     Compare(compare::Options),
     /// Says what would be read from files, and why.
     Inspect(inspect::Options),
+    /// Writes an archive of the standard turbulence in the shape of ECMWF's or of a flame simulation.
+    Synthesize(synthesize::Options),
     /// Says which devices and libraries are found.
     Doctor,
 }
@@ -77,6 +80,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Ftle(options) => ftle::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),
         Command::Inspect(options) => inspect::run(&common, &options),
+        Command::Synthesize(options) => synthesize::run(&common, &options),
         Command::Doctor => doctor::run(&common),
     }
 }

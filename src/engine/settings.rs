@@ -50,7 +50,7 @@ impl Settings {
     /// Checks all that can be checked before the source is opened.
     pub fn check(&self) -> Result<(), Refused> {
         let kind = self.source.kind;
-        self.source.check(self.domain.as_ref(), &self.archive.files)?;
+        self.source.check(self.domain.as_ref(), &self.archive)?;
         self.time.check(kind)?;
         self.flow.check(matches!(kind, SourceKind::Archive | SourceKind::Turbulence))?;
         self.surrogate.check(&self.network)?;

@@ -9,7 +9,8 @@ pub enum Geometry {
     Cartesian,
     /// Axes 0 and 1 are longitude and latitude in degrees; particles move on a sphere of this radius (in the velocity's unit of
     /// length). Node velocities are horizontal vectors in geocentric Cartesian components (x to 0°E 0°N, z to the north pole),
-    /// so that a pole is no singularity.
+    /// so that a pole is no singularity. Axis 2, where there is one, is a height in the unit of the radius; a horizontal length is one on
+    /// the radius at every height.
     Sphere {
         /// Radius.
         radius: f64,

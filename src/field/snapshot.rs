@@ -12,7 +12,8 @@ pub struct Snapshot {
     pub grid: Arc<Grid>,
     /// One node each: `[u, v, w, mark]`, x fastest, then y, then z. `mark` is 0 where the velocity is known and NaN where it is
     /// missing (land, fill value, NaN), so that a missing corner shows in every interpolation that touches it. Velocities
-    /// of missing nodes are 0. On the sphere `u, v, w` are geocentric Cartesian components (see [`Geometry::Sphere`]).
+    /// of missing nodes are 0. On the sphere `u, v, w` are geocentric Cartesian components of the horizontal velocity (see
+    /// [`Geometry::Sphere`]); with levels the mark of a known node is its vertical velocity, in units of the third axis per time.
     pub nodes: Vec<[f32; 4]>,
 }
 
@@ -21,7 +22,7 @@ pub const MISSING: [f32; 4] = [0.0, 0.0, 0.0, f32::NAN];
 
 impl Snapshot {
     /// Builds the node array from separate components (`w` empty in two dimensions); any non-finite component makes the node
-    /// missing. On the sphere `u` is eastward and `v` northward.
+    /// missing. On the sphere `u` is eastward, `v` northward and `w` along the third axis.
     ///
     /// # Panics
     /// When a component has not one value a node: readers check shapes before.
@@ -46,7 +47,7 @@ impl Snapshot {
                         (-east * sin_lon - north * sin_lat * cos_lon) as f32,
                         (east * cos_lon - north * sin_lat * sin_lon) as f32,
                         (north * cos_lat) as f32,
-                        0.0,
+                        if grid.dimensions() == 3 { up } else { 0.0 },
                     ]
                 }
             });

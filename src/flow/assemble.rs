@@ -2,6 +2,7 @@
 
 use super::grid_flow::GridFlow;
 use super::sphere::SphereFlow;
+use super::sphere_levels::LayeredSphereFlow;
 use super::steps::Chosen;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{Chart, Closed, Velocity};
@@ -116,6 +117,13 @@ impl<'a> Assembly<'a> {
                         self.kernel::<_, _, S, D, 3, 2>(
                             || SphereFlow::<f32>::new(&window, &grid, radius, policy, interpolation),
                             || SphereFlow::<f64>::new(&window, &grid, radius, policy, interpolation),
+                        )
+                    }
+                    (Geometry::Sphere { radius }, 3) => {
+                        positive("radius", radius)?;
+                        self.kernel::<_, _, S, D, 4, 3>(
+                            || LayeredSphereFlow::<f32>::new(&window, &grid, radius, policy, interpolation),
+                            || LayeredSphereFlow::<f64>::new(&window, &grid, radius, policy, interpolation),
                         )
                     }
                     (Geometry::Sphere { .. }, axes) => Err(FlowError::SphereAxes { axes }),

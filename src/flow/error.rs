@@ -60,8 +60,8 @@ pub enum FlowError {
         /// Axes of the domain.
         domain: usize,
     },
-    /// Three-dimensional flow on the sphere.
-    #[error("sphere metric is for two axes (longitude, latitude); the grid has {axes}")]
+    /// A number of axes that the sphere does not have.
+    #[error("sphere metric is for two or three axes (longitude, latitude, height); the grid has {axes}")]
     SphereAxes {
         /// Axes found.
         axes: usize,

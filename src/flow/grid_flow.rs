@@ -20,8 +20,9 @@ pub struct GridFlow<R, const D: usize> {
 impl<R: Real, const D: usize> GridFlow<R, D> {
     /// Prepares a window.
     pub fn new(window: &Window, grid: &Grid, policy: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
-        let sampler =
-            Sampler::new(window, grid, policy, interpolation, |axes| array(|c| axes.get(c).map_or(0.0, |axis| 1.0 / axis.spacing)))?;
+        let sampler = Sampler::new(window, grid, policy, interpolation, |axes| {
+            array(|c| if c == 3 { 1.0 } else { axes.get(c).map_or(0.0, |axis| 1.0 / axis.spacing) })
+        })?;
         let spacing = array(|k| sampler.axes[k].spacing);
         let ends: [[f64; 2]; D] = array(|k| sampler.axes[k].ends());
         let end = |i: usize| array(|k| R::from_f64(ends[k][i]));
@@ -64,12 +65,12 @@ impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
     }
     #[inline(always)]
     fn velocity(&self, stage: &Self::Stage, x: &[L; D]) -> ([L; D], L) {
-        let (velocity, mark) = self.sampler.value(stage, x);
+        let (velocity, mark) = self.sampler.value::<L, 3>(stage, x);
         (array(|i| velocity[i]), mark)
     }
     #[inline(always)]
     fn tangent(&self, stage: &Self::Stage, x: &[L; D], m: &[[L; D]; D]) -> ([L; D], [[L; D]; D], L) {
-        let sample = self.sampler.sample(stage, x);
+        let sample = self.sampler.sample::<L, 3>(stage, x);
         let product = array(|i| {
             array(|c| {
                 let mut sum = sample.slopes[0][i] * m[0][c];

@@ -17,6 +17,7 @@ mod rk4;
 mod sampler;
 mod settings;
 mod sphere;
+mod sphere_levels;
 mod stencil;
 mod steps;
 mod stretch;

@@ -90,7 +90,9 @@ fn displacements(snapshot: &Snapshot, interval: f64) -> (f64, usize, f64) {
                     let east = v[1] * cos_lon - v[0] * sin_lon;
                     let north_squared = (v.iter().map(|c| c * c).sum::<f64>() - east * east).max(0.0);
                     let (width, height) = (cell(0, place[0]).to_radians() * radius * cos_lat, cell(1, place[1]).to_radians() * radius);
-                    (latitude.abs() < 90.0 - POLAR).then(|| (east / width).powi(2) + north_squared / (height * height))
+                    // With levels the fourth number of a node is its vertical velocity.
+                    let up = if grid.dimensions() == 3 { f64::from(node[3]) * interval / cell(2, place[2]) } else { 0.0 };
+                    (latitude.abs() < 90.0 - POLAR).then(|| (east / width).powi(2) + north_squared / (height * height) + up * up)
                 }
             }
         })

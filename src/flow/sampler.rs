@@ -22,7 +22,7 @@ pub struct Sampler<R, const N: usize> {
     snapshots: Vec<Arc<Snapshot>>,
     times: Vec<f64>,
     pub(crate) axes: [AxisMap<R>; N],
-    /// Factors from node velocities to state units per time; the fourth, of the mark, is 1.
+    /// Factors from node velocities to state units per time; that of a plain mark is 1.
     rate: [f64; 4],
     row: usize,
     plane: usize,
@@ -40,11 +40,12 @@ pub struct GridStage<R> {
     weights: [[R; 4]; 2],
 }
 
-/// Velocity, its derivatives along each axis, and a mark that is NaN where a node read was missing.
-pub struct Sample<L, const N: usize> {
-    pub velocity: [L; 3],
+/// Velocity, its derivatives along each axis, and a mark that is NaN where a node read was missing. `M` is 3, or 4 where the mark of a
+/// node is a component too (levels on the sphere).
+pub struct Sample<L, const N: usize, const M: usize> {
+    pub velocity: [L; M],
     /// `slopes[axis][component]`, per state unit.
-    pub slopes: [[L; 3]; N],
+    pub slopes: [[L; M]; N],
     pub mark: L,
 }
 
@@ -52,13 +53,13 @@ pub struct Sample<L, const N: usize> {
 const SAME_TIME: f64 = 1e-9;
 
 impl<R: Real, const N: usize> Sampler<R, N> {
-    /// Prepares a window. `rate` turns node velocities into state units per time.
+    /// Prepares a window. `rate` turns the four numbers of a node into state units per time.
     pub fn new(
         window: &Window,
         grid: &Grid,
         policy: Boundary,
         interpolation: Interpolation,
-        rate: impl Fn(&[AxisMap<R>; N]) -> [f64; 3],
+        rate: impl Fn(&[AxisMap<R>; N]) -> [f64; 4],
     ) -> Result<Self, FlowError> {
         if policy == Boundary::Unbounded {
             return Err(FlowError::NotOnGrids { boundary: policy });
@@ -73,11 +74,10 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         }
         let axes: [AxisMap<R>; N] = array(|k| AxisMap::new(&grid.axes[k], policy));
         let [nx, ny, _] = grid.shape();
-        let [u, v, w] = rate(&axes);
         Ok(Self {
             times: snapshots.iter().map(|s| s.time).collect(),
             snapshots,
-            rate: [u, v, w, 1.0],
+            rate: rate(&axes),
             row: nx,
             plane: nx * ny,
             interpolation,
@@ -106,11 +106,7 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         if single {
             weight = 0.0;
         }
-        let weights = [1.0 - weight, weight].map(|w| {
-            let mut weights = self.rate.map(|rate| R::from_f64(rate * w));
-            weights[3] = R::from_f64(w);
-            weights
-        });
+        let weights = [1.0 - weight, weight].map(|w| self.rate.map(|rate| R::from_f64(rate * w)));
         GridStage { first, single, weights }
     }
 
@@ -141,7 +137,7 @@ impl<R: Real, const N: usize> Sampler<R, N> {
 
     /// Velocity and mark.
     #[inline(always)]
-    pub fn value<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> ([L; 3], L) {
+    pub fn value<L: Gather<Real = R>, const M: usize>(&self, stage: &GridStage<R>, x: &[L; N]) -> ([L; M], L) {
         let places = self.locate(x);
         match self.interpolation {
             Interpolation::Linear => {
@@ -157,14 +153,14 @@ impl<R: Real, const N: usize> Sampler<R, N> {
 
     /// Velocity, derivatives and mark.
     #[inline(always)]
-    pub fn sample<L: Gather<Real = R>>(&self, stage: &GridStage<R>, x: &[L; N]) -> Sample<L, N> {
+    pub fn sample<L: Gather<Real = R>, const M: usize>(&self, stage: &GridStage<R>, x: &[L; N]) -> Sample<L, N, M> {
         let places = self.locate(x);
         let mut sample = match self.interpolation {
             Interpolation::Linear => {
                 // The value, and its derivatives along all axes but x.
                 let pairs = self.linear::<L, N>(stage, &places);
                 let fraction = places[0].fraction;
-                let mut slopes = [[L::zero(); 3]; N];
+                let mut slopes = [[L::zero(); M]; N];
                 slopes[0] = array(|c| pairs[0][c + 4] - pairs[0][c]);
                 for k in 1..N {
                     slopes[k] = lerp_x(&pairs[k], fraction);
@@ -351,7 +347,7 @@ impl<L: Gather, const N: usize, const K: usize> Rows<L::Pair, K> for CubicRows<'
 
 /// The last interpolation, along x.
 #[inline(always)]
-fn lerp_x<L: Lanes>(pair: &[L; 8], fraction: L) -> [L; 3] {
+fn lerp_x<L: Lanes, const M: usize>(pair: &[L; 8], fraction: L) -> [L; M] {
     array(|c| fraction.mul_add(pair[c + 4] - pair[c], pair[c]))
 }
 

@@ -4,69 +4,90 @@
 //! p. The tangent is the exact derivative of that: d longitude = east . dp / cos(latitude), d latitude = north . dp. Singular values
 //! are those between the orthonormal bases (east, north) at seed and arrival, that is, in the metric of the sphere.
 
+use super::axis_map::AxisMap;
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Chart, Velocity, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
 use crate::simd::{Gather, Lanes, Real, array};
 
+/// Where a direction is on a longitude-latitude grid in degrees.
+#[derive(Debug, Clone)]
+pub(super) struct Globe<R> {
+    /// Longitude in the middle of the axis, degrees.
+    pub(super) middle: f64,
+    /// State units (grid spacings) in a radian.
+    pub(super) per_radian: [R; 2],
+    /// State coordinates of `middle` and of the equator.
+    origin: [R; 2],
+    /// Rotation about the axis by -middle, which keeps the branch cut of the longitude opposite to the grid.
+    turn: [R; 2],
+    /// State coordinates between which particles stay, `[low, high]` along longitude and latitude. A grid does not end at a pole.
+    pub(super) ends: [[f64; 2]; 2],
+}
+
 /// A window on a longitude-latitude grid in degrees.
 #[derive(Debug, Clone)]
 pub struct SphereFlow<R> {
     sampler: Sampler<R, 2>,
     bounds: [[R; 2]; 2],
-    /// Longitude in the middle of the axis, degrees.
-    middle: f64,
-    /// State units (grid spacings) in a radian.
-    per_radian: [R; 2],
-    /// State coordinates of `middle` and of the equator.
-    origin: [R; 2],
-    /// Rotation about the axis by -middle, which keeps the branch cut of the longitude opposite to the grid.
-    turn: [R; 2],
+    globe: Globe<R>,
 }
 
 impl<R: Real> SphereFlow<R> {
     /// Prepares a window.
     pub fn new(window: &Window, grid: &Grid, radius: f64, policy: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
-        let sampler = Sampler::<R, 2>::new(window, grid, policy, interpolation, |_| [1.0 / radius; 3])?;
-        let [longitude, latitude] = &sampler.axes;
-        let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
-        let (sine, cosine) = middle.to_radians().sin_cos();
-        let ends: [[f64; 2]; 2] = [longitude.ends(), latitude.ends()];
-        let end = |i: usize| array(|k| R::from_f64(ends[k][i]));
-        let real = R::from_f64;
-        Ok(Self {
-            bounds: bounds(policy, end(0), end(1)),
-            middle,
-            per_radian: [real(1f64.to_degrees() / longitude.spacing), real(1f64.to_degrees() / latitude.spacing)],
-            origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
-            turn: [real(cosine), real(sine)],
-            sampler,
-        })
+        let rate = 1.0 / radius;
+        let sampler = Sampler::<R, 2>::new(window, grid, policy, interpolation, |_| [rate, rate, rate, 1.0])?;
+        let globe = Globe::new(&sampler.axes[0], &sampler.axes[1]);
+        let end = |i: usize| array(|k| R::from_f64(globe.ends[k][i]));
+        Ok(Self { bounds: bounds(policy, end(0), end(1)), globe, sampler })
     }
 }
 
 /// Below this cosine of the latitude, longitude has no meaning: 6e-7 degrees from a pole.
-const AT_POLE: f64 = 1e-8;
+pub(super) const AT_POLE: f64 = 1e-8;
+/// Degrees from a pole within which the last row of a grid is the pole.
+const ROW_AT_POLE: f64 = 1e-6;
 
 /// The direction of a state, and its place on the grid.
-struct Here<L> {
+pub(super) struct Here<L> {
     /// Unit vector.
-    p: [L; 3],
-    inverse_length: L,
-    cosine: L,
+    pub(super) p: [L; 3],
+    pub(super) inverse_length: L,
+    pub(super) cosine: L,
     /// Longitude and latitude in grid spacings.
-    place: [L; 2],
+    pub(super) place: [L; 2],
 }
 
 #[inline(always)]
-fn dot<L: Lanes>(a: &[L; 3], b: &[L; 3]) -> L {
+pub(super) fn dot<L: Lanes>(a: &[L; 3], b: &[L; 3]) -> L {
     a[0].mul_add(b[0], a[1].mul_add(b[1], a[2] * b[2]))
 }
 
-impl<R: Real> SphereFlow<R> {
+impl<R: Real> Globe<R> {
+    pub(super) fn new(longitude: &AxisMap<R>, latitude: &AxisMap<R>) -> Self {
+        let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
+        let (sine, cosine) = middle.to_radians().sin_cos();
+        let real = R::from_f64;
+        let mut south_north = latitude.ends();
+        for (end, pole) in south_north.iter_mut().zip([-90.0, 90.0]) {
+            // Rounding must not put a particle that passes over the pole outside of the grid.
+            if end.is_finite() && (latitude.coordinate(*end) - pole).abs() < ROW_AT_POLE {
+                *end = f64::INFINITY.copysign(pole);
+            }
+        }
+        Self {
+            middle,
+            per_radian: [real(1f64.to_degrees() / longitude.spacing), real(1f64.to_degrees() / latitude.spacing)],
+            origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
+            turn: [real(cosine), real(sine)],
+            ends: [longitude.ends(), south_north],
+        }
+    }
+
     #[inline(always)]
-    fn here<L: Gather<Real = R>>(&self, x: &[L; 3]) -> Here<L> {
+    pub(super) fn here<L: Gather<Real = R>>(&self, x: &[L; 3]) -> Here<L> {
         let inverse_length = L::one() / dot(x, x).sqrt();
         let p: [L; 3] = array(|i| x[i] * inverse_length);
         let cosine = p[0].mul_add(p[0], p[1] * p[1]).sqrt();
@@ -79,17 +100,25 @@ impl<R: Real> SphereFlow<R> {
         Here { p, inverse_length, cosine: cosine.max(L::of(AT_POLE)), place }
     }
 
-    /// East and north at a direction.
-    #[inline(always)]
-    fn basis<L: Lanes<Real = R>>(p: &[L; 3], cosine: L) -> [[L; 3]; 2] {
-        let inverse = L::one() / cosine;
-        let at_pole = cosine.le(L::of(AT_POLE));
-        let (c, s) = (L::select(at_pole, L::one(), p[0] * inverse), L::select(at_pole, L::zero(), p[1] * inverse));
-        [[-s, c, L::zero()], [-(p[2] * c), -(p[2] * s), cosine]]
+    /// Longitude and latitude in degrees of a direction.
+    pub(super) fn arrival(&self, p: &[f64]) -> [f64; 2] {
+        let latitude = p[2].atan2(p[0].hypot(p[1])).to_degrees();
+        let longitude = p[1].atan2(p[0]).to_degrees();
+        [longitude + 360.0 * ((self.middle - longitude) / 360.0).round(), latitude]
     }
 }
 
-fn trigonometry(point: [f64; 3]) -> [f64; 4] {
+/// East and north at a direction.
+#[inline(always)]
+pub(super) fn basis<L: Lanes>(p: &[L; 3], cosine: L) -> [[L; 3]; 2] {
+    let inverse = L::one() / cosine;
+    let at_pole = cosine.le(L::of(AT_POLE));
+    let (c, s) = (L::select(at_pole, L::one(), p[0] * inverse), L::select(at_pole, L::zero(), p[1] * inverse));
+    [[-s, c, L::zero()], [-(p[2] * c), -(p[2] * s), cosine]]
+}
+
+/// Sine and cosine of the longitude, sine and cosine of the latitude.
+pub(super) fn trigonometry(point: [f64; 3]) -> [f64; 4] {
     let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (point[0].to_radians().sin_cos(), point[1].to_radians().sin_cos());
     [sin_lon, cos_lon, sin_lat, cos_lat]
 }
@@ -111,9 +140,7 @@ impl<R: Real> Chart<3, 2> for SphereFlow<R> {
         if axis == 0 { arc * point[1].to_radians().cos() } else { arc }
     }
     fn arrival(&self, state: &[f64; 3], seed: [f32; 3]) -> [f32; 3] {
-        let latitude = state[2].atan2(state[0].hypot(state[1])).to_degrees();
-        let longitude = state[1].atan2(state[0]).to_degrees();
-        let longitude = longitude + 360.0 * ((self.middle - longitude) / 360.0).round();
+        let [longitude, latitude] = self.globe.arrival(state);
         [longitude as f32, latitude as f32, seed[2]]
     }
     fn coordinate_jacobian(&self, seed: [f64; 3], state: &[f64; 3], metric: [[f64; 2]; 2]) -> [[f64; 2]; 2] {
@@ -134,26 +161,26 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     }
     #[inline(always)]
     fn velocity(&self, stage: &Self::Stage, x: &[L; 3]) -> ([L; 3], L) {
-        let here = self.here(x);
-        let (velocity, mark) = self.sampler.value(stage, &here.place);
+        let here = self.globe.here(x);
+        let (velocity, mark) = self.sampler.value::<L, 3>(stage, &here.place);
         let radial = dot(&here.p, &velocity);
         (array(|i| (-radial).mul_add(here.p[i], velocity[i])), mark)
     }
     #[inline(always)]
     fn tangent(&self, stage: &Self::Stage, x: &[L; 3], m: &[[L; 2]; 3]) -> ([L; 3], [[L; 2]; 3], L) {
-        let here = self.here(x);
-        let sample = self.sampler.sample(stage, &here.place);
+        let here = self.globe.here(x);
+        let sample = self.sampler.sample::<L, 3>(stage, &here.place);
         let p = &here.p;
         let radial = dot(p, &sample.velocity);
-        let [east, north] = Self::basis(p, here.cosine);
+        let [east, north] = basis(p, here.cosine);
         let mut product = [[L::zero(); 2]; 3];
         for c in 0..2 {
             // Change of direction for a change of the state along the column.
             let column: [L; 3] = array(|i| m[i][c]);
             let outward = dot(p, &column);
             let change: [L; 3] = array(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
-            let longitude = dot(&east, &change) / here.cosine * L::splat(self.per_radian[0]);
-            let latitude = dot(&north, &change) * L::splat(self.per_radian[1]);
+            let longitude = dot(&east, &change) / here.cosine * L::splat(self.globe.per_radian[0]);
+            let latitude = dot(&north, &change) * L::splat(self.globe.per_radian[1]);
             let interpolated: [L; 3] = array(|i| longitude.mul_add(sample.slopes[0][i], latitude * sample.slopes[1][i]));
             // Derivative of V - p (p . V).
             let turned = dot(&change, &sample.velocity) + dot(p, &interpolated);
@@ -165,7 +192,7 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     }
     #[inline(always)]
     fn inside(&self, x: &[L; 3]) -> L::Mask {
-        within(&self.bounds, &self.here(x).place)
+        within(&self.bounds, &self.globe.here(x).place)
     }
     #[inline(always)]
     fn settle(&self, x: &mut [L; 3]) {
@@ -186,7 +213,7 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     #[inline(always)]
     fn metric(&self, x: &[L; 3], m: &[[L; 2]; 3]) -> [[L; 2]; 2] {
         let cosine = x[0].mul_add(x[0], x[1] * x[1]).sqrt().max(L::of(AT_POLE));
-        let basis = Self::basis(x, cosine);
+        let basis = basis(x, cosine);
         array(|i| array(|c| dot(&basis[i], &array(|k| m[k][c]))))
     }
 }

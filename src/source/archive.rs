@@ -6,9 +6,11 @@ use super::cf::coordinate::Kind;
 use super::container::Container;
 use super::conversion::Conversion;
 use super::files::expand;
-use super::hyperslab::read_component;
-use super::layout::{ComponentPlan, Layout, difference, plan};
+use super::hyperslab::{Orders, read_component};
+use super::layout::{ComponentPlan, Layout, Resampling, difference, plan};
+use super::poles::Poles;
 use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::synthetic::synthesized;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
 use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
@@ -17,21 +19,33 @@ use std::sync::Arc;
 /// A file of the archive; closed until it is read.
 struct ArchiveFile {
     path: PathBuf,
-    components: Vec<ComponentPlan>,
+    frames: Vec<Vec<ComponentPlan>>,
 }
 
-/// Velocity in NetCDF files with CF conventions. Opening reads headers, coordinates and times; velocities are read one snapshot
-/// at a time. One file is open at any moment.
+/// Where a snapshot is.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    file: usize,
+    frame: usize,
+    entry: usize,
+}
+
+/// Velocity in NetCDF files with CF conventions, of WRF, on curvilinear grids, or in HDF5 files. Opening reads headers, coordinates and
+/// times; velocities are read one snapshot at a time. One file is open at any moment.
 pub struct NetCdfArchive {
     files: Vec<ArchiveFile>,
-    /// File and time entry of each snapshot, in time order.
-    places: Vec<(usize, usize)>,
+    /// In time order.
+    places: Vec<Place>,
     seconds: Vec<f64>,
     times: Vec<f64>,
     calendar: Option<Calendar>,
     axes: Vec<AxisPlan>,
     grid: Arc<Grid>,
     conversion: Option<Conversion>,
+    /// See [`Layout::vertical`].
+    vertical: Vec<f64>,
+    poles: Poles,
+    resampling: Option<Arc<Resampling>>,
     metric: Metric,
     in_cells: bool,
     description: SourceDescription,
@@ -45,18 +59,35 @@ impl NetCdfArchive {
     /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
     /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each names the file.
     pub fn open(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<Self, SourceError> {
+        Self::open_files(files_of(paths, settings)?, settings)
+    }
+
+    /// Opens files that are already a list.
+    pub(super) fn open_files(paths: Vec<PathBuf>, settings: &NetCdfSettings) -> Result<Self, SourceError> {
         check(settings)?;
-        let paths = expand(if paths.is_empty() { &settings.files } else { paths })?;
         let mut first: Option<(Layout, &'static str)> = None;
-        let mut entries: Vec<(f64, usize, usize)> = Vec::new();
+        let mut entries: Vec<(f64, Place)> = Vec::new();
         let mut files = Vec::with_capacity(paths.len());
         let mut last_open = None;
+        let mut used: Option<Vec<String>> = None;
         for path in paths {
-            let container = Container::open(&path)?;
-            let layout = plan(&container, settings)?;
+            let known = first.as_ref().map(|f| &f.0);
+            let mut container = Container::open_part(&path, used.as_deref())?;
+            let layout = match plan(&container, settings, known) {
+                // The part of the header that sufficed for the first file does not for this one.
+                Err(_) if used.is_some() => {
+                    container = Container::open(&path)?;
+                    plan(&container, settings, known)?
+                }
+                planned => planned?,
+            };
+            if used.is_none() && layout.resampling.is_none() {
+                used = Some(layout.used(&container.header));
+            }
             let index = files.len();
-            entries.extend(layout.time.seconds.iter().enumerate().map(|(i, &s)| (s, index, i)));
-            files.push(ArchiveFile { path, components: layout.components.clone() });
+            let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
+            entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
+            files.push(ArchiveFile { path, frames: layout.frames.clone() });
             match &first {
                 Some((reference, _)) => {
                     if let Some(what) = difference(reference, &layout) {
@@ -84,8 +115,11 @@ impl NetCdfArchive {
         };
         let grid = Arc::new(build_grid(path, &layout, settings)?);
         let description = describe(&layout, format, files.len(), &seconds);
-        Ok(Self {
-            places: entries.iter().map(|e| (e.1, e.2)).collect(),
+        let mut archive = Self {
+            places: entries.iter().map(|e| e.1).collect(),
+            vertical: layout.vertical,
+            poles: layout.poles,
+            resampling: layout.resampling,
             seconds,
             times,
             calendar,
@@ -97,7 +131,14 @@ impl NetCdfArchive {
             description,
             open: last_open,
             files,
-        })
+        };
+        if let Some([error, size]) = archive.resampling_error()? {
+            archive.description.notes.push(format!(
+                "resampling error, measured on the first snapshot at the file's own points: {error:.3} m/s of {size:.3} m/s ({:.1} %), root mean square",
+                100.0 * error / size.max(f64::MIN_POSITIVE)
+            ));
+        }
+        Ok(archive)
     }
 
     /// The files, in the order of their names in the arguments.
@@ -128,16 +169,12 @@ impl NetCdfArchive {
 
     /// Variable, component and reason of what is read.
     pub(super) fn chosen(&self) -> impl Iterator<Item = (&str, &'static str, &str)> {
-        self.files[0].components.iter().zip(["u", "v", "w"]).map(|(c, role)| (c.name.as_str(), role, c.why.as_str()))
+        self.files[0].frames[0].iter().zip(["u", "v", "w"]).map(|(c, role)| (c.name.as_str(), role, c.why.as_str()))
     }
 
     /// Measures one snapshot's velocities in SI and in cells per interval.
     pub(super) fn displacement(&mut self, index: usize) -> Result<Displacement, SourceError> {
-        let Some(&(file, entry)) = self.places.get(index) else {
-            return Err(SourceError::NoSuchSnapshot { index, count: self.places.len() });
-        };
-        let count = self.files[file].components.len();
-        let raw = (0..count).map(|which| self.component(file, entry, which)).collect::<Result<Vec<_>, _>>()?;
+        let raw = self.components(index)?;
         let mut cells = raw.clone();
         if !self.in_cells {
             Conversion::to_cells(&self.axes).apply(&mut cells, self.grid.shape(), self.interval(index));
@@ -172,8 +209,9 @@ impl NetCdfArchive {
             // Closed before the next is opened.
             self.open = None;
             let path = &self.files[file].path;
-            let container = Container::open(path)?;
-            for component in &self.files[file].components {
+            let names: Vec<String> = self.files[file].frames.iter().flatten().map(|c| c.name.clone()).collect();
+            let container = Container::open_part(path, self.resampling.is_none().then_some(&names[..]))?;
+            for component in self.files[file].frames.iter().flatten() {
                 let found = container.header.find(&component.name).map(|v| &container.header.variables[v]);
                 if found.is_none_or(|v| container.header.shape(v) != component.shape) {
                     let what = "it changed since the archive was opened".into();
@@ -188,11 +226,41 @@ impl NetCdfArchive {
         }
     }
 
-    /// One component in SI (or as it is, in cells), x fastest; missing values are NaN.
-    fn component(&mut self, file: usize, entry: usize, which: usize) -> Result<Vec<f32>, SourceError> {
+    /// The components of a snapshot in SI (or as they are, in cells), the third along the grid's third axis; x fastest; missing values
+    /// are NaN.
+    fn components(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
+        let Some(&Place { file, frame, entry }) = self.places.get(index) else {
+            return Err(SourceError::NoSuchSnapshot { index, count: self.places.len() });
+        };
         self.container(file)?;
         let Some((_, container)) = &self.open else { return Err(SourceError::NoFiles) };
-        read_component(container, &self.files[file].components[which], &self.axes, self.grid.shape(), entry)
+        let plans = &self.files[file].frames[frame];
+        let mut components = match &self.resampling {
+            Some(resampling) => resampling.read(container, plans, entry, self.axes.get(2).map_or(&[0], |a| &a.order))?,
+            None => {
+                let orders: Orders = std::array::from_fn(|k| self.axes.get(k).map_or_else(|| vec![0], |a| a.order.clone()));
+                plans.iter().map(|plan| read_component(container, plan, &orders, entry)).collect::<Result<_, _>>()?
+            }
+        };
+        if !self.vertical.is_empty()
+            && let Some(w) = components.get_mut(2)
+        {
+            let plane = w.len() / self.vertical.len();
+            for (values, &factor) in w.chunks_exact_mut(plane).zip(&self.vertical) {
+                values.iter_mut().for_each(|v| *v = (f64::from(*v) * factor) as f32);
+            }
+        }
+        self.poles.extend(&mut components, self.axes[0].axis.coordinates(), self.axes[1].order.len());
+        Ok(components)
+    }
+
+    /// How far resampling is off, measured on the first snapshot; none where nothing is resampled. See [`Resampling::error`].
+    pub(super) fn resampling_error(&mut self) -> Result<Option<[f64; 2]>, SourceError> {
+        let Some(resampling) = self.resampling.clone() else { return Ok(None) };
+        let Place { file, frame, entry } = self.places[0];
+        self.container(file)?;
+        let Some((_, container)) = &self.open else { return Err(SourceError::NoFiles) };
+        resampling.error(container, &self.files[file].frames[frame], entry).map(Some)
     }
 }
 
@@ -206,13 +274,7 @@ impl SnapshotSource for NetCdfArchive {
     }
 
     fn read(&mut self, index: usize) -> Result<Snapshot, SourceError> {
-        let Some(&(file, entry)) = self.places.get(index) else {
-            return Err(SourceError::NoSuchSnapshot { index, count: self.places.len() });
-        };
-        let mut components = Vec::with_capacity(3);
-        for which in 0..self.files[file].components.len() {
-            components.push(self.component(file, entry, which)?);
-        }
+        let mut components = self.components(index)?;
         if let Some(conversion) = &self.conversion {
             let interval = if self.metric == Metric::Index { self.interval(index) } else { 1.0 };
             conversion.apply(&mut components, self.grid.shape(), interval);
@@ -262,6 +324,15 @@ fn is_sphere(axes: &[AxisPlan]) -> bool {
     axes[0].kind == Kind::Longitude && axes[1].kind == Kind::Latitude
 }
 
+/// The files that are meant: those given, else those of the settings, else a synthetic archive.
+pub(super) fn files_of(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<Vec<PathBuf>, SourceError> {
+    let paths = if paths.is_empty() { &settings.files } else { paths };
+    match &settings.synthetic {
+        Some(synthetic) if paths.is_empty() => expand(&[synthesized(synthetic)?]),
+        _ => expand(paths),
+    }
+}
+
 /// Settings that are wrong whatever the files are.
 fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
     let fault = |key, found: String, accepted: &str| Err(SourceError::Setting { key, found, accepted: accepted.into() });
@@ -275,13 +346,18 @@ fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
     {
         return fault("slab", format!("{slab:?}"), "[lower, upper] with lower < upper");
     }
+    if let Some(scale) = settings.vertical_scale
+        && !(scale.is_finite() && scale > 0.0)
+    {
+        return fault("vertical_scale", scale.to_string(), "a number above 0");
+    }
     if settings.level.is_some_and(|l| !l.is_finite()) {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
     }
     Ok(())
 }
 
-fn check_duplicates(entries: &[(f64, usize, usize)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {
+fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {
     let (Some(first), Some(last)) = (entries.first(), entries.last()) else { return Ok(()) };
     // Times written in different units may differ in their last digits.
     let slack = (last.0 - first.0) * 1e-9;
@@ -289,8 +365,8 @@ fn check_duplicates(entries: &[(f64, usize, usize)], files: &[ArchiveFile], cale
         None => Ok(()),
         Some(pair) => Err(SourceError::DuplicateTime {
             time: calendar.and_then(|c| c.iso(pair[0].0)).unwrap_or_else(|| format!("time {}", pair[0].0)),
-            first: files[pair[0].1].path.clone(),
-            second: files[pair[1].1].path.clone(),
+            first: files[pair[0].1.file].path.clone(),
+            second: files[pair[1].1.file].path.clone(),
         }),
     }
 }
@@ -313,7 +389,7 @@ fn build_grid(path: &Path, layout: &Layout, settings: &NetCdfSettings) -> Result
 }
 
 fn describe(layout: &Layout, format: &str, files: usize, seconds: &[f64]) -> SourceDescription {
-    let variables = layout.components.iter().zip(["u", "v", "w"]).map(|(c, k)| format!("{k} = `{}`: {}", c.name, c.why)).collect();
+    let variables = layout.frames[0].iter().zip(["u", "v", "w"]).map(|(c, k)| format!("{k} = `{}`: {}", c.name, c.why)).collect();
     let mut notes = layout.notes.clone();
     for gap in time_gaps(seconds) {
         let show = |s: f64| layout.time.calendar.and_then(|c| c.iso(s)).unwrap_or_else(|| s.to_string());

@@ -22,6 +22,13 @@ pub(super) struct AxisPlan {
     pub(super) descending: bool,
 }
 
+impl AxisPlan {
+    /// An axis that is not one of the file.
+    pub(super) fn made(kind: Kind, axis: Axis, quantity: Quantity) -> Self {
+        Self { kind, order: (0..axis.len()).collect(), axis, notes: Vec::new(), quantity, descending: false }
+    }
+}
+
 /// What an axis measures.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Quantity {

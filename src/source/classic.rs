@@ -108,7 +108,7 @@ fn pick(piece: &[u8], number: NumberType, count: &[usize], strides: &[u64], out:
     }
     match number {
         NumberType::I8 => decode::<1>(piece, count, strides, |b| f64::from(b[0] as i8), out),
-        NumberType::U8 | NumberType::Other => decode::<1>(piece, count, strides, |b| f64::from(b[0]), out),
+        NumberType::U8 | NumberType::Text | NumberType::Other => decode::<1>(piece, count, strides, |b| f64::from(b[0]), out),
         NumberType::I16 => decode(piece, count, strides, |b| f64::from(i16::from_be_bytes(b)), out),
         NumberType::U16 => decode(piece, count, strides, |b| f64::from(u16::from_be_bytes(b)), out),
         NumberType::I32 => decode(piece, count, strides, |b| f64::from(i32::from_be_bytes(b)), out),
@@ -132,6 +132,7 @@ struct Parsed {
     records: Option<u64>,
     dimensions: Vec<(String, u64)>,
     variables: Vec<(Variable, u64)>,
+    attributes: Vec<(String, Attribute)>,
 }
 
 struct Parser<'a> {
@@ -147,7 +148,7 @@ impl Parser<'_> {
         let records = self.count()?;
         let streaming = if self.wide { u64::MAX } else { u64::from(u32::MAX) };
         let dimensions = self.list(0x0a, "dimensions", |p| Ok((p.name()?, p.count()?)))?;
-        self.attributes()?;
+        let attributes = self.attributes()?;
         let variables = self.list(0x0b, "variables", |p| {
             let name = p.name()?;
             let rank = p.length("dimensions")?;
@@ -161,7 +162,7 @@ impl Parser<'_> {
             let begin = if p.wide_offsets { u64::from_be_bytes(p.bytes()?) } else { u64::from(u32::from_be_bytes(p.bytes()?)) };
             Ok((Variable { name, number, dimensions: ids, attributes }, begin))
         })?;
-        Ok(Parsed { records: (records != streaming).then_some(records), dimensions, variables })
+        Ok(Parsed { records: (records != streaming).then_some(records), dimensions, variables, attributes })
     }
 
     fn bytes<const N: usize>(&mut self) -> Result<[u8; N], Fault> {
@@ -215,7 +216,7 @@ impl Parser<'_> {
         let code = u32::from_be_bytes(self.bytes()?);
         Ok(match code {
             1 => (NumberType::I8, 1),
-            2 => (NumberType::Other, 1),
+            2 => (NumberType::Text, 1),
             3 => (NumberType::I16, 2),
             4 => (NumberType::I32, 4),
             5 => (NumberType::F32, 4),
@@ -238,7 +239,7 @@ impl Parser<'_> {
             let bytes = p.padded(bytes)?;
             Ok((
                 name,
-                if number == NumberType::Other {
+                if number == NumberType::Text {
                     let text = bytes.split(|&b| b == 0).next().unwrap_or_default();
                     Attribute::Text(String::from_utf8_lossy(text).into_owned())
                 } else {
@@ -310,15 +311,18 @@ impl Parsed {
             let len = if len == 0 { records } else { len };
             usize::try_from(len).map(|len| Dimension { name, len }).map_err(|e| e.to_string())
         });
-        let header =
-            Header { dimensions: dimensions.collect::<Result<_, _>>()?, variables: self.variables.into_iter().map(|(v, _)| v).collect() };
+        let header = Header {
+            dimensions: dimensions.collect::<Result<_, _>>()?,
+            variables: self.variables.into_iter().map(|(v, _)| v).collect(),
+            attributes: self.attributes,
+        };
         Ok((header, places, record_bytes, needed))
     }
 }
 
 fn width(number: NumberType) -> usize {
     match number {
-        NumberType::I8 | NumberType::U8 | NumberType::Other => 1,
+        NumberType::I8 | NumberType::U8 | NumberType::Text | NumberType::Other => 1,
         NumberType::I16 | NumberType::U16 => 2,
         NumberType::I32 | NumberType::U32 | NumberType::F32 => 4,
         NumberType::I64 | NumberType::U64 | NumberType::F64 => 8,

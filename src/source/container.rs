@@ -2,6 +2,7 @@
 
 use super::SourceError;
 use super::classic::ClassicStore;
+use super::hdf5_store::Hdf5Store;
 use super::netcdf4::NetCdf4Store;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
@@ -20,11 +21,17 @@ pub(crate) enum NumberType {
     U64,
     F32,
     F64,
-    /// Text and types that hold no numbers.
+    /// Characters, one byte each.
+    Text,
+    /// Types that hold no numbers.
     Other,
 }
 
 impl NumberType {
+    pub(crate) fn is_number(self) -> bool {
+        !matches!(self, Self::Text | Self::Other)
+    }
+
     pub(crate) fn is_float(self) -> bool {
         matches!(self, Self::F32 | Self::F64)
     }
@@ -41,7 +48,8 @@ impl NumberType {
             Self::U64 => "uint64",
             Self::F32 => "float32",
             Self::F64 => "float64",
-            Self::Other => "text",
+            Self::Text => "text",
+            Self::Other => "other",
         }
     }
 }
@@ -103,9 +111,19 @@ impl Variable {
 pub(crate) struct Header {
     pub(crate) dimensions: Vec<Dimension>,
     pub(crate) variables: Vec<Variable>,
+    /// Attributes of the file itself.
+    pub(crate) attributes: Vec<(String, Attribute)>,
 }
 
 impl Header {
+    /// First number of an attribute of the file.
+    pub(crate) fn number(&self, name: &str) -> Option<f64> {
+        match self.attributes.iter().find(|(n, _)| n == name) {
+            Some((_, Attribute::Numbers(_, values))) => values.first().copied(),
+            _ => None,
+        }
+    }
+
     pub(crate) fn find(&self, name: &str) -> Option<usize> {
         self.variables.iter().position(|v| v.name == name)
     }
@@ -125,7 +143,9 @@ impl Header {
 pub(crate) enum Format {
     /// NetCDF classic: version 1, 2 (64-bit offset) or 5 (64-bit data).
     Classic(u8),
-    /// NetCDF-4, or HDF5 that may or may not have its structure.
+    /// NetCDF-4.
+    NetCdf4,
+    /// HDF5 without the structure of NetCDF.
     Hdf5,
 }
 
@@ -135,7 +155,8 @@ impl Format {
             Self::Classic(1) => "NetCDF classic",
             Self::Classic(2) => "NetCDF 64-bit offset",
             Self::Classic(_) => "NetCDF 64-bit data",
-            Self::Hdf5 => "NetCDF-4",
+            Self::NetCdf4 => "NetCDF-4",
+            Self::Hdf5 => "HDF5",
         }
     }
 }
@@ -143,7 +164,13 @@ impl Format {
 enum Store {
     Classic(ClassicStore),
     NetCdf4(NetCdf4Store),
+    Hdf5(Hdf5Store),
 }
+
+/// Deflate shrinks at most this much: a variable that would be larger than its file by more was never written.
+const LARGEST_SHRINKAGE: u64 = 1032;
+/// Values that any file may hold, however small it is.
+const ALWAYS_ALLOWED: u64 = 1 << 20;
 
 /// An open file.
 pub(crate) struct Container {
@@ -151,50 +178,75 @@ pub(crate) struct Container {
     pub(crate) format: Format,
     pub(crate) header: Header,
     store: Store,
+    /// Bytes of the file.
+    length: u64,
 }
 
 impl Container {
     /// Opens a file and reads its header, nothing else.
     pub(crate) fn open(path: &Path) -> Result<Self, SourceError> {
+        Self::open_part(path, None)
+    }
+
+    /// The same, with the headers of the variables `only` where that saves time: others may lack.
+    pub(crate) fn open_part(path: &Path, only: Option<&[String]>) -> Result<Self, SourceError> {
         let failed = |cause| SourceError::Open { path: path.to_path_buf(), cause };
         let mut file = File::open(path).map_err(failed)?;
         let length = file.metadata().map_err(failed)?.len();
         let format = sniff(&mut file, length).map_err(failed)?.map_err(|found| SourceError::NotNetCdf { path: path.into(), found })?;
-        let (header, store) = match format {
+        let (format, header, store) = match format {
             Format::Classic(version) => {
                 let (header, store) = ClassicStore::open(path, file, length, version)?;
-                (header, Store::Classic(store))
+                (format, header, Store::Classic(store))
             }
-            Format::Hdf5 => {
-                let (header, store) = NetCdf4Store::open(path)?;
-                (header, Store::NetCdf4(store))
-            }
+            Format::NetCdf4 | Format::Hdf5 => match NetCdf4Store::open(path, only)? {
+                Some((header, store)) => (Format::NetCdf4, header, Store::NetCdf4(store)),
+                None => {
+                    let (header, store) = Hdf5Store::open(path)?;
+                    (Format::Hdf5, header, Store::Hdf5(store))
+                }
+            },
         };
-        Ok(Self { path: path.to_path_buf(), format, header, store })
+        Ok(Self { path: path.to_path_buf(), format, header, store, length })
     }
 
     /// Raw values of a hyperslab as `f64` (no unpacking), in the file's order, slowest dimension first.
     pub(crate) fn read(&self, variable: usize, start: &[usize], count: &[usize]) -> Result<Vec<f64>, SourceError> {
         let header = &self.header.variables[variable];
         let failed = |what: String| SourceError::Read { path: self.path.clone(), variable: header.name.clone(), what };
-        if header.number == NumberType::Other {
-            return Err(failed("it holds no numbers".into()));
-        }
         let shape = self.header.shape(header);
         let inside = start.len() == shape.len() && count.len() == shape.len();
         if !inside || (0..shape.len()).any(|k| start[k].checked_add(count[k]).is_none_or(|end| end > shape[k])) {
             return Err(failed(format!("{count:?} values from {start:?} were asked for, but its shape is {shape:?}")));
         }
+        if header.number == NumberType::Other {
+            return Err(failed("it holds no numbers".into()));
+        }
         let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
+        if total as u64 > self.length.saturating_mul(LARGEST_SHRINKAGE).max(ALWAYS_ALLOWED) {
+            return Err(failed(format!(
+                "{total} values cannot come from a file of {} bytes: it is damaged or was never written",
+                self.length
+            )));
+        }
         let mut values: Vec<f64> = Vec::new();
         values.try_reserve_exact(total).map_err(|_| failed(format!("no memory for {total} values")))?;
         if total > 0 {
             match &self.store {
                 Store::Classic(store) => store.read(variable, &shape, start, count, &mut values).map_err(|e| failed(e.to_string()))?,
-                Store::NetCdf4(store) => store.read(&header.name, start, count, total, &mut values).map_err(failed)?,
+                Store::NetCdf4(store) => store.read(&header.name, header.number, start, count, total, &mut values).map_err(failed)?,
+                Store::Hdf5(store) => store.read(&header.name, start, count, &mut values).map_err(failed)?,
             }
         }
         Ok(values)
+    }
+
+    /// Rows of characters along the last dimension, without what pads them.
+    pub(crate) fn read_text(&self, variable: usize) -> Result<Vec<String>, SourceError> {
+        let width = self.header.shape(&self.header.variables[variable]).last().copied().unwrap_or(1).max(1);
+        let bytes = self.read_all(variable)?;
+        let row = |row: &[f64]| row.iter().map(|&b| char::from(b as u8)).collect::<String>();
+        Ok(bytes.chunks(width).map(|r| row(r).trim_matches(['\0', ' ']).to_owned()).collect())
     }
 
     /// All values of a variable.

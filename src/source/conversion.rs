@@ -40,6 +40,14 @@ impl Conversion {
         Self { u_x: ones(0), u_y, v_y: ones(1), w_z: ones(2) }
     }
 
+    /// The way back.
+    pub(super) fn inverse(mut self) -> Self {
+        for factors in [&mut self.u_x, &mut self.u_y, &mut self.v_y, &mut self.w_z] {
+            factors.iter_mut().for_each(|f| *f = 1.0 / *f);
+        }
+        self
+    }
+
     /// Converts u, v and, where there is one, w; `interval` seconds go into a time unit.
     pub(super) fn apply(&self, components: &mut [Vec<f32>], [nx, ny, _]: [usize; 3], interval: f64) {
         for (which, values) in components.iter_mut().enumerate() {

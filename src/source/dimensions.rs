@@ -30,6 +30,8 @@ impl Planner<'_> {
         if let Some(variable) = header.find(name) {
             return match header.variables[variable].dimensions[..] {
                 [dimension] => Ok(Some((dimension, Some(variable)))),
+                // Rows of characters.
+                [dimension, _] if header.variables[variable].number == NumberType::Text => Ok(Some((dimension, Some(variable)))),
                 ref dims => {
                     Err(self.misfit(variable, format!("`{key}` must name a coordinate of one dimension, this one has {}", dims.len())))
                 }
@@ -82,11 +84,17 @@ impl Planner<'_> {
         Ok(extents)
     }
 
+    /// A dimension with its coordinate variable and what it measures, whatever the settings say.
+    pub(super) fn measured(&self, dimension: usize) -> Extent {
+        let Dim { kind, coordinate } = self.measure(dimension);
+        Extent { dimension, kind, coordinate }
+    }
+
     /// Finds a dimension's coordinate variable and what it measures.
     fn measure(&self, dimension: usize) -> Dim {
         let header = self.header();
         let name = &header.dimensions[dimension].name;
-        let own = |i: &usize| header.variables[*i].dimensions == [dimension] && header.variables[*i].number != NumberType::Other;
+        let own = |i: &usize| header.variables[*i].dimensions == [dimension] && header.variables[*i].number.is_number();
         let candidates: Vec<usize> = (0..header.variables.len()).filter(own).collect();
         let known = |&i: &usize| classify(&header.variables[i]) != Kind::Unknown;
         let coordinate = candidates

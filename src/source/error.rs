@@ -9,7 +9,7 @@ use thiserror::Error;
 #[derive(Debug, Error)]
 pub enum SourceError {
     /// Nothing to open.
-    #[error("no file given: name NetCDF files, a folder of them or a pattern such as `data/*.nc`")]
+    #[error("no file given: name NetCDF or HDF5 files, a folder of them or a pattern such as `data/*.nc`")]
     NoFiles,
     /// A pattern or folder without files.
     #[error("no file matches `{pattern}`")]
@@ -26,7 +26,7 @@ pub enum SourceError {
         cause: std::io::Error,
     },
     /// Some other format.
-    #[error("{}: not a NetCDF file ({found}); accepted are NetCDF classic, 64-bit offset, 64-bit data and NetCDF-4", path.display())]
+    #[error("{}: neither NetCDF nor HDF5 ({found}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4 and HDF5", path.display())]
     NotNetCdf {
         /// The file.
         path: PathBuf,
@@ -50,12 +50,6 @@ pub enum SourceError {
         path: PathBuf,
         /// What does not fit.
         what: String,
-    },
-    /// HDF5 without the structure of NetCDF.
-    #[error("{}: HDF5 archives are not read yet; accepted are NetCDF classic and NetCDF-4", path.display())]
-    Hdf5 {
-        /// The file.
-        path: PathBuf,
     },
     /// Values of a variable cannot be read.
     #[error("{}: variable `{variable}` cannot be read: {what}", path.display())]
@@ -109,8 +103,8 @@ pub enum SourceError {
     },
     /// Components on different points.
     #[error(
-        "{}: `{first}` lies on ({first_dimensions}) but `{second}` on ({second_dimensions}): components on different points \
-         (staggered grids) are not read yet",
+        "{}: `{first}` lies on ({first_dimensions}) but `{second}` on ({second_dimensions}): staggered components \
+         are read where they are WRF's (dimensions `..._stag`, with PH and PHB) or have longitudes and latitudes of their own",
         path.display()
     )]
     Staggered {
@@ -204,6 +198,14 @@ pub enum SourceError {
         index: usize,
         /// How many there are.
         count: usize,
+    },
+    /// An archive cannot be written.
+    #[error("{}: cannot be written: {what}", path.display())]
+    Write {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the library or the operating system says.
+        what: String,
     },
     /// In-memory data that do not fit together.
     #[error("{what}")]

@@ -4,7 +4,7 @@ use super::SourceError;
 use std::path::{Path, PathBuf};
 
 /// Endings of files that are taken from a folder.
-const ENDINGS: [&str; 4] = ["nc", "nc4", "cdf", "netcdf"];
+const ENDINGS: [&str; 7] = ["nc", "nc4", "cdf", "netcdf", "h5", "hdf5", "hdf"];
 
 /// Expands folders and patterns, in name order; a file that is named twice counts once.
 pub(super) fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
@@ -33,15 +33,20 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
     for entry in std::fs::read_dir(path).map_err(failed)? {
         let file = entry.map_err(failed)?.path();
         let ending = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
-        if file.is_file() && ENDINGS.iter().any(|e| e.eq_ignore_ascii_case(ending)) {
+        let name = entry_name(&file);
+        if file.is_file() && (ENDINGS.iter().any(|e| e.eq_ignore_ascii_case(ending)) || name.starts_with("wrfout_")) {
             files.push(file);
         }
     }
     if files.is_empty() {
-        return Err(SourceError::NoMatch { pattern: path.join("*.nc").display().to_string() });
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5").display().to_string() });
     }
     files.sort();
     Ok(files)
+}
+
+fn entry_name(file: &Path) -> &str {
+    file.file_name().and_then(|n| n.to_str()).unwrap_or_default()
 }
 
 fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {

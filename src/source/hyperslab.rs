@@ -1,23 +1,28 @@
 //! One time of one component, from the file's order onto the grid.
 
 use super::SourceError;
-use super::axes::{AxisPlan, runs};
+use super::axes::runs;
 use super::container::Container;
 use super::layout::{ComponentPlan, Role};
 
-/// Reads one time of one component onto the grid.
-pub(super) fn read_component(
-    file: &Container,
-    component: &ComponentPlan,
-    axes: &[AxisPlan],
-    [nx, ny, nz]: [usize; 3],
-    entry: usize,
-) -> Result<Vec<f32>, SourceError> {
+/// Which entries of the file are the nodes along x, y and z.
+pub(super) type Orders = [Vec<usize>; 3];
+
+/// All entries, as they stand in the file; one where there is no such axis.
+pub(super) fn as_in_file(component: &ComponentPlan) -> Orders {
+    std::array::from_fn(|k| {
+        let along = component.roles.iter().zip(&component.shape).find(|(role, _)| **role == Role::Axis(k));
+        (0..along.map_or(1, |(_, &n)| n)).collect()
+    })
+}
+
+/// Reads one time of one component, x fastest.
+pub(super) fn read_component(file: &Container, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
+    let [nx, ny, nz] = [0, 1, 2].map(|k| orders[k].len());
     let gone = || SourceError::Read { path: file.path.clone(), variable: component.name.clone(), what: "it is gone".into() };
     let variable = file.header.find(&component.name).ok_or_else(gone)?;
     let mut values = vec![f32::NAN; nx * ny * nz];
-    let runs_of = |k: usize| axes.get(k).map_or_else(|| runs(&[0]), |a| runs(&a.order));
-    let (runs_x, runs_y, runs_z) = (runs_of(0), runs_of(1), runs_of(2));
+    let (runs_x, runs_y, runs_z) = (runs(&orders[0]), runs(&orders[1]), runs(&orders[2]));
     for run_z in &runs_z {
         for run_y in &runs_y {
             for run_x in &runs_x {

@@ -1,10 +1,9 @@
 //! What would be read from an archive, and why.
 
-use super::archive::{Displacement, NetCdfArchive};
+use super::archive::{Displacement, NetCdfArchive, files_of};
 use super::axes::Quantity;
 use super::cf::velocity;
 use super::container::{Container, Header};
-use super::files::expand;
 use super::settings::NetCdfSettings;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
 use serde::Serialize;
@@ -33,6 +32,8 @@ pub struct Inspection {
     pub axes: Vec<AxisReport>,
     /// Times.
     pub time: Option<TimeReport>,
+    /// What is resampled; none where the file's own nodes are read.
+    pub resampling: Option<ResamplingReport>,
     /// Missing values.
     pub missing: Option<MissingReport>,
     /// Whether the snapshots are close enough in time.
@@ -104,6 +105,17 @@ pub struct TimeReport {
     pub tau_problem: Option<String>,
 }
 
+/// Resampling and its error, measured on the first snapshot at the file's own points.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct ResamplingReport {
+    /// What is done, in words.
+    pub what: Vec<String>,
+    /// Root mean square of what interpolation on the new grid gives less what the file has, in m/s.
+    pub error: f64,
+    /// Root mean square of what the file has, in m/s.
+    pub velocity: f64,
+}
+
 /// Missing values, measured on a few snapshots.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct MissingReport {
@@ -131,11 +143,11 @@ pub struct ResolutionReport {
 /// # Errors
 /// No file, or a first file that is missing, damaged or of another format.
 pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
-    let files = expand(if paths.is_empty() { &settings.files } else { paths })?;
-    let Some(file) = files.first() else { return Err(SourceError::NoFiles) };
-    let first = Container::open(file)?;
+    let files = files_of(paths, settings)?;
+    let Some(file) = files.first().cloned() else { return Err(SourceError::NoFiles) };
+    let first = Container::open(&file)?;
     let mut inspection = Inspection {
-        file: file.clone(),
+        file,
         files: files.len(),
         format: first.format.name().into(),
         variables: variables(&first.header),
@@ -143,10 +155,11 @@ pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -
         source: None,
         axes: Vec::new(),
         time: None,
+        resampling: None,
         missing: None,
         resolution: None,
     };
-    match NetCdfArchive::open(&files, settings) {
+    match NetCdfArchive::open_files(files, settings) {
         Ok(archive) => inspection.fill(archive, tau)?,
         Err(error) => inspection.problem = Some(error.to_string()),
     }
@@ -200,6 +213,8 @@ impl Inspection {
                 period: plan.axis.period(),
             });
         }
+        let what = description.notes.iter().filter(|n| n.contains("resampled") || n.contains("components on faces")).cloned().collect();
+        self.resampling = archive.resampling_error()?.map(|[error, velocity]| ResamplingReport { what, error, velocity });
         self.time = Some(times(&archive, &description, tau));
         let count = archive.times().len();
         let sampled = count.min(SAMPLED);
@@ -288,6 +303,17 @@ impl fmt::Display for Inspection {
             if let Some(problem) = &t.tau_problem {
                 writeln!(f, "  {problem}")?;
             }
+        }
+        match &self.resampling {
+            Some(r) => writeln!(
+                f,
+                "\nresampling\n  error {} m/s of {} m/s ({:.2} %), root mean square at the file's own points\n  {}",
+                Short(r.error),
+                Short(r.velocity),
+                100.0 * r.error / r.velocity.max(f64::MIN_POSITIVE),
+                r.what.join("\n  ")
+            )?,
+            None => writeln!(f, "\nresampling\n  none: nodes are the file's own")?,
         }
         if let Some(m) = &self.missing {
             writeln!(f, "\nvelocity (measured on {} snapshots)\n  missing {:.1} %", m.sampled, 100.0 * m.share)?;

@@ -1,5 +1,6 @@
 //! `[source]` and `[domain]` of a scene file: which velocity, and the box of a closed form.
 
+use super::NetCdfSettings;
 use crate::setting::{Refused, count, require};
 use serde::{Deserialize, Serialize};
 
@@ -19,7 +20,7 @@ pub enum SourceKind {
     Shear,
     /// The standard synthetic turbulence, sampled on a grid.
     Turbulence,
-    /// NetCDF files (`[archive]`).
+    /// NetCDF and HDF5 files (`[archive]`).
     Archive,
 }
 
@@ -66,8 +67,8 @@ pub struct DomainSettings {
 }
 
 impl SourceSettings {
-    /// Checks ranges, and that a closed form has its box (`domain`) and an archive its `files`.
-    pub fn check(&self, domain: Option<&DomainSettings>, files: &[std::path::PathBuf]) -> Result<(), Refused> {
+    /// Checks ranges, and that a closed form has its box (`domain`) and an archive its files (or what to synthesize).
+    pub fn check(&self, domain: Option<&DomainSettings>, archive: &NetCdfSettings) -> Result<(), Refused> {
         let source = self;
         let kind = source.kind;
         use SourceKind::*;
@@ -123,8 +124,8 @@ impl SourceSettings {
             let proper = (0..3).all(|k| domain.min[k].is_finite() && domain.max[k].is_finite() && domain.max[k] > domain.min[k]);
             require(proper, "domain.max", domain.max, &format!("three finite numbers above domain.min = {:?}", domain.min))?;
         }
-        if kind == Archive && files.is_empty() {
-            fault("archive.files", "is empty", "a list of files or globs")?;
+        if kind == Archive && archive.files.is_empty() && archive.synthetic.is_none() {
+            fault("archive.files", "is empty", "a list of files or globs, or a table [archive.synthetic]")?;
         }
         Ok(())
     }

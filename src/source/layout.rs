@@ -7,12 +7,17 @@ use super::cf::coordinate::{Kind, classify};
 use super::cf::packing::Packing;
 use super::cf::units::{Unit, VELOCITY_UNITS};
 use super::cf::velocity::{self, Candidate, Velocity};
-use super::container::{Container, Header};
+use super::container::{Container, Format, Header};
+use super::curvilinear::Curvilinear;
 use super::dimensions::Extent;
+use super::poles::Poles;
 use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::staggered::Staggered;
 use super::times::TimePlan;
+use super::vertical::to_heights;
 use crate::field::{Axis, AxisFault};
 use std::path::Path;
+use std::sync::Arc;
 
 /// What a dimension of a variable is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,17 +42,79 @@ pub(super) struct ComponentPlan {
     pub(super) why: String,
 }
 
+#[cfg(test)]
+impl ComponentPlan {
+    /// Something to fill a field with.
+    pub(super) fn test() -> Self {
+        let variable = super::container::Variable {
+            name: String::new(),
+            number: super::container::NumberType::F32,
+            dimensions: Vec::new(),
+            attributes: Vec::new(),
+        };
+        let packing = Packing::of(&variable);
+        Self { name: String::new(), shape: Vec::new(), roles: Vec::new(), packing, factor: 1.0, why: String::new() }
+    }
+}
+
 /// Everything.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub(super) struct Layout {
-    /// u, v and, where there is one, w.
-    pub(super) components: Vec<ComponentPlan>,
-    /// x, y and, in three dimensions, z.
+    /// u, v and, where there is one, w: one frame, or as many as there are datasets whose names carry a time.
+    pub(super) frames: Vec<Vec<ComponentPlan>>,
+    /// x, y and, in three dimensions, z, as the grid has them.
     pub(super) axes: Vec<AxisPlan>,
+    /// Factors, a level each, from w in the file's SI to that along the grid's third axis; empty where they are 1.
+    pub(super) vertical: Vec<f64>,
+    pub(super) poles: Poles,
     pub(super) time: TimePlan,
     pub(super) metric: Metric,
+    /// Where nodes of the grid are no nodes of the file.
+    pub(super) resampling: Option<Arc<Resampling>>,
     /// Choices and conversions, in words.
     pub(super) notes: Vec<String>,
+}
+
+impl Layout {
+    /// Names of the variables that the plan rests on.
+    pub(super) fn used(&self, header: &Header) -> Vec<String> {
+        let named = |name: &str| header.find(name).is_some();
+        let mut names: Vec<String> = self.frames.iter().flatten().map(|c| c.name.clone()).collect();
+        names.extend(self.axes.iter().map(|a| a.axis.name().to_owned()).filter(|n| named(n)));
+        names.push(self.time.variable.clone());
+        names
+    }
+}
+
+/// How velocities come onto a grid whose nodes are not those of the file.
+#[derive(Debug)]
+pub(super) enum Resampling {
+    Staggered(Box<Staggered>),
+    Curvilinear(Curvilinear),
+}
+
+impl Resampling {
+    /// Reads one time onto the grid; `levels` are the file's entries of the grid's levels, where it keeps them.
+    pub(super) fn read(
+        &self,
+        file: &Container,
+        frame: &[ComponentPlan],
+        entry: usize,
+        levels: &[usize],
+    ) -> Result<Vec<Vec<f32>>, SourceError> {
+        match self {
+            Self::Staggered(s) => s.read(file, frame, entry),
+            Self::Curvilinear(c) => c.read(file, frame, entry, levels),
+        }
+    }
+
+    /// Root mean square, over the nodes of the file, of what interpolation on the grid gives less what the file has; and of what it has.
+    pub(super) fn error(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
+        match self {
+            Self::Staggered(s) => s.error(file, frame, entry),
+            Self::Curvilinear(c) => c.error(file, frame, entry),
+        }
+    }
 }
 /// The planning of one file, step by step.
 pub(super) struct Planner<'a> {
@@ -56,9 +123,10 @@ pub(super) struct Planner<'a> {
     pub(super) notes: Vec<String>,
 }
 
-/// Plans how to read a file.
-pub(super) fn plan(file: &Container, settings: &NetCdfSettings) -> Result<Layout, SourceError> {
-    Planner { file, settings, notes: Vec::new() }.plan()
+/// Plans how to read a file. What is dear to plan is taken from the archive's first file, where there is one.
+pub(super) fn plan(file: &Container, settings: &NetCdfSettings, first: Option<&Layout>) -> Result<Layout, SourceError> {
+    let planner = Planner { file, settings, notes: Vec::new() };
+    if file.format == Format::Hdf5 { planner.plan_hdf5() } else { planner.plan(first) }
 }
 
 impl Planner<'_> {
@@ -74,8 +142,15 @@ impl Planner<'_> {
         SourceError::Layout { path: self.path().into(), variable: self.header().variables[variable].name.clone(), what }
     }
 
-    fn plan(mut self) -> Result<Layout, SourceError> {
+    fn plan(mut self, first: Option<&Layout>) -> Result<Layout, SourceError> {
         let velocity = self.velocity()?;
+        if self.is_staggered(&velocity) {
+            return self.plan_staggered(&velocity, first);
+        }
+        if let Some(coordinates) = self.curvilinear_coordinates(&velocity)? {
+            return self.plan_curvilinear(&velocity, coordinates, first);
+        }
+        self.one_grid(&velocity)?;
         let u = velocity.u.variable;
         let mut extents = self.extents(u)?;
         self.name_by_position(u, &mut extents)?;
@@ -104,13 +179,24 @@ impl Planner<'_> {
             }
             roles.push((extent.dimension, role));
         }
-        for axis in &axes {
-            self.notes.extend(axis.notes.iter().cloned());
-        }
         let mut components =
             vec![self.component(&velocity.u, &roles, Some(&axes[0]))?, self.component(&velocity.v, &roles, Some(&axes[1]))?];
-        match (&velocity.w, three) {
-            (Some(w), true) => components.push(self.component(w, &roles, axes.get(2))?),
+        components.extend(self.vertical_component(velocity.w.as_ref(), &roles, &axes, three)?);
+        let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
+        let frames = vec![components];
+        Ok(Layout { frames, axes, vertical, poles, time, metric, resampling: None, notes: self.notes })
+    }
+
+    /// The third component, where there is one and it is wanted.
+    pub(super) fn vertical_component(
+        &mut self,
+        w: Option<&Candidate>,
+        roles: &[(usize, Role)],
+        axes: &[AxisPlan],
+        three: bool,
+    ) -> Result<Option<ComponentPlan>, SourceError> {
+        match (w, three) {
+            (Some(w), true) => return self.component(w, roles, axes.get(2)).map(Some),
             (Some(w), false) => {
                 let name = &self.header().variables[w.variable].name;
                 let note = format!("`{name}` is not used: the flow is read in two dimensions");
@@ -120,7 +206,47 @@ impl Planner<'_> {
             (None, true) => self.notes.push("no vertical velocity found: it is taken as 0".into()),
             (None, false) => {}
         }
-        Ok(Layout { components, axes, time, metric, notes: self.notes })
+        Ok(None)
+    }
+
+    /// Turns levels into heights and closes the poles, where the metric wants it; gathers the notes of all axes.
+    pub(super) fn finish_axes(&mut self, axes: &mut [AxisPlan], metric: Metric) -> Result<(Vec<f64>, Poles), SourceError> {
+        let fault = |fault| SourceError::Axis { path: self.path().into(), fault };
+        let mut vertical = Vec::new();
+        if metric != Metric::Index
+            && let Some(level) = axes.get(2)
+        {
+            let lowest = level.axis.first();
+            if level.quantity == Quantity::Pressure && lowest <= 0.0 {
+                let what = format!("a pressure of {lowest} Pa has no height; use `metric = \"index\"`, or another axis with `z`");
+                return Err(SourceError::Layout { path: self.path().into(), variable: level.axis.name().into(), what });
+            }
+            let (level, factors) = to_heights(level.clone(), self.settings.vertical_scale.unwrap_or(1.0)).map_err(fault)?;
+            axes[2] = level;
+            vertical = factors;
+        }
+        let mut poles = Poles::default();
+        if metric == Metric::Sphere {
+            let (longitude, rest) = axes.split_at_mut(1);
+            poles = Poles::close(&longitude[0], &mut rest[0]).map_err(fault)?;
+        }
+        for axis in axes.iter() {
+            self.notes.extend(axis.notes.iter().cloned());
+        }
+        let kinds = (axes[0].kind, axes[1].kind);
+        if kinds == (Kind::X, Kind::Y) && self.geographic_winds() {
+            self.notes.push(
+                "eastward and northward velocities are taken along x and y of the projection: its grid convergence is not applied".into(),
+            );
+        }
+        Ok((vertical, poles))
+    }
+
+    /// Whether some standard name promises geographic directions.
+    fn geographic_winds(&self) -> bool {
+        let names =
+            |v: &super::container::Variable| v.text("standard_name").is_some_and(|n| n == "eastward_wind" || n.starts_with("eastward_sea"));
+        self.header().variables.iter().any(names)
     }
 
     /// Variable that a setting names.
@@ -152,6 +278,17 @@ impl Planner<'_> {
             candidates: list_candidates(self.header()),
         })?;
         let header = self.header();
+        let mut names: Vec<String> = found.others.iter().map(|o| format!("`{}`", header.variables[o.variable].name)).collect();
+        if !names.is_empty() {
+            names.dedup();
+            self.notes.push(format!("also velocities, but passed over: {} ({})", names.join(", "), velocity::RULE));
+        }
+        Ok(found)
+    }
+
+    /// Refuses components on different points.
+    fn one_grid(&self, found: &Velocity) -> Result<(), SourceError> {
+        let header = self.header();
         for other in [Some(&found.v), found.w.as_ref()].into_iter().flatten() {
             if !velocity::same_dimensions(header, found.u.variable, other.variable) {
                 let (a, b) = (&header.variables[found.u.variable], &header.variables[other.variable]);
@@ -164,42 +301,41 @@ impl Planner<'_> {
                 });
             }
         }
-        let mut names: Vec<String> = found.others.iter().map(|o| format!("`{}`", header.variables[o.variable].name)).collect();
-        if !names.is_empty() {
-            names.dedup();
-            self.notes.push(format!("also velocities, but passed over: {} ({})", names.join(", "), velocity::RULE));
-        }
-        Ok(found)
+        Ok(())
     }
 
-    fn metric(&mut self, extents: &[Extent], three: bool) -> Result<Metric, SourceError> {
+    pub(super) fn metric(&mut self, extents: &[Extent], three: bool) -> Result<Metric, SourceError> {
         let has = |kind| extents.iter().any(|e| e.kind == kind);
         let sphere = has(Kind::Longitude) && has(Kind::Latitude);
+        let level = extents.iter().find(|e| e.kind == Kind::Level).and_then(|e| e.coordinate);
+        let unit = level.and_then(|c| Unit::parse(self.header().variables[c].units().unwrap_or_default()));
+        let measured = unit.is_some_and(|u| u.is_length() || u.is_pressure());
         let fault =
             |found: &str, accepted: &str| Err(SourceError::Setting { key: "metric", found: found.into(), accepted: accepted.into() });
         match (self.settings.metric, self.settings.velocity_unit) {
             (Some(Metric::Sphere), _) if !sphere => {
                 fault("sphere", "the axes are not longitude and latitude; accepted are index and cartesian")
             }
-            (Some(Metric::Sphere), _) if three => fault(
-                "sphere",
-                "with levels the sphere metric is not available yet; pick one with `level = ...` or set `metric = \"index\"`",
-            ),
+            (Some(Metric::Sphere), _) if three && !measured => {
+                fault("sphere", "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`")
+            }
             (Some(metric), VelocityUnit::Cells) if metric != Metric::Index => {
                 fault(&format!("{metric:?}").to_lowercase(), "velocities in cells want `metric = \"index\"`")
             }
             (Some(metric), _) => Ok(metric),
             (None, VelocityUnit::Cells) => Ok(Metric::Index),
-            (None, VelocityUnit::Si) if sphere && three => {
-                self.notes
-                    .push("longitude, latitude and levels: metric index (cells and snapshots); `level = ...` gives the sphere".into());
+            (None, VelocityUnit::Si) if sphere && three && !measured => {
+                self.notes.push(
+                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere"
+                        .into(),
+                );
                 Ok(Metric::Index)
             }
             (None, VelocityUnit::Si) => Ok(if sphere { Metric::Sphere } else { Metric::Cartesian }),
         }
     }
 
-    fn axis(&self, u: usize, extent: &Extent, k: usize) -> Result<AxisPlan, SourceError> {
+    pub(super) fn axis(&self, u: usize, extent: &Extent, k: usize) -> Result<AxisPlan, SourceError> {
         let header = self.header();
         let (name, len) = (&header.dimensions[extent.dimension].name, header.dimensions[extent.dimension].len);
         if len < 2 {
@@ -226,7 +362,14 @@ impl Planner<'_> {
             kind: extent.kind,
             values: self.coordinate_values(coordinate)?,
         };
-        coordinates.plan(range)
+        let mut plan = coordinates.plan(range)?;
+        if plan.axis.period().is_some() && self.settings.periodic.as_deref() == Some("none") {
+            let values = plan.axis.coordinates().to_vec();
+            plan.axis = Axis::new(plan.axis.name(), plan.axis.units(), values)
+                .map_err(|fault| SourceError::Axis { path: self.path().into(), fault })?;
+            plan.notes.push(format!("`{}` goes round, but ends where its nodes do, as set", plan.axis.name()));
+        }
+        Ok(plan)
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {
@@ -243,14 +386,19 @@ impl Planner<'_> {
         let why = if wide.is_empty() {
             "has no coordinate variable".into()
         } else {
-            format!("has only coordinates of two dimensions ({}): curvilinear grids are not read yet", wide.join(", "))
+            format!("has only coordinates of two dimensions ({}), of which no longitude and latitude are a pair", wide.join(", "))
         };
         format!(
             "dimension `{name}` {why}. Name a coordinate variable with `x`, `y` or `z`, or set `velocity_unit = \"cells\"` if its values are cells per snapshot interval"
         )
     }
 
-    fn component(&mut self, candidate: &Candidate, roles: &[(usize, Role)], axis: Option<&AxisPlan>) -> Result<ComponentPlan, SourceError> {
+    pub(super) fn component(
+        &mut self,
+        candidate: &Candidate,
+        roles: &[(usize, Role)],
+        axis: Option<&AxisPlan>,
+    ) -> Result<ComponentPlan, SourceError> {
         let variable = &self.header().variables[candidate.variable];
         let component = candidate.component.name();
         let role = |d: &usize| roles.iter().find(|r| r.0 == *d).map_or(Role::Fixed(0), |r| r.1);
@@ -316,15 +464,16 @@ pub(super) fn list_candidates(header: &Header) -> String {
 
 /// First difference between two files that matters.
 pub(super) fn difference(a: &Layout, b: &Layout) -> Option<String> {
-    let names = |l: &Layout| l.components.iter().map(|c| format!("`{}`", c.name)).collect::<Vec<_>>().join(", ");
-    if names(a) != names(b) {
+    let names = |l: &Layout| l.frames[0].iter().map(|c| format!("`{}`", c.name)).collect::<Vec<_>>().join(", ");
+    // Names of datasets may carry the time.
+    if names(a) != names(b) && a.frames.len() == 1 && !a.time.variable.is_empty() {
         return Some(format!("their velocities are {} and {}", names(a), names(b)));
     }
     if a.axes.len() != b.axes.len() {
         return Some(format!("they have {} and {} axes", a.axes.len(), b.axes.len()));
     }
     for (x, y) in a.axes.iter().zip(&b.axes) {
-        if x == y {
+        if x.axis == y.axis && x.order == y.order {
             continue;
         }
         let (one, two) = (&x.axis, &y.axis);

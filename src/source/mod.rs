@@ -1,4 +1,4 @@
-//! Where snapshots come from: NetCDF files, or memory (closed forms sampled on a grid).
+//! Where snapshots come from: NetCDF and HDF5 files, or memory (closed forms sampled on a grid).
 //!
 //! In: settings and files. Out: snapshots in time order, read ahead by one I/O thread. Calls `field`.
 //!
@@ -11,28 +11,39 @@ mod cf;
 mod classic;
 mod container;
 mod conversion;
+mod crash;
+mod curvilinear;
 mod dimensions;
 mod error;
 mod files;
+mod hdf5_layout;
+mod hdf5_store;
 mod hyperslab;
 mod inspect;
 mod kinds;
 mod layout;
 mod libraries;
+mod locator;
 mod memory;
 mod netcdf4;
+mod poles;
 mod reader;
 mod settings;
+mod staggered;
+mod synthetic;
 mod times;
+mod vertical;
 
 pub use archive::NetCdfArchive;
+pub use crash::report_crashes;
 pub use error::SourceError;
-pub use inspect::{AxisReport, Inspection, MissingReport, ResolutionReport, TimeReport, VariableReport, inspect};
+pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use kinds::{DomainSettings, SourceKind, SourceSettings};
 pub use libraries::{hdf5_version, netcdf_version};
 pub use memory::MemorySource;
 pub use reader::{DEFAULT_READ_AHEAD, ReadAhead, StillReading, read_ahead};
-pub use settings::{Metric, NetCdfSettings, VelocityUnit};
+pub use settings::{Metric, NetCdfSettings, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
+pub use synthetic::{GlobeTurbulence, synthesize};
 
 use crate::field::{Grid, Snapshot};
 use serde::Serialize;

@@ -2,25 +2,30 @@
 
 use super::SourceError;
 use super::container::{Attribute, Dimension, Header, NumberType, Variable};
+use super::crash::Reading;
 use netcdf::AttributeValue;
 use netcdf::types::{FloatType, IntType, NcVariableType};
 use std::cell::Cell;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// An open NetCDF-4 file.
 pub(super) struct NetCdf4Store {
     file: netcdf::File,
+    path: PathBuf,
 }
 
 impl NetCdf4Store {
-    pub(super) fn open(path: &Path) -> Result<(Header, Self), SourceError> {
+    /// Opens a file; none where it is HDF5 without the structure of NetCDF. `only` names the variables whose headers are wanted: those of
+    /// all others cost milliseconds a file.
+    pub(super) fn open(path: &Path, only: Option<&[String]>) -> Result<Option<(Header, Self)>, SourceError> {
         silence();
+        let _reading = Reading::opening(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
         let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
             let file = netcdf::open(path)?;
-            let header = read_header(&file)?;
+            let header = read_header(&file, only)?;
             Ok((header, file))
         }));
         let (header, file) = match opened {
@@ -31,15 +36,30 @@ impl NetCdf4Store {
         // libnetcdf invents dimensions for HDF5 files that have none.
         let invented = |d: &Dimension| d.name.starts_with("phony_dim_");
         if header.variables.is_empty() || header.dimensions.iter().all(invented) {
-            return Err(SourceError::Hdf5 { path: path.into() });
+            return Ok(None);
         }
-        Ok((header, Self { file }))
+        Ok(Some((header, Self { file, path: path.into() })))
     }
 
-    pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], total: usize, out: &mut Vec<f64>) -> Result<(), String> {
+    pub(super) fn read(
+        &self,
+        name: &str,
+        number: NumberType,
+        start: &[usize],
+        count: &[usize],
+        total: usize,
+        out: &mut Vec<f64>,
+    ) -> Result<(), String> {
         silence();
+        let _reading = Reading::of(&self.path);
         let read = catch_unwind(AssertUnwindSafe(|| {
             let variable = self.file.variable(name).ok_or("it is gone")?;
+            if number == NumberType::Text {
+                // The library converts no characters to numbers.
+                let bytes = variable.get_raw_values((start, count)).map_err(|e| e.to_string())?;
+                out.extend(bytes.into_iter().map(f64::from));
+                return if out.len() == total { Ok(()) } else { Err("its text has another length than its header says".into()) };
+            }
             out.resize(total, 0.0);
             if count.is_empty() {
                 out[0] = variable.get_value::<f64, _>(..).map_err(|e| e.to_string())?;
@@ -53,16 +73,20 @@ impl NetCdf4Store {
 
 /// libhdf5 prints its error stack on standard error unless told otherwise, once in each thread, even where libnetcdf only asks
 /// whether an attribute is there.
-fn silence() {
+pub(super) fn silence() {
     thread_local!(static SILENCED: Cell<bool> = const { Cell::new(false) });
     if !SILENCED.replace(true) {
         hdf5_metno::silence_errors(true);
     }
 }
 
-fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
-    let mut header = Header::default();
-    for variable in file.variables() {
+fn read_header(file: &netcdf::File, only: Option<&[String]>) -> Result<Header, netcdf::Error> {
+    let mut header = Header { attributes: attributes(file.attributes()), ..Header::default() };
+    let wanted: Vec<netcdf::Variable> = match only {
+        Some(names) => names.iter().filter_map(|name| file.variable(name)).collect(),
+        None => file.variables().collect(),
+    };
+    for variable in wanted {
         let mut dimensions = Vec::new();
         for dimension in variable.dimensions() {
             let found = Dimension { name: dimension.name(), len: dimension.len() };
@@ -72,13 +96,7 @@ fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
             });
             dimensions.push(index);
         }
-        let mut attributes = Vec::new();
-        for attribute in variable.attributes() {
-            // An attribute of a user-defined type says nothing that is needed here.
-            if let Ok(value) = attribute.value() {
-                attributes.push((attribute.name().to_owned(), convert(value)));
-            }
-        }
+        let attributes = attributes(variable.attributes());
         let number = match variable.vartype() {
             NcVariableType::Int(IntType::I8) => NumberType::I8,
             NcVariableType::Int(IntType::U8) => NumberType::U8,
@@ -90,11 +108,17 @@ fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
             NcVariableType::Int(IntType::U64) => NumberType::U64,
             NcVariableType::Float(FloatType::F32) => NumberType::F32,
             NcVariableType::Float(FloatType::F64) => NumberType::F64,
+            NcVariableType::Char => NumberType::Text,
             _ => NumberType::Other,
         };
         header.variables.push(Variable { name: variable.name(), number, dimensions, attributes });
     }
     Ok(header)
+}
+
+fn attributes<'a>(found: impl Iterator<Item = netcdf::Attribute<'a>>) -> Vec<(String, Attribute)> {
+    // An attribute of a user-defined type says nothing that is needed here.
+    found.filter_map(|a| a.value().ok().map(|value| (a.name().to_owned(), convert(value)))).collect()
 }
 
 fn convert(value: AttributeValue) -> Attribute {

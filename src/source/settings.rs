@@ -1,4 +1,4 @@
-//! `[archive]` of a scene file, for NetCDF archives.
+//! `[archive]` of a scene file.
 
 use serde::{Deserialize, Deserializer, Serialize};
 use std::path::PathBuf;
@@ -7,11 +7,14 @@ use std::path::PathBuf;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Metric {
-    /// Longitude and latitude on the sphere, metres and seconds. Default for longitude-latitude without levels.
+    /// Longitude and latitude on the sphere, metres and seconds; levels become heights. Default for longitude-latitude, unless its
+    /// levels are neither pressures nor lengths.
     Sphere,
-    /// Grid indices, and cells per snapshot interval; time counts snapshots. Default for longitude-latitude with levels.
+    /// Grid indices, and cells per snapshot interval; time counts snapshots. Default for levels without a unit, and for velocities in
+    /// cells.
     Index,
-    /// Coordinates are lengths. Default for everything else. With longitude and latitude, velocities become degrees per second.
+    /// Coordinates are lengths; pressures become heights. Default for everything else. With longitude and latitude, velocities become
+    /// degrees per second.
     Cartesian,
 }
 
@@ -24,6 +27,94 @@ pub enum VelocityUnit {
     Si,
     /// Cells per snapshot interval, taken as they are; wants the index metric.
     Cells,
+}
+
+/// How components that lie on the faces of cells (Arakawa C) come onto one grid.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Staggering {
+    /// A grid of faces and centres, twice as fine horizontally: linear interpolation on it is that of each component from its own faces.
+    #[default]
+    Faces,
+    /// Centres only, onto which the components are averaged: an eighth of the memory, and smeared over a cell.
+    Centres,
+}
+
+/// What an archive of synthetic turbulence looks like.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SyntheticShape {
+    /// Longitude, latitude and pressure levels, packed to 16 bits, CF conventions: a NetCDF file a day. The turbulence lives on the grid:
+    /// its cells are nodes of the archive, for the index metric.
+    Ecmwf,
+    /// The same files with a turbulence that lives on the sphere, smooth over the poles, for the sphere metric.
+    Globe,
+    /// Three components on (z, y, x) with their coordinates: an HDF5 file a snapshot, as a direct numerical simulation of a flame.
+    Flame,
+}
+
+/// `[archive.synthetic]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SyntheticSettings {
+    /// What it looks like.
+    pub shape: SyntheticShape,
+    /// Nodes along x, y and z.
+    #[serde(default = "SyntheticSettings::nodes")]
+    pub nodes: [usize; 3],
+    /// Snapshots.
+    #[serde(default = "SyntheticSettings::snapshots")]
+    pub snapshots: usize,
+    /// Modes of the turbulence.
+    #[serde(default = "SyntheticSettings::modes")]
+    pub modes: usize,
+    /// Largest wave number, cycles per short side.
+    #[serde(default = "SyntheticSettings::k_max")]
+    pub k_max: f64,
+    /// Root mean square speed, cells a snapshot at 192 cells along the short side.
+    #[serde(default = "SyntheticSettings::amplitude")]
+    pub amplitude: f64,
+    /// Seed of the turbulence.
+    #[serde(default)]
+    pub seed: u64,
+    /// Folder in which a folder for these settings is made.
+    #[serde(default = "SyntheticSettings::folder")]
+    pub folder: PathBuf,
+}
+
+impl SyntheticSettings {
+    fn nodes() -> [usize; 3] {
+        [96, 48, 24]
+    }
+    fn snapshots() -> usize {
+        12
+    }
+    fn modes() -> usize {
+        48
+    }
+    fn k_max() -> f64 {
+        14.0
+    }
+    fn amplitude() -> f64 {
+        3.0
+    }
+    fn folder() -> PathBuf {
+        PathBuf::from("out/synthetic")
+    }
+
+    /// The defaults of a shape.
+    pub fn new(shape: SyntheticShape) -> Self {
+        Self {
+            shape,
+            nodes: Self::nodes(),
+            snapshots: Self::snapshots(),
+            modes: Self::modes(),
+            k_max: Self::k_max(),
+            amplitude: Self::amplitude(),
+            seed: 0,
+            folder: Self::folder(),
+        }
+    }
 }
 
 /// Which files to read and, where the conventions do not say enough, how.
@@ -55,6 +146,32 @@ pub struct NetCdfSettings {
     pub level: Option<f64>,
     /// Part to read: `[x0, x1, y0, y1]` in the file's coordinates (longitudes may be given 360 degrees off).
     pub region: Option<[f64; 4]>,
+    /// What a vertical metre counts against a horizontal one, in the sphere and cartesian metrics with levels; 1 by default.
+    pub vertical_scale: Option<f64>,
+    /// HDF5: one dataset that holds all components; a `*` stands for the number of a snapshot (`Velocity_*`).
+    pub velocity: Option<String>,
+    /// HDF5: what the axes of the velocity datasets are, slowest first, as letters: x, y, z, t (time), c (component), `-` (one entry).
+    pub order: Option<String>,
+    /// HDF5 without coordinates: distances between nodes along x, y and z.
+    pub spacing: Option<[f64; 3]>,
+    /// HDF5 without coordinates: coordinates of the first node.
+    pub origin: Option<[f64; 3]>,
+    /// `"none"`: longitudes that go round end where their nodes do. HDF5: axes that repeat one spacing behind their last node, as letters
+    /// (`"xyz"`).
+    pub periodic: Option<String>,
+    /// HDF5: time between the numbers in dataset or file names, 1 by default.
+    pub time_step: Option<f64>,
+    /// WRF: heights in metres at which winds are wanted; by default the mean heights of its levels.
+    pub heights: Option<Vec<f64>>,
+    /// WRF: how the components on faces come onto one grid.
+    pub staggering: Staggering,
+    /// Curvilinear longitudes and latitudes: spacing in degrees of the grid that they are resampled to; by default the median of theirs.
+    pub resolution: Option<[f64; 2]>,
+    /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
+    /// decided by their standard names.
+    pub grid_relative: Option<bool>,
+    /// Where no files are named: an archive of the standard turbulence, written unless it is there already, and read.
+    pub synthetic: Option<SyntheticSettings>,
     /// Lower and upper end of the slab that a two-dimensional flow is extruded over; by default 0 and a tenth of the longer edge.
     pub slab: Option<[f64; 2]>,
 }

@@ -1,7 +1,8 @@
 //! Small NetCDF files, written by libnetcdf where a test needs them.
 #![allow(dead_code, unused_imports)] // Each test file uses its part.
 
-use netcdf::{AttributeValue, Options};
+use netcdf::types::NcVariableType;
+use netcdf::{AttributeValue, NcTypeDescriptor, Options};
 use ridgewatch::field::Snapshot;
 use std::path::{Path, PathBuf};
 
@@ -9,6 +10,20 @@ pub enum Data {
     F32(Vec<f32>),
     F64(Vec<f64>),
     I16(Vec<i16>),
+    /// Bytes of characters.
+    Text(&'static str),
+}
+
+/// A character as the library has it.
+#[repr(transparent)]
+#[derive(Clone, Copy)]
+struct Character(u8);
+
+// SAFETY: a byte has the layout of NC_CHAR.
+unsafe impl NcTypeDescriptor for Character {
+    fn type_descriptor() -> NcVariableType {
+        NcVariableType::Char
+    }
 }
 
 pub struct Variable {
@@ -23,6 +38,7 @@ pub struct Fixture {
     format: Format,
     dimensions: Vec<(String, usize)>,
     pub variables: Vec<Variable>,
+    attributes: Vec<(String, AttributeValue)>,
 }
 
 #[derive(Clone, Copy, PartialEq)]
@@ -37,7 +53,13 @@ pub use Format::{Classic as CLASSIC, Data64 as DATA_64, NetCdf4 as NETCDF4, Offs
 impl Fixture {
     /// Dimensions of length 0 are the record dimension.
     pub fn new(format: Format, dimensions: &[(&str, usize)]) -> Self {
-        Self { format, dimensions: dimensions.iter().map(|(n, l)| (n.to_string(), *l)).collect(), variables: vec![] }
+        Self { format, dimensions: dimensions.iter().map(|(n, l)| (n.to_string(), *l)).collect(), variables: vec![], attributes: vec![] }
+    }
+
+    /// Adds an attribute to the file.
+    pub fn attribute(mut self, name: &str, value: impl Into<AttributeValue>) -> Self {
+        self.attributes.push((name.into(), value.into()));
+        self
     }
 
     pub fn variable(mut self, name: &str, dimensions: &[&str], data: Data) -> Self {
@@ -68,6 +90,9 @@ impl Fixture {
             Format::NetCdf4 => Options::NETCDF4,
         };
         let mut file = netcdf::create_with(path, options).unwrap();
+        for (name, value) in &self.attributes {
+            file.add_attribute(name, value.clone()).unwrap();
+        }
         for (name, len) in &self.dimensions {
             file.add_dimension(name, *len).unwrap();
         }
@@ -77,6 +102,7 @@ impl Fixture {
                 Data::F32(_) => file.add_variable::<f32>(&v.name, &dims),
                 Data::F64(_) => file.add_variable::<f64>(&v.name, &dims),
                 Data::I16(_) => file.add_variable::<i16>(&v.name, &dims),
+                Data::Text(_) => file.add_variable_with_type(&v.name, &dims, &NcVariableType::Char),
             }
             .unwrap();
             for (name, value) in &v.attributes {
@@ -92,6 +118,7 @@ impl Fixture {
                 Data::F32(d) => d.len(),
                 Data::F64(d) => d.len(),
                 Data::I16(d) => d.len(),
+                Data::Text(t) => t.len(),
             };
             let fixed: usize = shape.iter().filter(|&&n| n > 0).product();
             let count: Vec<usize> = shape.iter().map(|&n| if n == 0 { len / fixed } else { n }).collect();
@@ -101,6 +128,7 @@ impl Fixture {
                 Data::F32(d) => variable.put_values(d, (start, count)),
                 Data::F64(d) => variable.put_values(d, (start, count)),
                 Data::I16(d) => variable.put_values(d, (start, count)),
+                Data::Text(t) => variable.put_values(&t.bytes().map(Character).collect::<Vec<_>>(), (start, count)),
             }
             .unwrap();
         }

@@ -69,7 +69,7 @@ fn default_fill(number: NumberType) -> Option<f64> {
         NumberType::U64 => Some(18_446_744_073_709_551_614.0),
         NumberType::F32 => Some(f64::from(9.969_21e36_f32)),
         NumberType::F64 => Some(9.969_209_968_386_869e36),
-        NumberType::I8 | NumberType::U8 | NumberType::Other => None,
+        NumberType::I8 | NumberType::U8 | NumberType::Text | NumberType::Other => None,
     }
 }
 

@@ -1,7 +1,7 @@
 //! Finding the velocity: by `standard_name`, then by usual names, then by `long_name`; always with a fitting unit.
 
 use super::units::Unit;
-use crate::source::container::{Header, NumberType, Variable};
+use crate::source::container::{Header, Variable};
 
 /// The rule by which one of several candidates is chosen, in words.
 pub(in crate::source) const RULE: &str = "standard names go before usual names before long names, then pairs of one naming family, then more \
@@ -106,7 +106,7 @@ pub(in crate::source) struct Lacking {
 /// Whether a variable may be a component; the error says what it lacks.
 pub(in crate::source) fn judge(header: &Header, index: usize) -> Result<Candidate, String> {
     let variable = &header.variables[index];
-    if variable.number == NumberType::Other {
+    if !variable.number.is_number() {
         return Err("holds no numbers".into());
     }
     if variable.dimensions.len() < 2 {

@@ -1,0 +1,201 @@
+//! Real archives (`RIDGEWATCH_DATA`, by default `../shared/data`) through the whole loop, or to the right error, and against an integration
+//! by other tools: `make test-data`.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
+
+use ridgewatch::field::{Geometry, Window};
+use ridgewatch::flow::{
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
+};
+use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, inspect};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::sync::Arc;
+
+/// A file of the collection, which must be there: `make test` leaves these tests out, and says so, where it is not.
+fn data(name: &str) -> PathBuf {
+    let root =
+        std::env::var_os("RIDGEWATCH_DATA").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../shared/data"), PathBuf::from);
+    let path = root.join(name);
+    assert!(path.exists(), "{} is not there; set RIDGEWATCH_DATA to the folder of the collection", path.display());
+    path
+}
+
+/// Replays through the front door; the summary.
+fn replay(arguments: &[&str]) -> serde_json::Value {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("run");
+    let output = Command::new(env!("CARGO_BIN_EXE_ridgewatch"))
+        .args(["replay", "--json", "--out", out.to_str().unwrap()])
+        .args(["--set", "render.width=64", "--set", "render.height=32", "--set", "render.samples=1"])
+        .args(["--set", "training.steps_per_frame=20", "--set", "time.slides=1"])
+        .args(arguments)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{arguments:?}: {}", String::from_utf8_lossy(&output.stderr));
+    assert!(out.join("frames/frame_000000.png").is_file());
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn globcurrent() {
+    let folder = data("globcurrent");
+    let mut archive = NetCdfArchive::open(&[folder.join("*.nc")], &NetCdfSettings::default()).unwrap();
+    let grid = archive.grid().clone();
+    assert_eq!((grid.shape(), archive.times().len()), ([81, 41, 1], 60));
+    assert!(matches!(grid.geometry, Geometry::Sphere { .. }));
+    assert_eq!((grid.axes[0].first(), grid.axes[1].first(), grid.axes[0].period()), (14.875, -40.125, None));
+    assert_eq!(archive.date(archive.times()[0]).as_deref(), Some("2002-01-01T00:00:00Z"));
+    assert_eq!(archive.date(archive.times()[59]).as_deref(), Some("2002-03-01T00:00:00Z"));
+    assert_eq!((archive.default_tau().unwrap(), archive.gaps().len()), (29.5 * 86_400.0, 0));
+    let snapshot = archive.read(0).unwrap();
+    // Counted with another tool: 769 of 3321 values are NaN.
+    assert_eq!(snapshot.missing(), 769);
+    let fastest = snapshot.nodes.iter().map(|n| n[..3].iter().map(|v| v * v).sum::<f32>().sqrt()).fold(0.0, f32::max);
+    assert!(fastest > 1.0 && fastest < 3.0, "the Agulhas current runs at {fastest} m/s");
+    replay(&[folder.join("*.nc").to_str().unwrap()]);
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn era5_on_a_projected_grid() {
+    let first = data("era5_utm32_2025_05_01_00.nc");
+    let pattern = first.with_file_name("era5_utm32_*.nc");
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&pattern), &NetCdfSettings::default()).unwrap();
+    assert_eq!((archive.grid().shape(), archive.times().len()), ([17, 30, 37], 3));
+    // Pressures of 1000 to 1 hPa become heights.
+    assert_eq!((archive.metric(), archive.grid().axes[2].first()), (Metric::Cartesian, 0.0));
+    assert!((archive.grid().axes[2].last() - 7000.0 * 1000f64.ln()).abs() < 1e-6);
+    let share = archive.read(1).unwrap().missing() as f64 / archive.grid().nodes() as f64;
+    // Counted with another tool: 14.1 %.
+    assert!((share - 0.141).abs() < 1e-3, "{share}");
+    replay(&[pattern.to_str().unwrap()]);
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn wrf_hurricane() {
+    let file = data("wrf_katrina_uvw_4t.nc");
+    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
+    assert_eq!((archive.grid().shape(), archive.times().len()), ([95, 95, 28], 4));
+    assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
+    let snapshot = archive.read(0).unwrap();
+    assert!((snapshot.missing() as f64) < 0.05 * snapshot.nodes.len() as f64);
+    let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), None).unwrap();
+    let resampling = inspection.resampling.unwrap();
+    println!("WRF resampling: {resampling:?}");
+    assert!(resampling.error < 0.01 * resampling.velocity, "{resampling:?}");
+    replay(&[file.to_str().unwrap(), "--set", "time.tau=3600"]);
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn what_cannot_be_traced_says_why() {
+    for (name, pieces) in [
+        ("jhtdb_iso1024coarse_pressure_64.h5", &["Pressure_0001", "one component a point: it is a scalar"][..]),
+        ("jhtdb_legacy_cutout_10x10.h5", &["`u01000`", "1 node(s) thick along z", "2 nodes or more"]),
+    ] {
+        let file = data(name);
+        let message = NetCdfArchive::open(&[file], &NetCdfSettings::default()).err().unwrap().to_string();
+        for piece in pieces.iter().chain([&name]) {
+            assert!(message.contains(piece), "{message}");
+        }
+    }
+}
+
+/// Our log-stretch at 50 seeds that live the whole tau, and that of tests/independent/ftle.py.
+fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
+    let python =
+        std::env::var_os("RIDGEWATCH_PYTHON").map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(".venv/bin/python"), PathBuf::from);
+    assert!(python.exists(), "{} is not there: make test-data installs it", python.display());
+    let mut archive = NetCdfArchive::open(files, &NetCdfSettings::default()).unwrap();
+    let times = archive.times().to_vec();
+    let mut window = Window::new(times[times.len() - 1] - times[0]);
+    for index in 0..times.len() {
+        window.push(Arc::new(archive.read(index).unwrap())).unwrap();
+    }
+    let map = FlowMap {
+        tau,
+        direction: Direction::Backward,
+        integrator: Integrator::DormandPrince,
+        precision: Precision::F64,
+        steps: Steps::Fixed(1),
+        gap: 1.0,
+        boundary: Boundary::Stop,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
+    };
+    let begin = times[times.len() - 1];
+    let tracer = cpu_tracer(VelocitySource::Window(Arc::new(window)), &map, begin).unwrap();
+    // Quasi-random seeds; those that stop are left out.
+    let seeds: Vec<[f32; 3]> = (0..2000)
+        .map(|i| {
+            let unit = [0.754_877_67, 0.569_840_29, 0.438_579_02].map(|r: f64| (0.5 + r * f64::from(i + 1)).fract() as f32);
+            tracer.domain().from_unit(unit)
+        })
+        .collect();
+    let mut out = Traced::default();
+    tracer.trace(&seeds, Extras::default(), &mut out);
+    let chosen: Vec<usize> = (0..seeds.len()).filter(|&i| out.lived[i] == 1.0 && !tracer.is_void(seeds[i])).take(50).collect();
+    assert_eq!(chosen.len(), 50);
+    let task = serde_json::json!({
+        "kind": kind,
+        "files": archive.files().map(|f| f.display().to_string()).collect::<Vec<_>>(),
+        "points": chosen.iter().map(|&i| seeds[i].map(f64::from)).collect::<Vec<_>>(),
+        "from": begin,
+        "tau": -tau,
+    });
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/independent/ftle.py");
+    let mut child = Command::new(python).arg(script).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    child.stdin.take().unwrap().write_all(task.to_string().as_bytes()).unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success());
+    let theirs: Vec<Option<f64>> = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!(theirs.len(), 50);
+    let pairs = chosen.iter().zip(theirs).filter_map(|(&i, theirs)| theirs.map(|t| (out.log_stretch_f64[i], t)));
+    pairs.unzip()
+}
+
+/// Root mean square and median difference of the FTLE, per second, root mean square FTLE, correlation.
+fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, f64) {
+    let n = ours.len() as f64;
+    let mean = |f: &dyn Fn(usize) -> f64| (0..ours.len()).map(f).sum::<f64>() / n;
+    let rms = mean(&|i| (ours[i] - theirs[i]).powi(2)).sqrt();
+    let size = mean(&|i| theirs[i].powi(2)).sqrt();
+    let mut apart: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).collect();
+    apart.sort_by(f64::total_cmp);
+    let (a, b) = (mean(&|i| ours[i]), mean(&|i| theirs[i]));
+    let correlation =
+        mean(&|i| (ours[i] - a) * (theirs[i] - b)) / (mean(&|i| (ours[i] - a).powi(2)) * mean(&|i| (theirs[i] - b).powi(2))).sqrt();
+    println!(
+        "{name}: {n} points, tau {tau} s: FTLE differs by {:.2e} 1/s root mean square, {:.2e} median, {:.2e} at most, of {:.2e}; correlation {correlation:.6}",
+        rms / tau,
+        apart[apart.len() / 2] / tau,
+        apart[apart.len() - 1] / tau,
+        size / tau
+    );
+    (rms / size, correlation)
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn era5_agrees_with_an_independent_integration() {
+    let first = data("era5_utm32_2025_05_01_00.nc");
+    let pairs = independent("era5", &[first.with_file_name("era5_utm32_*.nc")], 7200.0);
+    assert!(pairs.0.len() >= 45, "few of the 50 may graze a missing cell with a neighbour");
+    let (relative, correlation) = report("ERA5", 7200.0, &pairs);
+    // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
+    assert!(relative < 0.01 && correlation > 0.999, "{relative} {correlation}");
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn wrf_agrees_with_an_independent_integration() {
+    let file = data("wrf_katrina_uvw_4t.nc");
+    let pairs = independent("wrf", &[file], 3600.0);
+    assert!(pairs.0.len() >= 45, "few of the 50 may graze the ground with a neighbour");
+    let (relative, correlation) = report("WRF", 3600.0, &pairs);
+    // Horizontally the same interpolant; vertically ours has fixed heights, theirs the levels of each column.
+    assert!(relative < 0.05 && correlation > 0.99, "{relative} {correlation}");
+}

@@ -1,0 +1,145 @@
+"""Log-stretch of the flow map by other tools than ridgewatch's: netCDF4 reads, SciPy integrates (DOP853), neighbours 2 gap apart are
+differenced. The interpolation is written here, straight from what the files hold.
+
+Standard input: {"kind": "era5" | "wrf", "files": [...], "points": [[x, y, z], ...], "from": seconds, "tau": seconds (signed),
+"vertical_scale": 1}. Coordinates in metres, heights above the sea (ERA5: -7000 ln(p / 1000 hPa)). Standard output: a list of
+log-stretches, null where a particle met missing values."""
+
+import json
+import sys
+
+import netCDF4
+import numpy as np
+from scipy.integrate import solve_ivp
+
+EPOCH = "seconds since 1970-01-01"
+
+
+def seconds(variable, calendar="standard"):
+    dates = netCDF4.num2date(variable[:], variable.units, getattr(variable, "calendar", calendar))
+    return np.array([netCDF4.date2num(d, EPOCH, d.calendar) for d in dates], dtype=float)
+
+
+def filled(array):
+    return np.ma.filled(np.ma.asarray(array, dtype=float), np.nan)
+
+
+def cell(axis, x):
+    """Index and fraction along ascending nodes; None outside."""
+    if not axis[0] <= x <= axis[-1]:
+        return None
+    i = min(int(np.searchsorted(axis, x, side="right")) - 1, len(axis) - 2)
+    return i, (x - axis[i]) / (axis[i + 1] - axis[i])
+
+
+class Era5:
+    """Pressure levels on a projected grid: trilinear in x, y and height, linear in time."""
+
+    def __init__(self, files):
+        sets = sorted((netCDF4.Dataset(f) for f in files), key=lambda d: seconds(d["time"])[0])
+        self.time = np.concatenate([seconds(d["time"]) for d in sets])
+        pressure = filled(sets[0]["plev"][:])
+        self.x, self.y = filled(sets[0]["x"][:]), filled(sets[0]["y"][:])
+        up = np.argsort(-pressure)
+        self.z = (-7000.0 * np.log(pressure / 1e5))[up]
+        factor = (-7000.0 / pressure[up])[:, None, None]
+        read = lambda name: np.stack([filled(d[name][0])[up] for d in sets])
+        # (component, time, z, y, x)
+        self.v = np.stack([read("u"), read("v"), read("w") * factor[None]])
+
+    def at(self, place, t):
+        found = [cell(a, q) for a, q in zip((self.z, self.y, self.x, self.time), (place[2], place[1], place[0], t))]
+        if any(f is None for f in found):
+            return np.full(3, np.nan)
+        (k, c), (j, b), (i, a), (n, s) = found
+        out = 0.0
+        for dn, wn in ((0, 1 - s), (1, s)):
+            if wn == 0.0:
+                continue
+            block = self.v[:, n + dn, k : k + 2, j : j + 2, i : i + 2]
+            along = block[..., 0] * (1 - a) + block[..., 1] * a
+            along = along[..., 0] * (1 - b) + along[..., 1] * b
+            out = out + wn * (along[..., 0] * (1 - c) + along[..., 1] * c)
+        return out
+
+
+class Wrf:
+    """Arakawa C: each component from its own faces, each column between its own levels at the particle's place."""
+
+    def __init__(self, files):
+        d = netCDF4.Dataset(files[0])
+        rows = [b"".join(row).decode().replace("_", " ") for row in np.asarray(d["Times"][:])]
+        # As numpy has dates, not netCDF4.
+        self.time = np.array([(np.datetime64(r.replace(" ", "T")) - np.datetime64("1970-01-01T00:00:00")) / np.timedelta64(1, "s") for r in rows])
+        self.dx, self.dy = float(d.DX), float(d.DY)
+        self.u = filled(d["U"][:]) * filled(d["MAPFAC_U"][:])[:, None]
+        self.v = filled(d["V"][:]) * filled(d["MAPFAC_V"][:])[:, None]
+        self.w = filled(d["W"][:])
+        self.height = (filled(d["PH"][:]) + filled(d["PHB"][:])) / 9.81
+
+    @staticmethod
+    def plane(values, i, j):
+        """Columns of (z, y, x) values at a place counted in points."""
+        ny, nx = values.shape[1:]
+        if not (0 <= i <= nx - 1 and 0 <= j <= ny - 1):
+            return None
+        a, b = min(int(i), nx - 2), min(int(j), ny - 2)
+        s, t = i - a, j - b
+        block = values[:, b : b + 2, a : a + 2]
+        return (1 - t) * ((1 - s) * block[:, 0, 0] + s * block[:, 0, 1]) + t * ((1 - s) * block[:, 1, 0] + s * block[:, 1, 1])
+
+    def at_time(self, n, place):
+        i, j = place[0] / self.dx, place[1] / self.dy  # faces count from 0, centres from a half
+        full = self.plane(self.height[n], i - 0.5, j - 0.5)
+        if full is None:
+            return np.full(3, np.nan)
+        half = 0.5 * (full[1:] + full[:-1])
+        z = place[2]
+        if not full[0] <= z <= half[-1]:
+            return np.full(3, np.nan)
+        u, v, w = self.plane(self.u[n], i, j - 0.5), self.plane(self.v[n], i - 0.5, j), self.plane(self.w[n], i - 0.5, j - 0.5)
+        return np.array([np.interp(z, half, u), np.interp(z, half, v), np.interp(z, full, w)])
+
+    def at(self, place, t):
+        found = cell(self.time, t)
+        if found is None:
+            return np.full(3, np.nan)
+        n, s = found
+        before = self.at_time(n, place)
+        return before if s == 0.0 else (1 - s) * before + s * self.at_time(n + 1, place)
+
+
+def arrive(flow, start, begin, tau):
+    # Steps end where the velocity in time has kinks.
+    ends = [t for t in flow.time if min(begin, begin + tau) < t < max(begin, begin + tau)]
+    ends = sorted(ends, reverse=tau < 0) + [begin + tau]
+    x, t = np.asarray(start, dtype=float), begin
+    for end in ends:
+        solution = solve_ivp(lambda t, x: flow.at(x, t), (t, end), x, method="DOP853", rtol=1e-9, atol=1e-6, max_step=abs(tau) / 20)
+        x, t = solution.y[:, -1], end
+        if not solution.success or not np.isfinite(x).all():
+            return np.full(3, np.nan)
+    return x
+
+
+def main():
+    task = json.load(sys.stdin)
+    flow = {"era5": Era5, "wrf": Wrf}[task["kind"]](task["files"])
+    gaps = task.get("gaps", [1.0, 1.0, 0.05])
+    out = []
+    for point in task["points"]:
+        columns = []
+        for axis in range(3):
+            ends = []
+            for sign in (1, -1):
+                moved = np.array(point, dtype=float)
+                moved[axis] += sign * gaps[axis]
+                ends.append(arrive(flow, moved, task["from"], task["tau"]))
+            columns.append((ends[0] - ends[1]) / (2 * gaps[axis]))
+        jacobian = np.stack(columns, axis=1)
+        known = np.isfinite(jacobian).all()
+        out.append(float(np.log(np.linalg.svd(jacobian, compute_uv=False)[0])) if known else None)
+    json.dump(out, sys.stdout)
+
+
+main()
