@@ -48,6 +48,9 @@ fn grid(text: &str) -> Result<Grid, String> {
     }
 }
 
+/// Most seeds of a field: some 8 GiB of memory.
+const MOST_SEEDS: usize = 1 << 27;
+
 #[derive(Serialize)]
 struct Report {
     time: f64,
@@ -61,6 +64,8 @@ struct Report {
     mean: f64,
     maximum: f64,
     missing_seeds: usize,
+    /// Seeds with a velocity whose integration overflowed.
+    failed_seeds: usize,
     stopped_early_share: f64,
     seconds: f64,
     samples_per_second: f64,
@@ -72,6 +77,8 @@ struct Report {
 #[derive(Serialize)]
 struct Check {
     truth: &'static str,
+    /// Seeds that have a velocity.
+    compared: usize,
     rms: f64,
     maximum: f64,
     maximum_relative: Option<f64>,
@@ -133,6 +140,10 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         }
         _ => {}
     }
+    if grid.iter().product::<usize>() > MOST_SEEDS {
+        let [x, y, z] = grid;
+        bail!(Usage(format!("--grid {x}x{y}x{z}: accepted: at most 2^27 seeds in all")));
+    }
     let seeds = seeds(&*tracer, grid);
     let begun = std::time::Instant::now();
     let mut traced = Traced::default();
@@ -141,9 +152,10 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let tau = tracer.tau();
     let ftle: Vec<f64> =
         unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
-    let known: Vec<f64> = ftle.iter().copied().filter(|f| !f.is_nan()).collect();
-    let check = if options.check { Some(check(plan, slide, &seeds, &ftle)?) } else { None };
-    let convergence = if options.convergence { Some(convergence(plan, slide, &seeds)?) } else { None };
+    let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
+    let missing = seeds.iter().filter(|seed| tracer.is_void(**seed)).count();
+    let check = if options.check { Some(check(plan, slide, &*tracer, &seeds, &ftle)?) } else { None };
+    let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
     if let Some(out) = &options.out {
         write(out, plan, slide, &*tracer, grid, &ftle, &traced.lived).with_context(|| format!("cannot write {}", out.display()))?;
     }
@@ -158,7 +170,8 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         minimum: known.iter().copied().fold(f64::INFINITY, f64::min),
         mean: known.iter().sum::<f64>() / known.len().max(1) as f64,
         maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
-        missing_seeds: seeds.len() - known.len(),
+        missing_seeds: missing,
+        failed_seeds: seeds.len() - missing - known.len(),
         stopped_early_share: traced.lived.iter().zip(&ftle).filter(|(lived, ftle)| **lived < 1.0 && !ftle.is_nan()).count() as f64
             / seeds.len() as f64,
         seconds,
@@ -216,13 +229,15 @@ fn ftle(map: &FlowMap, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Vec<f64>> {
     Ok(unrounded(&traced).iter().map(|s| s / map.tau).collect())
 }
 
-fn check(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]], ftle: &[f64]) -> Result<Check> {
+fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]], ftle: &[f64]) -> Result<Check> {
     let (name, truth) = truth(plan, slide, seeds)?;
-    let (rms, maximum) = difference(ftle, &truth);
-    let peak = truth.iter().copied().filter(|f| f.is_finite()).fold(0.0, f64::max);
-    let relative = ftle.iter().zip(&truth).filter(|(a, _)| !a.is_nan()).map(|(a, b)| (a - b).abs() / b.abs()).fold(0.0, f64::max);
+    let pairs = comparable(tracer, seeds, ftle, &truth)?;
+    let (rms, maximum) = difference(&pairs);
+    let peak = pairs.iter().map(|(_, b)| *b).fold(0.0, f64::max);
+    let relative = pairs.iter().map(|(a, b)| (a - b).abs() / b.abs()).fold(0.0, f64::max);
     Ok(Check {
         truth: name,
+        compared: pairs.len(),
         rms,
         maximum,
         maximum_relative: relative.is_finite().then_some(relative),
@@ -230,24 +245,31 @@ fn check(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]], ftle: &[f64]) -> Result
     })
 }
 
-/// Root mean square and maximum over seeds that have a value.
-fn difference(a: &[f64], b: &[f64]) -> (f64, f64) {
-    let (mut square, mut maximum, mut count) = (0.0, 0.0f64, 0usize);
-    for (a, b) in a.iter().zip(b).filter(|(a, _)| !a.is_nan()) {
-        square += (a - b).powi(2);
-        maximum = maximum.max((a - b).abs());
-        count += 1;
+/// Both values at every seed that has a velocity. A value that is not finite there is a failure, nothing to be left out.
+fn comparable(tracer: &dyn Tracer, seeds: &[[f32; 3]], a: &[f64], b: &[f64]) -> Result<Vec<(f64, f64)>> {
+    let pairs = a.iter().copied().zip(b.iter().copied());
+    let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_void(**seed)).map(|(pair, _)| pair).collect();
+    let failed = pairs.iter().filter(|(a, b)| !a.is_finite() || !b.is_finite()).count();
+    match (pairs.len(), failed) {
+        (0, _) => bail!("no seed has a velocity: there is nothing to compare"),
+        (_, 0) => Ok(pairs),
+        (all, failed) => bail!("{failed} of {all} seeds have no finite FTLE, here or in the truth: a shorter tau or more steps may help"),
     }
-    ((square / count.max(1) as f64).sqrt(), maximum)
 }
 
-fn convergence(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<Convergence> {
+/// Root mean square and maximum of the difference.
+fn difference(pairs: &[(f64, f64)]) -> (f64, f64) {
+    let square = pairs.iter().map(|(a, b)| (a - b).powi(2)).sum::<f64>() / pairs.len() as f64;
+    (square.sqrt(), pairs.iter().map(|(a, b)| (a - b).abs()).fold(0.0, f64::max))
+}
+
+fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]]) -> Result<Convergence> {
     let (name, truth) = truth(plan, slide, seeds)?;
     let steps: Vec<usize> = (0..6).map(|k| 5 << k).collect();
     let mut rms = Vec::new();
     for &n in &steps {
         let map = FlowMap { integrator: Integrator::Tangent, precision: Precision::F64, steps: Steps::Fixed(n), ..plan.map.clone() };
-        rms.push(difference(&ftle(&map, slide, seeds)?, &truth).0);
+        rms.push(difference(&comparable(tracer, seeds, &ftle(&map, slide, seeds)?, &truth)?).0);
     }
     let order = rms.windows(2).map(|pair| (pair[0] / pair[1]).log2()).collect();
     Ok(Convergence { truth: name, steps, rms, order })
@@ -324,6 +346,9 @@ fn print_report(report: &Report) {
             report.missing_seeds,
             100.0 * report.stopped_early_share
         ));
+    }
+    if report.failed_seeds > 0 {
+        messages::note(format_args!("{} seeds have no finite FTLE: the integration overflowed there", report.failed_seeds));
     }
     if let Some(check) = &report.check {
         let relative = check.maximum_relative.map_or_else(String::new, |r| format!(", relative {r:.3e}"));

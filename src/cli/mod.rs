@@ -156,6 +156,10 @@ fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Result<
 
 /// Fails before the work rather than after it.
 fn check_folder(out: &Path) -> Result<()> {
+    // What is not a regular file would be replaced by one.
+    if std::fs::metadata(out).is_ok_and(|there| !there.is_file()) {
+        bail!(Usage(format!("{} is there and is no regular file", out.display())));
+    }
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
     tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;

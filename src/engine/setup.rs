@@ -1,11 +1,11 @@
 //! From a scene file to everything a run needs, checked before any work is done.
 
 use super::feed::{Feed, closed_form, no_domain, open_snapshots};
-use super::{EngineError, Settings};
+use super::{EngineError, Settings, TimeSettings};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
-use crate::setting::Refused;
+use crate::setting::{Refused, require};
 use crate::source::SourceKind;
 use crate::surrogate::Kind;
 
@@ -81,6 +81,9 @@ impl Setup {
             (_, _, Some(source)) => source.grid().domain(),
             _ => return Err(no_domain()),
         };
+        if closed.is_some() {
+            check_start(&scene.time, tau, direction.sign())?;
+        }
         check_picture(&scene, &domain, tau)?;
         scene.surrogate.check_nodes(domain.dimensions)?;
         if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
@@ -91,6 +94,17 @@ impl Setup {
         let slides = feed.expected_slides(times.as_deref(), tau);
         Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
     }
+}
+
+/// Refuses times so far from 0 that adding tau to them is lost in their last place: nothing would move, and the FTLE would be 0.
+fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> {
+    let last = time.start + time.step * time.slides.unwrap_or(1).saturating_sub(1) as f64;
+    for start in [time.start, last] {
+        let moved = ((start + sign * tau) - start).abs();
+        // A millionth of tau is far below what a step resolves.
+        require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")?;
+    }
+    Ok(())
 }
 
 /// Refuses a camera, light or transfer function before anything is read, rendered or written.

@@ -6,7 +6,7 @@
 
 use super::axis_map::AxisMap;
 use super::sampler::{GridStage, Sampler};
-use super::velocity::{Chart, Velocity, bounds, within};
+use super::velocity::{Chart, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
 use crate::simd::{Gather, Lanes, Real, array};
@@ -40,8 +40,10 @@ impl<R: Real> SphereFlow<R> {
         let rate = 1.0 / radius;
         let sampler = Sampler::<R, 2>::new(window, grid, policy, interpolation, |_| [rate, rate, rate, 1.0])?;
         let globe = Globe::new(&sampler.axes[0], &sampler.axes[1]);
-        let end = |i: usize| array(|k| R::from_f64(globe.ends[k][i]));
-        Ok(Self { bounds: bounds(policy, end(0), end(1)), globe, sampler })
+        let end = |i: usize| -> [R; 2] { array(|k| R::from_f64(globe.ends[k][i])) };
+        let slack = globe.per_radian.map(angle_slack);
+        let (low, high) = (array(|k| end(0)[k] - slack[k]), array(|k| end(1)[k] + slack[k]));
+        Ok(Self { bounds: bounds(policy, low, high), globe, sampler })
     }
 }
 

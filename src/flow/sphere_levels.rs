@@ -7,7 +7,7 @@
 
 use super::sampler::{GridStage, Sampler};
 use super::sphere::{AT_POLE, Globe, basis, dot, trigonometry};
-use super::velocity::{Chart, Velocity, bounds, within};
+use super::velocity::{Chart, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
 use crate::simd::{Gather, Real, array};
@@ -31,8 +31,12 @@ impl<R: Real> LayeredSphereFlow<R> {
         let [longitude, latitude, height] = &sampler.axes;
         let globe = Globe::new(longitude, latitude);
         let level_ends = height.ends();
-        let end = |i: usize| array(|k| R::from_f64(if k < 2 { globe.ends[k][i] } else { level_ends[i] }));
-        Ok(Self { bounds: bounds(policy, end(0), end(1)), level: height.spacing / radius, radius, globe, sampler })
+        let end = |i: usize| -> [R; 3] { array(|k| R::from_f64(if k < 2 { globe.ends[k][i] } else { level_ends[i] })) };
+        let [longitude, latitude] = globe.per_radian.map(angle_slack);
+        let (low, high) = (end(0), end(1));
+        let low = [low[0] - longitude, low[1] - latitude, low[2]];
+        let high = [high[0] + longitude, high[1] + latitude, high[2]];
+        Ok(Self { bounds: bounds(policy, low, high), level: height.spacing / radius, radius, globe, sampler })
     }
 
     /// Radii in a degree of longitude, a degree of latitude and a unit of height.

@@ -74,6 +74,13 @@ impl<F, R: Real, const D: usize> Closed<F, R, D> {
     }
 }
 
+/// Share of a turn by which a longitude or latitude that was computed in `R` from a unit vector may miss: a few units in the last place.
+/// A seed on the very edge of its grid must not be lost to that.
+pub(crate) fn angle_slack<R: Real>(radian: R) -> R {
+    let unit = R::one().above() - R::one();
+    R::from_f64(8.0 * std::f64::consts::PI) * unit * radian
+}
+
 /// The closed interval of states that may go on, for each axis.
 pub fn bounds<R: Real, const D: usize>(policy: Boundary, low: [R; D], high: [R; D]) -> [[R; D]; 2] {
     match policy {

@@ -3,7 +3,7 @@
 use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
 use super::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
-use crate::flow::{AxisMap, Boundary, FlowMap, Integrator, Interpolation};
+use crate::flow::{AxisMap, Boundary, FlowMap, Integrator, Interpolation, angle_slack};
 
 /// What a kernel for a window is launched with.
 #[derive(Debug)]
@@ -85,7 +85,11 @@ impl GridArguments {
             Geometry::Sphere { radius } => [scale / radius; 3],
         };
         let ends: [[f64; 2]; 3] = std::array::from_fn(|k| maps[k.min(maps.len() - 1)].ends());
-        let end = |i: usize| -> [R; 3] { std::array::from_fn(|k| R::from_f64(ends[k][i])) };
+        // As on the CPU: an angle computed from a unit vector may miss by a few units in the last place.
+        let slack = |k: usize| if sphere && k < 2 { angle_slack(R::from_f64(1f64.to_degrees() / spacing[k])) } else { R::from_f64(0.0) };
+        let end = |i: usize| -> [R; 3] {
+            std::array::from_fn(|k| if i == 0 { R::from_f64(ends[k][i]) - slack(k) } else { R::from_f64(ends[k][i]) + slack(k) })
+        };
         let (low, high) = match map.boundary {
             Boundary::Stop => (end(0), end(1)),
             Boundary::Zero => (end(0).map(R::above), end(1).map(R::below)),
