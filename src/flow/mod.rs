@@ -33,6 +33,7 @@ pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};
 pub use steps::Chosen;
 pub use tracer::Order;
+#[cfg(feature = "cuda")]
 pub(crate) use velocity::angle_slack;
 
 /// Which way particles travel from the seed.

@@ -111,12 +111,12 @@ impl Sorter {
         self.scratch.as_mut().ok_or_else(|| DeviceError::Unsupported { what: "sorting without scratch memory".into() })
     }
 
-    /// Memory for at most [`MOST`] points `{x, y, z, index as bits}` in an order of the caller's making.
+    /// Memory for at most `MOST` points `{x, y, z, index as bits}` in an order of the caller's making.
     pub fn buffer(&mut self, count: usize) -> Result<u64, DeviceError> {
         Ok(self.scratch(count, 1024)?.sorted.address())
     }
 
-    /// Sorts `count` points (3 f32 each at the device address `points`), at most [`MOST`]. Returns the address of `{x, y, z, index as
+    /// Sorts `count` points (3 f32 each at the device address `points`), at most `MOST`. Returns the address of `{x, y, z, index as
     /// bits}`, valid until the next call.
     ///
     /// # Safety
