@@ -64,6 +64,8 @@ pub struct RunReport {
     pub interrupted: bool,
     /// Seconds spent waiting for input.
     pub waited: f64,
+    /// Seconds spent on frames and on taking in snapshots that were there.
+    pub worked: f64,
     /// Optimizer steps.
     pub train_steps: u64,
     /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
@@ -625,6 +627,7 @@ impl<'a> Cycle<'a> {
         }
         self.report.frames += 1;
         self.report.waited += record.seconds.waiting;
+        self.report.worked += record.seconds.slide + record.seconds.total;
         self.report.slides = slide.index + 1;
         self.frame += 1;
         self.pictures += u64::from(!place.warmup);

@@ -6,7 +6,7 @@ use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require};
-use crate::source::SourceKind;
+use crate::source::{Metric, SourceKind, Steady, VelocityUnit};
 use crate::surrogate::Kind;
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
@@ -38,7 +38,7 @@ impl Setup {
         scene.check()?;
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
-        let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
+        let mut snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
         let flat = snapshots.as_ref().is_some_and(|s| s.grid().dimensions() == 2);
         let archive = scene.source.kind == SourceKind::Archive;
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
@@ -50,6 +50,9 @@ impl Setup {
                 }
                 tau.value().ok_or_else(|| Refused::new("time.tau", format_args!("is {tau:?}"), "a number, or words such as \"30 days\""))?
             }
+            (None, Some(_)) if archive && scene.archive.steady => {
+                return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
+            }
             (None, Some(source)) => {
                 let tau = source.default_tau()?;
                 notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
@@ -57,6 +60,19 @@ impl Setup {
             }
             (None, None) => return Err(Refused::new("time.tau", "is missing", "a number above 0").into()),
         };
+        if archive
+            && scene.archive.steady
+            && let Some(source) = snapshots
+        {
+            let counted = source.describe().metric == Metric::Index && scene.archive.velocity_unit == VelocityUnit::Si;
+            if counted {
+                let found = "is true, but the metric is index, which counts snapshots";
+                return Err(
+                    Refused::new("archive.steady", found, "metric = \"sphere\" or \"cartesian\", or velocity_unit = \"cells\"").into()
+                );
+            }
+            snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
+        }
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
             SourceKind::Archive => Boundary::Stop,
             SourceKind::Turbulence => Boundary::Clamp,
@@ -68,7 +84,7 @@ impl Setup {
             integrator: scene.flow.integrator,
             precision: scene.flow.precision,
             steps: match scene.flow.steps {
-                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.5 } else { 0.01 }) },
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
             gap: scene.flow.gap,
