@@ -148,6 +148,10 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let begun = std::time::Instant::now();
     let mut traced = Traced::default();
     tracer.trace(&seeds, Extras::default(), &mut traced);
+    device.check()?;
+    if let Some(failure) = device.failure() {
+        messages::note(format!("work on the GPU has ended, the CPU went on: {failure}"));
+    }
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
     let ftle: Vec<f64> =

@@ -140,7 +140,11 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Se
     match drive(setup, options, sink, stop, &mut report) {
         Ok(()) | Err(Halt::TimeIsUp) => {}
         Err(Halt::Stopped) => report.interrupted = true,
-        Err(Halt::Failed(error)) => return Err(error),
+        Err(Halt::Failed(error)) => {
+            // A lost device is the cause of what failed behind it.
+            options.device.check()?;
+            return Err(error);
+        }
     }
     Ok(report)
 }
@@ -158,6 +162,9 @@ fn drive(
     let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
     let threads = Threads::new(options.threads, &plan.scene)?;
+    if let Some(listener) = options.device.listener() {
+        feed.tell(listener);
+    }
     let first = feed.next_slide_unless(stop)?;
     heed(stop)?;
     let mut slide = first.ok_or(EngineError::EndedEarly)?;
@@ -596,7 +603,7 @@ impl<'a> Cycle<'a> {
         }
         self.options.device.check()?;
         if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
-            record.warnings.push(format!("the GPU is lost, the CPU goes on: {failure}"));
+            record.warnings.push(format!("work on the GPU has ended, the CPU goes on: {failure}"));
         }
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {

@@ -207,6 +207,18 @@ pub struct Traced {
     pub jacobian: Vec<[f32; 9]>,
 }
 
+impl Traced {
+    /// Room for so many seeds; entries that are new are unknown (NaN, lived 0). `double`: with unrounded log-stretches.
+    pub(crate) fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
+        let wanted = |yes: bool| if yes { count } else { 0 };
+        self.log_stretch.resize(count, f32::NAN);
+        self.log_stretch_f64.resize(wanted(double), f64::NAN);
+        self.lived.resize(count, 0.0);
+        self.arrival.resize(wanted(extras.arrival), [f32::NAN; 3]);
+        self.jacobian.resize(wanted(extras.jacobian), [f32::NAN; 9]);
+    }
+}
+
 /// Traces seeds in large batches; shared by all threads. [`cpu_tracer`] makes the CPU's.
 pub trait Tracer: Send + Sync {
     /// Where seeds may lie.
