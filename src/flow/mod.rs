@@ -34,7 +34,7 @@ pub use settings::{FlowSettings, StepsSetting};
 pub use steps::Chosen;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
-pub(crate) use velocity::angle_slack;
+pub(crate) use velocity::{angle_slack, bounds};
 
 /// Which way particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
