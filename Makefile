@@ -1,6 +1,7 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
 # make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/); what needs real archives runs where they are
 # make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
+# make test-long   what takes minutes: subscribers that stall for a minute, in Rust and in Python
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
@@ -13,7 +14,7 @@ SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 # The collection of real archives that tests/archive_real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
-.PHONY: all demo test test-data packages build check bench gpu-check clean
+.PHONY: all demo test test-data test-long packages build check bench gpu-check clean
 
 all: build
 
@@ -49,9 +50,12 @@ test: packages
 test-data: packages .venv/installed
 	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
 
+test-long: packages .venv/installed
+	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
+
 .venv/installed:
-	python3 -m venv .venv
-	.venv/bin/pip install --quiet numpy scipy netCDF4
+	$(PYTHON) -m venv .venv
+	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq
 	touch $@
 
 $(NVRTC)/done:

@@ -178,7 +178,12 @@ impl SceneFile {
     /// when the source is open.
     pub fn locate(&self, refused: Refused) -> ConfigError {
         let Origin { path, text, elsewhere } = &self.origin;
-        let set = elsewhere.iter().rev().find(|(key, _)| *key == refused.key).map(|(_, place)| place.clone());
+        // Of several keys at fault together, the one set last on the command line is what the user has in hand.
+        let named = |set: &str| {
+            let at_fault = std::iter::once(&refused.key).chain(&refused.beside);
+            at_fault.into_iter().any(|key| key == set || key.strip_prefix(set).is_some_and(|rest| rest.starts_with('.')))
+        };
+        let set = elsewhere.iter().rev().find(|(key, _)| named(key)).map(|(_, place)| place.clone());
         ConfigError::locate(refused, path, text, set)
     }
 

@@ -1,5 +1,6 @@
 //! A value of the scene file that is not accepted. Every room checks its own settings with these; [`crate::config`] finds the line.
 
+use serde::Serialize;
 use std::fmt::{Debug, Display};
 
 /// What is wrong with which setting.
@@ -12,18 +13,36 @@ pub struct Refused {
     pub found: String,
     /// What is accepted.
     pub accepted: String,
+    /// Further keys that have their part in the fault, as the other end of a range: any of them may be the one to mend.
+    pub beside: Vec<String>,
 }
 
 impl Refused {
     /// Puts the three together.
     pub fn new(key: impl Into<String>, found: impl Display, accepted: impl Into<String>) -> Self {
-        Self { key: key.into(), found: found.to_string(), accepted: accepted.into() }
+        Self { key: key.into(), found: found.to_string(), accepted: accepted.into(), beside: Vec::new() }
+    }
+
+    /// Names further keys that have their part in the fault.
+    pub fn beside(mut self, keys: &[&str]) -> Self {
+        self.beside.extend(keys.iter().map(|&key| key.to_owned()));
+        self
     }
 }
 
+/// A value as it is written in a scene file.
+pub fn shown(value: impl Serialize + Debug) -> String {
+    toml::Value::try_from(&value).map_or_else(|_| format!("{value:?}"), |value| value.to_string())
+}
+
+/// The same without quotation marks, for sentences.
+pub fn word(value: impl Serialize + Debug) -> String {
+    shown(value).trim_matches('"').to_owned()
+}
+
 /// Refuses unless `holds`.
-pub(crate) fn require(holds: bool, key: &str, value: impl Debug, accepted: &str) -> Result<(), Refused> {
-    if holds { Ok(()) } else { Err(Refused::new(key, format_args!("is {value:?}"), accepted)) }
+pub(crate) fn require(holds: bool, key: &str, value: impl Serialize + Debug, accepted: &str) -> Result<(), Refused> {
+    if holds { Ok(()) } else { Err(Refused::new(key, format_args!("is {}", shown(value)), accepted)) }
 }
 
 /// Refuses what is not a finite number above 0.

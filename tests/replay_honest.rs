@@ -31,13 +31,14 @@ batch = 2048
 kind = \"network\"
 ";
 
-fn records() -> Vec<FrameRecord> {
+fn records(options: &[&str]) -> Vec<FrameRecord> {
     let folder = tempfile::tempdir().unwrap();
     let scene = folder.path().join("scene.toml");
     std::fs::write(&scene, SCENE).unwrap();
     let out = folder.path().join("run");
     let output = Command::new(env!("CARGO_BIN_EXE_ridgewatch"))
-        .args(["replay", scene.to_str().unwrap(), "--verify", "100000", "--out", out.to_str().unwrap()])
+        .args(["replay", scene.to_str().unwrap(), "--out", out.to_str().unwrap()])
+        .args(options)
         .output()
         .unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
@@ -47,7 +48,7 @@ fn records() -> Vec<FrameRecord> {
 
 #[test]
 fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
-    let records = records();
+    let records = records(&["--verify", "100000"]);
     let pairs: Vec<_> = records.iter().filter_map(|r| Some((r.trusted?, r.verified?))).collect();
     assert!(pairs.len() >= 20, "{} of {} frames state an error", pairs.len(), records.len());
     // The bounds are those of the promise: 20 % in root mean square over frames, and the interval holds in 90 % of the frames.
@@ -78,4 +79,19 @@ fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
     assert!(first > before && last < first, "traced share {before:.3}, then {first:.3}, {last:.3}");
     // The surrogate's own PSNR over the whole domain is a learning curve.
     assert!(records.last().unwrap().surrogate_psnr.unwrap() > records[0].surrogate_psnr.unwrap() + 10.0);
+}
+
+#[test]
+fn a_spent_tracing_budget_is_said_and_flagged() {
+    let records = records(&["--set", "trust.trace_budget=1e-9", "--set", "time.slides=1"]);
+    let spent: Vec<_> = records.iter().filter(|r| r.over_budget > 0).collect();
+    assert!(!spent.is_empty(), "no frame had more to trace than a nanosecond allows");
+    for record in &records {
+        let said = record.warnings.iter().any(|w| w.contains("the tracing budget was spent"));
+        assert_eq!(said, record.over_budget > 0, "frame {}: {:?}", record.frame, record.warnings);
+        assert!(record.over_budget == 0 || record.over_tolerance.is_some(), "frame {} is flagged", record.frame);
+        assert!(record.traced + record.over_budget <= record.queries);
+    }
+    // Untrained, the network is far off where it is not trusted, and the frame says by how much.
+    assert!(spent[0].over_tolerance.unwrap() > 0.0, "{:?}", spent[0].over_tolerance);
 }

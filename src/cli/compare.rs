@@ -1,6 +1,6 @@
 //! `ridgewatch compare`.
 
-use super::{Common, print_json, print_text};
+use super::{Common, Usage, print_json, print_text};
 use anyhow::Result;
 use std::path::PathBuf;
 
@@ -19,6 +19,11 @@ pub struct Options {
 /// Compares.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let tone_map = [options.tone_map[0], options.tone_map[1], options.tone_map[2]];
+    let [contrast, brightness, gamma] = tone_map;
+    if !(contrast.is_finite() && brightness.is_finite() && gamma.is_finite() && gamma > 0.0) {
+        let accepted = "three finite numbers, the last above 0";
+        return Err(Usage(format!("--tone-map {contrast} {brightness} {gamma} is not accepted; accepted: {accepted}")).into());
+    }
     let comparison = ridgewatch::publish::compare_files(&options.a, &options.b, tone_map)?;
     if common.json {
         return print_json(&comparison);

@@ -5,6 +5,7 @@ use anyhow::{Context, Result, bail};
 use ridgewatch::engine::{Device, EngineError, Plan, Setup, Slide};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::setting::word;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 
@@ -148,6 +149,10 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let begun = std::time::Instant::now();
     let mut traced = Traced::default();
     tracer.trace(&seeds, Extras::default(), &mut traced);
+    device.check()?;
+    if let Some(failure) = device.failure() {
+        messages::note(format!("work on the GPU has ended, the CPU went on: {failure}"));
+    }
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
     let ftle: Vec<f64> =
@@ -317,7 +322,7 @@ fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usi
         }
         file.add_attribute("tau", tracer.tau())?;
         file.add_attribute("direction", plan.map.direction.name())?;
-        file.add_attribute("integrator", format!("{:?}, {:?}, {} steps", plan.map.integrator, plan.map.precision, tracer.steps()))?;
+        file.add_attribute("integrator", format!("{}, {}, {} steps", word(plan.map.integrator), word(plan.map.precision), tracer.steps()))?;
     }
     temporary.persist(out)?;
     Ok(())
@@ -336,8 +341,13 @@ fn print_report(report: &Report) {
     let [nx, ny, nz] = report.grid;
     let when = report.date.clone().unwrap_or_else(|| format!("t0 = {}", report.time));
     print_text(format_args!(
-        "{when}, tau = {}: {:?} {:?}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
-        report.tau, report.integrator, report.precision, report.steps, report.seconds, report.samples_per_second
+        "{when}, tau = {}: {}, {}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
+        report.tau,
+        word(report.integrator),
+        word(report.precision),
+        report.steps,
+        report.seconds,
+        report.samples_per_second
     ));
     print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
     if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {

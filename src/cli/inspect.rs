@@ -4,6 +4,7 @@ use super::{Common, Usage, located, print_json, print_text};
 use anyhow::Result;
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::TimeSpan;
+use ridgewatch::setting::word;
 use ridgewatch::source::{SourceError, SourceKind};
 use std::path::PathBuf;
 
@@ -25,7 +26,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         files => SceneFile::for_archive(files.to_vec(), &common.overrides)?,
     };
     if scene.source.kind != SourceKind::Archive {
-        return Err(Usage(format!("the scene's source is {:?}; inspect looks at archives", scene.source.kind)).into());
+        return Err(Usage(format!("the scene's source is {}; inspect looks at archives", word(scene.source.kind))).into());
     }
     let tau = match &options.tau {
         None => None,

@@ -151,6 +151,12 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
             for warning in &frame.record.warnings {
                 bar.suspend(|| messages::note(format_args!("frame {}: {warning}", frame.record.frame)));
             }
+            if last.is_none()
+                && let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference)
+            {
+                let text = format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many");
+                bar.suspend(|| messages::note(text));
+            }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
             *last = Some(frame.record.clone());
             output.frame(frame);

@@ -58,7 +58,7 @@ fn excerpt(line: &Option<(usize, String)>) -> String {
 impl ConfigError {
     /// Finds the line of `text` that set the key, unless it was set at another place.
     pub(super) fn locate(refused: Refused, path: &Path, text: &str, elsewhere: Option<String>) -> Self {
-        let Refused { key, found, accepted } = refused;
+        let Refused { key, found, accepted, .. } = refused;
         let line = if elsewhere.is_none() { span_of(text, &key).map(|at| line_at(text, at)) } else { None };
         let place = match (elsewhere, &line) {
             (Some(place), _) => place,
@@ -100,9 +100,15 @@ fn line_at(text: &str, at: usize) -> (usize, String) {
 pub(super) fn with_suggestion(message: &str) -> String {
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown")) else { return message.to_owned() };
-    let nearest = quoted.map(|known| (strsim::damerau_levenshtein(unknown, known), known)).min();
+    // A name that holds the other, as `tol` and `tolerance`, is nearer than its length says.
+    let contained = |known: &str| unknown.len().min(known.len()) >= 3 && (known.contains(unknown) || unknown.contains(known));
+    let nearest = quoted
+        .map(|known| (strsim::damerau_levenshtein(unknown, known), known))
+        .min_by_key(|&(distance, known)| (distance > 2 && !contained(known), distance));
     match nearest {
-        Some((distance, known)) if distance <= unknown.len().max(3) / 2 => format!("{message}. Did you mean `{known}`?"),
+        Some((distance, known)) if distance <= unknown.len().max(3) / 2 || contained(known) => {
+            format!("{message}. Did you mean `{known}`?")
+        }
         _ => message.to_owned(),
     }
 }

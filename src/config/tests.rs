@@ -42,7 +42,7 @@ fn overrides_take_words_numbers_and_lists() {
 #[test]
 fn parameters_of_another_flow_are_refused() {
     let said = error(&GYRE.replace("\"double_gyre\"\n", "\"double_gyre\"\nrate = 1\n"), &[]);
-    assert!(said.contains("`source.rate` does not belong to kind DoubleGyre"), "{said}");
+    assert!(said.contains("`source.rate` does not belong to kind \"double_gyre\""), "{said}");
     assert!(error("[source]\nkind = \"saddle\"\n[time]\ntau = 1\n", &[]).contains("`domain` is missing"));
     assert!(error("[source]\nkind = \"archive\"\n", &[]).contains("`archive.files` is empty"));
 }
@@ -64,7 +64,7 @@ fn with_fault(section: &str, fault: &str) -> (String, usize) {
 fn a_fault_in_any_section_points_at_its_line() {
     let camera = "look_at = [1, 0.5, 0]\nup = [0, 1, 0]";
     for (section, fault, key, found, accepted) in [
-        ("source", "epsilon = nan", "source.epsilon", "NaN", "a finite number"),
+        ("source", "epsilon = nan", "source.epsilon", "nan", "a finite number"),
         ("time", "stride = 0", "time.stride", "0", "from 1 to"),
         ("flow", "gap = 0.0", "flow.gap", "0", "above 0"),
         ("surrogate", "table_nodes = [1, 8, 8]", "surrogate.table_nodes", "[1, 8, 8]", "at least 2"),
@@ -113,4 +113,32 @@ fn paths_in_a_scene_are_relative_to_it_and_those_of_the_command_line_are_not() {
     let set = ["archive.files=b.nc".to_owned(), "training.resume=v.safetensors".to_owned()];
     let scene = SceneFile::read(&path, &set).unwrap();
     assert_eq!((scene.archive.files[0].to_str(), scene.training.resume.unwrap().to_str()), (Some("b.nc"), Some("v.safetensors")));
+}
+
+/// A range has two ends: the one that was just set is to be blamed, whichever is reported.
+#[test]
+fn of_two_keys_at_fault_together_the_one_on_the_command_line_is_named() {
+    let said = error(GYRE, &["domain.min=[3, 0, 0]"]);
+    assert!(said.starts_with("--set domain.min=[3, 0, 0]: `domain.max` is [2.0, 1.0, 1.0]"), "{said}");
+    let said = error(GYRE, &["domain={ min = [0, 0, 0], max = [0, 1, 1] }"]);
+    assert!(said.starts_with("--set domain={"), "{said}");
+    let said = error(&GYRE.replace("max = [2,", "max = [0,"), &["time.tau=5"]);
+    assert!(said.starts_with("scene.toml:5: `domain.max`"), "{said}");
+    let transfer = format!("{GYRE}[transfer]\nlow = 0.0\nhigh = 0.2\n");
+    let said = error(&transfer, &["transfer.low=0.3"]);
+    assert!(said.starts_with("--set transfer.low=0.3: `transfer.high` is 0.2"), "{said}");
+}
+
+#[test]
+fn values_are_shown_as_a_scene_file_writes_them() {
+    assert!(error(GYRE, &["time.tau=-1"]).contains("`time.tau` is -1.0;"));
+    assert!(error(GYRE, &["time.tau=soon"]).contains("`time.tau` is \"soon\";"));
+    assert!(error(GYRE, &["render.majorant_cells=[0, 1, 1]"]).contains("is [0, 1, 1];"));
+}
+
+#[test]
+fn a_name_cut_short_is_recognised() {
+    assert!(error(GYRE, &["trust.tol=0.1"]).contains("Did you mean `tolerance`?"));
+    assert!(error(GYRE, &["render.samples_per_pixel=4"]).contains("Did you mean `samples`?"));
+    assert!(!error(GYRE, &["trust.banana=0.1"]).contains("Did you mean"));
 }

@@ -78,14 +78,12 @@ impl<'a> Answers<'a> {
     }
 
     /// Whether every query is traced and none is kept, so that whoever traces may also walk.
-    #[cfg(feature = "cuda")]
-    pub(super) fn only_traces(&self) -> bool {
+    pub fn only_traces(&self) -> bool {
         self.surrogate.is_none() && self.keep <= 1
     }
 
     /// Takes in the figures of a frame whose queries were answered without this.
-    #[cfg(feature = "cuda")]
-    pub(super) fn answered_elsewhere(&mut self, stats: &crate::render::RenderStats) {
+    pub fn answered_elsewhere(&mut self, stats: &crate::render::RenderStats) {
         self.tally.queries += stats.queries;
         self.tally.traced += stats.traced;
         self.tally.missing += stats.missing;

@@ -2,9 +2,12 @@
 
 use super::EngineError;
 #[cfg(feature = "cuda")]
-use super::cuda::{CudaTracer, CudaTracerError, DeviceError, Gpu, GpuSettings, SnapshotStore, Tuning};
+use super::accelerator::Accelerator;
+#[cfg(feature = "cuda")]
+use super::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use crate::setting::{Refused, require};
+use crate::source::Listener;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
@@ -111,13 +114,9 @@ pub enum Device {
     },
     /// A GPU.
     #[cfg(feature = "cuda")]
-    Cuda {
+    Gpu {
         /// The device.
-        gpu: Arc<Gpu>,
-        /// What is there of the velocity.
-        snapshots: Arc<SnapshotStore>,
-        /// How it is used.
-        settings: DeviceSettings,
+        gpu: Arc<dyn Accelerator>,
         /// Whether the CPU does what this device cannot.
         may_fall_back: bool,
     },
@@ -144,11 +143,16 @@ impl Device {
             DeviceChoice::Auto => 0,
             DeviceChoice::Cuda(n) => n,
         };
-        let wanted = GpuSettings { memory_cap: settings.memory_mib.map(|mib| mib << 20), cache: None, polite: settings.polite };
+        let wanted = GpuSettings {
+            memory_cap: settings.memory_mib.map(|mib| mib << 20),
+            cache: None,
+            polite: settings.polite,
+            when_lost: settings.when_lost,
+        };
         match Gpu::open(ordinal, &wanted) {
             Ok(gpu) => {
-                let snapshots = Arc::new(SnapshotStore::new(&gpu));
-                Ok(Self::Cuda { gpu, snapshots, settings: settings.clone(), may_fall_back: choice == DeviceChoice::Auto })
+                let gpu = Arc::new(CudaAccelerator::new(gpu, settings.storage));
+                Ok(Self::Gpu { gpu, may_fall_back: choice == DeviceChoice::Auto })
             }
             Err(why) if choice == DeviceChoice::Auto => Ok(Self::Cpu { why: Some(why.to_string()) }),
             Err(why) => Err(why.into()),
@@ -173,9 +177,9 @@ impl Device {
         match self {
             Self::Cpu { .. } => "cpu".into(),
             #[cfg(feature = "cuda")]
-            Self::Cuda { gpu, .. } if gpu.failure().is_some() => "cpu".into(),
+            Self::Gpu { gpu, .. } if !gpu.health().works() => "cpu".into(),
             #[cfg(feature = "cuda")]
-            Self::Cuda { gpu, .. } => format!("cuda:{} {}", gpu.ordinal(), gpu.name()),
+            Self::Gpu { gpu, .. } => gpu.name(),
         }
     }
 
@@ -184,7 +188,7 @@ impl Device {
         match self {
             Self::Cpu { .. } => None,
             #[cfg(feature = "cuda")]
-            Self::Cuda { gpu, .. } => gpu.failure().map(|error| error.to_string()),
+            Self::Gpu { gpu, .. } => gpu.health().failure().map(|error| error.to_string()),
         }
     }
 
@@ -195,8 +199,25 @@ impl Device {
     pub fn check(&self) -> Result<(), EngineError> {
         match self {
             #[cfg(feature = "cuda")]
-            Self::Cuda { gpu, settings, .. } if settings.when_lost == WhenLost::Stop => gpu.failure().map_or(Ok(()), |e| Err(e.into())),
-            _ => Ok(()),
+            Self::Gpu { gpu, .. } => Ok(gpu.health().check()?),
+            Self::Cpu { .. } => Ok(()),
+        }
+    }
+
+    /// Who should hear of snapshots as they are read, so that they are on the device when the window wants them.
+    pub(super) fn listener(&self) -> Option<Listener> {
+        match self {
+            Self::Cpu { .. } => None,
+            #[cfg(feature = "cuda")]
+            Self::Gpu { gpu, .. } => {
+                // The I/O thread may outlive the run, and must not keep the device open.
+                let gpu = Arc::downgrade(gpu);
+                Some(Box::new(move |snapshot| {
+                    if let Some(gpu) = gpu.upgrade().filter(|gpu| gpu.health().works()) {
+                        gpu.expect(snapshot);
+                    }
+                }))
+            }
         }
     }
 
@@ -207,24 +228,21 @@ impl Device {
     pub fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
         match self {
             #[cfg(feature = "cuda")]
-            Self::Cuda { gpu, snapshots, settings, may_fall_back } if gpu.failure().is_none() => {
-                let tuning = Tuning { storage: settings.storage, ..Tuning::default() };
-                match CudaTracer::new(snapshots, gpu, source.clone(), map, t0, tuning) {
-                    Ok(tracer) => Ok((Box::new(tracer), None)),
-                    Err(CudaTracerError::Flow(error)) => Err(error.into()),
-                    Err(CudaTracerError::Device(error)) => {
-                        let lost = error.is_lost();
-                        if lost {
-                            gpu.fail(error.clone());
-                            self.check()?;
-                        }
-                        if !(lost || *may_fall_back) {
-                            return Err(error.into());
-                        }
-                        Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
+            Self::Gpu { gpu, may_fall_back } if gpu.health().works() => match gpu.tracer(source.clone(), map, t0) {
+                Ok(tracer) => Ok((tracer, None)),
+                Err(CudaTracerError::Flow(error)) => Err(error.into()),
+                Err(CudaTracerError::Device(error)) => {
+                    let lost = error.is_lost();
+                    if lost {
+                        gpu.health().fail(error.clone());
+                        self.check()?;
                     }
+                    if !(lost || *may_fall_back) {
+                        return Err(error.into());
+                    }
+                    Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
                 }
-            }
+            },
             _ => Ok((cpu_tracer(source, map, t0)?, None)),
         }
     }

@@ -7,7 +7,8 @@ use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
 use crate::setting::Refused;
 use crate::source::{
-    DEFAULT_READ_AHEAD, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
+    DEFAULT_READ_AHEAD, Listener, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading,
+    read_ahead,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -150,6 +151,13 @@ impl Feed {
                 })
             }
             (None, None) => Err(no_domain()),
+        }
+    }
+
+    /// `listener` hears of snapshots as they are read, some slides before they are needed.
+    pub fn tell(&self, listener: Listener) {
+        if let Feed::Archive { reader, .. } = self {
+            reader.tell(listener);
         }
     }
 

@@ -1,8 +1,8 @@
 //! Who makes a frame's film: the CPU's renderer, or a GPU's where every query is traced there.
 
-use super::answers::Answers;
 #[cfg(feature = "cuda")]
-use super::cuda::{CudaTracer, GpuRenderer, Traced};
+use super::accelerator::{DeviceRenderer, Health};
+use super::answers::Answers;
 use super::{Device, EngineError};
 use crate::flow::Tracer;
 use crate::render::{Film, RenderStats, Renderer};
@@ -29,10 +29,10 @@ pub(super) fn frame_renderer(device: &Device) -> Box<dyn FrameRenderer> {
     match device {
         Device::Cpu { .. } => Box::new(OnCpu),
         #[cfg(feature = "cuda")]
-        Device::Cuda { gpu, .. } => match GpuRenderer::new(gpu) {
-            Ok(device) => Box::new(OnGpu(device)),
+        Device::Gpu { gpu, .. } => match gpu.renderer() {
+            Ok(device) => Box::new(OnGpu { device, health: gpu.health().clone() }),
             Err(error) => {
-                gpu.fail(error);
+                gpu.health().fail(error);
                 Box::new(OnCpu)
             }
         },
@@ -57,9 +57,12 @@ impl FrameRenderer for OnCpu {
     }
 }
 
-/// Walks and traces on the GPU when nothing else is to be asked; otherwise, and when the GPU fails, as on the CPU.
+/// Makes films on the GPU where it can do so alone; otherwise, and once it fails, as on the CPU.
 #[cfg(feature = "cuda")]
-struct OnGpu(GpuRenderer);
+struct OnGpu {
+    device: Box<dyn DeviceRenderer>,
+    health: std::sync::Arc<Health>,
+}
 
 #[cfg(feature = "cuda")]
 impl FrameRenderer for OnGpu {
@@ -73,22 +76,16 @@ impl FrameRenderer for OnGpu {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
-        let on_device = tracer.as_any().and_then(|any| any.downcast_ref::<CudaTracer>());
-        // Which seeds lie on land is known on the host alone.
-        if let Some(traced) =
-            on_device.filter(|t| !t.device().meets_land() && t.device().gpu().failure().is_none() && answers.only_traces())
-        {
-            let end = u32::try_from(samples).unwrap_or(u32::MAX);
-            match self.0.render_samples(renderer, picture, 0..end, &Traced(traced.device()), progress, stop) {
-                Ok((film, stats)) => {
-                    answers.answered_elsewhere(&stats);
-                    return Ok((film, stats));
-                }
+        if self.health.works() {
+            match self.device.render(renderer, picture, samples, tracer, answers, progress, stop) {
+                Ok(Some(done)) => return Ok(done),
+                Ok(None) => {}
                 // The same frame on the CPU: same majorants, same random numbers. The cycle hears of the failure after it.
-                Err(EngineError::Device(error)) => traced.device().gpu().fail(*error),
+                Err(EngineError::Device(error)) => self.health.fail(*error),
                 Err(error) => return Err(error),
             }
         }
+        self.health.check()?;
         OnCpu.render(renderer, picture, samples, tracer, answers, progress, stop)
     }
 }

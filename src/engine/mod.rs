@@ -2,6 +2,8 @@
 //!
 //! In: [`Settings`]. Out: frames with their records. Calls `field`, `source`, `flow`, `surrogate`, `trust` and `render`.
 
+#[cfg(feature = "cuda")]
+mod accelerator;
 mod answers;
 mod audit;
 #[cfg(feature = "cuda")]
@@ -18,6 +20,8 @@ mod stop;
 mod training;
 
 pub use crate::trust::TrustedError;
+#[cfg(feature = "cuda")]
+pub use accelerator::{Accelerator, Backed, DeviceRenderer, DeviceTrace, Health};
 pub use answers::{Answers, Tally};
 pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};

@@ -39,7 +39,8 @@ pub struct FrameRecord {
     pub over_budget: u64,
     /// `traced / (queries - missing)`.
     pub traced_share: f64,
-    /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within.
+    /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within. Where the tracing budget
+    /// was spent: measured on the untrusted points, and 0 when they are within.
     pub over_tolerance: Option<f64>,
     /// Error measured on audit points of the trusted region; none when nothing is trusted.
     pub trusted: Option<TrustedError>,

@@ -2,7 +2,7 @@
 
 use crate::flow::{Direction, FlowSettings};
 use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
-use crate::setting::{Refused, count, positive, require};
+use crate::setting::{Refused, count, require};
 use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
 use crate::surrogate::{
     SurrogateSettings,
@@ -60,7 +60,7 @@ impl Settings {
             let accepted = "\"fixed\", with training.resume (or --resume): a checkpoint has one size";
             return Err(Refused::new("network.size", "is \"auto\"", accepted));
         }
-        check_trust(&self.trust)?;
+        self.trust.check()?;
         self.render.check()?;
         if let Some(camera) = &self.camera {
             Camera::new(camera, self.render.aspect())?;
@@ -206,30 +206,6 @@ impl TrainingSettings {
         }
         count("training.ring", t.ring, 1024, 1 << 28)
     }
-}
-
-fn check_trust(t: &TrustSettings) -> Result<(), Refused> {
-    positive("trust.tolerance", t.tolerance)?;
-    require((0.01..=1.0).contains(&t.audit_share), "trust.audit_share", t.audit_share, "a number from 0.01 to 1")?;
-    count("trust.audit_per_cell", t.audit_per_cell, 1, 4096)?;
-    count("trust.audit_most_per_cell", t.audit_most_per_cell, 1, 65_536)?;
-    require((0.001..=1.0).contains(&t.audit_precision), "trust.audit_precision", t.audit_precision, "a number from 0.001 to 1")?;
-    require((4.0..=4096.0).contains(&t.min_samples), "trust.min_samples", t.min_samples, "a number from 4 to 4096")?;
-    require(t.slide_inflation.is_finite() && t.slide_inflation >= 1.0, "trust.slide_inflation", t.slide_inflation, "a number from 1 up")?;
-    if let Some(seconds) = t.trace_budget {
-        positive("trust.trace_budget", seconds)?;
-    }
-    if let Some(cells) = t.cells {
-        for n in cells {
-            count("trust.cells", n, 1, 1024)?;
-        }
-        count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
-        // Every frame draws and traces this many points.
-        let a_cell = t.min_samples.ceil().max(t.audit_per_cell.max(t.audit_most_per_cell) as f64);
-        let points = a_cell * cells.iter().product::<usize>() as f64;
-        require(points <= f64::from(1 << 26), "trust.cells", points, "at most 2^26 points a frame (cells x samples a cell)")?;
-    }
-    Ok(())
 }
 
 #[cfg(test)]

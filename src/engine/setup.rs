@@ -5,7 +5,7 @@ use super::{EngineError, Settings, TimeSettings};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
-use crate::setting::{Refused, require};
+use crate::setting::{Refused, require, shown};
 use crate::source::{Metric, SourceKind, Steady, VelocityUnit};
 use crate::surrogate::Kind;
 
@@ -48,7 +48,8 @@ impl Setup {
                     let found = "has a unit, but the source's time is not in seconds (with the index metric it counts snapshots)";
                     return Err(Refused::new("time.tau", found, "a plain number").into());
                 }
-                tau.value().ok_or_else(|| Refused::new("time.tau", format_args!("is {tau:?}"), "a number, or words such as \"30 days\""))?
+                tau.value()
+                    .ok_or_else(|| Refused::new("time.tau", format_args!("is {}", shown(tau)), "a number, or words such as \"30 days\""))?
             }
             (None, Some(_)) if archive && scene.archive.steady => {
                 return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
@@ -118,7 +119,8 @@ fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> 
     for start in [time.start, last] {
         let moved = ((start + sign * tau) - start).abs();
         // A millionth of tau is far below what a step resolves.
-        require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")?;
+        require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")
+            .map_err(|refused| refused.beside(&["time.step", "time.slides", "time.tau"]))?;
     }
     Ok(())
 }

@@ -103,18 +103,9 @@ impl Tracer for Interruptible<'_> {
             self.measured(part.len(), start.elapsed().as_secs_f64());
         }
         if done < seeds.len() {
-            out.log_stretch.resize(seeds.len(), f32::NAN);
-            out.lived.resize(seeds.len(), 0.0);
-            if extras.arrival {
-                out.arrival.resize(seeds.len(), [f32::NAN; 3]);
-            }
-            if extras.jacobian {
-                out.jacobian.resize(seeds.len(), [f32::NAN; 9]);
-            }
             // Unrounded values are there for all seeds or for none.
-            if !out.log_stretch_f64.is_empty() {
-                out.log_stretch_f64.resize(seeds.len(), f64::NAN);
-            }
+            let double = !out.log_stretch_f64.is_empty();
+            out.set_len(seeds.len(), extras, double);
         }
     }
 }

@@ -236,7 +236,7 @@ impl Analytic {
                 [v[0] as f32, v[1] as f32, v[2] as f32, 0.0]
             })
             .collect();
-        Snapshot { time, grid: grid.clone(), nodes }
+        Snapshot::new(time, grid.clone(), nodes)
     }
 }
 

@@ -15,12 +15,20 @@ pub struct Snapshot {
     /// of missing nodes are 0. On the sphere `u, v, w` are geocentric Cartesian components of the horizontal velocity (see
     /// [`Geometry::Sphere`]); with levels the mark of a known node is its vertical velocity, in units of the third axis per time.
     pub nodes: Vec<[f32; 4]>,
+    /// Nodes without a velocity, counted once by whoever reads: a window that slides asks several times.
+    missing: usize,
 }
 
 /// Where a velocity is unknown.
 pub const MISSING: [f32; 4] = [0.0, 0.0, 0.0, f32::NAN];
 
 impl Snapshot {
+    /// A snapshot of finished nodes, one for each of the grid, as [`Self::nodes`] describes them.
+    pub fn new(time: f64, grid: Arc<Grid>, nodes: Vec<[f32; 4]>) -> Self {
+        let missing = nodes.iter().filter(|n| n[3].is_nan()).count();
+        Self { time, grid, nodes, missing }
+    }
+
     /// Builds the node array from separate components (`w` empty in two dimensions); any non-finite component makes the node
     /// missing. On the sphere `u` is eastward, `v` northward and `w` along the third axis; a row at a pole, where longitudes go round,
     /// becomes one vector, the mean of its known nodes.
@@ -65,12 +73,12 @@ impl Snapshot {
                 nodes.chunks_exact_mut(nx * ny).for_each(|level| make_one(&mut level[y * nx..(y + 1) * nx]));
             }
         }
-        Self { time, grid, nodes }
+        Self::new(time, grid, nodes)
     }
 
     /// Number of nodes whose velocity is missing.
     pub fn missing(&self) -> usize {
-        self.nodes.iter().filter(|n| n[3].is_nan()).count()
+        self.missing
     }
 
     /// Memory of the nodes, in bytes.

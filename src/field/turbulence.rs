@@ -156,7 +156,7 @@ impl Turbulence {
                 }
             },
         );
-        Snapshot { time, grid: grid.clone(), nodes }
+        Snapshot::new(time, grid.clone(), nodes)
     }
 
     /// A window of `snapshots` snapshots at times 0, 1, 2, ...

@@ -1,7 +1,7 @@
 //! Why a flow map cannot be traced.
 
 use super::{Boundary, Precision};
-use crate::setting::Refused;
+use crate::setting::{Refused, shown, word};
 use thiserror::Error;
 
 /// Why no tracer was made.
@@ -35,13 +35,13 @@ pub enum FlowError {
         covered: Option<(f64, f64)>,
     },
     /// Snapshots end where the grid ends.
-    #[error("boundary `{boundary:?}` is for closed-form flows; gridded velocity accepts Stop, Clamp, Periodic or Zero")]
+    #[error("boundary `{}` is for closed-form flows; gridded velocity accepts stop, clamp, periodic or zero", word(.boundary))]
     NotOnGrids {
         /// What was asked for.
         boundary: Boundary,
     },
     /// Neighbouring particles would fall on the same number.
-    #[error("`gap` {gap} vanishes in {precision:?} beside coordinates of {coordinate}; at least {least} or F64 is needed")]
+    #[error("`gap` {gap} vanishes in {} beside coordinates of {coordinate}; at least {least} or f64 is needed", word(.precision))]
     GapVanishes {
         /// What was asked for.
         gap: f64,
@@ -110,13 +110,14 @@ impl FlowError {
                 Refused::new(key, format_args!("is {found}"), *accepted)
             }
             FlowError::NotOnGrids { boundary } => {
-                Refused::new("flow.boundary", format_args!("is {boundary:?}"), "stop, clamp, periodic or zero on gridded velocity")
+                Refused::new("flow.boundary", format_args!("is {}", shown(boundary)), "stop, clamp, periodic or zero on gridded velocity")
             }
             FlowError::GapVanishes { gap, precision, coordinate, least } => Refused::new(
                 "flow.gap",
-                format_args!("is {gap}, which vanishes in {precision:?} beside coordinates of {coordinate}"),
+                format_args!("is {gap}, which vanishes in {} beside coordinates of {coordinate}", word(precision)),
                 format!("at least {least}, or flow.precision = \"f64\""),
-            ),
+            )
+            .beside(&["flow.precision"]),
             FlowError::SphereAxes { axes } => Refused::new(
                 "archive.metric",
                 format_args!("is sphere, for a grid of {axes} axes"),

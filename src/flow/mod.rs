@@ -36,7 +36,7 @@ pub(crate) use sphere::poles;
 pub use steps::Chosen;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
-pub(crate) use velocity::angle_slack;
+pub(crate) use velocity::{angle_slack, bounds};
 
 /// Which way particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -208,6 +208,18 @@ pub struct Traced {
     pub arrival: Vec<[f32; 3]>,
     /// Jacobians; empty unless asked for.
     pub jacobian: Vec<[f32; 9]>,
+}
+
+impl Traced {
+    /// Room for so many seeds; entries that are new are unknown (NaN, lived 0). `double`: with unrounded log-stretches.
+    pub(crate) fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
+        let wanted = |yes: bool| if yes { count } else { 0 };
+        self.log_stretch.resize(count, f32::NAN);
+        self.log_stretch_f64.resize(wanted(double), f64::NAN);
+        self.lived.resize(count, 0.0);
+        self.arrival.resize(wanted(extras.arrival), [f32::NAN; 3]);
+        self.jacobian.resize(wanted(extras.jacobian), [f32::NAN; 9]);
+    }
 }
 
 /// Traces seeds in large batches; shared by all threads. [`cpu_tracer`] makes the CPU's.

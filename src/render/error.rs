@@ -1,6 +1,8 @@
 //! What can be wrong with a scene.
 
-use crate::setting::Refused;
+use crate::setting::{Refused, shown};
+use serde::Serialize;
+use std::fmt::Debug;
 use thiserror::Error;
 
 /// Why a scene cannot be rendered, or two films cannot be merged.
@@ -39,7 +41,15 @@ pub enum RenderError {
 impl From<RenderError> for Refused {
     fn from(error: RenderError) -> Self {
         match error {
-            RenderError::Invalid { key, found, accepted } => Self::new(key, format_args!("is {found}"), accepted),
+            RenderError::Invalid { key, found, accepted } => {
+                let beside: &[&str] = match key {
+                    "transfer.high" => &["transfer.low"],
+                    "camera.look_at" | "camera.up" => &["camera.eye", "camera.look_at", "camera.up"],
+                    "camera.field_of_view" | "render.width" => &["render.width", "render.height"],
+                    _ => &[],
+                };
+                Self::new(key, format_args!("is {found}"), accepted).beside(beside)
+            }
             RenderError::Samples { end, limit, .. } => Self::new("render.samples", format_args!("is {end}"), format!("at most {limit}")),
             RenderError::FilmSize { found, expected } => {
                 Self::new("render.width", format_args!("gives {found:?}"), format!("{expected:?}"))
@@ -49,8 +59,8 @@ impl From<RenderError> for Refused {
 }
 
 /// Refuses unless `holds`.
-pub(super) fn require(holds: bool, key: &'static str, found: impl std::fmt::Debug, accepted: &'static str) -> Result<(), RenderError> {
-    if holds { Ok(()) } else { Err(RenderError::Invalid { key, found: format!("{found:?}"), accepted }) }
+pub(super) fn require(holds: bool, key: &'static str, found: impl Serialize + Debug, accepted: &'static str) -> Result<(), RenderError> {
+    if holds { Ok(()) } else { Err(RenderError::Invalid { key, found: shown(found), accepted }) }
 }
 
 /// Refuses a vector with a component that is not a finite number.

@@ -69,7 +69,7 @@ impl Transfer {
             let key = if settings.low.is_none() { "transfer.low" } else { "transfer.high" };
             return Err(RenderError::Invalid { key, found: "not set".into(), accepted: number });
         };
-        require_finite("transfer.low", &[low])?;
+        require(low.is_finite(), "transfer.low", low, "a finite number")?;
         let range = (high - low) as f32;
         require(
             high.is_finite() && high > low && range > 0.0 && (1.0 / range).is_finite(),
@@ -187,7 +187,7 @@ mod tests {
         };
         assert_eq!(fault(|s| s.high = Some(0.05)), "`transfer.high` is 0.05; accepted: a finite number above transfer.low");
         assert!(fault(|s| s.low = None).starts_with("`transfer.low` is not set"));
-        assert!(fault(|s| s.low = Some(f64::NAN)).starts_with("`transfer.low` is [NaN]"));
+        assert!(fault(|s| s.low = Some(f64::NAN)).starts_with("`transfer.low` is nan;"));
         assert!(fault(|s| s.extinction = Some(-1.0)).starts_with("`transfer.extinction` is -1.0"));
         assert!(fault(|s| s.albedo[1] = vec![]).contains("1 to 16 coefficients"));
         assert!(fault(|s| s.albedo[2] = vec![0.0, 3.0]).contains("values in [0, 1]"));

@@ -1,7 +1,7 @@
 //! `[source]` and `[domain]` of a scene file: which velocity, and the box of a closed form.
 
 use super::NetCdfSettings;
-use crate::setting::{Refused, count, require};
+use crate::setting::{Refused, count, require, shown};
 use serde::{Deserialize, Serialize};
 
 /// Where velocity comes from.
@@ -90,7 +90,11 @@ impl SourceSettings {
             let Some(value) = value else { continue };
             let key = format!("source.{key}");
             if !kinds.contains(&kind) {
-                return fault(&key, format!("does not belong to kind {kind:?}"), &format!("only with kind {kinds:?}"));
+                return fault(
+                    &key,
+                    format!("does not belong to kind {}", shown(kind)),
+                    &format!("only with kind {}", kinds.iter().map(shown).collect::<Vec<_>>().join(" or ")),
+                );
             }
             require(value.is_finite(), &key, value, "a finite number")?;
         }
@@ -122,7 +126,8 @@ impl SourceSettings {
         }
         if let Some(domain) = domain {
             let proper = (0..3).all(|k| domain.min[k].is_finite() && domain.max[k].is_finite() && domain.max[k] > domain.min[k]);
-            require(proper, "domain.max", domain.max, &format!("three finite numbers above domain.min = {:?}", domain.min))?;
+            let accepted = format!("three finite numbers above domain.min = {:?}", domain.min);
+            require(proper, "domain.max", domain.max, &accepted).map_err(|refused| refused.beside(&["domain.min"]))?;
         }
         if kind == Archive && archive.files.is_empty() && archive.synthetic.is_none() {
             fault("archive.files", "is empty", "a list of files or globs, or a table [archive.synthetic]")?;

@@ -42,7 +42,7 @@ pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, Resol
 pub use kinds::{DomainSettings, SourceKind, SourceSettings};
 pub use libraries::{hdf5_version, netcdf_version};
 pub use memory::MemorySource;
-pub use reader::{DEFAULT_READ_AHEAD, ReadAhead, StillReading, read_ahead};
+pub use reader::{DEFAULT_READ_AHEAD, Listener, ReadAhead, StillReading, read_ahead};
 pub use settings::{Metric, NetCdfSettings, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use steady::Steady;
 pub use synthetic::{GlobeTurbulence, synthesize};

@@ -3,13 +3,16 @@
 use super::{SnapshotSource, SourceError};
 use crate::field::Snapshot;
 use std::ops::Range;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
 /// Snapshots that wait in the channel unless asked otherwise.
 pub const DEFAULT_READ_AHEAD: usize = 2;
+
+/// Hears of every snapshot as soon as it is read, on the I/O thread; it should be quick.
+pub type Listener = Box<dyn Fn(&Arc<Snapshot>) + Send + Sync>;
 
 /// Snapshots in time order, read ahead by a thread of their own. Dropping it ends the thread after the read in progress.
 pub struct ReadAhead {
@@ -18,6 +21,7 @@ pub struct ReadAhead {
     count: usize,
     waited: Duration,
     reading_nanoseconds: Arc<AtomicU64>,
+    listener: Arc<OnceLock<Listener>>,
     /// Why the thread could not start; handed out once.
     failed: Option<SourceError>,
     ended: bool,
@@ -36,11 +40,16 @@ pub fn read_ahead(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capa
     let (sender, receiver) = sync_channel(capacity.max(1));
     let reading_nanoseconds = Arc::new(AtomicU64::new(0));
     let clock = reading_nanoseconds.clone();
+    let listener = Arc::new(OnceLock::<Listener>::new());
+    let told = listener.clone();
     let work = move || {
         for index in range {
             let begin = Instant::now();
             let read = source.read(index).map(Arc::new);
             clock.fetch_add(begin.elapsed().as_nanos() as u64, Ordering::Relaxed);
+            if let (Ok(snapshot), Some(tell)) = (&read, told.get()) {
+                tell(snapshot);
+            }
             // The receiver is gone: nobody wants the rest.
             if sender.send(read).is_err() {
                 return;
@@ -52,7 +61,7 @@ pub fn read_ahead(mut source: Box<dyn SnapshotSource>, range: Range<usize>, capa
         count,
         what: format!("it could not start: {e}"),
     });
-    ReadAhead { receiver, given: 0, count, waited: Duration::ZERO, reading_nanoseconds, failed, ended: false }
+    ReadAhead { receiver, given: 0, count, waited: Duration::ZERO, reading_nanoseconds, listener, failed, ended: false }
 }
 
 impl ReadAhead {
@@ -92,6 +101,12 @@ impl ReadAhead {
                 Ok(Some(Err(SourceError::ReaderStopped { index: self.given, count: self.count, what: "it panicked".into() })))
             }
         }
+    }
+
+    /// From now on `listener` hears of snapshots as they are read, before they are given. The first one that is set stays.
+    pub fn tell(&self, listener: Listener) {
+        // A second one has nothing to add: the first hears of everything.
+        let _ = self.listener.set(listener);
     }
 
     /// Snapshots still to come.
@@ -150,6 +165,22 @@ mod tests {
         let times: Vec<f64> = reader.by_ref().map(|s| s.unwrap().time).collect();
         assert_eq!(times, (5..20).map(f64::from).collect::<Vec<_>>());
         assert!(reader.next().is_none() && reader.reading() > Duration::ZERO);
+    }
+
+    #[test]
+    fn a_listener_hears_of_what_is_read_before_it_is_given() {
+        let made = Arc::new(AtomicUsize::new(0));
+        let mut reader = read_ahead(source(30, made.clone(), 99), 0..30, 2);
+        // Two wait and one is in hand: the thread stands still until the first is taken.
+        assert_eq!(settled(&made, 3), 3);
+        let heard = Arc::new(std::sync::Mutex::new(Vec::new()));
+        let hears = heard.clone();
+        reader.tell(Box::new(move |snapshot| hears.lock().unwrap().push(snapshot.time)));
+        for (index, snapshot) in reader.by_ref().enumerate() {
+            let time = snapshot.unwrap().time;
+            assert!(index < 3 || heard.lock().unwrap().contains(&time), "snapshot {time} was given unannounced");
+        }
+        assert_eq!(*heard.lock().unwrap(), (3..30).map(f64::from).collect::<Vec<_>>(), "those read from then on, once each, in order");
     }
 
     #[test]

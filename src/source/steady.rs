@@ -37,7 +37,9 @@ impl SnapshotSource for Steady {
         let Some(&time) = self.times.get(index) else {
             return Err(SourceError::NoSuchSnapshot { index, count: self.times.len() });
         };
-        Ok(Snapshot { time, ..self.source.read(0)? })
+        let mut snapshot = self.source.read(0)?;
+        snapshot.time = time;
+        Ok(snapshot)
     }
 
     fn date(&self, time: f64) -> Option<String> {

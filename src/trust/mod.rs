@@ -9,6 +9,7 @@ mod map;
 pub use error::TrustedError;
 pub use map::{Gate, Residual, Strata, TrustMap};
 
+use crate::setting::{Refused, count, positive, require};
 use serde::{Deserialize, Serialize};
 
 /// `[trust]` of a scene file.
@@ -50,5 +51,40 @@ impl Default for TrustSettings {
             slide_inflation: 4.0,
             trace_budget: None,
         }
+    }
+}
+
+impl TrustSettings {
+    /// Checks every value.
+    pub fn check(&self) -> Result<(), Refused> {
+        positive("trust.tolerance", self.tolerance)?;
+        require((0.01..=1.0).contains(&self.audit_share), "trust.audit_share", self.audit_share, "a number from 0.01 to 1")?;
+        count("trust.audit_per_cell", self.audit_per_cell, 1, 4096)?;
+        count("trust.audit_most_per_cell", self.audit_most_per_cell, 1, 65_536)?;
+        require((0.001..=1.0).contains(&self.audit_precision), "trust.audit_precision", self.audit_precision, "a number from 0.001 to 1")?;
+        require((4.0..=4096.0).contains(&self.min_samples), "trust.min_samples", self.min_samples, "a number from 4 to 4096")?;
+        let inflation = self.slide_inflation;
+        require(inflation.is_finite() && inflation >= 1.0, "trust.slide_inflation", inflation, "a number from 1 up")?;
+        if let Some(seconds) = self.trace_budget {
+            positive("trust.trace_budget", seconds)?;
+        }
+        if let Some(cells) = self.cells {
+            for n in cells {
+                count("trust.cells", n, 1, 1024)?;
+            }
+            count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
+            // Every frame draws and traces this many points.
+            let a_cell = self.min_samples.ceil().max(self.audit_per_cell.max(self.audit_most_per_cell) as f64);
+            let points = a_cell * cells.iter().product::<usize>() as f64;
+            if points > f64::from(1 << 26) {
+                let found = format_args!("is {cells:?}, which asks for {points:.0} points a frame");
+                return Err(Refused::new("trust.cells", found, "at most 2^26 points (cells x samples a cell)").beside(&[
+                    "trust.min_samples",
+                    "trust.audit_per_cell",
+                    "trust.audit_most_per_cell",
+                ]));
+            }
+        }
+        Ok(())
     }
 }

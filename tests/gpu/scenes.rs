@@ -62,7 +62,7 @@ pub fn on_gpu(source: &VelocitySource, map: &FlowMap, t0: f64, tuning: Tuning, s
     };
     let tracer = CudaTracer::new(store(), &gpu(), source.clone(), map, t0, tuning).unwrap();
     tracer.trace(seeds, EVERYTHING, &mut out);
-    assert_eq!(gpu().failure(), None);
+    assert_eq!(gpu().health().failure(), None);
     out
 }
 

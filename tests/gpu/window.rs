@@ -44,7 +44,7 @@ fn a_slide_brings_only_what_is_new() {
         }
         window.push(snapshot(&grid, f64::from(slide + 4), 0.5, false)).unwrap();
     }
-    assert_eq!(gpu.failure(), None);
+    assert_eq!(gpu.health().failure(), None);
 }
 
 #[test]

@@ -3,6 +3,8 @@
 use super::DeviceError;
 use super::compile::{self, KernelCache};
 use super::memory::{Budget, Buffer};
+use crate::engine::accelerator::Health;
+use crate::engine::device::WhenLost;
 use cudarc::driver::{CudaContext, CudaEvent, CudaFunction, CudaModule, CudaStream, DeviceRepr, result, sys};
 use cudarc::nvrtc::Ptx;
 use std::collections::HashMap;
@@ -21,6 +23,8 @@ pub struct GpuSettings {
     pub cache: Option<std::path::PathBuf>,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
+    /// What happens when the device is lost.
+    pub when_lost: WhenLost,
 }
 
 /// A device that the driver finds.
@@ -45,7 +49,7 @@ pub struct Gpu {
     budget: Arc<Budget>,
     cache: KernelCache,
     modules: Mutex<HashMap<String, Arc<CudaModule>>>,
-    failure: Mutex<Option<DeviceError>>,
+    health: Arc<Health>,
 }
 
 impl fmt::Debug for Gpu {
@@ -131,7 +135,7 @@ impl Gpu {
             budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64)),
             cache: KernelCache::new(settings.cache.clone()),
             modules: Mutex::new(HashMap::new()),
-            failure: Mutex::new(None),
+            health: Arc::new(Health::new(settings.when_lost)),
             context,
         };
         gpu.keep_freed_memory()?;
@@ -276,13 +280,8 @@ impl Gpu {
         Ok(2.0 * bytes as f64 / f64::from(best) * 1e3)
     }
 
-    /// Remembers the first failure of GPU work; later work is not tried.
-    pub fn fail(&self, error: DeviceError) {
-        self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
-    }
-
-    /// The first failure of GPU work.
-    pub fn failure(&self) -> Option<DeviceError> {
-        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    /// Whether it still works, and what follows when it does not.
+    pub fn health(&self) -> &Arc<Health> {
+        &self.health
     }
 }

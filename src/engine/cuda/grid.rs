@@ -3,7 +3,7 @@
 use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
 use super::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
-use crate::flow::{AxisMap, Boundary, FlowMap, Integrator, Interpolation, angle_slack, poles};
+use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
 
 /// What a kernel for a window is launched with.
 #[derive(Debug)]
@@ -90,13 +90,7 @@ impl GridArguments {
         let end = |i: usize| -> [R; 3] {
             std::array::from_fn(|k| if i == 0 { R::from_f64(ends[k][i]) - slack(k) } else { R::from_f64(ends[k][i]) + slack(k) })
         };
-        let (low, high) = match map.boundary {
-            Boundary::Stop => (end(0), end(1)),
-            Boundary::Zero => (end(0).map(R::above), end(1).map(R::below)),
-            Boundary::Clamp | Boundary::Periodic | Boundary::Unbounded => {
-                ([R::from_f64(f64::NEG_INFINITY); 3], [R::from_f64(f64::INFINITY); 3])
-            }
-        };
+        let [low, high] = bounds(map.boundary, end(0), end(1));
         let [nx, ny, _] = grid.shape();
         let (longitude, latitude) = (&maps[0], &maps[1]);
         let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);

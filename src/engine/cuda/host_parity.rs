@@ -335,7 +335,7 @@ fn half_precision_windows() {
     for snapshot in window.snapshots() {
         let round = |x: f32| if x.is_nan() { x } else { round_to_half(x / HALF_SCALE) * HALF_SCALE };
         let nodes = snapshot.nodes.iter().map(|n| n.map(round)).collect();
-        rounded.push(Arc::new(Snapshot { time: snapshot.time, grid: snapshot.grid.clone(), nodes })).unwrap();
+        rounded.push(Arc::new(Snapshot::new(snapshot.time, snapshot.grid.clone(), nodes))).unwrap();
     }
     let map = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
     let seeds = fresh(&window.grid().unwrap().domain(), 500);

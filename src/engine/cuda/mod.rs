@@ -4,6 +4,8 @@
 //! gives. Kernels are in `kernels/`, compiled at start for the device found. Everything here returns [`DeviceError`]; nothing panics where
 //! libraries or devices are missing.
 
+mod accelerator;
+mod ahead;
 pub mod compile;
 mod device;
 mod error;
@@ -20,9 +22,11 @@ mod sort;
 mod table;
 mod trace;
 mod tracer;
+mod transfer;
 mod window;
 
 pub use super::device::Storage;
+pub use accelerator::CudaAccelerator;
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use launch::{launch, threads};
@@ -32,5 +36,5 @@ pub use render::{DeviceAnswers, GpuRenderer, LookAhead, Timeline, Traced};
 pub use sort::{SortCells, Sorter};
 pub use table::DeviceTable;
 pub use trace::{DeviceTracer, Tuning};
-pub use tracer::{CudaTracer, CudaTracerError};
+pub use tracer::{CudaTrace, CudaTracer, CudaTracerError};
 pub use window::{DeviceSnapshot, DeviceWindow, SnapshotStore};

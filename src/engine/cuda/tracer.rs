@@ -3,8 +3,8 @@
 use super::layout::Outputs;
 use super::trace::{DeviceTracer, Tuning};
 use super::{Buffer, DeviceError, Gpu, SnapshotStore};
-use crate::field::Domain;
-use crate::flow::{Chosen, Extras, FlowError, FlowMap, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
+use crate::engine::accelerator::{Backed, DeviceTrace};
+use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, cpu_tracer};
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
 
@@ -22,11 +22,12 @@ pub enum CudaTracerError {
     Device(#[from] DeviceError),
 }
 
-/// A flow map on the GPU, with the CPU's tracer behind it: the latter checks the settings, chooses the number of steps and goes on when
-/// the device is lost.
-pub struct CudaTracer {
+/// A flow map on the GPU, with the CPU's tracer behind it.
+pub type CudaTracer = Backed<CudaTrace>;
+
+/// A flow map on the GPU, for seeds on the host.
+pub struct CudaTrace {
     device: DeviceTracer,
-    host: Box<dyn Tracer>,
     double: bool,
     /// One call at a time.
     room: Mutex<Option<Room>>,
@@ -59,15 +60,22 @@ impl CudaTracer {
     ) -> Result<Self, CudaTracerError> {
         let host = cpu_tracer(source.clone(), map, t0)?;
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
-        Ok(Self { device, host, double: map.precision == Precision::F64, room: Mutex::new(None) })
+        let trace = CudaTrace { device, double: map.precision == Precision::F64, room: Mutex::new(None) };
+        Ok(Self::with(trace, host, gpu.health().clone()))
     }
 
     /// The device's side, for callers whose seeds are there.
     pub fn device(&self) -> &DeviceTracer {
-        &self.device
+        &self.on_device().device
+    }
+}
+
+impl DeviceTrace for CudaTrace {
+    fn double(&self) -> bool {
+        self.double
     }
 
-    fn on_device(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         let gpu = self.device.gpu();
         let mut room = self.room.lock().unwrap_or_else(PoisonError::into_inner);
         let most = seeds.len().min(BATCH);
@@ -116,45 +124,5 @@ impl CudaTracer {
             }
         }
         Ok(())
-    }
-}
-
-impl Tracer for CudaTracer {
-    fn domain(&self) -> &Domain {
-        self.host.domain()
-    }
-    fn tau(&self) -> f64 {
-        self.host.tau()
-    }
-    fn steps(&self) -> usize {
-        self.host.steps()
-    }
-    fn chosen(&self) -> Option<Chosen> {
-        self.host.chosen()
-    }
-    fn is_void(&self, seed: [f32; 3]) -> bool {
-        self.host.is_void(seed)
-    }
-
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        Some(self)
-    }
-
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
-        let gpu = self.device.gpu();
-        if gpu.failure().is_none() {
-            let wanted = |yes: bool| if yes { seeds.len() } else { 0 };
-            out.log_stretch.resize(seeds.len(), 0.0);
-            out.lived.resize(seeds.len(), 0.0);
-            out.log_stretch_f64.resize(wanted(self.double), 0.0);
-            out.arrival.resize(wanted(extras.arrival), [0.0; 3]);
-            out.jacobian.resize(wanted(extras.jacobian), [0.0; 9]);
-            match self.on_device(seeds, extras, out) {
-                Ok(()) => return,
-                // The cycle asks for the failure after each frame and records it.
-                Err(error) => gpu.fail(error),
-            }
-        }
-        self.host.trace(seeds, extras, out);
     }
 }

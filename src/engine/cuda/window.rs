@@ -1,12 +1,16 @@
-//! Snapshots on the device: each comes over once, from page-locked memory on the transfer stream, while kernels run on the work stream.
-//! A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
+//! Snapshots on the device: each comes over once, those that are expected by a thread of their own, while frames of the slide before are
+//! made. A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
 
+use super::ahead::Ahead;
 use super::grid::Nodes;
-use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
+use super::transfer::Carrier;
+use super::{Buffer, DeviceError, Gpu, Storage};
 use crate::field::{Snapshot, Window};
-use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
+use cudarc::driver::CudaEvent;
 use rayon::prelude::*;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 
 impl Storage {
     /// Bytes of a node.
@@ -25,25 +29,30 @@ impl Storage {
     }
 }
 
-/// Nodes of a page-locked piece: 8 MiB.
-const PIECE: usize = 1 << 19;
 /// Half-precision velocities of the first window are scaled to below this, which leaves later ones room to grow sixteenfold.
 const HALF_PEAK: f32 = 4096.0;
 /// Largest half-precision number that is used; beyond it the window is encoded anew.
 const HALF_MOST: f32 = 60_000.0;
+/// Snapshots that come over before a window wants them, at most.
+const AHEAD: usize = 2;
+/// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
+const AHEAD_SHARE: u64 = 4;
+/// Threads that copy expected snapshots to page-locked memory, at most: as many as keep the bus busy.
+const COPIERS: usize = 4;
 
 /// One snapshot on the device.
 #[derive(Debug)]
 pub struct DeviceSnapshot {
     /// Holding it keeps its address from being given to another one.
-    host: Arc<Snapshot>,
+    pub(super) host: Arc<Snapshot>,
     /// `f32`: 4 words a node, `f16`: 2.
-    nodes: Buffer<u32>,
-    storage: Storage,
-    scale: f32,
+    pub(super) nodes: Buffer<u32>,
+    pub(super) storage: Storage,
+    pub(super) scale: f32,
     /// Whether some node is missing.
-    missing: bool,
-    ready: CudaEvent,
+    pub(super) missing: bool,
+    /// When it is there.
+    pub(super) ready: CudaEvent,
 }
 
 /// The snapshots of one window, oldest first.
@@ -72,36 +81,65 @@ impl DeviceWindow {
 /// Brings snapshots over and remembers those that are there.
 #[derive(Debug)]
 pub struct SnapshotStore {
+    shared: Arc<Shared>,
+    /// Brings expected ones; started with the first.
+    thread: Mutex<Option<JoinHandle<()>>>,
+}
+
+#[derive(Debug)]
+struct Shared {
     gpu: Arc<Gpu>,
     state: Mutex<State>,
+    /// Told of every change that somebody may wait for.
+    changed: Condvar,
+    /// Locked behind `state`, never before it.
+    carrier: Mutex<Carrier>,
 }
 
 #[derive(Debug, Default)]
 struct State {
+    /// Those of the latest window.
     held: Vec<Arc<DeviceSnapshot>>,
-    pieces: Option<Pieces>,
-    to_half: Option<CudaFunction>,
+    ahead: Ahead<DeviceSnapshot>,
+    /// How the latest window is held: storage and scale. None before the first.
+    form: Option<(Storage, f32)>,
+    /// Host memory that nobody needs: giving it back takes milliseconds, which are the thread's.
+    gone: Vec<Arc<Snapshot>>,
     brought: u64,
-}
-
-/// Two page-locked pieces that take turns, and for half precision their images on the device.
-#[derive(Debug)]
-struct Pieces {
-    pinned: [PinnedHostSlice<u32>; 2],
-    /// When the transfer out of each was done.
-    free: [Option<CudaEvent>; 2],
-    images: Option<[Buffer<u32>; 2]>,
+    brought_ahead: u64,
+    ended: bool,
 }
 
 impl SnapshotStore {
     /// Nothing there yet.
     pub fn new(gpu: &Arc<Gpu>) -> Self {
-        Self { gpu: gpu.clone(), state: Mutex::default() }
+        let shared = Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), carrier: Mutex::new(Carrier::new(gpu)) };
+        Self { shared: Arc::new(shared), thread: Mutex::new(None) }
     }
 
     /// Snapshots brought over so far.
     pub fn brought(&self) -> u64 {
-        self.state.lock().unwrap_or_else(PoisonError::into_inner).brought
+        self.shared.state().brought
+    }
+
+    /// Of them, those that were there before a window wanted them.
+    pub fn brought_ahead(&self) -> u64 {
+        self.shared.state().brought_ahead
+    }
+
+    /// A snapshot that windows will want, after those expected before: it comes over beside other work, once there is a window and where
+    /// memory allows.
+    pub fn expect(&self, snapshot: &Arc<Snapshot>) {
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        if thread.is_none() {
+            let shared = self.shared.clone();
+            let started = std::thread::Builder::new().name("ridgewatch-upload".into()).spawn(move || shared.bring_expected());
+            // Without the thread, windows bring their snapshots themselves.
+            let Ok(started) = started else { return };
+            *thread = Some(started);
+        }
+        self.shared.state().ahead.expect(snapshot);
+        self.shared.changed.notify_all();
     }
 
     /// The window on the device. Brings over what is not there yet and forgets what the window no longer holds. Kernels launched on the
@@ -110,9 +148,55 @@ impl SnapshotStore {
     /// # Errors
     /// [`DeviceError::WindowTooLarge`] with the numbers and the ways out.
     pub fn window(&self, window: &Window, storage: Storage) -> Result<DeviceWindow, DeviceError> {
-        let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
+        let result = self.shared.window(window, storage);
+        self.shared.changed.notify_all();
+        result
+    }
+}
+
+impl Drop for SnapshotStore {
+    fn drop(&mut self) {
+        self.shared.state().ended = true;
+        self.shared.changed.notify_all();
+        let thread = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner).take();
+        // It ends after the snapshot in its hands.
+        let _ = thread.map(JoinHandle::join);
+    }
+}
+
+impl Shared {
+    fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wait<'a>(&self, state: MutexGuard<'a, State>) -> MutexGuard<'a, State> {
+        self.changed.wait(state).unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn carry(&self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<Arc<DeviceSnapshot>, DeviceError> {
+        let mut carrier = self.carrier.lock().unwrap_or_else(PoisonError::into_inner);
+        carrier.carry(snapshot, storage, scale).map(Arc::new)
+    }
+
+    fn window(&self, window: &Window, storage: Storage) -> Result<DeviceWindow, DeviceError> {
         let wanted: Vec<&Arc<Snapshot>> = window.snapshots().collect();
-        state.held.retain(|s| s.storage == storage && wanted.iter().any(|w| Arc::ptr_eq(w, &s.host)));
+        let mut state = self.state();
+        while wanted.iter().any(|s| state.ahead.is_on_the_way(s)) {
+            state = self.wait(state);
+        }
+        if state.form.is_some_and(|(held, _)| held != storage) {
+            state.held.clear();
+            state.ahead.let_go();
+            state.form = None;
+        }
+        let taken = state.ahead.take(&wanted);
+        state.brought_ahead += taken.len() as u64;
+        state.held.extend(taken);
+        let (held, gone) = std::mem::take(&mut state.held).into_iter().partition(|s| wanted.iter().any(|w| Arc::ptr_eq(w, &s.host)));
+        state.held = held;
+        let gone: Vec<Arc<DeviceSnapshot>> = gone;
+        state.gone.extend(gone.iter().map(|s| s.host.clone()));
+        drop(gone);
         let fresh = |state: &State| -> Vec<Arc<Snapshot>> {
             wanted.iter().filter(|w| !state.held.iter().any(|s| Arc::ptr_eq(w, &s.host))).map(|w| Arc::clone(w)).collect()
         };
@@ -123,12 +207,17 @@ impl SnapshotStore {
             if state.held.is_empty() || peak / scale > HALF_MOST {
                 // A power of two, so that nothing but range is changed.
                 state.held.clear();
+                state.ahead.let_go();
                 missing = fresh(&state);
                 let peak = missing.iter().map(|s| self::peak(s)).fold(f32::MIN_POSITIVE, f32::max);
                 scale = (peak / HALF_PEAK).log2().ceil().clamp(-100.0, 100.0).exp2();
             }
         }
         let needed = |bytes: u64| missing.iter().map(|s| s.nodes.len() as u64 * bytes).sum::<u64>();
+        if needed(storage.bytes()) > self.gpu.memory_left() {
+            // What is here early makes room for what is wanted now.
+            state.ahead.let_go();
+        }
         let left = self.gpu.memory_left();
         if needed(storage.bytes()) > left {
             return Err(DeviceError::WindowTooLarge {
@@ -141,9 +230,11 @@ impl SnapshotStore {
             });
         }
         for snapshot in &missing {
-            let there = self.bring(&mut state, snapshot, storage, scale)?;
-            state.held.push(Arc::new(there));
+            let there = self.carry(snapshot, storage, scale)?;
+            state.held.push(there);
+            state.brought += 1;
         }
+        state.form = Some((storage, scale));
         let doing = DeviceError::driver("ordering the transfer of snapshots");
         let mut snapshots = Vec::with_capacity(wanted.len());
         for snapshot in wanted {
@@ -154,68 +245,52 @@ impl SnapshotStore {
         Ok(DeviceWindow { snapshots })
     }
 
-    fn bring(&self, state: &mut State, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<DeviceSnapshot, DeviceError> {
-        let gpu = &self.gpu;
-        let doing = DeviceError::driver("bringing a snapshot over");
-        let words = (storage.bytes() / 4) as usize;
-        let mut nodes = Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "a snapshot", snapshot.nodes.len() * words)?.read_by(gpu.work());
-        if state.pieces.is_none() {
-            // SAFETY: pieces are written before they are read.
-            let pinned = || unsafe { gpu.context().alloc_pinned::<u32>(4 * PIECE) }.map_err(&doing);
-            state.pieces = Some(Pieces { pinned: [pinned()?, pinned()?], free: [None, None], images: None });
-        }
-        if storage == Storage::F16 && state.to_half.is_none() {
-            state.to_half = Some(gpu.kernel("window.cu", &[], "to_half_nodes")?);
-        }
-        let State { pieces: Some(pieces), to_half, brought, .. } = state else {
-            return Err(DeviceError::Unsupported { what: "a transfer without page-locked memory".into() });
-        };
-        if storage == Storage::F16 && pieces.images.is_none() {
-            let image = || Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "half-precision encoding", 4 * PIECE);
-            pieces.images = Some([image()?, image()?]);
-        }
-        for (turn, part) in snapshot.nodes.chunks(PIECE).enumerate() {
-            let side = turn % 2;
-            if let Some(event) = &pieces.free[side] {
-                event.synchronize().map_err(&doing)?;
-            }
-            let piece = &mut pieces.pinned[side].as_mut_slice().map_err(&doing)?[..4 * part.len()];
-            piece.par_chunks_mut(1 << 16).zip(part.par_chunks(1 << 14)).for_each(|(to, from)| {
-                for (to, from) in to.chunks_exact_mut(4).zip(from) {
-                    for (to, from) in to.iter_mut().zip(from) {
-                        *to = from.to_bits();
-                    }
-                }
+    /// The thread: brings what is expected, and gives back the memory of what is gone.
+    fn bring_expected(&self) {
+        let copiers = std::thread::available_parallelism().map_or(1, |n| n.get() / 4).clamp(1, COPIERS);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(copiers).thread_name(|i| format!("ridgewatch-copy-{i}")).build();
+        let Ok(pool) = pool else { return };
+        let mut state = self.state();
+        while !state.ended {
+            let gone = std::mem::take(&mut state.gone);
+            let next = state.form.and_then(|form| {
+                let fits = |s: &Snapshot| s.nodes.len() as u64 * form.0.bytes() <= self.gpu.memory_left() / AHEAD_SHARE;
+                state.ahead.next(AHEAD, fits).map(|snapshot| (snapshot, form))
             });
-            let piece = &*piece;
-            let at = turn * PIECE * words;
-            match (&mut pieces.images, &*to_half) {
-                (Some(images), Some(kernel)) if storage == Storage::F16 => {
-                    let (from, to) = (images[side].address(), nodes.address_of(at));
-                    let (count, inverse) = (part.len() as u64, 1.0 / scale);
-                    // SAFETY: the piece is not written before its event; the image holds a piece, and `nodes` the part from `at` on.
-                    unsafe {
-                        images[side].write_behind(0, piece)?;
-                        let mut call = gpu.transfer().launch_builder(kernel);
-                        launch(call.arg(&from).arg(&count).arg(&inverse).arg(&to), threads(part.len(), 256))?;
-                    }
-                }
-                // SAFETY: the piece is not written before its event.
-                _ => unsafe { nodes.write_behind(at, piece)? },
+            if gone.is_empty() && next.is_none() {
+                state = self.wait(state);
+                continue;
             }
-            pieces.free[side] = Some(gpu.transfer().record_event(None).map_err(&doing)?);
+            drop(state);
+            drop(gone);
+            let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.bring_one(snapshot, *form));
+            // A panic must not leave a window waiting for what will never come.
+            let there = next.as_ref().and_then(|next| catch_unwind(AssertUnwindSafe(|| bring(next))).ok().flatten());
+            state = self.state();
+            if let Some((snapshot, form)) = next {
+                // A window may have been encoded anew meanwhile.
+                let there = there.filter(|_| state.form == Some(form));
+                state.brought += u64::from(there.is_some());
+                state.ahead.arrived(&snapshot, there);
+                self.changed.notify_all();
+            }
         }
-        *brought += 1;
-        let ready = gpu.transfer().record_event(None).map_err(&doing)?;
-        let missing = snapshot.nodes.par_iter().with_min_len(1 << 14).any(|node| node[3].is_nan());
-        Ok(DeviceSnapshot {
-            host: snapshot.clone(),
-            nodes,
-            storage,
-            scale: if storage == Storage::F16 { scale } else { 1.0 },
-            missing,
-            ready,
-        })
+    }
+
+    /// One expected snapshot; none where it cannot come over now. The window that wants it then brings it, and says what is wrong.
+    fn bring_one(&self, snapshot: &Arc<Snapshot>, (storage, scale): (Storage, f32)) -> Option<Arc<DeviceSnapshot>> {
+        if storage == Storage::F16 && peak(snapshot) / scale > HALF_MOST {
+            return None;
+        }
+        match self.carry(snapshot, storage, scale) {
+            Ok(there) => Some(there),
+            Err(error) => {
+                if error.is_lost() {
+                    self.gpu.health().fail(error);
+                }
+                None
+            }
+        }
     }
 }
 

@@ -100,8 +100,9 @@ impl Model {
             let moments = self.table_moments.take();
             Lent::new(parameter, moments)
         });
-        let placeholder = Param::initialized(ParamId::from(0), Tensor::zeros([1], &Default::default()));
-        let layers = std::mem::replace(&mut self.module.layers, placeholder);
+        // burn's module cannot be without layers: while they are lent out it holds a tensor that nothing reads.
+        let unread = Param::initialized(ParamId::from(0), Tensor::zeros([1], &Default::default()));
+        let layers = std::mem::replace(&mut self.module.layers, unread);
         Loan { tables, layers: Lent::new(layers, self.layer_moments.take()) }
     }
 }

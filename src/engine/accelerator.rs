@@ -1,0 +1,166 @@
+//! The seam between the engine and a GPU: what is asked of one, and what happens when it breaks.
+//!
+//! CUDA implements it; so does a test's device that breaks at any call, on machines without a GPU.
+
+use super::EngineError;
+use super::answers::Answers;
+use super::cuda::{CudaTracerError, DeviceError};
+use super::device::WhenLost;
+use crate::field::{Domain, Snapshot};
+use crate::flow::{Chosen, Extras, FlowMap, Traced, Tracer, VelocitySource};
+use crate::render::{Film, RenderStats, Renderer};
+use std::fmt;
+use std::sync::{Arc, Mutex, PoisonError};
+
+/// An opened GPU, as the engine sees it.
+pub trait Accelerator: fmt::Debug + Send + Sync {
+    /// For records, e.g. `cuda:0 NVIDIA H200`.
+    fn name(&self) -> String;
+
+    /// Whether it still works, and what follows when it does not.
+    fn health(&self) -> &Arc<Health>;
+
+    /// A tracer for seeds at `t0`, best a [`Backed`] one.
+    ///
+    /// # Errors
+    /// What [`crate::flow::cpu_tracer`] refuses, and what the device cannot do.
+    fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, CudaTracerError>;
+
+    /// What makes films on it.
+    ///
+    /// # Errors
+    /// What the device says.
+    fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError>;
+
+    /// A snapshot that a window will want soon: it may come over while other work goes on.
+    fn expect(&self, snapshot: &Arc<Snapshot>);
+}
+
+/// Makes films on a GPU.
+pub trait DeviceRenderer: Send + Sync {
+    /// Renders samples 0 to `samples` of every pixel, with the answers that `answers` would give by asking `tracer`; none where it cannot.
+    ///
+    /// # Errors
+    /// [`EngineError::Device`]; then `answers` has counted nothing and `renderer` learnt nothing of this frame, which can be rendered
+    /// again by other means.
+    fn render(
+        &mut self,
+        renderer: &mut Renderer,
+        picture: u64,
+        samples: usize,
+        tracer: &dyn Tracer,
+        answers: &mut Answers<'_>,
+        progress: Option<&dyn Fn(f32)>,
+        stop: &std::sync::atomic::AtomicBool,
+    ) -> Result<Option<(Film, RenderStats)>, EngineError>;
+}
+
+/// Whether a device works. The first failure ends all work on it.
+#[derive(Debug, Default)]
+pub struct Health {
+    failure: Mutex<Option<DeviceError>>,
+    when_lost: WhenLost,
+}
+
+impl Health {
+    /// Works.
+    pub fn new(when_lost: WhenLost) -> Self {
+        Self { failure: Mutex::default(), when_lost }
+    }
+
+    /// Remembers the first failure; later work is not tried.
+    pub fn fail(&self, error: DeviceError) {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
+    }
+
+    /// The first failure.
+    pub fn failure(&self) -> Option<DeviceError> {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Whether nothing has failed.
+    pub fn works(&self) -> bool {
+        self.failure.lock().unwrap_or_else(PoisonError::into_inner).is_none()
+    }
+
+    /// Whether the run is to go on without the device.
+    ///
+    /// # Errors
+    /// The failure, where it is to end the run.
+    pub fn check(&self) -> Result<(), DeviceError> {
+        match self.when_lost {
+            WhenLost::Cpu => Ok(()),
+            WhenLost::Stop => self.failure().map_or(Ok(()), Err),
+        }
+    }
+}
+
+/// Traces on a device, where any call may be the last.
+pub trait DeviceTrace: Send + Sync + 'static {
+    /// What [`Tracer::trace`] does; `out` has the lengths that it should have.
+    ///
+    /// # Errors
+    /// What the device says; `out` then holds anything.
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError>;
+
+    /// Whether [`Traced::log_stretch_f64`] is filled.
+    fn double(&self) -> bool;
+}
+
+/// A device's tracer with the CPU's behind it: that one checks the settings, chooses the number of steps, and goes on when the device
+/// is lost. Where the run is to end then, what is asked afterwards is NaN, so that the run gets there soon.
+pub struct Backed<T> {
+    device: T,
+    host: Box<dyn Tracer>,
+    health: Arc<Health>,
+}
+
+impl<T: DeviceTrace> Backed<T> {
+    /// `host` traces the same flow map.
+    pub fn with(device: T, host: Box<dyn Tracer>, health: Arc<Health>) -> Self {
+        Self { device, host, health }
+    }
+
+    /// The device's side.
+    pub fn on_device(&self) -> &T {
+        &self.device
+    }
+}
+
+impl<T: DeviceTrace> Tracer for Backed<T> {
+    fn domain(&self) -> &Domain {
+        self.host.domain()
+    }
+    fn tau(&self) -> f64 {
+        self.host.tau()
+    }
+    fn steps(&self) -> usize {
+        self.host.steps()
+    }
+    fn chosen(&self) -> Option<Chosen> {
+        self.host.chosen()
+    }
+    fn is_void(&self, seed: [f32; 3]) -> bool {
+        self.host.is_void(seed)
+    }
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        Some(self)
+    }
+
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+        if self.health.works() {
+            out.set_len(seeds.len(), extras, self.device.double());
+            match self.device.trace(seeds, extras, out) {
+                Ok(()) => return,
+                // The cycle asks for the failure after each frame and records it.
+                Err(error) => self.health.fail(error),
+            }
+        }
+        if self.health.check().is_ok() {
+            self.host.trace(seeds, extras, out);
+        } else {
+            *out = Traced::default();
+            out.set_len(seeds.len(), extras, self.device.double());
+        }
+    }
+}

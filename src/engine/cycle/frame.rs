@@ -1,0 +1,245 @@
+//! One frame: rendered with frozen weights while the live ones train, held against what it traced, and recorded.
+
+use super::{Cycle, KEEP_A_FRAME, Place, fixed_steps};
+use crate::engine::answers::{Answers, Tally};
+use crate::engine::audit;
+use crate::engine::feed::Slide;
+use crate::engine::training::{Until, train};
+use crate::engine::{EngineError, Event, Frame, FrameRecord, StageSeconds};
+use crate::flow::{Tracer, VelocitySource};
+use crate::render::{Film, Method, RenderStats};
+use crate::surrogate::{Learned, Predict, SampleRing, Samples, Surrogate};
+use crate::trust::{Gate, Residual, Strata};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// Number of the first warm-up picture, far beyond all others.
+const WARMUP_PICTURES: u64 = 1 << 40;
+
+/// What the rendering threads hand back.
+pub(super) struct Rendered {
+    pub(super) film: Film,
+    samples_per_pixel: usize,
+    pub(super) stats: RenderStats,
+    pub(super) tally: Tally,
+    pub(super) samples: Samples,
+    pub(super) audit: audit::Audit,
+    pub(super) strata: Strata,
+    /// Of the audit points; none without a surrogate.
+    pub(super) residuals: Option<Vec<Residual>>,
+    pub(super) render_seconds: f64,
+    pub(super) audit_seconds: f64,
+}
+
+enum Trainer<'scope, 'b> {
+    Beside(std::thread::ScopedJoinHandle<'scope, Learned>),
+    After(&'b mut Box<dyn Surrogate>, &'b SampleRing),
+}
+
+impl Cycle<'_> {
+    pub(super) fn frame(
+        &mut self,
+        tracer: &dyn Tracer,
+        slide: &mut Slide,
+        place: Place,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<Frame, EngineError> {
+        let start = Instant::now();
+        let scene = &self.plan.scene;
+        let gate = match scene.render.method {
+            Method::Gated => self.trust.gate(),
+            Method::Reference => Gate::uniform(false),
+            Method::Surrogate => Gate::uniform(true),
+        };
+        // Frozen weights: what is rendered with has not seen this frame's samples.
+        let front: Option<Arc<dyn Predict>> = self.live.as_ref().map(|live| live.freeze());
+        let (work, learned) = self.picture(tracer, front.as_deref(), &gate, place, sink)?;
+        let mut record = self.record(tracer, &work, slide);
+        record.surrogate = front.as_ref().map(|s| s.name().to_owned());
+        let auditing = Instant::now();
+        if let Some(front) = front.as_deref() {
+            self.assess(front, tracer, &gate, &work, &mut record);
+        }
+        let audit_seconds = work.audit_seconds + auditing.elapsed().as_secs_f64();
+        let total = start.elapsed().as_secs_f64();
+        if let Some(front) = front.as_deref() {
+            // The measurement's time, not the frame's.
+            record.verified = self.verify(front, tracer, &gate);
+        }
+        self.options.device.check()?;
+        if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
+            record.warnings.push(format!("work on the GPU has ended, the CPU goes on: {failure}"));
+        }
+        let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
+        if let Some(learned) = &learned {
+            self.report.train_steps += learned.steps;
+            if learned.rollbacks > 0 {
+                record
+                    .warnings
+                    .push(format!("training diverged {} time(s): rolled back to the last good weights at a lower rate", learned.rollbacks));
+            }
+        }
+        record.training = learned;
+        record.ring = self.ring.len() as u64;
+        record.seconds = StageSeconds {
+            slide: place.preparing,
+            waiting: std::mem::take(&mut slide.waited),
+            render: work.render_seconds - work.tally.trace_seconds - work.tally.predict_seconds,
+            trace: work.tally.trace_seconds,
+            predict: work.tally.predict_seconds,
+            audit: audit_seconds,
+            train: train_seconds,
+            total,
+            elapsed: self.began.elapsed().as_secs_f64(),
+        };
+        if let VelocitySource::Window(window) = &slide.velocity {
+            self.report.window_bytes = self.report.window_bytes.max(window.bytes());
+        }
+        self.report.frames += 1;
+        self.report.waited += record.seconds.waiting;
+        self.report.worked += record.seconds.slide + record.seconds.total;
+        self.report.slides = slide.index + 1;
+        self.frame += 1;
+        self.pictures += u64::from(!place.warmup);
+        Ok(Frame { record: Arc::new(record), film: Arc::new(work.film), tone_map: scene.render.tone_map })
+    }
+
+    /// Renders and draws the audit points, while other threads train; and what they learned.
+    fn picture(
+        &mut self,
+        tracer: &dyn Tracer,
+        front: Option<&dyn Predict>,
+        gate: &Gate,
+        place: Place,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<(Rendered, Option<Learned>), EngineError> {
+        let scene = &self.plan.scene;
+        let per_cell = scene.trust.audit_per_cell;
+        let cells = self.trust.shape();
+        let samples_per_pixel = self.options.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
+        // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
+        // the warm-up was.
+        let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
+        let rendered = AtomicBool::new(false);
+        let flow_map = self.wants_flow_map();
+        let (mut learned, mut work) = (None, None);
+        {
+            let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
+            let (renderer, trust, frame, seed, stop) = (&mut self.renderer, &self.trust, self.frame, scene.seed, self.stop);
+            let frames = &mut self.frames;
+            std::thread::scope(|scope| {
+                let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
+                    let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
+                    match &threads.train {
+                        Some([beside, all]) => Trainer::Beside(scope.spawn(move || {
+                            let learned = beside.install(|| train(&mut **live, ring.samples(), settings, Until::Rendered(rendered), stop));
+                            let left = settings.seconds_per_frame - learned.seconds;
+                            if settings.steps_per_frame.is_some() || left <= 0.0 {
+                                return learned;
+                            }
+                            // The picture is done: its threads are free.
+                            learned.and(all.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(left), stop)))
+                        })),
+                        None => Trainer::After(live, ring),
+                    }
+                });
+                let mut render = || -> Result<Rendered, EngineError> {
+                    let mut answers = Answers::new(
+                        tracer,
+                        front,
+                        gate,
+                        scene.trust.trace_budget,
+                        if front.is_some() { scene.training.ring / KEEP_A_FRAME } else { 0 },
+                    )
+                    .with_flow_map(flow_map);
+                    let progress = std::sync::Mutex::new(&mut *sink);
+                    let report = |share: f32| {
+                        if let Ok(mut sink) = progress.lock() {
+                            (*sink)(Event::Progress(share));
+                        }
+                    };
+                    let walk = Instant::now();
+                    let (film, stats) = frames.render(
+                        renderer,
+                        picture,
+                        samples_per_pixel,
+                        tracer,
+                        &mut answers,
+                        Some(&report),
+                        &AtomicBool::new(false),
+                    )?;
+                    let render_seconds = walk.elapsed().as_secs_f64();
+                    let (tally, samples) = (answers.tally, answers.samples);
+                    let auditing = Instant::now();
+                    let strata = match front {
+                        Some(_) => {
+                            let wanted = (scene.trust.audit_share * tally.queries as f64).ceil() as usize;
+                            trust.audit_strata(gate, per_cell.max(wanted.div_ceil(cells.iter().product())))
+                        }
+                        None => Strata::even(cells, 1),
+                    };
+                    let unit = audit::stratified_points(&strata, seed, 2 * frame);
+                    let audit = audit::trace(tracer, &unit, flow_map);
+                    let residuals = front.map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
+                    Ok(Rendered {
+                        film,
+                        samples_per_pixel,
+                        stats,
+                        tally,
+                        samples,
+                        audit,
+                        strata,
+                        residuals,
+                        render_seconds,
+                        audit_seconds: auditing.elapsed().as_secs_f64(),
+                    })
+                };
+                work = Some(threads.render.install(&mut render));
+                rendered.store(true, Ordering::Release);
+                learned = match training {
+                    Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
+                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| {
+                        train(&mut **live, ring.samples(), &scene.training, Until::Seconds(scene.training.seconds_per_frame), stop)
+                    })),
+                    None => None,
+                };
+            });
+        }
+        Ok((work.ok_or(EngineError::EndedEarly)??, learned))
+    }
+
+    /// The figures that rendering alone decides.
+    fn record(&mut self, tracer: &dyn Tracer, work: &Rendered, slide: &mut Slide) -> FrameRecord {
+        FrameRecord {
+            frame: self.frame,
+            slide: slide.index,
+            time: slide.time,
+            date: slide.date.clone(),
+            tau: tracer.tau(),
+            direction: self.plan.map.direction.name().into(),
+            method: match self.plan.scene.render.method {
+                Method::Reference => "reference".into(),
+                Method::Surrogate => "surrogate".into(),
+                Method::Gated => "gated".into(),
+            },
+            device: self.options.device.name(),
+            size: [work.film.width, work.film.height],
+            samples_per_pixel: work.samples_per_pixel,
+            queries: work.tally.queries,
+            traced: work.tally.traced,
+            missing: work.tally.missing,
+            over_budget: work.tally.over_budget,
+            traced_share: work.tally.traced as f64 / (work.tally.queries - work.tally.missing).max(1) as f64,
+            integration_steps: fixed_steps(tracer).map(|steps| steps as u64),
+            integration_difference: self.report.integration_difference,
+            probed: std::mem::take(&mut self.probed),
+            audited: work.audit.samples.len() as u64,
+            lived_share: work.audit.lived_share,
+            majorant_exceeded: work.stats.majorant_exceeded,
+            traced_ahead: work.stats.ahead,
+            warnings: std::mem::take(&mut slide.warnings),
+            ..FrameRecord::default()
+        }
+    }
+}

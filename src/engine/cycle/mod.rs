@@ -1,0 +1,326 @@
+//! The cycle: slide, render with the weights of the cycle before, test, then train.
+//!
+//! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames
+//! before. Samples traced for frame n are held against the frozen weights, which have not seen them, before they go to the ring.
+
+mod assess;
+mod frame;
+mod prepare;
+
+use super::feed::{Feed, Slide};
+use super::frames::{FrameRenderer, frame_renderer};
+use super::setup::{Plan, Setup};
+use super::stop::{Halt, Interruptible, heed};
+use super::training::Threads;
+use super::{Device, EngineError, Frame};
+use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use crate::render::{Method, Renderer};
+use crate::surrogate::network::Size;
+use crate::surrogate::{Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
+use crate::trust::TrustMap;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// What a run may be told besides its scene.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
+    pub verify_points: usize,
+    /// Wall-clock seconds after which no further frame is begun.
+    pub seconds: Option<f64>,
+    /// Worker threads; 0: all that the process may use.
+    pub threads: usize,
+    /// Where to write the trained surrogate at the end.
+    pub checkpoint: Option<PathBuf>,
+    /// Samples a pixel of warm-up frames; none: the scene's.
+    pub warmup_samples: Option<usize>,
+    /// What traces.
+    pub device: Device,
+}
+
+/// What a run tells while it goes.
+pub enum Event {
+    /// Before the first frame: frames to come, where known.
+    Begin {
+        /// How many.
+        frames: Option<u64>,
+        /// What should be known.
+        notes: Vec<String>,
+    },
+    /// A finished frame.
+    Frame(Frame),
+    /// Share of the current frame that is rendered.
+    Progress(f32),
+}
+
+/// What a run came to.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RunReport {
+    /// Frames made.
+    pub frames: u64,
+    /// Slides seen.
+    pub slides: u64,
+    /// Whether it was stopped from outside.
+    pub interrupted: bool,
+    /// Seconds spent waiting for input.
+    pub waited: f64,
+    /// Seconds spent on frames and on taking in snapshots that were there.
+    pub worked: f64,
+    /// Optimizer steps.
+    pub train_steps: u64,
+    /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
+    pub integration_steps: Option<usize>,
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
+    pub integration_difference: Option<f64>,
+    /// Size of the surrogate, bytes.
+    pub surrogate_bytes: usize,
+    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no size is tried in vain twice.
+    pub sizes: Vec<String>,
+    /// Whether the snapshots are close enough in time; none for closed forms.
+    pub time_resolution: Option<TimeResolution>,
+    /// Largest size of the window, bytes.
+    pub window_bytes: usize,
+}
+
+/// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
+const COARSE_IN_TIME: f64 = 0.25;
+/// A frame keeps at most one in so many of the ring's places, so that the ring remembers several frames.
+const KEEP_A_FRAME: usize = 4;
+/// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
+const RENDER_RESIDUALS: usize = 1 << 16;
+
+/// The state that goes from frame to frame.
+struct Cycle<'a> {
+    plan: &'a Plan,
+    options: &'a RunOptions,
+    threads: Threads,
+    frames: Box<dyn FrameRenderer>,
+    renderer: Renderer,
+    trust: TrustMap,
+    ring: SampleRing,
+    live: Option<Box<dyn Surrogate>>,
+    /// What it is built from, with the data's own nodes.
+    surrogate: SurrogateSettings,
+    /// Finds its size, with `size = "auto"`.
+    sizing: Option<Sizing>,
+    /// The size that the next frame should have.
+    resize: Option<Resize>,
+    frame: u64,
+    /// Points traced since the last frame to prepare the next.
+    probed: u64,
+    /// Frames that were no warm-up.
+    pictures: u64,
+    /// Whether a lost device was told of.
+    told_of_failure: bool,
+    report: &'a mut RunReport,
+    /// Set from outside when the run should end.
+    stop: &'a AtomicBool,
+    /// Largest log-stretch that audit points of this slide have met.
+    peak: f32,
+    began: Instant,
+}
+
+/// Where a frame stands in the run.
+#[derive(Clone, Copy)]
+struct Place {
+    warmup: bool,
+    /// Seconds that preparing the slide took, for its first frame.
+    preparing: f64,
+}
+
+/// Runs the whole scene. `sink` gets every event. Setting `stop` ends the run after the current frame; where none is in progress
+/// (while the window fills, tables are traced, or cells are probed) within about a second.
+pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
+    let mut report = RunReport::default();
+    match drive(setup, options, sink, stop, &mut report) {
+        Ok(()) | Err(Halt::TimeIsUp) => {}
+        Err(Halt::Stopped) => report.interrupted = true,
+        Err(Halt::Failed(error)) => {
+            // A lost device is the cause of what failed behind it.
+            options.device.check()?;
+            return Err(error);
+        }
+    }
+    Ok(report)
+}
+
+fn drive(
+    setup: Setup,
+    options: &RunOptions,
+    sink: &mut (dyn FnMut(Event) + Send),
+    stop: &AtomicBool,
+    report: &mut RunReport,
+) -> Result<(), Halt> {
+    let began = Instant::now();
+    let Setup { plan, mut feed, slides, notes } = setup;
+    let time = &plan.scene.time;
+    let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    sink(Event::Begin { frames, notes });
+    let threads = Threads::new(options.threads, &plan.scene)?;
+    if let Some(listener) = options.device.listener() {
+        feed.tell(listener);
+    }
+    let first = feed.next_slide_unless(stop)?;
+    heed(stop)?;
+    let mut slide = first.ok_or(EngineError::EndedEarly)?;
+    let begun = Instant::now();
+    let (tracer, told) = threads.render.install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    slide.warnings.extend(told);
+    heed(stop)?;
+    // The number of steps is settled once, on the first slide, so that frames compare.
+    let map = match fixed_steps(&*tracer) {
+        Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
+        None => plan.map.clone(),
+    };
+    let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
+    let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| cycle.later_slides(&mut feed, &map, sink));
+    // What was learned is kept whether or not the run was stopped.
+    match ended {
+        Err(Halt::Failed(error)) => Err(Halt::Failed(error)),
+        ended => cycle.finish().map_err(Halt::Failed).and(ended),
+    }
+}
+
+impl<'a> Cycle<'a> {
+    fn new(
+        plan: &'a Plan,
+        options: &'a RunOptions,
+        threads: Threads,
+        tracer: &dyn Tracer,
+        first: &Slide,
+        began: Instant,
+        stop: &'a AtomicBool,
+        report: &'a mut RunReport,
+    ) -> Result<Self, Halt> {
+        let scene = &plan.scene;
+        let settled = threads.render.install(|| prepare::settled_scene(plan, tracer, first.time));
+        heed(stop)?;
+        let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
+        let surrogate = match &first.velocity {
+            VelocitySource::Window(window) => window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape())),
+            VelocitySource::Analytic(..) => None,
+        };
+        let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
+        let method = scene.render.method;
+        let mut sizing = None;
+        let mut live = if method == Method::Reference {
+            None
+        } else {
+            if scene.network.size == Size::Auto {
+                sizing = Some(Sizing::new(&surrogate, &scene.network, &plan.domain)?);
+            }
+            Some(threads.render.install(|| prepare::build(plan, &surrogate, sizing.as_ref(), tracer))?)
+        };
+        heed(stop)?;
+        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
+            && surrogate.learns()
+        {
+            surrogate.load(path)?;
+            // Its table is that of another window, for all that is known.
+            threads.render.install(|| surrogate.window_slid(tracer));
+            heed(stop)?;
+        }
+        report.integration_steps = fixed_steps(tracer);
+        report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
+        Ok(Self {
+            plan,
+            options,
+            threads,
+            frames: frame_renderer(&options.device),
+            renderer,
+            trust: TrustMap::new(&scene.trust, &plan.domain),
+            ring: SampleRing::new(scene.training.ring),
+            surrogate,
+            sizing,
+            resize: None,
+            live,
+            frame: 0,
+            probed: 0,
+            pictures: 0,
+            told_of_failure: false,
+            report,
+            stop,
+            peak: f32::NEG_INFINITY,
+            began,
+        })
+    }
+
+    /// Prepares the first slide, which was begun at `begun`, and renders its frames.
+    fn first_slide(
+        &mut self,
+        tracer: &dyn Tracer,
+        map: &FlowMap,
+        slide: &mut Slide,
+        begun: Instant,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<(), Halt> {
+        if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
+            slide.warnings.push(format!(
+                "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                chosen.steps, chosen.difference
+            ));
+        }
+        if let VelocitySource::Window(window) = &slide.velocity {
+            let resolution = self.threads.render.install(|| time_resolution(window, map, slide.time))?;
+            if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
+                slide.warnings.push(format!(
+                    "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
+                    100.0 * change / resolution.ftle_rms
+                ));
+            }
+            self.report.time_resolution = Some(resolution);
+        }
+        self.pilot(tracer)?;
+        self.probe(tracer, slide.index)?;
+        self.frames(tracer, slide, begun, sink)
+    }
+
+    /// Goes on until the source ends.
+    fn later_slides(&mut self, feed: &mut Feed, map: &FlowMap, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
+        loop {
+            let next = feed.next_slide_unless(self.stop)?;
+            heed(self.stop)?;
+            let Some(mut slide) = next else { return Ok(()) };
+            let begun = Instant::now();
+            let (tracer, told) = self.options.device.tracer(slide.velocity.clone(), map, slide.time)?;
+            slide.warnings.extend(told);
+            self.slid(&*tracer)?;
+            self.probe(&*tracer, slide.index)?;
+            self.frames(&*tracer, &mut slide, begun, sink)?;
+        }
+    }
+
+    /// The frames of one slide.
+    fn frames(&mut self, tracer: &dyn Tracer, slide: &mut Slide, begun: Instant, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
+        let time = &self.plan.scene.time;
+        let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
+        for number in 0..warmups + time.frames_per_slide {
+            let place = Place { warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            if self.resized(&Interruptible::new(tracer, self.stop))? {
+                self.trust.reset();
+                self.probe(tracer, slide.index)?;
+            }
+            let frame = self.frame(tracer, slide, place, sink)?;
+            sink(Event::Frame(frame));
+            heed(self.stop)?;
+            if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
+                return Err(Halt::TimeIsUp);
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), EngineError> {
+        if let (Some(path), Some(live)) = (&self.options.checkpoint, &self.live) {
+            live.save(path)?;
+        }
+        self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
+        Ok(())
+    }
+}
+
+/// Steps a path, unless each path chooses its own.
+fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+    Some(tracer.steps()).filter(|steps| *steps > 0)
+}

@@ -1,0 +1,159 @@
+//! What comes before a slide's frames: sizes, tables, probes and the pilot.
+
+use super::{Cycle, KEEP_A_FRAME, RENDER_RESIDUALS};
+use crate::engine::EngineError;
+use crate::engine::answers::Answers;
+use crate::engine::audit;
+use crate::engine::setup::{Plan, assemble};
+use crate::engine::stop::{Halt, Interruptible, heed};
+use crate::flow::{Extras, Traced, Tracer};
+use crate::render::Scene;
+use crate::surrogate::network::Target;
+use crate::surrogate::{Kind, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
+use crate::trust::{Gate, Strata};
+
+/// Random stream of the first probe, apart from those of audit points.
+const PROBE_STREAM: u64 = 1 << 62;
+/// Number of the pilot's picture.
+const PILOT_PICTURE: u64 = 1 << 41;
+
+impl Cycle<'_> {
+    /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
+    pub(super) fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
+        let Some(resize) = self.resize.take() else { return Ok(false) };
+        let built = self.threads.render.install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer));
+        heed(self.stop)?;
+        let live = built?;
+        let text = format!("frame {}: {} ({:.2} MB)", self.frame, resize.why, live.bytes() as f64 / 1e6);
+        tracing::info!("{text}");
+        self.report.sizes.push(text);
+        self.live = Some(live);
+        Ok(true)
+    }
+
+    /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold, trust must be earned
+    /// again.
+    pub(super) fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
+        let tracer = Interruptible::new(tracer, self.stop);
+        self.peak = f32::NEG_INFINITY;
+        let resized = self.resized(&tracer)?;
+        if let Some(live) = &mut self.live {
+            if !resized {
+                self.threads.render.install(|| live.window_slid(&tracer));
+                heed(self.stop)?;
+            }
+            self.trust.window_slid();
+            self.ring.mark_stale();
+            let holding = self.threads.render.install(|| self.share_of_labels_that_hold(&tracer));
+            heed(self.stop)?;
+            self.ring.revalidate(holding);
+        }
+        self.renderer.window_slid();
+        Ok(())
+    }
+
+    /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and held against the surrogate they earn
+    /// trust without tracing a whole frame. They decide the gate, so they say nothing about the error that is stated; audit points do.
+    pub(super) fn probe(&mut self, tracer: &dyn Tracer, slide: u64) -> Result<(), Halt> {
+        let scene = &self.plan.scene;
+        let per_cell = scene.trust.min_samples.ceil() as usize;
+        let strata = Strata::even(self.trust.shape(), per_cell as u32);
+        let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
+        let flow_map = self.wants_flow_map();
+        let interruptible = Interruptible::new(tracer, self.stop);
+        let probe = self.threads.render.install(|| audit::trace(&interruptible, &unit, flow_map));
+        heed(self.stop)?;
+        let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
+        self.renderer.observe(&points, &probe.samples.log_stretch);
+        self.probed += probe.drawn as u64;
+        self.learn_of(tracer, &probe.samples, Some(&strata));
+        Ok(())
+    }
+
+    /// A picture of one sample a pixel, by RK4 and for nobody's eyes: a renderer that has seen nothing walks with the largest majorant
+    /// everywhere and makes several times the queries, so that the first frame had better not be its first.
+    pub(super) fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
+        let gate = Gate::uniform(false);
+        let interruptible = Interruptible::new(tracer, self.stop);
+        let keep = if self.live.is_some() { self.plan.scene.training.ring / KEEP_A_FRAME } else { 0 };
+        let mut answers = Answers::new(&interruptible, None, &gate, None, keep).with_flow_map(self.wants_flow_map());
+        let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
+        self.threads.render.install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
+        heed(stop)?;
+        let (samples, traced) = (answers.samples, answers.tally.traced);
+        self.probed += traced;
+        self.learn_of(tracer, &samples, None);
+        Ok(())
+    }
+
+    /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.
+    pub(super) fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, strata: Option<&Strata>) {
+        let Some(live) = &self.live else { return };
+        let front = live.freeze();
+        let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
+        let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
+        match strata {
+            Some(strata) => self.trust.observe(&residuals, strata, &[]),
+            None => self.trust.observe(&[], &Strata::even(self.trust.shape(), 0), &residuals),
+        }
+        self.ring.push(samples);
+    }
+
+    pub(super) fn wants_flow_map(&self) -> bool {
+        self.plan.scene.network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table
+    }
+
+    /// Traces some of the old labels anew: the share whose ramp is within the tolerance of what the label says.
+    pub(super) fn share_of_labels_that_hold(&self, tracer: &dyn Tracer) -> f64 {
+        const PROBES: usize = 2048;
+        let stale = self.ring.stale();
+        let chosen = self.ring.probe(PROBES, self.plan.scene.seed, self.frame);
+        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| tracer.domain().from_unit(stale.points[i])).collect();
+        let mut traced = Traced::default();
+        tracer.trace(&points, Extras::default(), &mut traced);
+        let ramp = |s: f32| self.renderer.transfer().ramp(s / tracer.tau() as f32);
+        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(stale.log_stretch[i])).abs()) <= self.plan.scene.trust.tolerance;
+        let held = chosen.iter().zip(&traced.log_stretch).filter(|pair| holds(*pair)).count();
+        held as f64 / chosen.len().max(1) as f64
+    }
+}
+
+/// The surrogate at its size.
+pub(super) fn build(
+    plan: &Plan,
+    settings: &SurrogateSettings,
+    sizing: Option<&Sizing>,
+    tracer: &dyn Tracer,
+) -> Result<Box<dyn Surrogate>, SurrogateError> {
+    let scene = &plan.scene;
+    let plain = || (settings.clone(), scene.network.clone());
+    let (settings, network) = sizing.map_or_else(plain, |sizing| sizing.settings(settings, &scene.network));
+    crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)
+}
+
+pub(super) fn every(samples: &Samples, stride: usize) -> Samples {
+    Samples {
+        points: samples.points.iter().copied().step_by(stride).collect(),
+        log_stretch: samples.log_stretch.iter().copied().step_by(stride).collect(),
+        ..Samples::default()
+    }
+}
+
+/// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
+/// for the whole run, so that colours compare.
+pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
+    let file = &plan.scene;
+    let mut scene = assemble(file, &plan.domain);
+    if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
+        const PROBES: usize = 64;
+        let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
+        let unit = audit::stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
+        let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
+        let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
+        if ftle.is_empty() {
+            return Err(EngineError::AllMissing { points: unit.len(), time });
+        }
+        scene.transfer = scene.transfer.scaled_to(&ftle);
+    }
+    Ok(scene)
+}
