@@ -48,6 +48,8 @@ pub struct Strata {
     pub shape: [usize; 3],
     /// Points drawn in each cell, x fastest.
     pub drawn: Vec<u32>,
+    /// Standard deviation of the squared optical residual in each cell as earlier frames have seen it; empty where none is known.
+    pub spread: Vec<f64>,
 }
 
 /// One-sided 95 % quantile of the normal distribution.
@@ -181,6 +183,7 @@ impl TrustMap {
                 *drawn += (more * spread(cell) / spreads).round() as u32;
             }
         }
+        strata.spread = self.cells.iter().map(spread).collect();
         strata
     }
 
@@ -195,7 +198,7 @@ impl TrustMap {
 impl Strata {
     /// As many points in every cell.
     pub fn even(shape: [usize; 3], per_cell: u32) -> Self {
-        Self { shape, drawn: vec![per_cell; shape.iter().product()] }
+        Self { shape, drawn: vec![per_cell; shape.iter().product()], spread: Vec::new() }
     }
 
     /// Points in all.
