@@ -9,6 +9,8 @@ use serde::{Deserialize, Serialize};
 mod adam;
 mod architecture;
 mod dense;
+#[cfg(target_arch = "x86_64")]
+mod dense512;
 mod encode;
 mod lanes;
 mod model;
