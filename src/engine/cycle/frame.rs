@@ -209,6 +209,7 @@ impl Cycle<'_> {
             slide: slide.index,
             time: slide.time,
             date: slide.date.clone(),
+            live: slide.live.clone(),
             tau: tracer.tau(),
             direction: self.plan.map.direction.name().into(),
             method: match self.plan.scene.render.method {
