@@ -102,7 +102,8 @@ impl SceneFile {
     /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
     /// Paths in `archive.files`, `live.ring`, `live.connections` and `training.resume` are relative to the scene file's folder.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
-        let text = std::fs::read_to_string(path)
+        let text = crate::files::open(path)
+            .and_then(std::io::read_to_string)
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
         let mut scene = Self::parse(path, &text, overrides)?;
         let folder = path.parent().unwrap_or(Path::new("."));

@@ -13,6 +13,7 @@
 pub mod config;
 pub mod engine;
 pub mod field;
+pub mod files;
 pub mod flow;
 pub mod publish;
 pub mod render;

@@ -65,6 +65,12 @@ fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
     let held = pairs.iter().filter(holds).count();
     assert!(held as f64 >= 0.9 * pairs.len() as f64, "the interval holds the truth in {held} of {} frames", pairs.len());
 
+    // An interval that holds everything says nothing.
+    let mut widths: Vec<f64> = pairs.iter().map(|(s, _)| (s.optical_rms_interval[1] - s.optical_rms_interval[0]) / s.optical_rms).collect();
+    widths.sort_by(f64::total_cmp);
+    let median = widths[widths.len() / 2];
+    assert!(median <= 1.0, "the median interval is {median:.2} times as wide as its value");
+
     let of_slide = |slide: u64| records.iter().filter(move |r| r.slide == slide);
     for slide in 1..4 {
         let before = of_slide(slide - 1).next_back().unwrap();

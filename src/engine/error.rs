@@ -43,12 +43,15 @@ pub enum EngineError {
     #[error("the source ended before its window was full")]
     EndedEarly,
     /// Every point is land.
-    #[error("no velocity anywhere: all {points} points probed at time {time} lie on missing cells")]
+    #[error(
+        "no velocity anywhere at {when}: all {points} points probed lie on missing cells (fill values or NaN; `ridgewatch inspect` counts \
+         them). Colours are scaled to this slide; with transfer.low and transfer.high in the scene it is shown as missing, and the run goes on"
+    )]
     AllMissing {
         /// Points probed.
         points: usize,
-        /// Their time.
-        time: f64,
+        /// Their date or time.
+        when: String,
     },
     /// The thread pool.
     #[error("cannot start worker threads: {0}")]

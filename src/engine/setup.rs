@@ -49,7 +49,7 @@ impl Setup {
     }
 
     fn settle(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
-        let mut notes = Vec::new();
+        let mut notes: Vec<String> = snapshots.as_ref().map(|s| s.describe().notes).unwrap_or_default();
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
         let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));

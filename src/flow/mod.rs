@@ -77,6 +77,7 @@ pub enum Integrator {
     /// Central differences of 2 particles an axis, `gap` apart from the seed, Runge-Kutta of order 4 (the published way).
     Differences,
     /// Tangent flow by the adaptive pair of Dormand and Prince in f64: the reference.
+    #[serde(rename = "dormand_prince", alias = "dormandprince")]
     DormandPrince,
 }
 

@@ -99,7 +99,7 @@ impl FlowSettings {
             refuse("flow.boundary", "is \"unbounded\"", "stop, clamp, periodic or zero: gridded velocity ends at its grid")?;
         }
         if flow.integrator == Integrator::DormandPrince && flow.precision == Precision::F32 {
-            refuse("flow.precision", "is \"f32\"", "\"f64\" with integrator = \"dormandprince\", which is the reference")?;
+            refuse("flow.precision", "is \"f32\"", "\"f64\" with integrator = \"dormand_prince\", which is the reference")?;
         }
         Ok(())
     }

@@ -5,7 +5,7 @@ use super::{PublishError, run_folder::write_whole};
 use crate::{engine::FrameRecord, render::Film};
 use exr::meta::MetaData;
 use exr::prelude::*;
-use std::io::Cursor;
+use std::io::{Cursor, Read};
 use std::path::Path;
 
 /// Largest picture that is read: samples of all channels. A damaged header must not ask for all memory.
@@ -66,7 +66,9 @@ pub fn write_exr(path: &Path, film: &Film, record: Option<&FrameRecord>) -> std:
 /// stay empty, and channels of other names are ignored.
 pub fn read_exr(path: &Path) -> std::result::Result<Film, PublishError> {
     let problem = |problem: String| PublishError::Exr { path: path.to_owned(), problem };
-    let bytes = std::fs::read(path).map_err(|e| problem(format!("cannot be read: {e}")))?;
+    let unreadable = |e: std::io::Error| problem(format!("cannot be read: {e}"));
+    let mut bytes = Vec::new();
+    crate::files::open(path).and_then(|mut file| file.read_to_end(&mut bytes)).map_err(unreadable)?;
     decode_exr(&bytes).map_err(problem)
 }
 

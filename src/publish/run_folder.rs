@@ -72,8 +72,15 @@ impl RunFolder {
         let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
         let frames = path.join(FRAMES);
         fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
-        for old in run_files(path).map_err(|e| refuse(path, e))? {
-            if !overwrite {
+        let old = run_files(path).map_err(|e| refuse(path, e))?;
+        // A run that failed before its first frame left nothing that anybody could miss.
+        let empty = old.iter().all(|file| match file.file_name().and_then(|name| name.to_str()) {
+            Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
+            Some(name) => !is_picture(name),
+            None => false,
+        });
+        for old in old {
+            if !overwrite && !empty {
                 let found = old.strip_prefix(path).unwrap_or(&old).display().to_string();
                 return Err(PublishError::Occupied { path: path.to_owned(), found });
             }
@@ -225,6 +232,18 @@ mod tests {
     use super::*;
     use crate::render::Film;
     use std::sync::Arc;
+
+    #[test]
+    fn a_run_without_a_frame_does_not_occupy_its_folder() {
+        let folder = tempfile::tempdir().unwrap();
+        drop(RunFolder::create(folder.path(), false).unwrap());
+        fs::write(folder.path().join(SUMMARY), "{}").unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        assert!(!folder.path().join(SUMMARY).exists());
+        run.append_record(&frame(0).record).unwrap();
+        drop(run);
+        assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
+    }
 
     fn frame(number: u64) -> Frame {
         let film = Film { width: 4, height: 2, rgba: vec![[number as f32, 0.5, 0.25, 1.0]; 8], ..Default::default() };

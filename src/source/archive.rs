@@ -404,6 +404,9 @@ fn build_grid(path: &Path, layout: &Layout, settings: &NetCdfSettings) -> Result
 fn describe(layout: &Layout, format: &str, files: usize, seconds: &[f64]) -> SourceDescription {
     let variables = layout.frames[0].iter().zip(["u", "v", "w"]).map(|(c, k)| format!("{k} = `{}`: {}", c.name, c.why)).collect();
     let mut notes = layout.notes.clone();
+    if layout.time.units.trim().is_empty() && layout.metric != Metric::Index {
+        notes.push(format!("`{}` has no unit: taken as seconds", layout.time.variable));
+    }
     for gap in time_gaps(seconds) {
         let show = |s: f64| layout.time.calendar.and_then(|c| c.iso(s)).unwrap_or_else(|| s.to_string());
         notes.push(format!(

@@ -206,7 +206,7 @@ impl Container {
     /// of dimensions are taken on trust. (Of a NetCDF-4 file libnetcdf reads every variable: milliseconds, and many small reads.)
     pub(crate) fn open_like(path: &Path, like: Option<&Header>) -> Result<Self, SourceError> {
         let failed = |cause| SourceError::Open { path: path.to_path_buf(), cause };
-        let mut file = File::open(path).map_err(failed)?;
+        let mut file = crate::files::open(path).map_err(failed)?;
         let length = file.metadata().map_err(failed)?.len();
         let format = sniff(&mut file, length).map_err(failed)?.map_err(|found| SourceError::NotNetCdf { path: path.into(), found })?;
         let (format, header, store) = match format {

@@ -1,5 +1,7 @@
 //! What is said about the surrogate's error in the trusted region.
 
+#[cfg(test)]
+use super::map::Seen;
 use super::{Residual, Strata};
 use serde::{Deserialize, Serialize};
 
@@ -34,7 +36,8 @@ impl TrustedError {
     /// (stratified sampling, Cochran 1977, chapter 5). Squares of residuals are skewed: a few ridges carry most of the mean. The
     /// interval is that of the mean square by Hall's transformation of Student's t, which takes the skewness out (Hall 1992,
     /// J. R. Stat. Soc. B 54, 221). Points that happen to miss a cell's few large residuals give too small a mean and too small a
-    /// variance at once; where earlier frames have seen a larger spread, the interval is as wide as that says.
+    /// variance at once; therefore the variance of a cell is pooled with that of the frame before's audit points there, which count for as
+    /// many points at most as were drawn now.
     pub fn of(residuals: &[Residual], strata: &Strata) -> Option<Self> {
         if residuals.len() < 2 {
             return None;
@@ -53,19 +56,23 @@ impl TrustedError {
         // Second and third moment of the estimate: the sums over points of the deviation from their cell's mean, each with its share of
         // the whole. Where a cell has one point only, the mean over all cells stands for its own.
         let (mut variance, mut third) = (0.0, 0.0);
+        let mut of_cells = vec![0.0; cells.len()];
         for (residual, weight) in residuals.iter().zip(&weights) {
             let cell = cells[strata.cell(residual.point)];
             let share = weight / whole;
             let (centre, correction) =
                 if cell.count > 1.0 { (cell.square / cell.count, cell.count / (cell.count - 1.0)) } else { (square, 1.0) };
             let deviation = squared(residual) - centre;
-            variance += correction * (share * deviation).powi(2);
+            of_cells[strata.cell(residual.point)] += correction * (share * deviation).powi(2);
             third += (share * deviation).powi(3);
         }
+        for (cell, ((own, sums), &drawn)) in of_cells.into_iter().zip(&cells).zip(&strata.drawn).enumerate() {
+            let seen = strata.seen.get(cell).copied().unwrap_or_default();
+            let weight = seen.weight.min(sums.count);
+            let before = sums.count * seen.variance / (f64::from(drawn.max(1)) * whole).powi(2);
+            variance += if weight > 0.0 { (sums.count * own + weight * before) / (sums.count + weight) } else { own };
+        }
         let gamma = if variance > 0.0 { third / variance.powf(1.5) } else { 0.0 };
-        let seen_before = strata.spread.iter().zip(&strata.drawn).zip(&cells).filter(|(_, cell)| cell.count > 0.0);
-        let expected: f64 = seen_before.map(|((spread, &drawn), cell)| cell.count * (spread / (f64::from(drawn) * whole)).powi(2)).sum();
-        let variance = variance.max(expected);
         let bound = |z: f64| (square - variance.sqrt() * hall_inverse(z, gamma)).max(0.0).sqrt();
         let n = residuals.len() as f64;
         // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
@@ -227,9 +234,8 @@ mod tests {
     fn a_spread_seen_before_keeps_the_interval_wide() {
         let cells = [16, 1, 1];
         let (mean, fourth) = (0.005 * 0.09 / 3.0, 0.005 * 0.0081 / 5.0);
-        let spread = f64::sqrt(fourth - mean * mean);
-        let held = |spread: Vec<f64>| {
-            let strata = Strata { spread, ..Strata::even(cells, 20) };
+        let held = |seen: Vec<Seen>| {
+            let strata = Strata { seen, ..Strata::even(cells, 20) };
             let mut state = 11;
             let covered = (0..400).filter(|_| {
                 let mut sample = Vec::new();
@@ -247,7 +253,7 @@ mod tests {
             });
             covered.count()
         };
-        let (alone, with) = (held(Vec::new()), held(vec![spread; 16]));
+        let (alone, with) = (held(Vec::new()), held(vec![Seen { weight: 20.0, variance: fourth - mean * mean }; 16]));
         // 400 trials of 0.95 less three standard errors: 367.
         assert!(alone < 367 && with >= 367, "{alone} without, {with} with");
     }

@@ -28,6 +28,8 @@ pub struct TrustMap {
     shape: [usize; 3],
     cells: Vec<Cell>,
     settings: TrustSettings,
+    /// Sums over the audit points of the latest frame alone: neither inflated nor mixed with samples that pictures chose.
+    audited: Vec<Cell>,
     /// Mean square residual over the latest uniform points; its ratio across a slide is the drift.
     before_slide: Option<f64>,
     just_slid: bool,
@@ -48,8 +50,17 @@ pub struct Strata {
     pub shape: [usize; 3],
     /// Points drawn in each cell, x fastest.
     pub drawn: Vec<u32>,
-    /// Standard deviation of the squared optical residual in each cell as earlier frames have seen it; empty where none is known.
-    pub spread: Vec<f64>,
+    /// What the audit points of the frame before saw in each cell; empty where there were none.
+    pub(super) seen: Vec<Seen>,
+}
+
+/// Squared optical residuals of a cell's audit points in the frame before.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Seen {
+    /// How many points there were.
+    pub(super) weight: f64,
+    /// Variance of the squared residual.
+    pub(super) variance: f64,
 }
 
 /// One-sided 95 % quantile of the normal distribution.
@@ -73,6 +84,21 @@ pub(crate) fn cubic_cells(domain: &Domain, count: usize) -> [usize; 3] {
     std::array::from_fn(|k| if k < axes { ((extent[k] / edge).round() as usize).clamp(1, count) } else { 1 })
 }
 
+impl Cell {
+    fn add(&mut self, residual: &Residual) {
+        let square = f64::from(residual.optical).powi(2);
+        self.weight += 1.0;
+        self.optical_square += square;
+        self.optical_fourth += square * square;
+    }
+
+    fn seen(&self) -> Seen {
+        let weight = self.weight.max(f64::MIN_POSITIVE);
+        let variance = (self.optical_fourth / weight - (self.optical_square / weight).powi(2)).max(0.0);
+        Seen { weight: self.weight, variance }
+    }
+}
+
 impl TrustMap {
     /// A map that trusts nothing yet.
     pub fn new(settings: &TrustSettings, domain: &Domain) -> Self {
@@ -81,7 +107,15 @@ impl TrustMap {
             None => cubic_cells(domain, if domain.dimensions == 3 { 4096 } else { 512 }),
         };
         let cells = vec![Cell::default(); shape.iter().product()];
-        Self { shape, cells, settings: settings.clone(), before_slide: None, just_slid: false, measured_growth: 1.0 }
+        Self {
+            shape,
+            audited: cells.clone(),
+            cells,
+            settings: settings.clone(),
+            before_slide: None,
+            just_slid: false,
+            measured_growth: 1.0,
+        }
     }
 
     /// Cells along x, y and z.
@@ -91,6 +125,7 @@ impl TrustMap {
 
     /// Older residuals lose weight, since the weights that they were measured with have changed. Call once a frame.
     pub fn decay(&mut self) {
+        self.audited.fill(Cell::default());
         for cell in &mut self.cells {
             cell.weight *= DECAY;
             cell.optical_square *= DECAY;
@@ -113,11 +148,10 @@ impl TrustMap {
             self.just_slid = false;
         }
         for residual in uniform.iter().chain(others).filter(|r| r.optical.is_finite()) {
-            let cell = &mut self.cells[cell_of(self.shape, residual.point)];
-            let square = f64::from(residual.optical).powi(2);
-            cell.weight += 1.0;
-            cell.optical_square += square;
-            cell.optical_fourth += square * square;
+            self.cells[cell_of(self.shape, residual.point)].add(residual);
+        }
+        for residual in uniform.iter().filter(|r| r.optical.is_finite()) {
+            self.audited[cell_of(self.shape, residual.point)].add(residual);
         }
     }
 
@@ -130,12 +164,14 @@ impl TrustMap {
             cell.optical_square *= SLIDE_DECAY * inflation;
             cell.optical_fourth *= SLIDE_DECAY * inflation * inflation;
         }
+        self.audited.fill(Cell::default());
         self.just_slid = true;
     }
 
     /// Forgets everything: tau, direction or the transfer function changed.
     pub fn reset(&mut self) {
         self.cells.fill(Cell::default());
+        self.audited.fill(Cell::default());
         self.before_slide = None;
         self.just_slid = false;
     }
@@ -159,7 +195,7 @@ impl TrustMap {
     /// in proportion to the spread of the squared residual there (Neyman 1934), as bring the standard error of the stated root mean
     /// square to the setting's share of it, within the setting's bound.
     pub fn audit_strata(&self, gate: &Gate, least: usize) -> Strata {
-        let mut strata = Strata::even(self.shape, least as u32);
+        let mut strata = Strata { seen: self.audited.iter().map(Cell::seen).collect(), ..Strata::even(self.shape, least as u32) };
         let trusted = || self.cells.iter().zip(&gate.trusted).filter(|(_, trusted)| **trusted).map(|(cell, _)| cell);
         let cells = trusted().count();
         let weight: f64 = trusted().map(|c| c.weight).sum();
@@ -183,7 +219,6 @@ impl TrustMap {
                 *drawn += (more * spread(cell) / spreads).round() as u32;
             }
         }
-        strata.spread = self.cells.iter().map(spread).collect();
         strata
     }
 
@@ -198,7 +233,7 @@ impl TrustMap {
 impl Strata {
     /// As many points in every cell.
     pub fn even(shape: [usize; 3], per_cell: u32) -> Self {
-        Self { shape, drawn: vec![per_cell; shape.iter().product()], spread: Vec::new() }
+        Self { shape, drawn: vec![per_cell; shape.iter().product()], seen: Vec::new() }
     }
 
     /// Points in all.
@@ -344,6 +379,6 @@ mod tests {
         assert!(here > 3 * elsewhere, "{here} against {elsewhere}");
         // Rounding may add half a point a cell.
         assert!(strata.total() <= 512 * 32 + 256, "{} points", strata.total());
-        assert_eq!(map.audit_strata(&Gate::uniform(false), 8), Strata::even(map.shape(), 8), "nothing is trusted: nothing is stated");
+        assert_eq!(map.audit_strata(&Gate::uniform(false), 8).drawn, vec![8; 512], "nothing is trusted: nothing is stated");
     }
 }

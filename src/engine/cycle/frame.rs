@@ -57,6 +57,9 @@ impl Cycle<'_> {
         let (work, learned) = self.picture(tracer, front.as_deref(), &gate, place, sink)?;
         let mut record = self.record(tracer, &work, slide);
         record.surrogate = front.as_ref().map(|s| s.name().to_owned());
+        if work.audit.drawn > 0 && work.audit.samples.is_empty() {
+            record.warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
+        }
         let auditing = Instant::now();
         if let Some(front) = front.as_deref() {
             self.assess(front, tracer, &gate, &work, &mut record);

@@ -198,7 +198,7 @@ impl<'a> Cycle<'a> {
         report: &'a mut RunReport,
     ) -> Result<Self, Halt> {
         let scene = &plan.scene;
-        let settled = threads.render.install(|| prepare::settled_scene(plan, tracer, first.time));
+        let settled = threads.render.install(|| prepare::settled_scene(plan, tracer, first));
         heed(stop)?;
         let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
         let surrogate = match &first.velocity {

@@ -4,6 +4,7 @@ use super::{Cycle, KEEP_A_FRAME, RENDER_RESIDUALS};
 use crate::engine::EngineError;
 use crate::engine::answers::Answers;
 use crate::engine::audit;
+use crate::engine::feed::Slide;
 use crate::engine::setup::{Plan, assemble};
 use crate::engine::stop::{Halt, Interruptible, heed};
 use crate::flow::{Extras, Traced, Tracer};
@@ -146,7 +147,7 @@ pub(super) fn every(samples: &Samples, stride: usize) -> Samples {
 
 /// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
 /// for the whole run, so that colours compare.
-pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Result<Scene, EngineError> {
+pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, slide: &Slide) -> Result<Scene, EngineError> {
     let file = &plan.scene;
     let mut scene = assemble(file, &plan.domain);
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
@@ -156,7 +157,10 @@ pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, time: f64) -> Resu
         let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
         let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {
-            return Err(EngineError::AllMissing { points: unit.len(), time });
+            return Err(EngineError::AllMissing {
+                points: unit.len(),
+                when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
+            });
         }
         scene.transfer = scene.transfer.scaled_to(&ftle);
     }
