@@ -40,9 +40,11 @@ enum End {
     Hung,
 }
 
-fn inspect(files: &[&Path]) -> End {
+fn read(files: &[&Path]) -> End {
     let files = files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(" ");
-    let command = format!("ulimit -v {MEMORY}; exec {} inspect {files}", env!("CARGO_BIN_EXE_ridgewatch"));
+    // Two are traced, so that snapshots of the second are read.
+    let (work, then) = if files.contains(' ') { ("ftle", "--grid 5x5 --set time.tau=7200") } else { ("inspect", "") };
+    let command = format!("ulimit -v {MEMORY}; exec {} {work} {files} {then}", env!("CARGO_BIN_EXE_ridgewatch"));
     let mut child = Command::new("sh")
         .args(["-c", &command])
         .env("RIDGEWATCH_OPENING_LIMIT", "5")
@@ -115,7 +117,7 @@ fn mutated_files_end_in_an_answer_or_a_message() {
             let begin = Instant::now();
             // Alone and behind a whole one, which is not read in the same way.
             let before = if random(&mut state).is_multiple_of(2) { &other[..] } else { &[] };
-            let end = inspect(&[before, &[&file]].concat());
+            let end = read(&[before, &[&file]].concat());
             longest = longest.max(begin.elapsed());
             *ends.entry(end).or_insert(0u64) += 1;
             if matches!(end, End::Hung | End::Crashed | End::GivenUp)

@@ -11,8 +11,10 @@ const FEWEST: usize = 4;
 const MOST: usize = 16_384;
 /// Fewest steps a snapshot interval, at whose ends the change in time has a corner.
 const LEAST_AN_INTERVAL: usize = 2;
-/// Most steps a snapshot interval.
+/// Most steps a snapshot interval, but where so many cells are crossed.
 const MOST_AN_INTERVAL: usize = 32;
+/// Most steps a snapshot interval for cells that are crossed: a velocity may be any number.
+const MOST_FOR_CELLS: usize = 256;
 /// Share of the points, the most different ones, that does not count on grids.
 const TRIMMED: f64 = 0.02;
 /// Points that must have lived the whole span for the judgement to rest on them alone.
@@ -82,10 +84,10 @@ pub fn choose(
     let points = points(domain, POINTS);
     let (mut once, mut twice) = (Traced::default(), Traced::default());
     let gridded = intervals > 0;
-    let most = if gridded { MOST_AN_INTERVAL * intervals } else { MOST };
     let trimmed = if gridded { TRIMMED } else { 0.0 };
-    let first = (cells.ceil() as usize).max(LEAST_AN_INTERVAL * intervals).next_multiple_of(intervals.max(1));
-    let mut steps = if gridded { first.min(most) } else { FEWEST };
+    let first = (cells.ceil() as usize).clamp(LEAST_AN_INTERVAL * intervals, MOST_FOR_CELLS * intervals).next_multiple_of(intervals.max(1));
+    let mut steps = if gridded { first } else { FEWEST };
+    let most = if gridded { first.max(MOST_AN_INTERVAL * intervals) } else { MOST };
     let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
     while steps <= most {
         trace(steps, &points, &mut once);
