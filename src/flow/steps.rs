@@ -64,20 +64,20 @@ pub struct Chosen {
 pub struct Gridded {
     /// Snapshot intervals in tau; 0 for a closed form.
     pub intervals: usize,
-    /// Cells that a path crosses in tau.
-    pub cells: f64,
+    /// Steps that the cells crossed in tau ask for.
+    pub least: f64,
 }
 
 /// The fewest steps of a ladder (by halves upwards) whose log-stretch differs from that of twice as many by at most `tolerance`, root mean
-/// square. On grids the ladder begins at two steps a snapshot interval and one a cell: fewer may agree with one another and be wrong, and a
-/// path that stops at an edge or at land is cut to whole steps.
+/// square. On grids the ladder begins at two steps a snapshot interval and one a cell, two where paths stop at edges and land, which cuts
+/// them to whole steps: fewer may agree with one another and be wrong.
 ///
 /// On grids the gradient of the interpolant jumps at cell faces, and a few paths along a separatrix turn one way with n steps and the
 /// other with 2n, at any n: there the most different [`TRIMMED`] of the points is left out, and the ladder ends at [`MOST_AN_INTERVAL`]
 /// steps a snapshot interval, beyond which the data's own resolution decides. Not meeting the tolerance is then told, not refused.
 pub fn choose(
     tolerance: f64,
-    Gridded { intervals, cells }: Gridded,
+    Gridded { intervals, least }: Gridded,
     domain: &Domain,
     mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
 ) -> Result<Chosen, FlowError> {
@@ -85,7 +85,7 @@ pub fn choose(
     let (mut once, mut twice) = (Traced::default(), Traced::default());
     let gridded = intervals > 0;
     let trimmed = if gridded { TRIMMED } else { 0.0 };
-    let first = (cells.ceil() as usize).clamp(LEAST_AN_INTERVAL * intervals, MOST_FOR_CELLS * intervals).next_multiple_of(intervals.max(1));
+    let first = (least.ceil() as usize).clamp(LEAST_AN_INTERVAL * intervals, MOST_FOR_CELLS * intervals).next_multiple_of(intervals.max(1));
     let mut steps = if gridded { first } else { FEWEST };
     let most = if gridded { first.max(MOST_AN_INTERVAL * intervals) } else { MOST };
     let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
