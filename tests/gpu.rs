@@ -7,6 +7,8 @@
 
 #[path = "gpu/device.rs"]
 mod device;
+#[path = "gpu/lost.rs"]
+mod lost;
 #[path = "gpu/render.rs"]
 mod render;
 #[path = "gpu/scenes.rs"]

@@ -6,7 +6,7 @@ use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require, shown};
-use crate::source::SourceKind;
+use crate::source::{SnapshotSource, SourceKind};
 use crate::surrogate::Kind;
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
@@ -36,9 +36,15 @@ impl Setup {
     /// Opens the source and settles what the scene leaves open.
     pub fn new(scene: Settings) -> Result<Self, EngineError> {
         scene.check()?;
+        let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
+        Self::over(scene, snapshots)
+    }
+
+    /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
+    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
+        scene.check()?;
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
-        let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
         let flat = snapshots.as_ref().is_some_and(|s| s.grid().dimensions() == 2);
         let archive = scene.source.kind == SourceKind::Archive;
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
