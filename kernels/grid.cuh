@@ -37,7 +37,7 @@ template <class R> struct GridData {
     // Mean spacing of axis i over that of axis j.
     R ratios[3][3];
     // Sphere only (see sphere.cuh).
-    R per_radian[2], origin[2], turn[2];
+    R per_radian[2], origin[2], turn[2], poles[2];
     double middle;
 };
 
@@ -265,6 +265,13 @@ template <class Config, class Real> struct Sampler {
         return fma_(R(second), weight, R(first));
     }
 
+    // One node less another, subtracted before anything is rounded.
+    RW_FN R less(float first, float from_first, float second, float from_second, R weight) const {
+        const R a = R(first) - R(from_first), b = R(second) - R(from_second);
+        if (DOUBLE) return fma_(b, weight, a * (R(1) - weight));
+        return fma_(b, weight, a);
+    }
+
     RW_FN bool value(const Step& step, int stage, const R (&x)[N], R (&v)[3], Memory& kept) const {
         if constexpr (Config::CUBIC && N == 3) {
             Sample<R, N> sample;
@@ -319,11 +326,13 @@ template <class Config, class Real> struct Sampler {
                 RW_UNROLL for (int c = 0; c < NC; c++) {
                     R v = 0, dx = 0, dy = 0;
                     RW_UNROLL for (int j = 0; j < 4; j++) {
+                        // The weights of a slope sum to 0: what all nodes have in common is taken out first (see sampler.rs).
+                        const float common[2] = {kept.first[4 * j + 1][c], kept.second[4 * j + 1][c]};
                         R row = 0, row_slope = 0;
                         RW_UNROLL for (int i = 0; i < 4; i++) {
-                            const R e = in_time(kept.first[4 * j + i][c], kept.second[4 * j + i][c], weight);
-                            row = fma_(e, sx.weights[i], row);
-                            row_slope = fma_(e, sx.slopes[i], row_slope);
+                            const float first = kept.first[4 * j + i][c], second = kept.second[4 * j + i][c];
+                            row = fma_(in_time(first, second, weight), sx.weights[i], row);
+                            if (i != 1) row_slope = fma_(less(first, common[0], second, common[1], weight), sx.slopes[i], row_slope);
                         }
                         v = fma_(row, sy.weights[j], v);
                         dx = fma_(row_slope, sy.weights[j], dx);
@@ -339,7 +348,9 @@ template <class Config, class Real> struct Sampler {
                     R d[KEPT / 2], e[KEPT / 2];
                     RW_UNROLL for (int k = 0; k < KEPT / 2; k++) {
                         const R left = in_time(kept.first[2 * k][c], kept.second[2 * k][c], weight);
-                        d[k] = in_time(kept.first[2 * k + 1][c], kept.second[2 * k + 1][c], weight) - left;
+                        // Beside a pole neighbours along the first axis are close.
+                        if ((Config::SEAM & 1) != 0) d[k] = less(kept.first[2 * k + 1][c], kept.first[2 * k][c], kept.second[2 * k + 1][c], kept.second[2 * k][c], weight);
+                        else d[k] = in_time(kept.first[2 * k + 1][c], kept.second[2 * k + 1][c], weight) - left;
                         e[k] = fma_(d[k], fx, left);
                     }
                     const R near_y = e[1] - e[0], near = fma_(near_y, fy, e[0]), near_x = fma_(fy, d[1] - d[0], d[0]);

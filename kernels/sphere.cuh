@@ -20,8 +20,11 @@ template <class Config, class Real> struct SphereFlow {
     // Below this cosine of the latitude, longitude has no meaning.
     static RW_FN R at_pole() { return R(1e-8); }
 
+    // As `least_colatitude` there.
+    static RW_FN R least() { return sizeof(R) == 4 ? R(1.0 / 1024.0) : R(1.0 / 1073741824.0); }
+
     struct Here {
-        R p[3], inverse_length, cosine, place[2];
+        R p[3], inverse_length, cosine, circle, place[2];
     };
     RW_FN Here here(const R (&x)[3]) const {
         Here h;
@@ -32,14 +35,18 @@ template <class Config, class Real> struct SphereFlow {
         if (cosine < at_pole()) ahead = 1;
         h.place[0] = fma_(atan2_(aside, ahead), data.per_radian[0], data.origin[0]);
         h.place[1] = fma_(atan2_(h.p[2], cosine), data.per_radian[1], data.origin[1]);
+        // Beside a row at a pole the circle of latitude has the length that belongs to the place on the grid.
+        h.place[1] = min_(max_(h.place[1], data.poles[0] + least()), data.poles[1] - least());
+        const R beside = min_(h.place[1] - data.poles[0], data.poles[1] - h.place[1]), angle = beside / data.per_radian[1];
         h.cosine = max_(cosine, at_pole());
+        h.circle = beside < R(0.125) ? angle * fma_(angle * angle, R(-1.0 / 6.0), R(1)) : h.cosine;
         return h;
     }
     // East and north at a direction.
     RW_FN void basis(const R (&p)[3], R cosine, R (&b)[2][3]) const {
         const R inverse = R(1) / cosine;
         const bool pole = cosine <= at_pole();
-        const R c = pole ? R(1) : p[0] * inverse, s = pole ? R(0) : p[1] * inverse;
+        const R c = pole ? data.turn[0] : p[0] * inverse, s = pole ? data.turn[1] : p[1] * inverse;
         b[0][0] = -s;
         b[0][1] = c;
         b[0][2] = 0;
@@ -98,7 +105,7 @@ template <class Config, class Real> struct SphereFlow {
             const R outward = dot(h.p, column);
             R change[3], between[3];
             RW_UNROLL for (int i = 0; i < 3; i++) change[i] = fma_(-outward, h.p[i], column[i]) * h.inverse_length;
-            const R longitude = dot(b[0], change) / h.cosine * data.per_radian[0], latitude = dot(b[1], change) * data.per_radian[1];
+            const R longitude = dot(b[0], change) / h.circle * data.per_radian[0], latitude = dot(b[1], change) * data.per_radian[1];
             RW_UNROLL for (int i = 0; i < 3; i++) between[i] = fma_(longitude, sample.slopes[0][i], latitude * sample.slopes[1][i]);
             // Derivative of V - p (p . V).
             const R turned = dot(change, sample.velocity) + dot(h.p, between);

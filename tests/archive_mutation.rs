@@ -21,11 +21,14 @@ fn random(state: &mut u64) -> u64 {
 
 /// Address space of a child, kB: the program and its libraries take half of it.
 const MEMORY: u64 = 2_000_000;
+/// Bytes of it that a child may touch: a whole file takes 20 MB, and 2^20 values may be read from any (see `Container::read`), of three
+/// components as f64, f32 and nodes.
+const MOST_RESIDENT: u64 = 200 << 20;
 /// Milliseconds' work; the machine may be busy.
 const LONGEST: Duration = Duration::from_secs(20);
 
 /// How a child ended.
-#[derive(Debug, PartialEq, Eq, Hash, Clone, Copy)]
+#[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Clone, Copy)]
 enum End {
     Answered,
     Refused,
@@ -37,8 +40,9 @@ enum End {
     Hung,
 }
 
-fn inspect(file: &Path) -> End {
-    let command = format!("ulimit -v {MEMORY}; exec {} inspect {}", env!("CARGO_BIN_EXE_ridgewatch"), file.display());
+fn inspect(files: &[&Path]) -> End {
+    let files = files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(" ");
+    let command = format!("ulimit -v {MEMORY}; exec {} inspect {files}", env!("CARGO_BIN_EXE_ridgewatch"));
     let mut child = Command::new("sh")
         .args(["-c", &command])
         .env("RIDGEWATCH_OPENING_LIMIT", "5")
@@ -75,21 +79,23 @@ fn inspect(file: &Path) -> End {
 
 #[test]
 fn mutated_files_end_in_an_answer_or_a_message() {
-    // RIDGEWATCH_MUTATIONS=10000 for a long run.
-    let count: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(150);
+    // RIDGEWATCH_MUTATIONS=10000 (of each format) for a long run.
+    let count: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(75);
     let dir = tempfile::tempdir().unwrap();
     let netcdf = plane(NETCDF4, &[0.0, 1.0, 2.0], "hours since 2000-01-01").write(&dir.path().join("whole.nc"));
     let small = SyntheticSettings { nodes: [4, 4, 4], snapshots: 2, ..SyntheticSettings::new(SyntheticShape::Flame) };
     let hdf5 = synthesize(&small, dir.path()).unwrap().remove(0);
     let mut state = 7;
-    let mut ends = std::collections::HashMap::new();
-    for (whole, mutant) in [(netcdf, "mutant.nc"), (hdf5, "mutant.h5")] {
+    let later = plane(NETCDF4, &[7.0], "hours since 2000-01-01").write(&dir.path().join("later.nc"));
+    for (whole, mutant, other) in [(netcdf, "mutant.nc", vec![later.as_path()]), (hdf5, "mutant.h5", vec![])] {
         assert!(NetCdfArchive::open(std::slice::from_ref(&whole), &NetCdfSettings::default()).is_ok());
         let whole = std::fs::read(whole).unwrap();
         let file = dir.path().join(mutant);
         // Where the file holds structure: most of it is zeros and values.
         let used: Vec<usize> = (0..whole.len()).filter(|&i| whole[i] != 0).collect();
-        for _ in 0..count / 2 {
+        let mut ends = std::collections::BTreeMap::new();
+        let mut longest = Duration::ZERO;
+        for _ in 0..count {
             let mut bytes = whole.clone();
             for _ in 0..1 + random(&mut state) % 4 {
                 let near = used[random(&mut state) as usize % used.len()] + random(&mut state) as usize % 4;
@@ -106,7 +112,11 @@ fn mutated_files_end_in_an_answer_or_a_message() {
             }
             let _ = std::fs::remove_file(&file);
             std::fs::write(&file, &bytes).unwrap();
-            let end = inspect(&file);
+            let begin = Instant::now();
+            // Alone and behind a whole one, which is not read in the same way.
+            let before = if random(&mut state).is_multiple_of(2) { &other[..] } else { &[] };
+            let end = inspect(&[before, &[&file]].concat());
+            longest = longest.max(begin.elapsed());
             *ends.entry(end).or_insert(0u64) += 1;
             if matches!(end, End::Hung | End::Crashed | End::GivenUp)
                 && let Some(keep) = std::env::var_os("RIDGEWATCH_KEEP_MUTANTS")
@@ -114,8 +124,20 @@ fn mutated_files_end_in_an_answer_or_a_message() {
                 std::fs::copy(&file, Path::new(&keep).join(format!("{end:?}_{}_{mutant}", ends[&end]))).unwrap();
             }
         }
+        println!("{mutant}: {count} mutants: {ends:?}, {longest:.1?} at most, {} MB at most so far", peak_of_children() >> 20);
+        assert!(ends[&End::Answered] > 0 && ends[&End::Refused] > 0, "mutations must reach both ends");
+        assert!(!ends.contains_key(&End::Hung), "no hang");
     }
-    println!("{count} mutants: {ends:?}");
-    assert!(ends[&End::Answered] > 0 && ends[&End::Refused] > 0, "mutations must reach both ends");
-    assert!(!ends.contains_key(&End::Hung), "no hang");
+    assert!(peak_of_children() < MOST_RESIDENT, "{}", peak_of_children());
+}
+
+/// Bytes that the largest child so far had in memory.
+fn peak_of_children() -> u64 {
+    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
+    let usage = unsafe {
+        let mut usage: libc::rusage = std::mem::zeroed();
+        assert_eq!(libc::getrusage(libc::RUSAGE_CHILDREN, &raw mut usage), 0);
+        usage
+    };
+    usage.ru_maxrss as u64 * 1024
 }

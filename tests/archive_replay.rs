@@ -96,6 +96,38 @@ fn a_variable_that_the_file_lacks_points_at_its_line() {
     assert!(output.status.code() == Some(2) && said.contains("--set archive.v=vo: `archive.v`"), "{said}");
 }
 
+#[test]
+fn one_snapshot_is_a_steady_flow_where_that_is_set() {
+    // Half a rotation a day about (0, 0), on a plane in metres.
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("one.nc");
+    let axis: Vec<f64> = (0..21).map(|i| f64::from(i) * 1000.0 - 10_000.0).collect();
+    let rate = std::f64::consts::PI / 86_400.0;
+    let at = axis.clone();
+    Fixture::new(NETCDF4, &[("time", 1), ("y", 21), ("x", 21)])
+        .axis("x", "m", &axis)
+        .axis("y", "m", &axis)
+        .axis("time", "days since 2000-01-01", &[3.0])
+        .variable("u", &["time", "y", "x"], f32s(fill(1, 21, 21, |_, y, _| -rate * at[y])))
+        .with("units", "m/s")
+        .variable("v", &["time", "y", "x"], f32s(fill(1, 21, 21, |_, _, x| rate * at[x])))
+        .with("units", "m/s")
+        .write(&file);
+    let file = file.display().to_string();
+    let said = |output: Output| (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned());
+    let (code, message) = said(ridgewatch(&["ftle", &file, "--set", "time.tau=1 day"]));
+    assert!(code != Some(0) && message.contains("one.nc holds one time (2000-01-04T00:00:00Z)"), "{message}");
+    let (code, message) = said(ridgewatch(&["ftle", &file, "--set", "archive.steady=true"]));
+    assert!(code == Some(2) && message.contains("`time.tau` is missing"), "{message}");
+    let steady = ["--set", "archive.steady=true", "--set", "time.tau=1 day", "--set", "flow.boundary=clamp", "--grid", "5x5", "--json"];
+    for direction in ["time.direction=backward", "time.direction=forward"] {
+        let output = succeeds(&[&["ftle", &file, "--set", direction][..], &steady].concat());
+        let found: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+        let text = found.to_string();
+        assert!(text.contains("2000-01-04T00:00:00Z"), "{text}");
+    }
+}
+
 fn gyre(folder: &Path, frames: usize) -> String {
     let path = folder.join(format!("gyre{frames}.toml"));
     let text = format!(

@@ -466,6 +466,21 @@ fn steps_are_chosen_by_error() {
     let steps = cpu_tracer(VelocitySource::Window(turbulence([32, 16, 16], 12)), &gridded, 0.0).unwrap().steps();
     println!("easy turbulence, tau 11: {steps} steps for 2e-2");
     assert_eq!(steps % 11, 0, "whole steps an interval");
+
+    // A wind that is the same everywhere agrees with itself at any number of steps: one a cell all the same, two an interval at least.
+    let axis = |name| Axis::uniform(name, "", 0.0, 100.0, 101).unwrap();
+    let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+    for (speed, steps) in [(0.1f32, 6), (8.4, 27)] {
+        let mut window = Window::new(3.0);
+        for time in 0..4 {
+            let count = grid.nodes();
+            window
+                .push(Arc::new(Snapshot::from_components(f64::from(time), grid.clone(), &vec![speed; count], &vec![0.0; count], &[])))
+                .unwrap();
+        }
+        let map = FlowMap { boundary: Boundary::Clamp, steps: Steps::Auto { tolerance: 0.1 }, ..map(3.0, 1, Precision::F32) };
+        assert_eq!(cpu_tracer(VelocitySource::Window(Arc::new(window)), &map, 0.0).unwrap().steps(), steps, "{speed} cells an interval");
+    }
 }
 
 #[test]

@@ -24,7 +24,8 @@ fn mutated_files_are_answered() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("mutant.nc");
     let mut state = 1;
-    let (mut read, mut refused) = (0, 0);
+    let mut longest = Duration::ZERO;
+    let before = peak();
     for options in [CLASSIC, OFFSET_64, DATA_64] {
         // With a record dimension, packing and text attributes.
         let whole = Fixture::new(options, &[("time", 0), ("lat", 3), ("lon", 4)])
@@ -40,6 +41,7 @@ fn mutated_files_are_answered() {
             .write(&file);
         let whole = std::fs::read(whole).unwrap();
         assert!(NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).is_ok());
+        let (mut read, mut refused) = (0, 0);
         for _ in 0..count / 3 {
             let mut bytes = whole.clone();
             for _ in 0..1 + random(&mut state) % 4 {
@@ -78,9 +80,25 @@ fn mutated_files_are_answered() {
                 assert!(inspection.to_string().contains("mutant.nc"));
             }
             // A millisecond's work; the machine may be busy.
+            longest = longest.max(begin.elapsed());
             assert!(begin.elapsed() < Duration::from_secs(10), "took {:?}", begin.elapsed());
         }
+        println!("{} mutants: {read} read, {refused} refused", count / 3);
+        assert!(read > 0 && refused > 0, "mutations must reach both ends");
     }
-    println!("{read} read, {refused} refused");
-    assert!(read > 0 && refused > 0, "mutations must reach both ends");
+    let grown = peak() - before;
+    println!("{longest:.1?} at most, {} MB more at most than before", grown >> 20);
+    // 2^20 values may be read from any file (see `Container::read`), of three components as f64, f32 and nodes.
+    assert!(grown < 200 << 20, "{grown}");
+}
+
+/// Bytes that this process had in memory at most.
+fn peak() -> u64 {
+    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
+    let usage = unsafe {
+        let mut usage: libc::rusage = std::mem::zeroed();
+        assert_eq!(libc::getrusage(libc::RUSAGE_SELF, &raw mut usage), 0);
+        usage
+    };
+    usage.ru_maxrss as u64 * 1024
 }

@@ -427,3 +427,42 @@ fn two_hundred_files_start_at_once() {
         assert!(took.as_secs() < 10, "{took:?}");
     }
 }
+
+#[test]
+fn later_files_have_packing_and_time_units_of_their_own() {
+    let dir = tempdir().unwrap();
+    let file = |name: &str, units: &str, scale: f64, upside_down: bool| {
+        let mut y = [0.0, 2.0, 4.0];
+        if upside_down {
+            y.reverse();
+        }
+        let others = |mut fixture: Fixture| {
+            for k in 0..5 {
+                fixture = fixture.variable(&format!("other{k}"), &["y", "x"], Data::F32(vec![0.0; 12])).with("units", "K");
+            }
+            fixture
+        };
+        others(Fixture::new(NETCDF4, &[("time", 1), ("y", 3), ("x", 4)]))
+            .axis("x", "m", &[0.0, 1.0, 2.0, 3.0])
+            .axis("y", "m", &y)
+            .axis("time", units, &[0.0])
+            .variable("u", &["time", "y", "x"], Data::I16((0..12).collect()))
+            .with("scale_factor", scale)
+            .with("_FillValue", 3i16)
+            .with("units", "m/s")
+            .variable("v", &["time", "y", "x"], Data::I16((0..12).collect()))
+            .with("units", "cm/s")
+            .write(&dir.path().join(name))
+    };
+    let first = file("a.nc", "days since 2000-01-02", 0.5, false);
+    let second = file("b.nc", "hours since 2000-01-01", 0.25, false);
+    let mut archive = open(&[first.clone(), second]);
+    assert_eq!(archive.date(archive.times()[0]).as_deref(), Some("2000-01-01T00:00:00Z"), "the second one is the earlier");
+    for (index, scale) in [(0, 0.25), (1, 0.5)] {
+        let snapshot = archive.read(index).unwrap();
+        assert_eq!((snapshot.nodes[4][0], snapshot.nodes[4][1]), (4.0 * scale, 0.04));
+        assert!(snapshot.nodes[3][3].is_nan() && snapshot.missing() == 1);
+    }
+    let error = NetCdfArchive::open(&[first, file("c.nc", "days since 2000-01-05", 1.0, true)], &NetCdfSettings::default()).err().unwrap();
+    assert!(error.to_string().contains("c.nc") && error.to_string().contains("do not belong to one archive"), "{error}");
+}

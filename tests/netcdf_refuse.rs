@@ -223,8 +223,14 @@ fn times_that_repeat_turn_back_or_are_missing() {
 
 #[test]
 fn mixed_files() {
+    for format in [CLASSIC, NETCDF4] {
+        mixed_files_of(format);
+    }
+}
+
+fn mixed_files_of(format: Format) {
     let dir = tempdir().unwrap();
-    let first = plane(CLASSIC, &[0.0], DAYS).write(&dir.path().join("a.nc"));
+    let first = plane(format, &[0.0], DAYS).write(&dir.path().join("a.nc"));
     let mixed = |second: Fixture, piece: &str| {
         let error = refused(&[first.clone(), second.write(&dir.path().join("b.nc"))]);
         let message = error.to_string();
@@ -234,7 +240,7 @@ fn mixed_files() {
         }
     };
     let other = |x: &[f64], names: [&str; 2], calendar: &str| {
-        Fixture::new(CLASSIC, &[("time", 1), ("y", 3), ("x", x.len())])
+        Fixture::new(format, &[("time", 1), ("y", 3), ("x", x.len())])
             .axis("x", "m", x)
             .axis("y", "m", &[0.0, 2.0, 4.0])
             .axis("time", DAYS, &[1.0])
@@ -264,6 +270,36 @@ fn tau_against_the_archive() {
     let short = plane(CLASSIC, &[0.0, 1.0], DAYS).write(&dir.path().join("short.nc"));
     let archive = NetCdfArchive::open(&[short], &NetCdfSettings::default()).unwrap();
     assert!(matches!(archive.default_tau(), Err(SourceError::TooShort { needed: 3, found: 2, .. })));
+    let one = plane(CLASSIC, &[1.0], DAYS).write(&dir.path().join("one.nc"));
+    let archive = NetCdfArchive::open(&[one], &NetCdfSettings::default()).unwrap();
+    for message in [archive.default_tau().unwrap_err().to_string(), archive.check_tau(day).unwrap_err().to_string()] {
+        for piece in ["one.nc holds one time (", "-02T00:00:00Z)", "archive.steady = true", "time.tau"] {
+            assert!(message.contains(piece), "{message}");
+        }
+    }
+}
+
+#[test]
+fn packing_that_unpacks_nothing() {
+    let dir = tempdir().unwrap();
+    let packed = |attribute: &str, value: f64| {
+        Fixture::new(CLASSIC, &[("time", 1), ("y", 3), ("x", 4)])
+            .axis("x", "m", &[0.0, 1.0, 2.0, 3.0])
+            .axis("y", "m", &[0.0, 1.0, 2.0])
+            .axis("time", DAYS, &[1.0])
+            .variable("u", &["time", "y", "x"], Data::I16(vec![1; 12]))
+            .variable("v", &["time", "y", "x"], Data::I16(vec![1; 12]))
+            .with(attribute, value)
+            .write(&dir.path().join("packed.nc"))
+    };
+    for (attribute, value, found) in
+        [("scale_factor", 0.0, "is 0"), ("scale_factor", f64::NAN, "is NaN"), ("add_offset", f64::INFINITY, "is inf")]
+    {
+        let message = refused_with(&[packed(attribute, value)], &NetCdfSettings::default()).to_string();
+        for piece in ["packed.nc", "`v`", attribute, found, "accepted is a finite number"] {
+            assert!(message.contains(piece), "{message}");
+        }
+    }
 }
 
 #[test]

@@ -190,6 +190,8 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "slides": report.slides,
         "interrupted": report.interrupted,
         "waited_seconds": report.waited,
+        // Of waiting for input and working, saving and publishing not counted.
+        "waited_share": if report.waited > 0.0 { report.waited / (report.waited + report.worked) } else { 0.0 },
         "optimizer_steps": report.train_steps,
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,

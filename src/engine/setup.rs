@@ -6,7 +6,7 @@ use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require, shown};
-use crate::source::{SnapshotSource, SourceKind};
+use crate::source::{Metric, SnapshotSource, SourceKind, Steady, VelocityUnit};
 use crate::surrogate::Kind;
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
@@ -41,7 +41,7 @@ impl Setup {
     }
 
     /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
-    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
+    pub fn over(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
         scene.check()?;
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
@@ -57,6 +57,9 @@ impl Setup {
                 tau.value()
                     .ok_or_else(|| Refused::new("time.tau", format_args!("is {}", shown(tau)), "a number, or words such as \"30 days\""))?
             }
+            (None, Some(_)) if archive && scene.archive.steady => {
+                return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
+            }
             (None, Some(source)) => {
                 let tau = source.default_tau()?;
                 notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
@@ -64,6 +67,19 @@ impl Setup {
             }
             (None, None) => return Err(Refused::new("time.tau", "is missing", "a number above 0").into()),
         };
+        if archive
+            && scene.archive.steady
+            && let Some(source) = snapshots
+        {
+            let counted = source.describe().metric == Metric::Index && scene.archive.velocity_unit == VelocityUnit::Si;
+            if counted {
+                let found = "is true, but the metric is index, which counts snapshots";
+                return Err(
+                    Refused::new("archive.steady", found, "metric = \"sphere\" or \"cartesian\", or velocity_unit = \"cells\"").into()
+                );
+            }
+            snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
+        }
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
             SourceKind::Archive => Boundary::Stop,
             SourceKind::Turbulence => Boundary::Clamp,
@@ -75,7 +91,7 @@ impl Setup {
             integrator: scene.flow.integrator,
             precision: scene.flow.precision,
             steps: match scene.flow.steps {
-                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.5 } else { 0.01 }) },
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
             gap: scene.flow.gap,

@@ -17,6 +17,14 @@ pub enum Geometry {
     },
 }
 
+/// Degrees from a pole within which a row of a grid is the pole.
+const ROW_AT_POLE: f64 = 1e-6;
+
+/// Whether a latitude in degrees is that of a pole.
+pub fn is_pole(latitude: f64) -> bool {
+    90.0 - latitude.abs() < ROW_AT_POLE
+}
+
 /// A rectilinear grid of two or three axes, x fastest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Grid {

@@ -1,6 +1,7 @@
 //! From a description of a flow map to the kernel that is compiled for it.
 
 use super::grid_flow::GridFlow;
+use super::resolution::cells_crossed;
 use super::sphere::SphereFlow;
 use super::sphere_levels::LayeredSphereFlow;
 use super::steps::Chosen;
@@ -165,7 +166,11 @@ impl<'a> Assembly<'a> {
                 // Rounding must not decide, so steps are chosen in double precision.
                 let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
                 let intervals = intervals(Chart::breaks(&tracer.field), from, to);
-                let chosen = steps::choose(tolerance, intervals, &self.domain, |steps, points, out| {
+                let cells = match &self.source {
+                    VelocitySource::Window(window) => cells_crossed(window, from, to),
+                    VelocitySource::Analytic(..) => 0.0,
+                };
+                let chosen = steps::choose(tolerance, steps::Gridded { intervals, cells }, &self.domain, |steps, points, out| {
                     tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
                     tracer.trace(points, super::Extras::default(), out);
                 })?;

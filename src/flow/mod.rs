@@ -31,6 +31,8 @@ pub(crate) use axis_map::AxisMap;
 pub use error::FlowError;
 pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};
+#[cfg(feature = "cuda")]
+pub(crate) use sphere::poles;
 pub use steps::Chosen;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
@@ -125,7 +127,8 @@ pub enum Interpolation {
 /// How many Runge-Kutta steps a path gets.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Steps {
-    /// The fewest whose log-stretch differs from twice as many by at most this root mean square, on a few thousand points.
+    /// The fewest whose log-stretch differs from twice as many by at most this root mean square, on a few thousand points; on grids at least
+    /// two a snapshot interval and one a cell that is crossed.
     Auto {
         /// Root mean square of the log-stretch.
         tolerance: f64,

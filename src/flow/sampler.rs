@@ -3,6 +3,10 @@
 //! The hot path reads, for each lane, pairs of nodes that are neighbours along x with one load, interpolates them along t, y and z
 //! as one vector, and turns the pairs of all lanes into lanes before the last interpolation, along x.
 //!
+//! Where longitudes go round, nodes beside a pole lie so close that the slope along x is a small difference of large numbers over a tiny
+//! length. There, and for cubics, neighbours are subtracted first, which is exact, and interpolated then: a row of equal nodes (a pole)
+//! has slope 0 in every precision.
+//!
 //! Beyond the end of an axis that does not repeat, the velocity is that at the end (so that a stage of a step may look a little past
 //! it), and its derivative across the end is 0.
 //!
@@ -141,7 +145,8 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         let places = self.locate(x);
         match self.interpolation {
             Interpolation::Linear => {
-                let [pair] = self.linear::<L, 1>(stage, &places);
+                let [pair] =
+                    if self.seams { self.linear_across_seams::<L, 1>(stage, &places) } else { self.linear_inside::<L, 1>(stage, &places) };
                 (lerp_x(&pair, places[0].fraction), pair[3] + pair[7])
             }
             Interpolation::Cubic => {
@@ -157,15 +162,23 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         let places = self.locate(x);
         let mut sample = match self.interpolation {
             Interpolation::Linear => {
-                // The value, and its derivatives along all axes but x.
-                let pairs = self.linear::<L, N>(stage, &places);
+                // The value, and its derivatives along all axes but x; along x too where there is a seam.
                 let fraction = places[0].fraction;
                 let mut slopes = [[L::zero(); M]; N];
-                slopes[0] = array(|c| pairs[0][c + 4] - pairs[0][c]);
+                let along = |pair: &[L; 8]| array(|c| pair[c + 4] - pair[c]);
+                let pairs = if self.seams {
+                    let found = self.linear_across_seams::<L, 4>(stage, &places);
+                    slopes[0] = array(|c| found[3][c] + found[3][c + 4]);
+                    array(|k| found[k])
+                } else {
+                    let pairs: [[L; 8]; N] = self.linear_inside(stage, &places);
+                    slopes[0] = along(&pairs[0]);
+                    pairs
+                };
                 for k in 1..N {
                     slopes[k] = lerp_x(&pairs[k], fraction);
                 }
-                let velocity = array(|c| fraction.mul_add(slopes[0][c], pairs[0][c]));
+                let velocity = lerp_x(&pairs[0], fraction);
                 Sample { velocity, slopes, mark: pairs[0][3] + pairs[0][7] }
             }
             Interpolation::Cubic => {
@@ -184,10 +197,7 @@ impl<R: Real, const N: usize> Sampler<R, N> {
 
     /// Node pairs interpolated along t, y and z (`[0]`), and, where K > 1, their derivatives along y and z.
     #[inline(always)]
-    fn linear<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
-        if self.seams {
-            return self.linear_across_seams(stage, places);
-        }
+    fn linear_inside<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
         let first = self.snapshots[stage.first].nodes.as_ptr();
         let weights = array(|i| L::Pair::repeat(stage.weights[i]));
         let mut flat = places[N - 1].cell;
@@ -203,7 +213,8 @@ impl<R: Real, const N: usize> Sampler<R, N> {
         }
     }
 
-    /// The same where a cell's nodes may lie at opposite ends of an axis.
+    /// The same where a cell's nodes may lie at opposite ends of an axis; `[3]`, where it is asked for, is the derivative along x, to be
+    /// summed over both halves.
     #[inline(never)]
     fn linear_across_seams<L: Gather<Real = R>, const K: usize>(&self, stage: &GridStage<R>, places: &[Place<L>; N]) -> [[L; 8]; K] {
         L::gather(&SeamRows { nodes: self.nodes(stage), sampler: self, places })
@@ -229,14 +240,22 @@ struct NodesInTime<'a, P> {
 }
 
 impl<P: NodePair> NodesInTime<'_, P> {
-    /// Two nodes, interpolated in time.
+    /// Pairs of nodes interpolated in time: as they are, and less the second node of the first pair, which is taken off before anything is
+    /// rounded.
     #[inline(always)]
-    fn pair(&self, left: usize, right: usize) -> P {
-        let a = P::joined(self.first[left], self.first[right]) * self.weights[0];
-        match self.second {
-            None => a,
-            Some(second) => P::joined(second[left], second[right]).mul_add(self.weights[1], a),
+    fn pairs<const K: usize>(&self, at: [[usize; 2]; K]) -> ([P; K], [P; K]) {
+        let raw = |nodes: &[[f32; 4]]| -> [P; K] { array(|k| P::joined(nodes[at[k][0]], nodes[at[k][1]])) };
+        let first = raw(self.first);
+        let common = first[0].second_twice();
+        let mut values: [P; K] = array(|k| first[k] * self.weights[0]);
+        let mut rest: [P; K] = array(|k| (first[k] - common) * self.weights[0]);
+        if let Some(second) = self.second {
+            let second = raw(second);
+            let common = second[0].second_twice();
+            values = array(|k| second[k].mul_add(self.weights[1], values[k]));
+            rest = array(|k| (second[k] - common).mul_add(self.weights[1], rest[k]));
         }
+        (values, rest)
     }
 }
 
@@ -292,14 +311,26 @@ impl<L: Gather, const N: usize, const K: usize> Rows<L::Pair, K> for SeamRows<'_
         });
         let fetch = |y: usize, z: usize| {
             let base = ends[1][y] * self.sampler.row + if N == 3 { ends[N - 1][z] * self.sampler.plane } else { 0 };
-            self.nodes.pair(base + ends[0][0], base + ends[0][1])
+            let ([pair], [rest]) = self.nodes.pairs([[base + ends[0][0], base + ends[0][1]]]);
+            // First less second node, turned round, and nothing in the second place.
+            (pair, -rest)
         };
         let y = L::Pair::splat(self.places[1].fraction.lane(lane));
         if N == 2 {
-            bilinear(y, [fetch(0, 0), fetch(1, 0)])
+            let rows = [fetch(0, 0), fetch(1, 0)];
+            let mut out = bilinear(y, array(|i| rows[i].0));
+            if K > 3 {
+                [out[3]] = bilinear(y, array(|i| rows[i].1));
+            }
+            out
         } else {
             let z = L::Pair::splat(self.places[N - 1].fraction.lane(lane));
-            trilinear(y, z, [fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)])
+            let rows = [fetch(0, 0), fetch(1, 0), fetch(0, 1), fetch(1, 1)];
+            let mut out = trilinear(y, z, array(|i| rows[i].0));
+            if K > 3 {
+                [out[3]] = trilinear(y, z, array(|i| rows[i].1));
+            }
+            out
         }
     }
 }
@@ -329,12 +360,13 @@ impl<L: Gather, const N: usize, const K: usize> Rows<L::Pair, K> for CubicRows<'
             };
             for iy in 0..4 {
                 let base = z_base + y.nodes[iy] * self.sampler.row;
-                let halves = [self.nodes.pair(base + x.nodes[0], base + x.nodes[1]), self.nodes.pair(base + x.nodes[2], base + x.nodes[3])];
+                let (halves, rest) = self.nodes.pairs([[base + x.nodes[0], base + x.nodes[1]], [base + x.nodes[2], base + x.nodes[3]]]);
                 let row = halves[0].mul_add(weights_x[0], halves[1] * weights_x[1]);
                 let weight = L::Pair::splat(y.weights[iy] * z_weight);
                 sums[0] = row.mul_add(weight, sums[0]);
                 if K > 1 {
-                    let row_slope = halves[0].mul_add(slopes_x[0], halves[1] * slopes_x[1]);
+                    // The weights of a slope sum to 0: what all nodes have in common may be taken out.
+                    let row_slope = rest[0].mul_add(slopes_x[0], rest[1] * slopes_x[1]);
                     sums[1] = row_slope.mul_add(weight, sums[1]);
                     sums[2] = row.mul_add(L::Pair::splat(y.slopes[iy] * z_weight), sums[2]);
                     sums[3] = row.mul_add(L::Pair::splat(y.weights[iy] * z_slope), sums[3]);

@@ -56,7 +56,7 @@ pub struct FlowSettings {
     /// Runge-Kutta steps a path.
     pub steps: StepsSetting,
     /// With `steps = "auto"`: root mean square of the log-stretch that a doubling of the steps may change; none: 0.01 for closed forms
-    /// and the synthetic turbulence, 0.5 for archives, whose interpolated gradient
+    /// and the synthetic turbulence, 0.1 for archives, whose interpolated gradient
     /// converges slowly. What was reached is in the summary.
     pub tolerance: Option<f64>,
     /// Distance of difference particles, in coordinate units.

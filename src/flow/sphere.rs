@@ -8,7 +8,7 @@ use super::axis_map::AxisMap;
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Chart, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
-use crate::field::{Grid, Window};
+use crate::field::{Grid, Window, is_pole};
 use crate::simd::{Gather, Lanes, Real, array};
 
 /// Where a direction is on a longitude-latitude grid in degrees.
@@ -24,6 +24,8 @@ pub(super) struct Globe<R> {
     turn: [R; 2],
     /// State coordinates between which particles stay, `[low, high]` along longitude and latitude. A grid does not end at a pole.
     pub(super) ends: [[f64; 2]; 2],
+    /// State coordinates of the poles that are rows of the grid; infinite where they are not.
+    pub(super) poles: [R; 2],
 }
 
 /// A window on a longitude-latitude grid in degrees.
@@ -49,8 +51,23 @@ impl<R: Real> SphereFlow<R> {
 
 /// Below this cosine of the latitude, longitude has no meaning: 6e-7 degrees from a pole.
 pub(super) const AT_POLE: f64 = 1e-8;
-/// Degrees from a pole within which the last row of a grid is the pole.
-const ROW_AT_POLE: f64 = 1e-6;
+/// Within so many spacings of a row at a pole the circle of latitude has the length that belongs to the place on the grid: the slope along
+/// it and its length vanish together, and rounding must not part them.
+const NEAR_POLE: f64 = 0.125;
+
+/// Spacings from a pole that a place keeps, so that both do not vanish: 16 units in the last place of a grid of 1024 rows.
+pub(crate) fn least_colatitude<R: Real>() -> R {
+    R::from_f64(if size_of::<R>() == size_of::<f32>() { 1.0 / 1024.0 } else { 1.0 / f64::from(1 << 30) })
+}
+
+/// State coordinates of the poles that are rows of the grid, minus and plus infinity where they are not.
+pub(crate) fn poles<R: Real>(latitude: &AxisMap<R>) -> [f64; 2] {
+    let ends = latitude.ends();
+    array(|k| {
+        let beyond = [f64::NEG_INFINITY, f64::INFINITY][k];
+        if ends[k].is_finite() && is_pole(latitude.coordinate(ends[k])) { ends[k] } else { beyond }
+    })
+}
 
 /// The direction of a state, and its place on the grid.
 pub(super) struct Here<L> {
@@ -58,6 +75,8 @@ pub(super) struct Here<L> {
     pub(super) p: [L; 3],
     pub(super) inverse_length: L,
     pub(super) cosine: L,
+    /// Radius of the circle of latitude through `place`: the cosine, but beside a pole that is a row of the grid.
+    pub(super) circle: L,
     /// Longitude and latitude in grid spacings.
     pub(super) place: [L; 2],
 }
@@ -72,11 +91,12 @@ impl<R: Real> Globe<R> {
         let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
         let (sine, cosine) = middle.to_radians().sin_cos();
         let real = R::from_f64;
-        let mut south_north = latitude.ends();
-        for (end, pole) in south_north.iter_mut().zip([-90.0, 90.0]) {
+        let poles = poles(latitude);
+        let mut ends = latitude.ends();
+        for k in 0..2 {
             // Rounding must not put a particle that passes over the pole outside of the grid.
-            if end.is_finite() && (latitude.coordinate(*end) - pole).abs() < ROW_AT_POLE {
-                *end = f64::INFINITY.copysign(pole);
+            if poles[k].is_finite() {
+                ends[k] = [f64::NEG_INFINITY, f64::INFINITY][k];
             }
         }
         Self {
@@ -84,7 +104,8 @@ impl<R: Real> Globe<R> {
             per_radian: [real(1f64.to_degrees() / longitude.spacing), real(1f64.to_degrees() / latitude.spacing)],
             origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
             turn: [real(cosine), real(sine)],
-            ends: [longitude.ends(), south_north],
+            ends: [longitude.ends(), ends],
+            poles: poles.map(real),
         }
     }
 
@@ -98,8 +119,24 @@ impl<R: Real> Globe<R> {
         // At a pole any longitude will do.
         let ahead = L::select(L::lt(cosine, L::of(AT_POLE)), L::one(), ahead);
         let angles = [aside.atan2(ahead), p[2].atan2(cosine)];
-        let place = array(|k| angles[k].mul_add(L::splat(self.per_radian[k]), L::splat(self.origin[k])));
-        Here { p, inverse_length, cosine: cosine.max(L::of(AT_POLE)), place }
+        let mut place: [L; 2] = array(|k| angles[k].mul_add(L::splat(self.per_radian[k]), L::splat(self.origin[k])));
+        let ([south, north], least) = (self.poles.map(L::splat), L::splat(least_colatitude()));
+        place[1] = place[1].max(south + least).min(north - least);
+        let beside = (place[1] - south).min(north - place[1]);
+        let angle = beside / L::splat(self.per_radian[1]);
+        // The sine of an angle of an eighth of a cell.
+        let circle = angle * (angle * angle).mul_add(L::of(-1.0 / 6.0), L::one());
+        let cosine = cosine.max(L::of(AT_POLE));
+        Here { p, inverse_length, cosine, circle: L::select(L::lt(beside, L::of(NEAR_POLE)), circle, cosine), place }
+    }
+
+    /// East and north at a direction; at a pole those of the longitude that [`Globe::here`] takes there.
+    #[inline(always)]
+    pub(super) fn basis<L: Gather<Real = R>>(&self, p: &[L; 3], cosine: L) -> [[L; 3]; 2] {
+        let inverse = L::one() / cosine;
+        let at_pole = cosine.le(L::of(AT_POLE));
+        let [c, s] = array(|k| L::select(at_pole, L::splat(self.turn[k]), p[k] * inverse));
+        [[-s, c, L::zero()], [-(p[2] * c), -(p[2] * s), cosine]]
     }
 
     /// Longitude and latitude in degrees of a direction.
@@ -108,15 +145,6 @@ impl<R: Real> Globe<R> {
         let longitude = p[1].atan2(p[0]).to_degrees();
         [longitude + 360.0 * ((self.middle - longitude) / 360.0).round(), latitude]
     }
-}
-
-/// East and north at a direction.
-#[inline(always)]
-pub(super) fn basis<L: Lanes>(p: &[L; 3], cosine: L) -> [[L; 3]; 2] {
-    let inverse = L::one() / cosine;
-    let at_pole = cosine.le(L::of(AT_POLE));
-    let (c, s) = (L::select(at_pole, L::one(), p[0] * inverse), L::select(at_pole, L::zero(), p[1] * inverse));
-    [[-s, c, L::zero()], [-(p[2] * c), -(p[2] * s), cosine]]
 }
 
 /// Sine and cosine of the longitude, sine and cosine of the latitude.
@@ -174,14 +202,14 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
         let sample = self.sampler.sample::<L, 3>(stage, &here.place);
         let p = &here.p;
         let radial = dot(p, &sample.velocity);
-        let [east, north] = basis(p, here.cosine);
+        let [east, north] = self.globe.basis(p, here.cosine);
         let mut product = [[L::zero(); 2]; 3];
         for c in 0..2 {
             // Change of direction for a change of the state along the column.
             let column: [L; 3] = array(|i| m[i][c]);
             let outward = dot(p, &column);
             let change: [L; 3] = array(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
-            let longitude = dot(&east, &change) / here.cosine * L::splat(self.globe.per_radian[0]);
+            let longitude = dot(&east, &change) / here.circle * L::splat(self.globe.per_radian[0]);
             let latitude = dot(&north, &change) * L::splat(self.globe.per_radian[1]);
             let interpolated: [L; 3] = array(|i| longitude.mul_add(sample.slopes[0][i], latitude * sample.slopes[1][i]));
             // Derivative of V - p (p . V).
@@ -215,7 +243,7 @@ impl<L: Gather> Velocity<L, 3, 2> for SphereFlow<L::Real> {
     #[inline(always)]
     fn metric(&self, x: &[L; 3], m: &[[L; 2]; 3]) -> [[L; 2]; 2] {
         let cosine = x[0].mul_add(x[0], x[1] * x[1]).sqrt().max(L::of(AT_POLE));
-        let basis = basis(x, cosine);
+        let basis = self.globe.basis(x, cosine);
         array(|i| array(|c| dot(&basis[i], &array(|k| m[k][c]))))
     }
 }

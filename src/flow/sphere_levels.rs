@@ -6,7 +6,7 @@
 //! are in radii, along (east, north, up).
 
 use super::sampler::{GridStage, Sampler};
-use super::sphere::{AT_POLE, Globe, basis, dot, trigonometry};
+use super::sphere::{AT_POLE, Globe, dot, trigonometry};
 use super::velocity::{Chart, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
@@ -102,14 +102,14 @@ impl<L: Gather> Velocity<L, 4, 3> for LayeredSphereFlow<L::Real> {
         let (p, v) = (&here.p, &sample.velocity);
         let horizontal = direction(v);
         let radial = dot(p, &horizontal);
-        let [east, north] = basis(p, here.cosine);
+        let [east, north] = self.globe.basis(p, here.cosine);
         let mut product = [[L::zero(); 3]; 4];
         for c in 0..3 {
             // Change of direction for a change of the state along the column.
             let column: [L; 3] = array(|i| m[i][c]);
             let outward = dot(p, &column);
             let change: [L; 3] = array(|i| (-outward).mul_add(p[i], column[i]) * here.inverse_length);
-            let longitude = dot(&east, &change) / here.cosine * L::splat(self.globe.per_radian[0]);
+            let longitude = dot(&east, &change) / here.circle * L::splat(self.globe.per_radian[0]);
             let latitude = dot(&north, &change) * L::splat(self.globe.per_radian[1]);
             let interpolated: [L; 4] = array(|i| {
                 let along_level = m[3][c] * sample.slopes[2][i];
@@ -154,7 +154,7 @@ impl<L: Gather> Velocity<L, 4, 3> for LayeredSphereFlow<L::Real> {
     #[inline(always)]
     fn metric(&self, x: &[L; 4], m: &[[L; 3]; 4]) -> [[L; 3]; 3] {
         let cosine = x[0].mul_add(x[0], x[1] * x[1]).sqrt().max(L::of(AT_POLE));
-        let [east, north] = basis(&direction(x), cosine);
+        let [east, north] = self.globe.basis(&direction(x), cosine);
         let column = |c: usize| array(|k| m[k][c]);
         [array(|c| dot(&east, &column(c))), array(|c| dot(&north, &column(c))), array(|c| m[3][c] * L::of(self.level))]
     }

@@ -9,6 +9,8 @@ const POINTS: usize = 2048;
 const FEWEST: usize = 4;
 /// Most steps tried.
 const MOST: usize = 16_384;
+/// Fewest steps a snapshot interval, at whose ends the change in time has a corner.
+const LEAST_AN_INTERVAL: usize = 2;
 /// Most steps a snapshot interval.
 const MOST_AN_INTERVAL: usize = 32;
 /// Share of the points, the most different ones, that does not count on grids.
@@ -56,15 +58,24 @@ pub struct Chosen {
     pub met: bool,
 }
 
-/// The fewest steps of a ladder (by halves upwards, from `intervals`) whose log-stretch differs from that of twice as many by at
-/// most `tolerance`, root mean square.
+/// Where a ladder on a grid begins: what is known about it.
+pub struct Gridded {
+    /// Snapshot intervals in tau; 0 for a closed form.
+    pub intervals: usize,
+    /// Cells that a path crosses in tau.
+    pub cells: f64,
+}
+
+/// The fewest steps of a ladder (by halves upwards) whose log-stretch differs from that of twice as many by at most `tolerance`, root mean
+/// square. On grids the ladder begins at two steps a snapshot interval and one a cell: fewer may agree with one another and be wrong, and a
+/// path that stops at an edge or at land is cut to whole steps.
 ///
 /// On grids the gradient of the interpolant jumps at cell faces, and a few paths along a separatrix turn one way with n steps and the
 /// other with 2n, at any n: there the most different [`TRIMMED`] of the points is left out, and the ladder ends at [`MOST_AN_INTERVAL`]
 /// steps a snapshot interval, beyond which the data's own resolution decides. Not meeting the tolerance is then told, not refused.
 pub fn choose(
     tolerance: f64,
-    intervals: usize,
+    Gridded { intervals, cells }: Gridded,
     domain: &Domain,
     mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
 ) -> Result<Chosen, FlowError> {
@@ -73,7 +84,8 @@ pub fn choose(
     let gridded = intervals > 0;
     let most = if gridded { MOST_AN_INTERVAL * intervals } else { MOST };
     let trimmed = if gridded { TRIMMED } else { 0.0 };
-    let mut steps = if gridded { intervals } else { FEWEST };
+    let first = (cells.ceil() as usize).max(LEAST_AN_INTERVAL * intervals).next_multiple_of(intervals.max(1));
+    let mut steps = if gridded { first.min(most) } else { FEWEST };
     let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
     while steps <= most {
         trace(steps, &points, &mut once);

@@ -22,6 +22,11 @@ impl NodePair for f32x8 {
     fn spread(first: f32, second: f32) -> Self {
         Self::joined([first; 4], [second; 4])
     }
+    #[inline(always)]
+    fn second_twice(self) -> Self {
+        let a = self.to_array();
+        f32x8::new([a[4], a[5], a[6], a[7], a[4], a[5], a[6], a[7]])
+    }
 }
 
 impl NodePair for Two<f64x4> {
@@ -41,6 +46,10 @@ impl NodePair for Two<f64x4> {
     #[inline(always)]
     fn spread(first: f64, second: f64) -> Self {
         Two(f64x4::splat(first), f64x4::splat(second))
+    }
+    #[inline(always)]
+    fn second_twice(self) -> Self {
+        Two(self.1, self.1)
     }
 }
 

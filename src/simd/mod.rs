@@ -154,6 +154,8 @@ pub trait NodePair: Lanes {
     fn repeat(four: [Self::Real; 4]) -> Self;
     /// One number for all of the first node, another for all of the second.
     fn spread(first: Self::Real, second: Self::Real) -> Self;
+    /// The second node in both places.
+    fn second_twice(self) -> Self;
 }
 
 /// Lanes that each read their own place of a node array.

@@ -3,7 +3,7 @@
 use super::axes::AxisPlan;
 use super::cf::calendar::Calendar;
 use super::cf::coordinate::Kind;
-use super::container::Container;
+use super::container::{Container, Format, Header};
 use super::conversion::Conversion;
 use super::files::expand;
 use super::hyperslab::{Orders, read_component};
@@ -50,6 +50,8 @@ pub struct NetCdfArchive {
     in_cells: bool,
     description: SourceDescription,
     open: Option<(usize, Container)>,
+    /// Header of the velocities, where files may be opened by it.
+    like: Option<Header>,
 }
 
 impl NetCdfArchive {
@@ -69,20 +71,23 @@ impl NetCdfArchive {
         let mut entries: Vec<(f64, Place)> = Vec::new();
         let mut files = Vec::with_capacity(paths.len());
         let mut last_open = None;
-        let mut used: Option<Vec<String>> = None;
+        let mut like: Option<Header> = None;
         for path in paths {
             let known = first.as_ref().map(|f| &f.0);
-            let mut container = Container::open_part(&path, used.as_deref())?;
-            let layout = match plan(&container, settings, known) {
-                // The part of the header that sufficed for the first file does not for this one.
-                Err(_) if used.is_some() => {
-                    container = Container::open(&path)?;
-                    plan(&container, settings, known)?
-                }
-                planned => planned?,
+            let mut container = Container::open_like(&path, like.as_ref())?;
+            let mut planned = plan(&container, settings, known);
+            let fits = |planned: &Result<Layout, SourceError>| match (planned, known) {
+                (Ok(layout), Some(known)) => difference(known, layout).is_none(),
+                (planned, _) => planned.is_ok(),
             };
-            if used.is_none() && layout.resampling.is_none() {
-                used = Some(layout.used(&container.header));
+            if like.is_some() && !fits(&planned) {
+                // The part of the header that sufficed for the first file does not for this one, which decides nothing.
+                container = Container::open(&path)?;
+                planned = plan(&container, settings, known);
+            }
+            let layout = planned?;
+            if like.is_none() && layout.resampling.is_none() && container.format == Format::NetCdf4 {
+                like = Some(container.header.part(&layout.used(&container.header)));
             }
             let index = files.len();
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
@@ -115,6 +120,8 @@ impl NetCdfArchive {
         };
         let grid = Arc::new(build_grid(path, &layout, settings)?);
         let description = describe(&layout, format, files.len(), &seconds);
+        let names: Vec<String> = layout.frames.iter().flatten().map(|c| c.name.clone()).collect();
+        let like = like.map(|header| header.part(&names));
         let mut archive = Self {
             places: entries.iter().map(|e| e.1).collect(),
             vertical: layout.vertical,
@@ -130,6 +137,7 @@ impl NetCdfArchive {
             in_cells: settings.velocity_unit == VelocityUnit::Cells,
             description,
             open: last_open,
+            like,
             files,
         };
         if let Some([error, size]) = archive.resampling_error()? {
@@ -209,8 +217,7 @@ impl NetCdfArchive {
             // Closed before the next is opened.
             self.open = None;
             let path = &self.files[file].path;
-            let names: Vec<String> = self.files[file].frames.iter().flatten().map(|c| c.name.clone()).collect();
-            let container = Container::open_part(path, self.resampling.is_none().then_some(&names[..]))?;
+            let container = Container::open_like(path, self.like.as_ref())?;
             for component in self.files[file].frames.iter().flatten() {
                 let found = container.header.find(&component.name).map(|v| &container.header.variables[v]);
                 if found.is_none_or(|v| container.header.shape(v) != component.shape) {
@@ -297,6 +304,13 @@ impl SnapshotSource for NetCdfArchive {
 
     fn describe(&self) -> SourceDescription {
         self.description.clone()
+    }
+
+    fn name(&self) -> String {
+        match &self.files[..] {
+            [file] => file.path.display().to_string(),
+            files => format!("{} and {} other file(s)", files[0].path.display(), files.len() - 1),
+        }
     }
 }
 

@@ -124,6 +124,20 @@ impl Header {
         }
     }
 
+    /// Index of a dimension, which is added where it is not there.
+    pub(crate) fn dimension(&mut self, dimension: Dimension) -> usize {
+        self.dimensions.iter().position(|d| *d == dimension).unwrap_or_else(|| {
+            self.dimensions.push(dimension);
+            self.dimensions.len() - 1
+        })
+    }
+
+    /// The same header with these variables only.
+    pub(crate) fn part(&self, names: &[String]) -> Self {
+        let variables = self.variables.iter().filter(|v| names.contains(&v.name)).cloned().collect();
+        Self { dimensions: self.dimensions.clone(), variables, attributes: Vec::new() }
+    }
+
     pub(crate) fn find(&self, name: &str) -> Option<usize> {
         self.variables.iter().position(|v| v.name == name)
     }
@@ -185,11 +199,12 @@ pub(crate) struct Container {
 impl Container {
     /// Opens a file and reads its header, nothing else.
     pub(crate) fn open(path: &Path) -> Result<Self, SourceError> {
-        Self::open_part(path, None)
+        Self::open_like(path, None)
     }
 
-    /// The same, with the headers of the variables `only` where that saves time: others may lack.
-    pub(crate) fn open_part(path: &Path, only: Option<&[String]>) -> Result<Self, SourceError> {
+    /// The same where a file is expected to hold the variables of `like`: where it saves time, others are left out of the header, and the names
+    /// of dimensions are taken on trust. (Of a NetCDF-4 file libnetcdf reads every variable: milliseconds, and many small reads.)
+    pub(crate) fn open_like(path: &Path, like: Option<&Header>) -> Result<Self, SourceError> {
         let failed = |cause| SourceError::Open { path: path.to_path_buf(), cause };
         let mut file = File::open(path).map_err(failed)?;
         let length = file.metadata().map_err(failed)?.len();
@@ -199,12 +214,15 @@ impl Container {
                 let (header, store) = ClassicStore::open(path, file, length, version)?;
                 (format, header, Store::Classic(store))
             }
-            Format::NetCdf4 | Format::Hdf5 => match NetCdf4Store::open(path, only)? {
-                Some((header, store)) => (Format::NetCdf4, header, Store::NetCdf4(store)),
-                None => {
-                    let (header, store) = Hdf5Store::open(path)?;
-                    (Format::Hdf5, header, Store::Hdf5(store))
-                }
+            Format::NetCdf4 | Format::Hdf5 => match like.and_then(|like| Hdf5Store::open_like(path, like)) {
+                Some((header, store)) => (Format::NetCdf4, header, Store::Hdf5(store)),
+                None => match NetCdf4Store::open(path)? {
+                    Some((header, store)) => (Format::NetCdf4, header, Store::NetCdf4(store)),
+                    None => {
+                        let (header, store) = Hdf5Store::open(path)?;
+                        (Format::Hdf5, header, Store::Hdf5(store))
+                    }
+                },
             },
         };
         Ok(Self { path: path.to_path_buf(), format, header, store, length })

@@ -7,7 +7,6 @@
 use super::SourceError;
 use super::axes::{AxisPlan, Quantity};
 use super::cf::coordinate::{Kind, classify};
-use super::cf::packing::Packing;
 use super::cf::units::Unit;
 use super::cf::velocity::Velocity;
 use super::container::{Container, Variable};
@@ -144,7 +143,7 @@ impl Planner<'_> {
             let shape = header.shape(variable);
             let count: Vec<usize> = shape.iter().enumerate().map(|(k, &n)| if k + 2 >= shape.len() { n } else { 1 }).collect();
             let values = self.file.read(index, &vec![0; shape.len()], &count)?;
-            let packing = Packing::of(variable);
+            let packing = self.packing(index)?;
             let radians = variable.units().is_some_and(|u| u.to_ascii_lowercase().starts_with("radian"));
             let degrees = |v: f64| if radians { v.to_degrees() } else { v };
             let values = values.into_iter().map(|v| degrees(packing.unpack(v))).collect();

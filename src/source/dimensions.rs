@@ -2,7 +2,6 @@
 
 use super::SourceError;
 use super::cf::coordinate::{Kind, classify, classify_name};
-use super::cf::packing::Packing;
 use super::container::NumberType;
 use super::layout::Planner;
 
@@ -178,7 +177,7 @@ impl Planner<'_> {
         if count > LONGEST_AXIS {
             return Err(self.misfit(variable, format!("{count} coordinates are too many; accepted are up to {LONGEST_AXIS}")));
         }
-        let packing = Packing::of(header);
+        let packing = self.packing(variable)?;
         Ok(self.file.read_all(variable)?.into_iter().map(|v| packing.unpack(v)).collect())
     }
 }

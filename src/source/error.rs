@@ -175,6 +175,17 @@ pub enum SourceError {
         /// What is accepted.
         accepted: String,
     },
+    /// One time, and nothing said about others.
+    #[error(
+        "{source_name} holds one time ({time}): the FTLE needs velocities over a duration. Add files of other times or, to take the flow as \
+         steady, set `archive.steady = true` and `time.tau`"
+    )]
+    OneTime {
+        /// The archive.
+        source_name: String,
+        /// The time.
+        time: String,
+    },
     /// The archive is shorter than tau.
     #[error(
         "tau = {tau} needs {needed} snapshots {interval} apart, but the archive has {found}, which span {span}: shorten tau or add files"

@@ -7,7 +7,6 @@
 use super::SourceError;
 use super::axes::{AxisPlan, Coordinates};
 use super::cf::coordinate::Kind;
-use super::cf::packing::Packing;
 use super::cf::units::Unit;
 use super::cf::velocity;
 use super::container::{Attribute, Variable};
@@ -315,7 +314,7 @@ impl Planner<'_> {
         let unit = v.units().and_then(Unit::parse).filter(Unit::is_velocity);
         let factor = if self.settings.velocity_unit == VelocityUnit::Cells { 1.0 } else { unit.map_or(1.0, |u| u.factor) };
         let why = part.map_or_else(|| why.to_owned(), |part| format!("component {part} of {why}"));
-        Ok(ComponentPlan { name: v.name.clone(), shape: found, roles, packing: Packing::of(v), factor, why })
+        Ok(ComponentPlan { name: v.name.clone(), shape: found, roles, packing: self.packing(variable)?, factor, why })
     }
 
     /// Times of all frames: by a dataset or attribute that holds them, or by the numbers in names.

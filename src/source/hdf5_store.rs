@@ -45,6 +45,30 @@ impl Hdf5Store {
         }
     }
 
+    /// Opens a file that is expected to be like another, whose header is `like`: only its variables are looked for, by name, and their
+    /// dimensions are taken to have the same names. None where something is not as expected.
+    pub(super) fn open_like(path: &Path, like: &Header) -> Option<(Header, Self)> {
+        silence();
+        let _reading = Reading::opening(path);
+        let open = || -> Option<(Header, Self)> {
+            let file = hdf5_metno::File::open(path).ok()?;
+            let mut header = Header::default();
+            for expected in &like.variables {
+                let dataset = file.dataset(&expected.name).ok()?;
+                let shape = dataset.shape();
+                let number = number_type(&dataset.dtype().ok()?.to_descriptor().ok()?);
+                if shape.len() != expected.dimensions.len() || number != expected.number {
+                    return None;
+                }
+                let named = expected.dimensions.iter().zip(shape).map(|(&d, len)| Dimension { name: like.dimensions[d].name.clone(), len });
+                let dimensions = named.map(|dimension| header.dimension(dimension)).collect();
+                header.variables.push(Variable { name: expected.name.clone(), number, dimensions, attributes: attributes(&dataset) });
+            }
+            Some((header, Self { file, path: path.into() }))
+        };
+        catch_unwind(AssertUnwindSafe(open)).ok().flatten()
+    }
+
     /// Reads a hyperslab as `f64`.
     pub(super) fn read(&self, name: &str, start: &[usize], count: &[usize], out: &mut Vec<f64>) -> Result<(), String> {
         silence();
@@ -82,14 +106,8 @@ fn collect(group: &Group, prefix: &str, depth: usize, header: &mut Header) -> hd
         }
         let path = if prefix.is_empty() { name.clone() } else { format!("{prefix}/{name}") };
         if let Ok(dataset) = group.dataset(&name) {
-            let dimensions = dataset.shape().into_iter().enumerate().map(|(place, len)| {
-                let found = Dimension { name: format!("axis {place}"), len };
-                header.dimensions.iter().position(|d| *d == found).unwrap_or_else(|| {
-                    header.dimensions.push(found);
-                    header.dimensions.len() - 1
-                })
-            });
-            let dimensions = dimensions.collect();
+            let named = dataset.shape().into_iter().enumerate().map(|(place, len)| Dimension { name: format!("axis {place}"), len });
+            let dimensions = named.map(|dimension| header.dimension(dimension)).collect();
             let number = dataset.dtype().and_then(|t| t.to_descriptor()).map_or(NumberType::Other, |t| number_type(&t));
             header.variables.push(Variable { name: path, number, dimensions, attributes: attributes(&dataset) });
         } else if depth < DEEPEST

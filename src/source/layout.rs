@@ -52,7 +52,7 @@ impl ComponentPlan {
             dimensions: Vec::new(),
             attributes: Vec::new(),
         };
-        let packing = Packing::of(&variable);
+        let packing = Packing::of(&variable).unwrap_or_else(|fault| panic!("{fault}"));
         Self { name: String::new(), shape: Vec::new(), roles: Vec::new(), packing, factor: 1.0, why: String::new() }
     }
 }
@@ -140,6 +140,11 @@ impl Planner<'_> {
 
     pub(super) fn misfit(&self, variable: usize, what: String) -> SourceError {
         SourceError::Layout { path: self.path().into(), variable: self.header().variables[variable].name.clone(), what }
+    }
+
+    /// How a variable's numbers become values.
+    pub(super) fn packing(&self, variable: usize) -> Result<Packing, SourceError> {
+        Packing::of(&self.header().variables[variable]).map_err(|what| self.misfit(variable, what))
     }
 
     fn plan(mut self, first: Option<&Layout>) -> Result<Layout, SourceError> {
@@ -442,7 +447,7 @@ impl Planner<'_> {
             name: variable.name.clone(),
             shape: self.header().shape(variable),
             roles: variable.dimensions.iter().map(role).collect(),
-            packing: Packing::of(variable),
+            packing: self.packing(candidate.variable)?,
             factor,
             why: candidate.why.clone(),
         })

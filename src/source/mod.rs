@@ -30,6 +30,7 @@ mod poles;
 mod reader;
 mod settings;
 mod staggered;
+mod steady;
 mod synthetic;
 mod times;
 mod vertical;
@@ -43,6 +44,7 @@ pub use libraries::{hdf5_version, netcdf_version};
 pub use memory::MemorySource;
 pub use reader::{DEFAULT_READ_AHEAD, Listener, ReadAhead, StillReading, read_ahead};
 pub use settings::{Metric, NetCdfSettings, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
+pub use steady::Steady;
 pub use synthetic::{GlobeTurbulence, synthesize};
 
 use crate::field::{Grid, Snapshot};
@@ -70,12 +72,20 @@ pub trait SnapshotSource: Send {
     /// What it is, in words.
     fn describe(&self) -> SourceDescription;
 
+    /// What messages call it.
+    fn name(&self) -> String {
+        self.describe().kind
+    }
+
     /// |tau| where none is given: half the span of the archive, at least two intervals.
     ///
     /// # Errors
     /// Fewer than three snapshots.
     fn default_tau(&self) -> Result<f64, SourceError> {
         let times = self.times();
+        if times.len() == 1 {
+            return Err(SourceError::OneTime { source_name: self.name(), time: self.show(times[0]) });
+        }
         let (span, interval) = (span(times), median_interval(times));
         let tau = (span / 2.0).max(2.0 * interval);
         if times.len() < 3 {
@@ -83,6 +93,11 @@ pub trait SnapshotSource: Send {
         }
         // Uneven steps: two median intervals may be longer than the archive.
         Ok(tau.min(span))
+    }
+
+    /// A time as a date or, where there is no calendar, as a number.
+    fn show(&self, time: f64) -> String {
+        self.date(time).unwrap_or_else(|| format!("{time} {}", self.describe().time_unit))
     }
 
     /// Whether the snapshots cover an integration over `tau`.
@@ -93,6 +108,9 @@ pub trait SnapshotSource: Send {
         let times = self.times();
         if !(tau.is_finite() && tau > 0.0) {
             return Err(SourceError::Setting { key: "tau", found: tau.to_string(), accepted: "a positive duration".into() });
+        }
+        if times.len() == 1 {
+            return Err(SourceError::OneTime { source_name: self.name(), time: self.show(times[0]) });
         }
         let (span, interval) = (span(times), median_interval(times));
         // The window's slack.

@@ -16,16 +16,15 @@ pub(super) struct NetCdf4Store {
 }
 
 impl NetCdf4Store {
-    /// Opens a file; none where it is HDF5 without the structure of NetCDF. `only` names the variables whose headers are wanted: those of
-    /// all others cost milliseconds a file.
-    pub(super) fn open(path: &Path, only: Option<&[String]>) -> Result<Option<(Header, Self)>, SourceError> {
+    /// Opens a file; none where it is HDF5 without the structure of NetCDF.
+    pub(super) fn open(path: &Path) -> Result<Option<(Header, Self)>, SourceError> {
         silence();
         let _reading = Reading::opening(path);
         let damaged = |what: String| SourceError::Damaged { path: path.into(), what };
         // The crate panics on names that are not UTF-8 and on types it does not know; a file must not take the program down.
         let opened = catch_unwind(AssertUnwindSafe(|| -> Result<_, netcdf::Error> {
             let file = netcdf::open(path)?;
-            let header = read_header(&file, only)?;
+            let header = read_header(&file)?;
             Ok((header, file))
         }));
         let (header, file) = match opened {
@@ -80,21 +79,12 @@ pub(super) fn silence() {
     }
 }
 
-fn read_header(file: &netcdf::File, only: Option<&[String]>) -> Result<Header, netcdf::Error> {
+fn read_header(file: &netcdf::File) -> Result<Header, netcdf::Error> {
     let mut header = Header { attributes: attributes(file.attributes()), ..Header::default() };
-    let wanted: Vec<netcdf::Variable> = match only {
-        Some(names) => names.iter().filter_map(|name| file.variable(name)).collect(),
-        None => file.variables().collect(),
-    };
-    for variable in wanted {
+    for variable in file.variables() {
         let mut dimensions = Vec::new();
         for dimension in variable.dimensions() {
-            let found = Dimension { name: dimension.name(), len: dimension.len() };
-            let index = header.dimensions.iter().position(|d| *d == found).unwrap_or_else(|| {
-                header.dimensions.push(found);
-                header.dimensions.len() - 1
-            });
-            dimensions.push(index);
+            dimensions.push(header.dimension(Dimension { name: dimension.name(), len: dimension.len() }));
         }
         let attributes = attributes(variable.attributes());
         let number = match variable.vartype() {

@@ -138,6 +138,8 @@ pub struct NetCdfSettings {
     pub z: Option<String>,
     /// Time variable.
     pub time: Option<String>,
+    /// Takes an archive of one time as a steady flow; wants a `time.tau`.
+    pub steady: bool,
     /// Metric; by default chosen from the axes.
     pub metric: Option<Metric>,
     /// What velocities are in.

@@ -9,7 +9,6 @@
 use super::SourceError;
 use super::axes::{AxisPlan, Quantity};
 use super::cf::coordinate::{Kind, classify_name};
-use super::cf::packing::Packing;
 use super::cf::velocity::Velocity;
 use super::container::{Container, NumberType};
 use super::dimensions::Extent;
@@ -213,7 +212,7 @@ impl Planner<'_> {
     }
 
     /// A variable on (time, level, y, x), or fewer of these from the left.
-    fn plain(&self, variable: usize, factor: f64, why: String) -> ComponentPlan {
+    fn plain(&self, variable: usize, factor: f64, why: String) -> Result<ComponentPlan, SourceError> {
         let v = &self.header().variables[variable];
         let rank = v.dimensions.len();
         let time = |d: usize| classify_name(&self.header().dimensions[d].name) == Kind::Time;
@@ -222,14 +221,14 @@ impl Planner<'_> {
             axis @ 0..=2 => Role::Axis(axis),
             _ => Role::Fixed(0),
         };
-        ComponentPlan {
+        Ok(ComponentPlan {
             name: v.name.clone(),
             shape: self.header().shape(v),
             roles: (0..rank).map(role).collect(),
-            packing: Packing::of(v),
+            packing: self.packing(variable)?,
             factor,
             why,
-        }
+        })
     }
 
     pub(super) fn plan_staggered(mut self, velocity: &Velocity, first: Option<&Layout>) -> Result<Layout, SourceError> {
@@ -249,7 +248,7 @@ impl Planner<'_> {
                 continue;
             };
             let checked = self.component(candidate, &[], None)?;
-            let plan = self.plain(candidate.variable, checked.factor, candidate.why.clone());
+            let plan = self.plain(candidate.variable, checked.factor, candidate.why.clone())?;
             if from_end == 2 && plan.shape.len() != components.first().map_or(0, |u: &ComponentPlan| u.shape.len()) {
                 continue;
             }
@@ -259,7 +258,7 @@ impl Planner<'_> {
         let cells = [along(&components[0], 0).saturating_sub(1), along(&components[0], 1), along(&components[0], 2)];
         let find = |name: &str| self.header().find(name);
         let geopotential = match (find("PH"), find("PHB")) {
-            (Some(p), Some(b)) => [self.plain(p, 1.0, String::new()), self.plain(b, 1.0, String::new())],
+            (Some(p), Some(b)) => [self.plain(p, 1.0, String::new())?, self.plain(b, 1.0, String::new())?],
             _ => return Err(self.not_found("heights", "PH")),
         };
         let expected = [[cells[0] + 1, cells[1], cells[2]], [cells[0], cells[1] + 1, cells[2]], [cells[0], cells[1], cells[2] + 1]];
@@ -279,8 +278,8 @@ impl Planner<'_> {
         let scale: Vec<Option<ComponentPlan>> = scale
             .into_iter()
             .enumerate()
-            .map(|(k, plan)| plan.filter(|p| along(p, 0) == expected[k][0] && along(p, 1) == expected[k][1]))
-            .collect();
+            .map(|(k, plan)| Ok(plan.transpose()?.filter(|p| along(p, 0) == expected[k][0] && along(p, 1) == expected[k][1])))
+            .collect::<Result<_, SourceError>>()?;
         let scale: [Option<ComponentPlan>; 2] = std::array::from_fn(|k| scale[k].clone());
         let (Some(dx), Some(dy)) = (self.header().number("DX"), self.header().number("DY")) else {
             return Err(SourceError::Layout {

@@ -3,7 +3,7 @@
 use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
 use super::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
-use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds};
+use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
 
 /// What a kernel for a window is launched with.
 #[derive(Debug)]
@@ -107,6 +107,7 @@ impl GridArguments {
             per_radian: [real(1f64.to_degrees() / spacing[0]), real(1f64.to_degrees() / spacing[1])],
             origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
             turn: [real(cosine), real(sine)],
+            poles: poles(latitude).map(real),
             middle,
         };
         let stages: Vec<GridStep<R>> = stages(times, span.0, span.1, steps)

@@ -46,6 +46,7 @@ pub struct GridData<R> {
     pub per_radian: [R; 2],
     pub origin: [R; 2],
     pub turn: [R; 2],
+    pub poles: [R; 2],
     pub middle: f64,
 }
 
@@ -144,7 +145,7 @@ mod tests {
     fn sizes_are_those_of_cpp() {
         // As nvcc and g++ lay them out (static_asserts in tests/kernels_host.cpp hold the other side).
         assert_eq!((size_of::<AxisData<f32>>(), size_of::<AxisData<f64>>()), (64, 80));
-        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (304, 448));
+        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (312, 464));
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
         assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (48, 40, 12));
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));

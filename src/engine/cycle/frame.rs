@@ -98,6 +98,7 @@ impl Cycle<'_> {
         }
         self.report.frames += 1;
         self.report.waited += record.seconds.waiting;
+        self.report.worked += record.seconds.slide + record.seconds.total;
         self.report.slides = slide.index + 1;
         self.frame += 1;
         self.pictures += u64::from(!place.warmup);

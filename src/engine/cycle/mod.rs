@@ -65,6 +65,8 @@ pub struct RunReport {
     pub interrupted: bool,
     /// Seconds spent waiting for input.
     pub waited: f64,
+    /// Seconds spent on frames and on taking in snapshots that were there.
+    pub worked: f64,
     /// Optimizer steps.
     pub train_steps: u64,
     /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.

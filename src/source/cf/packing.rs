@@ -15,10 +15,24 @@ pub(in crate::source) struct Packing {
 }
 
 impl Packing {
-    pub(in crate::source) fn of(variable: &Variable) -> Self {
+    /// The packing that a variable's attributes tell.
+    ///
+    /// # Errors
+    /// A `scale_factor` that is 0 or no finite number, an `add_offset` that is none, or one of them as text: what was found and what is
+    /// accepted.
+    pub(in crate::source) fn of(variable: &Variable) -> Result<Self, String> {
         let number = |name: &str| variable.numbers(name).first().copied();
-        let scale = number("scale_factor").filter(|s| s.is_finite()).unwrap_or(1.0);
-        let offset = number("add_offset").filter(|s| s.is_finite()).unwrap_or(0.0);
+        let factor = |name: &str, default: f64, accepted: &str, fits: fn(f64) -> bool| match variable.attribute(name) {
+            None => Ok(default),
+            Some(Attribute::Text(text)) => Err(format!("its attribute `{name}` is the text \"{text}\"; accepted is {accepted}")),
+            Some(Attribute::Numbers(_, values)) => match values.first() {
+                Some(&value) if fits(value) => Ok(value),
+                Some(value) => Err(format!("its attribute `{name}` is {value}; accepted is {accepted}")),
+                None => Err(format!("its attribute `{name}` is empty; accepted is {accepted}")),
+            },
+        };
+        let scale = factor("scale_factor", 1.0, "a finite number other than 0", |s| s.is_finite() && s != 0.0)?;
+        let offset = factor("add_offset", 0.0, "a finite number", f64::is_finite)?;
         let unsigned = variable.text("_Unsigned").is_some_and(|t| t.eq_ignore_ascii_case("true"));
         let wrap = match variable.number {
             NumberType::I8 if unsigned => 256.0,
@@ -36,7 +50,7 @@ impl Packing {
         let limit = |name: &str, k: usize| {
             let Some(Attribute::Numbers(of, values)) = variable.attribute(name) else { return None };
             let value = *values.get(k)?;
-            let unpacked = of.is_float() && !variable.number.is_float() && scale != 0.0;
+            let unpacked = of.is_float() && !variable.number.is_float();
             value.is_finite().then_some(if unpacked { (value - offset) / scale } else { raw(value) })
         };
         let low = limit("valid_range", 0).or_else(|| limit("valid_min", 0));
@@ -46,7 +60,7 @@ impl Packing {
             // A negative scale turns unpacked limits round.
             (low, high) = (high, low);
         }
-        Self { scale, offset, missing, valid: (low, high), wrap }
+        Ok(Self { scale, offset, missing, valid: (low, high), wrap })
     }
 
     /// The value, or NaN where it is missing.
@@ -79,7 +93,7 @@ mod tests {
 
     fn packed(number: NumberType, attributes: &[(&str, NumberType, &[f64])]) -> Packing {
         let attributes = attributes.iter().map(|(n, t, v)| (n.to_string(), Attribute::Numbers(*t, v.to_vec()))).collect();
-        Packing::of(&Variable { name: "u".into(), number, dimensions: vec![], attributes })
+        Packing::of(&Variable { name: "u".into(), number, dimensions: vec![], attributes }).unwrap()
     }
 
     #[test]
@@ -118,8 +132,28 @@ mod tests {
                 ("_FillValue".into(), Attribute::Numbers(NumberType::I8, vec![-1.0])),
             ],
         };
-        let packing = Packing::of(&variable);
+        let packing = Packing::of(&variable).unwrap();
         assert_eq!(packing.unpack(-56.0), 200.0);
         assert!(packing.unpack(-1.0).is_nan());
+    }
+    #[test]
+    fn factors_that_unpack_nothing_are_refused() {
+        let with = |name: &str, attribute: Attribute| {
+            let attributes = vec![(name.to_owned(), attribute)];
+            Packing::of(&Variable { name: "u".into(), number: NumberType::I16, dimensions: vec![], attributes })
+        };
+        let numbers = |value: f64| Attribute::Numbers(NumberType::F64, vec![value]);
+        for (name, attribute, found) in [
+            ("scale_factor", numbers(0.0), "is 0;"),
+            ("scale_factor", numbers(f64::NAN), "is NaN;"),
+            ("scale_factor", numbers(f64::INFINITY), "is inf;"),
+            ("scale_factor", Attribute::Text("0.01".into()), "is the text \"0.01\""),
+            ("add_offset", numbers(f64::NEG_INFINITY), "is -inf;"),
+            ("add_offset", Attribute::Numbers(NumberType::F64, vec![]), "is empty"),
+        ] {
+            let said = with(name, attribute).unwrap_err();
+            assert!(said.contains(name) && said.contains(found) && said.contains("accepted is a finite number"), "{said}");
+        }
+        assert!(with("add_offset", numbers(0.0)).is_ok() && with("scale_factor", numbers(-2.0)).is_ok());
     }
 }
