@@ -3,6 +3,9 @@
 # make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
 # make test-long   what takes minutes: subscribers that stall for a minute, in Rust and in Python
 # make vendored    builds with HDF5 and NetCDF inside, where their libraries cannot be had or the program is to run elsewhere
+# make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
+# make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
+# make test-adapters   their tests against compilers: gfortran, mpicc, Python; what is missing is installed where apt is, or named as NOT RUN
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
@@ -87,6 +90,46 @@ $(NVRTC)/done: | python-packages
 gpu-check: packages
 	scripts/gpu-check-prepare .gpu/check
 	@if nvidia-smi >/dev/null 2>&1; then OUT=out/gpu-check .gpu/check/run; else echo "no GPU here: take .gpu/check to one and start .gpu/check/run"; fi
+
+# Rust and a C linker suffice for the library itself.
+adapters:
+	$(CARGO) build --release -p ridgewatch-c
+	mkdir -p $(ADAPTERS)/lib $(ADAPTERS)/include
+	cp target/release/libridgewatch_adapter.so target/release/libridgewatch_adapter.a $(ADAPTERS)/lib/
+	cp adapters/c/include/ridgewatch.h $(ADAPTERS)/include/
+	@if command -v gfortran >/dev/null; then \
+	  gfortran -O2 -std=f2018 -fPIC -J $(ADAPTERS)/include -c adapters/fortran/ridgewatch.f90 -o $(ADAPTERS)/ridgewatch.o && \
+	  rm -f $(ADAPTERS)/lib/libridgewatch_fortran.a && ar rcs $(ADAPTERS)/lib/libridgewatch_fortran.a $(ADAPTERS)/ridgewatch.o && \
+	  rm $(ADAPTERS)/ridgewatch.o; else \
+	  echo "NOT BUILT: the Fortran module, since gfortran is not installed"; fi
+	@$(MAKE) --no-print-directory python-adapter || echo "NOT BUILT: the Python wheel (needs python3-venv and the network, or maturin)"
+
+python-adapter: $(ADAPTERS)/venv/installed
+	$(ADAPTERS)/venv/bin/maturin build --release --quiet -m adapters/python/Cargo.toml --target-dir target/python --out $(ADAPTERS)/wheel
+
+$(ADAPTERS)/venv/installed:
+	$(PYTHON) -m venv $(ADAPTERS)/venv
+	$(ADAPTERS)/venv/bin/pip install --quiet 'maturin>=1.7,<2' numpy pytest
+	touch $@
+
+install-adapters: adapters
+	install -d $(DESTDIR)$(PREFIX)/lib/pkgconfig $(DESTDIR)$(PREFIX)/include
+	install -m 644 $(ADAPTERS)/lib/* $(DESTDIR)$(PREFIX)/lib/
+	install -m 644 $(ADAPTERS)/include/* $(DESTDIR)$(PREFIX)/include/
+	sed -e 's|@PREFIX@|$(PREFIX)|' -e 's|@VERSION@|$(VERSION)|' adapters/c/ridgewatch.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/ridgewatch.pc
+
+# Only what is missing, and only for these tests.
+adapter-packages:
+	@missing=""; command -v gfortran >/dev/null || missing="$$missing gfortran"; command -v mpicc >/dev/null || missing="$$missing openmpi-bin libopenmpi-dev"; \
+	if [ -n "$$missing" ] && command -v apt-get >/dev/null; then \
+	  $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null || echo "could not install$$missing"; fi
+
+test-adapters: adapter-packages adapters
+	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-c -- --nocapture
+	@if ls $(ADAPTERS)/wheel/*.whl >/dev/null 2>&1; then \
+	  $(ADAPTERS)/venv/bin/pip install --quiet --force-reinstall --no-deps $(ADAPTERS)/wheel/*.whl && $(ADAPTERS)/venv/bin/pytest -q adapters/python/tests; else \
+	  echo "NOT RUN: the tests of the Python package, since its wheel was not built"; fi
+	scripts/live-mpi-check
 
 bench: packages
 	$(CARGO) bench

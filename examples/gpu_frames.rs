@@ -1,5 +1,5 @@
-//! Frames of the standard easy turbulence on a GPU, every query traced: frames a second, where the time goes, what 64 accumulated frames
-//! are worth, what a new snapshot costs. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+//! Frames of the standard easy turbulence on a GPU, every query traced: frames a second, where the time goes, what a new snapshot costs.
+//! Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -9,8 +9,7 @@ use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
 };
-use ridgewatch::publish::compare_films;
-use ridgewatch::render::{Film, RenderSettings, Renderer, Scene, TransferSettings};
+use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -50,7 +49,7 @@ fn scene(tracer: &dyn Tracer, width: usize, height: usize, seed: u64) -> Scene {
 fn settled(device: &mut GpuRenderer, tracer: &CudaTracer, scene: Scene) -> Renderer {
     let mut renderer = Renderer::new(scene, tracer.domain(), TAU).unwrap();
     for frame in 0..6 {
-        device.render_samples(&mut renderer, 1 << 40 | frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
+        device.render_samples(&mut renderer, 1 << 40 | frame, 0..1, &mut Traced(tracer.device()), None, &NEVER).unwrap();
     }
     renderer
 }
@@ -92,7 +91,7 @@ fn main() {
         let mut frames: Vec<(f64, Timeline, u64)> = (0..9)
             .map(|frame| {
                 let began = Instant::now();
-                let (_, stats) = device.render_samples(&mut renderer, frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
+                let (_, stats) = device.render_samples(&mut renderer, frame, 0..1, &mut Traced(tracer.device()), None, &NEVER).unwrap();
                 (began.elapsed().as_secs_f64(), device.timeline(), stats.queries)
             })
             .collect();
@@ -116,35 +115,17 @@ fn main() {
         }
     }
 
-    // What frames are worth, at a quarter of the edge.
-    let (w, h) = (width / 4, height / 4);
-    let tracer = CudaTracer::new(&store, &gpu, source, &map(22), 0.0, Tuning::default()).unwrap();
-    device = device.with_look_ahead(LookAhead { camera: 4, shadow: 8 });
-    let mut renderer = settled(&mut device, &tracer, scene(&tracer, w, h, 0));
-    let tone_map = renderer.scene().settings.tone_map;
-    let mut reference = settled(&mut device, &tracer, scene(&tracer, w, h, 77));
-    let began = Instant::now();
-    let (truth, stats) = device.render_samples(&mut reference, 0, 0..4096, &Traced(tracer.device()), None, &NEVER).unwrap();
-    let seconds = began.elapsed().as_secs_f64();
-    println!("{w}x{h}: 4,096 samples in {seconds:.1} s ({:.0} M queries/s)", 1e-6 * stats.queries as f64 / seconds);
-    let mut sum = Film::new(w, h);
-    let began = Instant::now();
-    for frame in 0..64 {
-        let (film, _) = device.render_samples(&mut renderer, frame, 0..1, &Traced(tracer.device()), None, &NEVER).unwrap();
-        sum.accumulate(&film).unwrap();
-    }
-    let psnr = compare_films(&sum, &truth, tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-    println!("{w}x{h}: 64 frames of one sample, accumulated, in {:.2} s: {psnr:.1} dB", began.elapsed().as_secs_f64());
-
     // A slide: one more snapshot, brought over and taken into the window, then a frame.
     let _ = window.push(next).unwrap();
+    let tracer = CudaTracer::new(&store, &gpu, source, &map(22), 0.0, Tuning::default()).unwrap();
+    device = device.with_look_ahead(LookAhead { camera: 4, shadow: 8 });
     let mut renderer = settled(&mut device, &tracer, scene(&tracer, width, height, 0));
     let before = gpu.memory().0;
     let began = Instant::now();
     let slid = CudaTracer::new(&store, &gpu, VelocitySource::Window(Arc::new(window)), &map(22), 1.0, Tuning::default()).unwrap();
     let seconds = began.elapsed().as_secs_f64();
     renderer.window_slid();
-    device.render_samples(&mut renderer, 1, 0..1, &Traced(slid.device()), None, &NEVER).unwrap();
+    device.render_samples(&mut renderer, 1, 0..1, &mut Traced(slid.device()), None, &NEVER).unwrap();
     println!(
         "a new snapshot: {:.1} ms until the tracer of the slid window stands, {:.1} ms with the first frame on it (a frame: {:.1} ms); \
          memory {} MiB before, {} MiB after",

@@ -76,6 +76,13 @@ RW_FN Four load(const Four* p) {
     return *p;
 #endif
 }
+RW_FN float load(const float* p) {
+#if RW_DEVICE
+    return __ldg(p);
+#else
+    return *p;
+#endif
+}
 RW_FN Words4 load(const Words4* p) {
 #if RW_DEVICE
     uint4 v = __ldg(reinterpret_cast<const uint4*>(p));

@@ -1,29 +1,26 @@
 // Wavefront rendering: waves of flights that fly to their next tentative collisions, which are then answered in one large batch.
 //
 // 1. render_start: every slot starts its first path and queues its first collisions.
-// 2. The collisions are answered: traced (see trace.cu), or looked up where the gate trusts the table (render_split, render_join).
+// 2. The collisions are answered: all traced (trace_grid.cu, trace_closed.cu), or some of them by a surrogate (answer.cu).
 // 3. render_advance: every live slot takes its answers, ends and starts paths, and queues the next collisions; 2 and 3 until no slot
 //    is left.
 // 4. render_film: sums to pixels.
 // The order within lists is that of the atomics and changes from run to run; no result depends on it.
-#include "gate.cuh"
 #include "wavefront.cuh"
 
 using namespace rw;
 
 // Set to 0 before each wave, but for the totals, which go on through the frame.
 struct Control {
-    uint32_t live;      // slots in the list of the next wave
-    uint32_t length;    // collisions in the queue
-    uint32_t to_trace;  // collisions that the table does not answer
-    uint32_t pad;
+    uint32_t live;    // slots in the list of the next wave
+    uint32_t length;  // collisions in the queue
     unsigned long long totals[COUNTS];
-    unsigned long long pad_end;
 };
+static_assert(sizeof(Control) == 56, "layout");
 
 // Adds up a warp's counts and puts them into the totals. All threads of the warp come here.
 __device__ __forceinline__ void add_counts(const Counts& counts, Control* control) {
-    const uint32_t each[COUNTS] = {counts.queries, counts.traced, counts.missing, counts.exceeded, counts.paths};
+    const uint32_t each[COUNTS] = {counts.queries, counts.traced, counts.missing, counts.exceeded, counts.paths, counts.over_budget};
     RW_UNROLL
     for (int k = 0; k < COUNTS; ++k) {
         uint32_t sum = each[k];
@@ -61,41 +58,4 @@ render_advance(const __grid_constant__ FrameScene scene, MajorantGrid grid, Watc
 extern "C" __global__ void __launch_bounds__(256) render_film(Band band, Slots slots, PixelValue* __restrict__ film) {
     const uint32_t pixel = blockIdx.x * 256u + threadIdx.x;
     if (pixel < band.pixels) film[pixel] = finished(band, slots, pixel);
-}
-
-// Scale and offset to unit coordinates, per axis, as `field::Domain::to_unit`.
-struct UnitDomain {
-    double min[3];
-    double extent[3];
-};
-
-// Answers from the table what the gate trusts; the rest goes, with its places in the queue, to the list that is traced.
-extern "C" __global__ void __launch_bounds__(256)
-render_split(const float* __restrict__ points, uint32_t count, UnitDomain domain, Gate gate, Table table, float* __restrict__ log_stretch,
-             unsigned char* __restrict__ traced, float* __restrict__ trace_points, uint32_t* __restrict__ places, Control* control) {
-    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
-    if (i >= count) return;
-    float point[3], unit_point[3];
-    for (int k = 0; k < 3; ++k) {
-        point[k] = points[3 * (size_t)i + k];
-        unit_point[k] = (float)(((double)point[k] - domain.min[k]) / domain.extent[k]);
-    }
-    if (trusts(gate, unit_point)) {
-        log_stretch[i] = look_up(table, unit_point);
-        traced[i] = 0;
-    } else {
-        const uint32_t at = reserve(&control->to_trace);
-        for (int k = 0; k < 3; ++k) trace_points[3 * (size_t)at + k] = point[k];
-        places[at] = i;
-    }
-}
-
-// Puts traced answers where their collisions are.
-extern "C" __global__ void __launch_bounds__(256)
-render_join(const float* __restrict__ answers, const uint32_t* __restrict__ places, uint32_t count, float* __restrict__ log_stretch,
-            unsigned char* __restrict__ traced) {
-    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
-    if (i >= count) return;
-    log_stretch[places[i]] = answers[i];
-    traced[places[i]] = 1;
 }

@@ -1,5 +1,5 @@
-// The table surrogate: log-stretch at regular nodes over the unit domain, interpolated multilinearly. As src/surrogate/table.rs.
-#include "base.cuh"
+// The table surrogate: seeds of its nodes, and lookups.
+#include "table.cuh"
 
 using namespace rw;
 
@@ -54,39 +54,11 @@ extern "C" __global__ void __launch_bounds__(256) table_mend(float* values, uint
     if ((threadIdx.x & 31u) == 0 && ballot) atomicAdd(not_finite, __popc(ballot));
 }
 
-__device__ __forceinline__ float lookup(const TableFrame& frame, const float* __restrict__ values, const float (&unit)[3]) {
-    float f[3];
-    size_t base = 0, stride[3], step = 1;
-#pragma unroll
-    for (int k = 0; k < 3; k++) {
-        stride[k] = step;
-        if (k < frame.dimensions) {
-            const int cells = frame.nodes[k] - 1;
-            const float position = fminf(fmaxf(unit[k], 0.0f), 1.0f) * float(cells);
-            const int cell = min(max(int(position), 0), cells - 1);
-            f[k] = position - float(cell);
-            base += step * size_t(cell);
-        }
-        step *= size_t(frame.nodes[k]);
-    }
-    auto row = [&](size_t at) {
-        const float low = __ldg(values + at), high = __ldg(values + at + 1);
-        return fmaf(high - low, f[0], low);
-    };
-    auto plane = [&](size_t at) {
-        const float low = row(at), high = row(at + stride[1]);
-        return fmaf(high - low, f[1], low);
-    };
-    const float near = plane(base);
-    if (frame.dimensions == 2) return near;
-    return fmaf(plane(base + stride[2]) - near, f[2], near);
-}
-
 // points: 3 floats each, unit coordinates (clamped).
 extern "C" __global__ void __launch_bounds__(256)
-table_lookup(const TableFrame frame, const float* __restrict__ values, const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
+table_lookup(const Table table, const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
     if (i >= n) return;
     const float unit[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
-    out[i] = lookup(frame, values, unit);
+    out[i] = look_up(table, unit);
 }

@@ -53,13 +53,21 @@ struct Counts {
     uint32_t missing;
     uint32_t exceeded;
     uint32_t paths;
+    uint32_t over_budget;
 };
-constexpr int COUNTS = 5;
+constexpr int COUNTS = 6;
+
+// Who answered.
+enum AnsweredBy : unsigned char {
+    PREDICTED,   // the surrogate; or nobody, on land
+    TRACED,      // RK4
+    OVER_BUDGET  // the surrogate where it is not trusted, since the tracing budget was spent
+};
 
 // A tentative collision's answer.
 struct Answer {
-    float log_stretch;
-    bool traced;
+    float log_stretch;  // NaN: there is no value
+    unsigned char by;   // AnsweredBy
 };
 
 RW_FN void flight_point(const Flight& flight, float t, float point[3]) {
@@ -159,9 +167,10 @@ RW_FN Verdict resolve(const FrameScene& scene, Flight& flight, const Hit& hit, A
     // Transmittance below which Russian roulette decides whether a shadow flight goes on.
     const float roulette_below = 1.0f / 16.0f;
     counts.queries += 1;
-    counts.traced += answer.traced ? 1 : 0;
+    counts.traced += answer.by == TRACED ? 1 : 0;
+    counts.over_budget += answer.by == OVER_BUDGET ? 1 : 0;
     flight.path.queries += 1;
-    flight.path.traced += answer.traced ? 1 : 0;
+    flight.path.traced += answer.by == TRACED ? 1 : 0;
     flight.t = hit.t;
     if (!is_finite(answer.log_stretch)) {
         counts.missing += 1;

@@ -46,7 +46,7 @@ struct Queue {
     uint32_t* length;
     const Four* answered;         // records that the answers belong to
     const float* log_stretch;     // NaN: no value there
-    const unsigned char* traced;  // whether RK4 answered
+    const unsigned char* by;      // AnsweredBy
 };
 
 RW_FN void load_flight(const Slots& slots, const Band& band, uint32_t slot, Flight& flight) {
@@ -134,7 +134,7 @@ RW_FN bool advance(const FrameScene& scene, const MajorantGrid& grid, const Watc
         Verdict verdict;
         for (;;) {
             const Four record = queue.answered[at];
-            const Answer answer = {queue.log_stretch[at], queue.traced[at] != 0};
+            const Answer answer = {queue.log_stretch[at], queue.by[at]};
             verdict = resolve(scene, flight, Hit{record.x, record.y, float_bits(record.z)}, answer, watch, counts);
             const uint32_t next = float_bits(record.w);
             if (verdict != NULL_COLLISION || next == NONE) break;

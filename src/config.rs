@@ -12,6 +12,7 @@ use crate::flow::FlowSettings;
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
 use crate::setting::Refused;
+use crate::source::live::LiveSettings;
 use crate::source::{DomainSettings, NetCdfSettings, SourceSettings};
 use crate::surrogate::{SurrogateSettings, network::NetworkSettings};
 use crate::trust::TrustSettings;
@@ -33,6 +34,9 @@ pub struct SceneFile {
     /// Which files, variables and metric, for `source.kind = "archive"`.
     #[serde(default)]
     pub archive: NetCdfSettings,
+    /// Which simulation, for `source.kind = "live"`.
+    #[serde(default)]
+    pub live: LiveSettings,
     /// The box in which seeds lie; needed by closed forms.
     pub domain: Option<DomainSettings>,
     /// Integration time, direction and the slides of the window.
@@ -96,7 +100,7 @@ impl Origin {
 
 impl SceneFile {
     /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
-    /// Paths in `archive.files` and `training.resume` are relative to the scene file's folder.
+    /// Paths in `archive.files`, `live.ring`, `live.connections` and `training.resume` are relative to the scene file's folder.
     pub fn read(path: &Path, overrides: &[String]) -> Result<Self, ConfigError> {
         let text = std::fs::read_to_string(path)
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
@@ -105,7 +109,9 @@ impl SceneFile {
         // What is named by `--set` is relative to where the command runs, as on any command line.
         let files = scene.archive.files.iter_mut().filter(|_| !scene.origin.sets("archive.files"));
         let resume = scene.training.resume.iter_mut().filter(|_| !scene.origin.sets("training.resume"));
-        for file in files.chain(resume).filter(|file| file.is_relative()) {
+        let ring = scene.live.ring.iter_mut().filter(|_| !scene.origin.sets("live.ring"));
+        let connections = scene.live.connections.iter_mut().filter(|_| !scene.origin.sets("live.connections"));
+        for file in files.chain(resume).chain(ring).chain(connections).filter(|file| file.is_relative()) {
             *file = folder.join(&*file);
         }
         Ok(scene)
@@ -134,6 +140,19 @@ impl SceneFile {
         Ok(scene)
     }
 
+    /// A scene for a simulation that runs now, of which only the place is known: every default.
+    pub fn for_live(overrides: &[String]) -> Result<Self, ConfigError> {
+        let origin = Path::new("(command line)");
+        let text = "[source]\nkind = \"live\"\n";
+        let mut scene: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(origin, text, &e))?;
+        if !overrides.is_empty() {
+            scene = Self::overridden(&scene, overrides)?;
+        }
+        scene.origin = Origin::new(origin, "", overrides);
+        scene.check()?;
+        Ok(scene)
+    }
+
     /// What the cycle is told.
     pub fn settings(&self) -> Settings {
         let Self {
@@ -141,6 +160,7 @@ impl SceneFile {
             seed,
             source,
             archive,
+            live,
             domain,
             time,
             flow,
@@ -154,7 +174,24 @@ impl SceneFile {
             transfer,
             ..
         } = self.clone();
-        Settings { title, seed, source, archive, domain, time, flow, surrogate, network, training, trust, render, camera, light, transfer }
+        Settings {
+            title,
+            seed,
+            source,
+            archive,
+            live,
+            domain,
+            time,
+            flow,
+            surrogate,
+            network,
+            training,
+            trust,
+            render,
+            camera,
+            light,
+            transfer,
+        }
     }
 
     /// Notes that a key was set by an option of the command line, which is named in its faults (`--spp 0`).

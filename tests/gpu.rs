@@ -5,6 +5,8 @@
 // Helpers of a test may unwrap, and figures are printed for the record.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
+#[path = "gpu/answers.rs"]
+mod answers;
 #[path = "gpu/device.rs"]
 mod device;
 #[path = "gpu/lost.rs"]

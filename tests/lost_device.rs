@@ -8,11 +8,12 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaTracerError, DeviceError};
 use ridgewatch::engine::{
     Accelerator, Answers, Backed, Device, DeviceRenderer, DeviceTrace, EngineError, Event, FrameRecord, Health, RunOptions, Setup,
-    StageSeconds, WhenLost, run,
+    StageSeconds, Tally, WhenLost, run,
 };
 use ridgewatch::field::Snapshot;
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
+use ridgewatch::surrogate::Samples;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -121,7 +122,8 @@ impl DeviceRenderer for Render {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError> {
-        if !answers.only_traces() {
+        let asked = answers.asked();
+        if asked.surrogate.is_some() || asked.keep > 1 {
             return Ok(None);
         }
         renderer.set_up(picture, 0..samples as u32)?;
@@ -134,7 +136,14 @@ impl DeviceRenderer for Render {
         self.line.call("reading a film back")?;
         let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
         let (film, stats) = renderer.render(picture, &mut ByHost(&*traces.on_device().host), samples, progress, stop)?;
-        answers.answered_elsewhere(&stats);
+        let tally = Tally {
+            queries: stats.queries,
+            traced: stats.traced,
+            missing: stats.missing,
+            trace_seconds: stats.evaluate_seconds,
+            ..Tally::default()
+        };
+        answers.answered_elsewhere(tally, Samples::default());
         Ok(Some((film, stats)))
     }
 }

@@ -2,20 +2,23 @@
 //! GPU, held to the reference on machines without one. Needs a C++ compiler (`c++`, or what CXX names).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
-use ridgewatch::field::Domain;
-use ridgewatch::flow::{Extras, Traced, Tracer};
+use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch::flow::{
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
+    cpu_tracer,
+};
 use ridgewatch::render::rng::{FrameRandom, philox};
 use ridgewatch::render::{
     Camera, CameraSettings, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, SeenInCells, Transfer,
     TransferSettings,
 };
 use ridgewatch::surrogate::{Predict, Table};
-use ridgewatch::trust::{Residual, Strata, TrustMap, TrustSettings};
+use ridgewatch::trust::{Gate, Residual, Strata, TrustMap, TrustSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::OnceLock;
 use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, OnceLock};
 
 static NEVER: AtomicBool = AtomicBool::new(false);
 
@@ -147,24 +150,37 @@ impl LogStretch for Waves {
 
 /// A frame tracked by the harness.
 struct Tracked {
-    /// Queries, traced, missing, exceeded, paths.
-    counts: [u64; 5],
+    /// Queries, traced, missing, exceeded, paths, over budget.
+    counts: [u64; 6],
     film: Film,
     seen: SeenInCells,
 }
 
 /// Tracks samples of a frame with the kernels' code. `parts` of a pixel's samples run side by side, `ahead` collisions of a flight.
 fn tracked(renderer: &mut Renderer, frame: u64, samples: std::ops::Range<u32>, parts: u32, ahead: [u32; 2]) -> Tracked {
+    tracked_by("frame", &[], renderer, frame, samples, parts, ahead)
+}
+
+/// The same with answers as `request` says, which is told `desk` before.
+fn tracked_by(
+    request: &str,
+    desk: &[u8],
+    renderer: &mut Renderer,
+    frame: u64,
+    samples: std::ops::Range<u32>,
+    parts: u32,
+    ahead: [u32; 2],
+) -> Tracked {
     let setup = renderer.set_up(frame, samples.clone()).unwrap();
     let (pixels, cells) = (setup.parameters.pixels(), setup.majorants.len());
-    let mut input = setup.parameters.as_bytes().to_vec();
+    let mut input = [desk, setup.parameters.as_bytes()].concat();
     input.extend(bytes(setup.majorants));
     input.extend(bytes(setup.may_miss));
     input.extend(bytes(&[0, pixels as u32, parts, samples.start, samples.end - samples.start, 0]));
     input.extend(bytes(&ahead));
-    let output = ask("frame", &input);
+    let output = ask(request, &input);
     let mut output = &output[..];
-    let counts = read::<[u32; 5]>(&mut output, 1)[0].map(u64::from);
+    let counts = read::<[u32; 6]>(&mut output, 1)[0].map(u64::from);
     let mut film = Film::new(37, 23);
     film.write_pixels(0, &read::<PixelValue>(&mut output, pixels));
     let seen = SeenInCells { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
@@ -191,7 +207,7 @@ fn whole_frames_are_the_same_bits() {
             let found = tracked(&mut renderer, frame, samples, 1, [1, 1]);
             assert_eq!(
                 found.counts,
-                [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths],
+                [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, 0],
                 "frame {frame}, cells {cells:?}"
             );
             assert!(bits(&found.film) == bits(&expected), "frame {frame}, cells {cells:?}");
@@ -237,18 +253,7 @@ fn parts_of_a_pixel_merge_to_the_whole() {
 
 #[test]
 fn the_gate_trusts_the_same_points() {
-    let settings = TrustSettings { cells: Some([5, 3, 4]), ..TrustSettings::default() };
-    let mut map = TrustMap::new(&settings, &domain());
-    let mut random = uniform(2);
-    let residuals: Vec<Residual> = (0..4000)
-        .map(|_| {
-            let point = [random(), random(), random()];
-            Residual { point, optical: if point[0] + point[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
-        })
-        .collect();
-    map.observe(&[], &Strata::even(map.shape(), 0), &residuals);
-    let gate = map.gate();
-    assert!(gate.share() > 0.1 && gate.share() < 0.9, "both kinds of cells: {}", gate.share());
+    let gate = some_gate();
     let mut random = uniform(3);
     let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| std::array::from_fn(|_| 1.2 * random() - 0.1)).collect();
     points.extend([[0.0; 3], [1.0; 3]]);
@@ -278,6 +283,10 @@ impl Tracer for Plane {
     }
 }
 
+fn table_bytes(table: &Table, dimensions: i32) -> Vec<u8> {
+    [bytes(&table.nodes().map(|n| n as i32)), bytes(&[dimensions]), bytes(table.values())].concat()
+}
+
 #[test]
 fn tables_are_looked_up_alike() {
     for (domain, dimensions) in [(domain(), 3), (Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), 2)] {
@@ -287,15 +296,207 @@ fn tables_are_looked_up_alike() {
         points.extend([[0.0; 3], [1.0; 3]]);
         let mut expected = vec![0.0; points.len()];
         table.predict(&points, &mut expected);
-        let mut input = bytes(&table.nodes().map(|n| n as i32));
-        input.extend(bytes(&[dimensions]));
-        input.extend(bytes(table.values()));
+        let mut input = table_bytes(&table, dimensions);
         input.extend(bytes(&[points.len() as u32]));
         input.extend(bytes(&points));
         let output = ask("table", &input);
         for ((found, expected), point) in read::<f32>(&mut &output[..], points.len()).iter().zip(&expected).zip(&points) {
-            // The CPU's lanes fuse multiply and add where the processor can: two roundings of values up to 2 at each of three levels.
+            // Where the processor cannot fuse multiply and add, the CPU's lanes round twice: values up to 2 at each of three levels.
             assert!((found - expected).abs() <= 1e-6, "{point:?}: {found} and {expected}");
+        }
+    }
+}
+
+/// Constant velocity on [`axes`], the first of them periodic if asked, with missing nodes at the time of the seeds.
+fn holed(periodic: bool) -> Box<dyn Tracer> {
+    let [x, y, z] = axes(periodic);
+    let x = Axis::new("x", "", x).unwrap();
+    let x = if periodic { x.with_period(2.0) } else { x };
+    let axes = vec![x, Axis::new("y", "", y).unwrap(), Axis::new("z", "", z).unwrap()];
+    let grid = Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+    let mut window = Window::new(1.0);
+    for time in [0.0, 1.0] {
+        let u: Vec<f32> = (0..grid.nodes()).map(|i| if i % 41 == 3 && time == 0.0 { f32::NAN } else { 0.1 }).collect();
+        let v = vec![0.0; grid.nodes()];
+        window.push(Arc::new(Snapshot::from_components(time, grid.clone(), &u, &v, &v))).unwrap();
+    }
+    let map = FlowMap {
+        tau: 1.0,
+        direction: Direction::Forward,
+        integrator: Integrator::Tangent,
+        precision: Precision::F32,
+        steps: Steps::Fixed(2),
+        gap: 1e-4,
+        boundary: Boundary::Clamp,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
+    };
+    cpu_tracer(VelocitySource::Window(Arc::new(window)), &map, 0.0).unwrap()
+}
+
+/// Uneven nodes over the domain.
+fn axes(periodic: bool) -> [Vec<f64>; 3] {
+    let at = |length: f64, n: usize| -> Vec<f64> {
+        (0..n).map(|i| length * (i as f64 + 0.3 * (2.0 * i as f64).sin()) / (n as f64 - 1.0 + 0.3 * (2.0 * n as f64 - 2.0).sin())).collect()
+    };
+    [at(if periodic { 1.8 } else { 2.0 }, 11), at(1.0, 6), at(1.0, 7)]
+}
+
+/// Land as the harness reads it: the cells whose middle the tracer calls void.
+fn land_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
+    let axes = axes(periodic);
+    let mut out = bytes(&[3_i32]);
+    let mut middles: Vec<Vec<f64>> = axes.iter().map(|nodes| nodes.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0).collect()).collect();
+    if periodic {
+        middles[0].push(1.9);
+    }
+    for (k, nodes) in axes.iter().enumerate() {
+        out.extend(bytes(&[if periodic && k == 0 { 2.0 } else { 0.0 }]));
+        out.extend(bytes(&[nodes.len() as i32]));
+        out.extend(bytes(nodes));
+    }
+    for &z in &middles[2] {
+        for &y in &middles[1] {
+            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_void([x as f32, y as f32, z as f32]))));
+        }
+    }
+    out
+}
+
+/// Who answers, as the harness reads it. No gate: RK4 everywhere.
+fn desk_bytes(domain: &Domain, spent: bool, gate: Option<&Gate>, land: &[u8], table: &Table) -> Vec<u8> {
+    let mut out = bytes(&[domain.min, domain.extent()]);
+    out.extend(bytes(&[i32::from(spent)]));
+    match gate {
+        Some(gate) => {
+            out.extend(bytes(&gate.shape().map(|n| n as i32)));
+            out.extend(bytes(gate.cells()));
+        }
+        None => out.extend(bytes(&[0_i32; 3])),
+    }
+    out.extend(land);
+    out.extend(table_bytes(table, 3));
+    out
+}
+
+/// A gate that trusts some cells and not others.
+fn some_gate() -> Gate {
+    let mut map = TrustMap::new(&TrustSettings { cells: Some([5, 3, 4]), ..TrustSettings::default() }, &domain());
+    let mut random = uniform(7);
+    let residuals: Vec<Residual> = (0..4000)
+        .map(|_| {
+            let point = [random(), random(), random()];
+            Residual { point, optical: if point[0] + point[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
+        })
+        .collect();
+    map.observe(&[], &Strata::even(map.shape(), 0), &residuals);
+    let gate = map.gate();
+    assert!(gate.share() > 0.1 && gate.share() < 0.9, "both kinds of cells: {}", gate.share());
+    gate
+}
+
+#[test]
+fn the_same_one_answers_at_every_point() {
+    let (gate, domain) = (some_gate(), domain());
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    for (periodic, spent) in [(false, false), (true, true)] {
+        let tracer = holed(periodic);
+        let mut random = uniform(8);
+        let mut points: Vec<[f32; 3]> = (0..20_000).map(|_| domain.from_unit([random(), random(), random()])).collect();
+        // Outside the domain, corners, and nodes of the velocity grid themselves.
+        points.extend((0..5000).map(|_| domain.from_unit([(); 3].map(|()| 1.8 * random() - 0.4))));
+        points.extend([[0.0; 3], [2.0, 1.0, 1.0]]);
+        let nodes = axes(periodic);
+        points.extend((0..77).map(|i| [nodes[0][i % 11] as f32, nodes[1][i % 6] as f32, nodes[2][i % 7] as f32]));
+        let mut input = desk_bytes(&domain, spent, Some(&gate), &land_bytes(&*tracer, periodic), &table);
+        input.extend(bytes(&[points.len() as u32]));
+        input.extend(bytes(&points));
+        let output = ask("choices", &input);
+        let mut output = &output[..];
+        let mut seen = [0; 4];
+        for &point in &points {
+            let who = read::<i32>(&mut output, 1)[0];
+            let values = read::<f32>(&mut output, 4);
+            let unit = domain.to_unit(point);
+            let expected = match (tracer.is_void(point), gate.trusts(unit), spent) {
+                (true, ..) => 0,
+                (_, true, _) => 1,
+                (.., true) => 2,
+                _ => 3,
+            };
+            assert_eq!(who, expected, "{point:?}");
+            seen[expected as usize] += 1;
+            if expected > 0 {
+                let mut predicted = [0.0];
+                table.predict(&[unit], &mut predicted);
+                assert_eq!(values[..3], unit, "{point:?}");
+                assert!((values[3] - predicted[0]).abs() <= 1e-6, "{point:?}");
+            }
+        }
+        let unused = if spent { 3 } else { 2 };
+        assert!((0..4).all(|who| (seen[who] > 500) != (who == unused)), "{seen:?}");
+    }
+}
+
+#[test]
+#[cfg(feature = "cuda")]
+fn the_same_labels_are_kept() {
+    let mut random = uniform(9);
+    let points: Vec<[f32; 3]> = (0..20_000).map(|_| std::array::from_fn(|_| random())).collect();
+    for shift in [0_u32, 1, 5, 32] {
+        let mut input = bytes(&[shift, points.len() as u32]);
+        input.extend(bytes(&points));
+        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::engine::cuda::keeps_label(p, shift))).collect();
+        assert!(ask("labels", &input) == expected, "1 in 2^{shift}");
+    }
+}
+
+/// Answers on the CPU: land, the gate, a table, and the waves where neither answers.
+struct Gated<'a> {
+    tracer: &'a dyn Tracer,
+    gate: Option<&'a Gate>,
+    table: &'a Table,
+    spent: bool,
+    over_budget: u64,
+}
+
+impl LogStretch for Gated<'_> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        for (i, &p) in points.iter().enumerate() {
+            let unit = domain().to_unit(p);
+            traced[i] = false;
+            if self.tracer.is_void(p) {
+                log_stretch[i] = f32::NAN;
+            } else if self.gate.is_some_and(|gate| self.spent || gate.trusts(unit)) {
+                self.over_budget += u64::from(self.gate.is_some_and(|gate| !gate.trusts(unit)));
+                self.table.predict(&[unit], &mut log_stretch[i..=i]);
+            } else {
+                (log_stretch[i], traced[i]) = ((7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos(), true);
+            }
+        }
+    }
+}
+
+#[test]
+fn gated_frames_are_the_cpu_s() {
+    let (gate, domain) = (some_gate(), domain());
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    let tracer = holed(false);
+    let land = land_bytes(&*tracer, false);
+    for (gate, spent) in [(Some(&gate), false), (Some(&gate), true), (None, false)] {
+        let scene = scene(false, false, None);
+        let mut reference = Renderer::new(scene.clone(), &domain, 1.0).unwrap();
+        let mut renderer = Renderer::new(scene, &domain, 1.0).unwrap();
+        let desk = desk_bytes(&domain, spent, gate, &land, &table);
+        for (frame, samples) in [(0, 0..2), (1, 0..5)] {
+            let mut answers = Gated { tracer: &*tracer, gate, table: &table, spent, over_budget: 0 };
+            let (expected, stats) = reference.render_samples(frame, samples.clone(), &mut answers, None, &NEVER).unwrap();
+            let found = tracked_by("gated", &desk, &mut renderer, frame, samples, 1, [3, 5]);
+            let tally = [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, answers.over_budget];
+            assert_eq!(found.counts, tally, "frame {frame}, budget spent: {spent}");
+            assert!(bits(&found.film) == bits(&expected), "frame {frame}, budget spent: {spent}");
+            assert!(stats.missing > 100 && (answers.over_budget > 100) == spent && (stats.traced > 100) != spent, "{tally:?}");
+            assert!(renderer.absorb(&found.seen));
         }
     }
 }

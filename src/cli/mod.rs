@@ -1,10 +1,13 @@
 //! What can be asked on the command line, one file a command.
 
+mod attach;
 mod compare;
 mod doctor;
 mod ftle;
 mod inspect;
 pub mod messages;
+mod publish;
+mod relay;
 mod render;
 mod replay;
 mod synthesize;
@@ -57,6 +60,12 @@ pub struct Common {
 enum Command {
     /// Runs the whole loop over an archive or a closed-form flow: frames, records and a summary into a folder.
     Replay(replay::Options),
+    /// Runs the loop beside a simulation: waits for it, follows it, survives its end and restart.
+    Attach(attach::Options),
+    /// Plays an archive into a ring, as if it were a simulation.
+    Publish(publish::Options),
+    /// Ships the rings of this node to ridgewatch on another one.
+    Relay(relay::Options),
     /// Renders one picture.
     Render(render::Options),
     /// Computes the FTLE field on a grid, as NetCDF; `--check` holds it against the truth.
@@ -76,6 +85,9 @@ pub fn run(arguments: Arguments) -> Result<()> {
     let common = arguments.common;
     match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
+        Command::Attach(options) => attach::run(&common, options),
+        Command::Publish(options) => publish::run(&common, &options),
+        Command::Relay(options) => relay::run(&common, &options),
         Command::Render(options) => render::run(&common, options),
         Command::Ftle(options) => ftle::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),

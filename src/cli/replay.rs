@@ -16,6 +16,13 @@ pub struct Options {
     /// A scene file (.toml), or data files and globs that just get the defaults.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
+    #[command(flatten)]
+    run: RunArguments,
+}
+
+/// What `replay` and `attach` have in common.
+#[derive(Debug, clap::Args)]
+pub struct RunArguments {
     /// Run folder.
     #[arg(long, short, default_value = "out/run")]
     out: PathBuf,
@@ -39,45 +46,78 @@ pub struct Options {
     seconds: Option<f64>,
     /// Writes the trained surrogate here at the end.
     #[arg(long, value_name = "FILE")]
-    checkpoint: Option<PathBuf>,
+    pub(super) checkpoint: Option<PathBuf>,
     /// Starts from a surrogate written by --checkpoint.
     #[arg(long, value_name = "FILE")]
-    resume: Option<PathBuf>,
+    pub(super) resume: Option<PathBuf>,
 }
 
 /// Replays.
 pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
-    if let Some(method) = options.method {
-        scene.render.method = method;
-    }
-    if let Some(keep) = options.keep {
-        if keep == 0 {
-            bail!(Usage("--keep 0: accepted: 1 or more".into()));
-        }
-        scene.publish.keep = Some(keep);
-    }
-    if let Some(endpoint) = &options.publish {
-        scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
-        scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
-    }
-    check_learns(&scene, "--checkpoint", options.checkpoint.as_deref())?;
-    check_learns(&scene, "--resume", options.resume.as_deref())?;
-    scene.training.resume = options.resume.clone().or(scene.training.resume);
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
-    runtime.block_on(replay(common, &options, scene))
+    options.run.apply(&mut scene)?;
+    let open = |scene: &SceneFile, _: &AtomicBool| {
+        Setup::new(scene.settings()).map(Some).map_err(|error| located(scene, error, EngineError::refused))
+    };
+    conduct(common, &options.run, scene, None, open)
 }
 
-async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<()> {
-    let setup = Setup::new(scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
+impl RunArguments {
+    /// What the options change in the scene.
+    pub(super) fn apply(&self, scene: &mut SceneFile) -> Result<()> {
+        if let Some(method) = self.method {
+            scene.render.method = method;
+        }
+        if let Some(keep) = self.keep {
+            if keep == 0 {
+                bail!(Usage("--keep 0: accepted: 1 or more".into()));
+            }
+            scene.publish.keep = Some(keep);
+        }
+        if let Some(endpoint) = &self.publish {
+            scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
+            scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
+        }
+        check_learns(scene, "--checkpoint", self.checkpoint.as_deref())?;
+        check_learns(scene, "--resume", self.resume.as_deref())?;
+        scene.training.resume = self.resume.clone().or(scene.training.resume.take());
+        Ok(())
+    }
+}
+
+/// Runs a scene into a run folder and onto the socket. `open` may wait for its source until the flag is set, and gives none then.
+pub(super) fn conduct(
+    common: &Common,
+    options: &RunArguments,
+    scene: SceneFile,
+    checkpoint_seconds: Option<f64>,
+    open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
+) -> Result<()> {
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
+    runtime.block_on(frames(common, options, scene, checkpoint_seconds, open))
+}
+
+async fn frames(
+    common: &Common,
+    options: &RunArguments,
+    scene: SceneFile,
+    checkpoint_seconds: Option<f64>,
+    open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
+) -> Result<()> {
+    let stop = Arc::new(AtomicBool::new(false));
+    // A source that is waited for must be left by a signal; one that is there is opened before signals are caught, so that they end it at once.
+    let early = if checkpoint_seconds.is_some() { watch_signals(stop.clone()).map(tokio::spawn) } else { None };
+    let Some(setup) = open(&scene, &stop)? else {
+        messages::note("stopped before a simulation came");
+        return Ok(());
+    };
     let device = super::device(common, &scene)?;
     if let Some(checkpoint) = &options.checkpoint {
         super::check_folder(checkpoint)?;
     }
     // Before anything is written: from here on a signal leaves a complete folder.
-    let stop = Arc::new(AtomicBool::new(false));
-    let signals = watch_signals(stop.clone()).map(tokio::spawn);
+    let signals = early.or_else(|| watch_signals(stop.clone()).map(tokio::spawn));
     // The socket first: a port in use must not cost the run that the folder holds.
     let mut output = Output::start(&scene.publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
     output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
@@ -89,6 +129,7 @@ async fn replay(common: &Common, options: &Options, scene: SceneFile) -> Result<
         seconds: options.seconds,
         threads: common.threads,
         checkpoint: options.checkpoint.clone(),
+        checkpoint_seconds,
         device,
         ..RunOptions::default()
     };
@@ -206,7 +247,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
 }
 
 /// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process. Both are caught from this call on.
-fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output = ()>> {
+pub(super) fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output = ()>> {
     use tokio::signal::unix::{SignalKind, signal};
     let (Ok(mut interrupt), Ok(mut terminate)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
         messages::note("cannot watch for signals: an interrupt will end the run at once");

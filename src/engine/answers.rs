@@ -26,6 +26,21 @@ pub struct Answers<'a> {
     scratch: Scratch,
 }
 
+/// Whom [`Answers`] asks, beside the tracer.
+#[derive(Clone, Copy)]
+pub struct Asked<'a> {
+    /// Where the gate trusts it; none: the tracer is asked everywhere.
+    pub surrogate: Option<&'a dyn Predict>,
+    /// Where the surrogate is trusted.
+    pub gate: &'a Gate,
+    /// Seconds of tracing after which the surrogate is asked everywhere.
+    pub trace_budget: Option<f64>,
+    /// Traced samples to keep: fewer than so many.
+    pub keep: usize,
+    /// Whether arrival and Jacobian are kept with each of them.
+    pub flow_map: bool,
+}
+
 /// Counts and times of one frame's answers.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Tally {
@@ -37,9 +52,9 @@ pub struct Tally {
     pub missing: u64,
     /// Queries of untrusted cells that the surrogate answered because the tracing budget was spent.
     pub over_budget: u64,
-    /// Seconds spent tracing.
+    /// Seconds spent tracing: wall clock on the CPU, device time where a GPU answers.
     pub trace_seconds: f64,
-    /// Seconds spent predicting.
+    /// Seconds spent predicting, likewise.
     pub predict_seconds: f64,
 }
 
@@ -77,17 +92,15 @@ impl<'a> Answers<'a> {
         self
     }
 
-    /// Whether every query is traced and none is kept, so that whoever traces may also walk.
-    pub fn only_traces(&self) -> bool {
-        self.surrogate.is_none() && self.keep <= 1
+    /// Whom to ask, for an engine that asks them itself.
+    pub fn asked(&self) -> Asked<'a> {
+        Asked { surrogate: self.surrogate, gate: self.gate, trace_budget: self.trace_budget, keep: self.keep, flow_map: self.keep_arrival }
     }
 
-    /// Takes in the figures of a frame whose queries were answered without this.
-    pub fn answered_elsewhere(&mut self, stats: &crate::render::RenderStats) {
-        self.tally.queries += stats.queries;
-        self.tally.traced += stats.traced;
-        self.tally.missing += stats.missing;
-        self.tally.trace_seconds += stats.evaluate_seconds;
+    /// Takes in the figures and samples of a frame whose queries were answered without this.
+    pub fn answered_elsewhere(&mut self, tally: Tally, samples: Samples) {
+        self.tally = tally;
+        self.samples = samples;
     }
 
     fn domain(&self) -> &'a Domain {

@@ -5,7 +5,7 @@ use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
 use crate::surrogate::{Predict, Samples};
-use crate::trust::{Gate, Residual, Strata, TrustedError};
+use crate::trust::{Gate, Residual, Strata, TrustedError, log_stretch_rms};
 
 /// Dimension that no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX;
@@ -81,7 +81,7 @@ pub fn trusted_error(residuals: &[Residual], strata: &Strata, gate: &Gate) -> Op
 /// PSNR in decibels of the surrogate's log-stretch over the points of `residuals`, for the largest traced value `peak`. None where
 /// either has no finite value.
 pub fn psnr(residuals: &[Residual], peak: f32, strata: &Strata) -> Option<f64> {
-    let error = TrustedError::of(residuals, strata)?.log_stretch_rms;
+    let error = log_stretch_rms(residuals, strata);
     Some(20.0 * (f64::from(peak) / error).log10()).filter(|psnr| psnr.is_finite())
 }
 

@@ -6,6 +6,7 @@ use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
 use crate::setting::Refused;
+use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
     DEFAULT_READ_AHEAD, Listener, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading,
     read_ahead,
@@ -25,6 +26,8 @@ pub struct Slide {
     pub time: f64,
     /// The same as a date, where the source has a calendar.
     pub date: Option<String>,
+    /// Of a simulation that runs now.
+    pub live: Option<LiveRecord>,
     /// What is integrated.
     pub velocity: VelocitySource,
     /// What was odd on the way here.
@@ -71,6 +74,17 @@ pub enum Feed {
         /// Warnings since the last slide.
         warnings: Vec<String>,
     },
+    /// A simulation that runs now: its window moves by itself.
+    Live {
+        /// The window.
+        window: LiveWindow,
+        /// Forward seeds start at the oldest time, backward ones at the newest.
+        direction: Direction,
+        /// Slides given so far.
+        given: u64,
+        /// Slides to give at most.
+        slides: u64,
+    },
 }
 
 /// The closed form that `[source]` describes; none for gridded kinds.
@@ -91,13 +105,18 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
         SourceKind::Saddle => Analytic::Saddle { rate: or(source.rate, 1.0) },
         SourceKind::Rotation => Analytic::Rotation { omega: or(source.omega, 1.0) },
         SourceKind::Shear => Analytic::Shear { rate: or(source.rate, 1.0) },
-        SourceKind::Turbulence | SourceKind::Archive => return None,
+        SourceKind::Turbulence | SourceKind::Archive | SourceKind::Live => return None,
     })
 }
 
 /// A gridded source, opened.
 pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, EngineError> {
     let source = &scene.source;
+    if source.kind == SourceKind::Live {
+        return Err(
+            Refused::new("source.kind", "is \"live\"", "with `ridgewatch attach`: this command wants what it can read again").into()
+        );
+    }
     if source.kind == SourceKind::Archive {
         return Ok(Box::new(NetCdfArchive::open(&scene.archive.files, &scene.archive)?));
     }
@@ -179,6 +198,7 @@ impl Feed {
                     index: *given - 1,
                     time,
                     date: None,
+                    live: None,
                     velocity: VelocitySource::Analytic(flow.clone(), domain.clone()),
                     warnings: Vec::new(),
                     waited: 0.0,
@@ -219,18 +239,55 @@ impl Feed {
                     index: *given - 1,
                     time,
                     date: dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone()),
+                    live: None,
                     velocity: VelocitySource::Window(Arc::new(window.clone())),
                     warnings: std::mem::take(warnings),
+                    waited: start.elapsed().as_secs_f64(),
+                }))
+            }
+            Feed::Live { window, direction, given, slides } => {
+                if *given == *slides {
+                    return Ok(None);
+                }
+                let start = Instant::now();
+                let taken = loop {
+                    if stop.load(Ordering::Relaxed) {
+                        return Ok(None);
+                    }
+                    match window.next_within(LOOK_UP) {
+                        Ok(Some(taken)) => break taken,
+                        Ok(None) => return Ok(None),
+                        Err(StillReading) => {}
+                    }
+                };
+                *given += 1;
+                let ends = match direction {
+                    Direction::Forward => taken.window.oldest(),
+                    Direction::Backward => taken.window.newest(),
+                };
+                Ok(Some(Slide {
+                    index: *given - 1,
+                    time: ends.ok_or(EngineError::EndedEarly)?,
+                    date: None,
+                    live: Some(taken.live),
+                    velocity: VelocitySource::Window(Arc::new(taken.window)),
+                    warnings: taken.warnings,
                     waited: start.elapsed().as_secs_f64(),
                 }))
             }
         }
     }
 
+    /// The feed of a simulation that runs now.
+    pub fn live(scene: &Settings, window: LiveWindow, direction: Direction) -> Self {
+        Feed::Live { window, direction, given: 0, slides: scene.time.slides.map_or(u64::MAX, |n| n as u64) }
+    }
+
     /// Slides that will come in all, where that is known.
     pub fn expected_slides(&self, times: Option<&[f64]>, tau: f64) -> Option<u64> {
         match self {
             Feed::Closed { slides, .. } => Some(*slides),
+            Feed::Live { slides, .. } => Some(*slides).filter(|n| *n < u64::MAX),
             Feed::Archive { slides, stride, .. } => {
                 let times = times?;
                 let first = times.iter().position(|t| t - times[0] >= tau * (1.0 - 1e-9))?;

@@ -1,4 +1,4 @@
-//! Who makes a frame's film: the CPU's renderer, or a GPU's where every query is traced there.
+//! Who makes a frame's film: the CPU's renderer, or a GPU's where every query can be answered there.
 
 #[cfg(feature = "cuda")]
 use super::accelerator::{DeviceRenderer, Health};

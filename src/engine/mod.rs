@@ -22,12 +22,12 @@ mod training;
 pub use crate::trust::TrustedError;
 #[cfg(feature = "cuda")]
 pub use accelerator::{Accelerator, Backed, DeviceRenderer, DeviceTrace, Health};
-pub use answers::{Answers, Tally};
+pub use answers::{Answers, Asked, Tally};
 pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
 pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;
-pub use feed::{Feed, Slide};
+pub use feed::{Feed, Slide, open_snapshots};
 pub use record::{FrameRecord, StageSeconds};
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};

@@ -14,6 +14,9 @@ pub struct FrameRecord {
     pub time: f64,
     /// The same as a date, where the source has a calendar.
     pub date: Option<String>,
+    /// Of a simulation that runs now; none otherwise.
+    #[serde(default)]
+    pub live: Option<crate::source::live::LiveRecord>,
     /// |tau|.
     pub tau: f64,
     /// `forward` or `backward`.

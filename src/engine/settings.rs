@@ -3,6 +3,7 @@
 use crate::flow::{Direction, FlowSettings};
 use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, count, require};
+use crate::source::live::LiveSettings;
 use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
 use crate::surrogate::{
     SurrogateSettings,
@@ -22,6 +23,8 @@ pub struct Settings {
     pub source: SourceSettings,
     /// Which files, variables and metric, for archives.
     pub archive: NetCdfSettings,
+    /// Which simulation, for those that run now.
+    pub live: LiveSettings,
     /// The box in which seeds lie; needed by closed forms.
     pub domain: Option<DomainSettings>,
     /// Integration time, direction and the slides of the window.
@@ -52,7 +55,8 @@ impl Settings {
         let kind = self.source.kind;
         self.source.check(self.domain.as_ref(), &self.archive)?;
         self.time.check(kind)?;
-        self.flow.check(matches!(kind, SourceKind::Archive | SourceKind::Turbulence))?;
+        self.live.check()?;
+        self.flow.check(matches!(kind, SourceKind::Archive | SourceKind::Turbulence | SourceKind::Live))?;
         self.surrogate.check(&self.network)?;
         self.network.validate()?;
         self.training.check()?;
@@ -149,7 +153,7 @@ impl TimeSettings {
             Some(tau) => {
                 let accepted = "a number above 0 in the source's time unit, or words such as \"30 days\", \"36 h\", \"90 min\"";
                 require(tau.value().is_some_and(|v| v.is_finite() && v > 0.0), "time.tau", tau, accepted)?;
-                if tau.has_unit() && kind != SourceKind::Archive {
+                if tau.has_unit() && !matches!(kind, SourceKind::Archive | SourceKind::Live) {
                     refuse("time.tau", "has a unit", "a plain number: the time of a closed form has no unit")?;
                 }
             }

@@ -6,6 +6,7 @@ use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
 use crate::setting::{Refused, require, shown};
+use crate::source::live::Live;
 use crate::source::{Metric, SnapshotSource, SourceKind, Steady, VelocityUnit};
 use crate::surrogate::Kind;
 
@@ -41,16 +42,28 @@ impl Setup {
     }
 
     /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
-    pub fn over(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
+    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
         scene.check()?;
+        Self::settle(scene, snapshots, None)
+    }
+
+    /// The same for a simulation that was found running; its window begins to fill.
+    pub fn live(scene: Settings, live: Live) -> Result<Self, EngineError> {
+        scene.check()?;
+        Self::settle(scene, None, Some(live))
+    }
+
+    fn settle(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
-        let flat = snapshots.as_ref().is_some_and(|s| s.grid().dimensions() == 2);
-        let archive = scene.source.kind == SourceKind::Archive;
+        let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
+        let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));
+        let flat = grid.as_ref().is_some_and(|grid| grid.dimensions() == 2);
+        let archive = matches!(scene.source.kind, SourceKind::Archive | SourceKind::Live);
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
         let tau = match (&scene.time.tau, &snapshots) {
-            (Some(tau), source) => {
-                if tau.has_unit() && source.as_ref().is_some_and(|s| s.describe().time_unit != "s") {
+            (Some(tau), _) => {
+                if tau.has_unit() && unit.as_ref().is_some_and(|unit| unit != "s") {
                     let found = "has a unit, but the source's time is not in seconds (with the index metric it counts snapshots)";
                     return Err(Refused::new("time.tau", found, "a plain number").into());
                 }
@@ -81,7 +94,7 @@ impl Setup {
             snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
         }
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
-            SourceKind::Archive => Boundary::Stop,
+            SourceKind::Archive | SourceKind::Live => Boundary::Stop,
             SourceKind::Turbulence => Boundary::Clamp,
             _ => Boundary::Unbounded,
         });
@@ -99,9 +112,9 @@ impl Setup {
             normalisation: scene.flow.normalisation,
             interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
         };
-        let domain = match (&closed, &scene.domain, &snapshots) {
+        let domain = match (&closed, &scene.domain, &grid) {
             (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },
-            (_, _, Some(source)) => source.grid().domain(),
+            (_, _, Some(grid)) => grid.domain(),
             _ => return Err(no_domain()),
         };
         if closed.is_some() {
@@ -113,7 +126,10 @@ impl Setup {
             notes.push("training.resume is not read: neither method reference nor a table goes on from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
-        let feed = Feed::open(&scene, snapshots, tau, direction)?;
+        let feed = match live {
+            Some(live) => Feed::live(&scene, live.follow(tau, scene.time.stride)?, direction),
+            None => Feed::open(&scene, snapshots, tau, direction)?,
+        };
         let slides = feed.expected_slides(times.as_deref(), tau);
         Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
     }

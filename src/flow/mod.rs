@@ -37,6 +37,8 @@ pub use steps::Chosen;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
 pub(crate) use velocity::{angle_slack, bounds};
+#[cfg(feature = "cuda")]
+pub(crate) use voids::Voids;
 
 /// Which way particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

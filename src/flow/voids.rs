@@ -1,7 +1,8 @@
 //! Cells in which no particle can start.
 
 use super::Interpolation;
-use crate::field::{Axis, Snapshot, Window};
+use crate::field::{Axis, Grid, Snapshot, Window};
+use rayon::prelude::*;
 use std::sync::Arc;
 
 /// The snapshots that bracket the start time, where any of their velocities is missing, and how many nodes an interpolation reads
@@ -30,13 +31,38 @@ impl Voids {
 
     /// Whether a node that the interpolation reads at the seed has no velocity.
     pub fn hold(&self, seed: [f32; 3]) -> bool {
+        let Some(grid) = self.grid() else { return false };
+        let mut cell = [0; 3];
+        for (k, axis) in grid.axes.iter().enumerate() {
+            cell[k] = below(axis, f64::from(seed[k]));
+        }
+        self.around(cell)
+    }
+
+    /// Whether a particle cannot start in a cell, for every cell of the grid, x fastest; none where it can start in all of them. A
+    /// periodic axis has a cell between its last node and the first one's image.
+    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
+    pub fn cells(&self) -> Option<(Arc<Grid>, Vec<bool>)> {
+        let grid = self.grid()?;
+        let count: [usize; 3] = std::array::from_fn(|k| grid.axes.get(k).map_or(1, Axis::cells));
+        let cell = |i: usize| [i % count[0], i / count[0] % count[1], i / (count[0] * count[1])];
+        let cells = (0..count.iter().product()).into_par_iter().with_min_len(1 << 12).map(|i| self.around(cell(i))).collect();
+        Some((grid.clone(), cells))
+    }
+
+    fn grid(&self) -> Option<&Arc<Grid>> {
+        self.snapshots.first().map(|snapshot| &snapshot.grid)
+    }
+
+    /// Whether a node that the interpolation reads in a cell has no velocity.
+    fn around(&self, cell: [usize; 3]) -> bool {
         self.snapshots.iter().any(|snapshot| {
             let axes = &snapshot.grid.axes;
             let [nx, ny, _] = snapshot.grid.shape();
             let width = 2 + 2 * self.beyond;
             let mut nodes = [[0; 4]; 3];
             for (k, axis) in axes.iter().enumerate() {
-                nodes[k] = stencil(axis, f64::from(seed[k]), self.beyond);
+                nodes[k] = stencil(axis, cell[k], self.beyond);
             }
             let along = |k: usize| if k < axes.len() { width } else { 1 };
             (0..along(0) * along(1) * along(2)).any(|i| {
@@ -47,37 +73,34 @@ impl Voids {
     }
 }
 
-/// Indices of the nodes around a coordinate, `beyond` further ones on either side (the last ones again past an end of the axis).
-fn stencil(axis: &Axis, x: f64, beyond: usize) -> [usize; 4] {
-    let [low, high] = cell(axis, x);
+/// Indices of a cell's two nodes, and `beyond` further ones on either side (the last ones again past an end of the axis).
+fn stencil(axis: &Axis, cell: usize, beyond: usize) -> [usize; 4] {
+    let n = axis.len();
+    let (low, high) = (cell, (cell + 1) % n);
     if beyond == 0 {
         return [low, high, high, high];
     }
-    let n = axis.len();
     match axis.period() {
         Some(_) => [(low + n - 1) % n, low, high, (high + 1) % n],
         None => [low.saturating_sub(1), low, high, (high + 1).min(n - 1)],
     }
 }
 
-/// Indices of the nodes on either side of a coordinate; the nearest cell's outside the axis.
-fn cell(axis: &Axis, x: f64) -> [usize; 2] {
+/// Index of the cell around a coordinate, which is that of the node below; the nearest cell's outside the axis.
+fn below(axis: &Axis, x: f64) -> usize {
     let nodes = axis.coordinates();
     let x = axis.period().map_or(x, |period| axis.first() + (x - axis.first()).rem_euclid(period));
     let above = nodes.partition_point(|c| *c <= x);
     match axis.period() {
-        Some(_) => [(above + nodes.len() - 1) % nodes.len(), above % nodes.len()],
-        None => {
-            let above = above.clamp(1, nodes.len() - 1);
-            [above - 1, above]
-        }
+        Some(_) => (above + nodes.len() - 1) % nodes.len(),
+        None => above.clamp(1, nodes.len() - 1) - 1,
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Geometry, Grid};
+    use crate::field::Geometry;
 
     #[test]
     fn a_missing_corner_makes_its_four_cells_void() {
@@ -95,6 +118,12 @@ mod tests {
         let wider = Voids::at(&window, 1.0, Interpolation::Cubic);
         assert!(wider.hold([100.0, 0.5, 0.0]) && wider.hold([10.0, 2.5, 0.0]), "cubic reads one node further");
         assert!(!voids.hold([100.0, 0.5, 0.0]) && !voids.hold([10.0, 2.5, 0.0]));
+        for voids in [&voids, &wider] {
+            let (_, cells) = voids.cells().unwrap();
+            let held = |i: usize| voids.hold([90.0 * (i % 4) as f32 + 45.0, (i / 4) as f32 + 0.5, 0.0]);
+            assert_eq!(cells, (0..12).map(held).collect::<Vec<_>>(), "four cells around, three along the latitude");
+        }
+        assert!(Voids::none().cells().is_none());
         u[4] = 0.0;
         window.push(Arc::new(Snapshot::from_components(2.0, grid, &u, &[0.0; 16], &[]))).unwrap();
         assert!(!Voids::at(&window, 2.0, Interpolation::Linear).hold([10.0, 0.5, 0.0]), "the newest snapshot has it");

@@ -44,15 +44,32 @@ impl Film {
     }
 
     /// The same with its memory in place: the pages of a fresh large film come one by one as they are first written, which takes longer than
-    /// the picture's copy.
+    /// the picture's copy, and longer than a frame's work on a GPU. So all threads of rayon's current pool write them.
     #[cfg(feature = "cuda")]
     pub(crate) fn resident(width: usize, height: usize) -> Self {
-        let mut film = Self::new(width, height);
-        film.rgba.fill(std::hint::black_box([0.0; 4]));
-        for layer in [&mut film.traced, &mut film.samples, &mut film.missing, &mut film.queries] {
-            layer.fill(std::hint::black_box(0.0));
+        use rayon::prelude::*;
+        /// A megabyte: many pages, and many pieces.
+        const PIECE: usize = 1 << 18;
+        fn layer(pixels: usize, value: f32) -> Vec<f32> {
+            // Zeros come without pages.
+            let mut values = vec![0.0_f32; pixels];
+            values.par_chunks_mut(PIECE).for_each(|piece| piece.fill(std::hint::black_box(value)));
+            values
         }
-        film
+        let pixels = width * height;
+        let mut rgba = vec![[0.0_f32; 4]; pixels];
+        rgba.par_chunks_mut(PIECE / 4).for_each(|piece| piece.fill(std::hint::black_box([0.0; 4])));
+        Self {
+            width,
+            height,
+            rgba,
+            ftle_mean: layer(pixels, f32::NAN),
+            traced: layer(pixels, 0.0),
+            variance: layer(pixels, f32::NAN),
+            samples: layer(pixels, 0.0),
+            missing: layer(pixels, 0.0),
+            queries: layer(pixels, 0.0),
+        }
     }
 
     /// Tone-mapped 8-bit RGB with `((c - 0.5) * contrast + brightness)^(1/gamma)`.

@@ -396,10 +396,9 @@ fn build_grid(path: &Path, layout: &Layout, settings: &NetCdfSettings) -> Result
         Metric::Index => layout.axes.iter().map(index_axis).collect::<Result<_, SourceError>>()?,
         Metric::Sphere | Metric::Cartesian => layout.axes.iter().map(|p| p.axis.clone()).collect(),
     };
-    let edge = axes[..2].iter().map(|a| a.last() - a.first()).fold(0.0, f64::max);
-    let [low, high] = settings.slab.unwrap_or([0.0, edge / 10.0]);
+    let slab = settings.slab.map_or_else(|| super::slab_of(&axes), |[low, high]| (low, high));
     let geometry = if layout.metric == Metric::Sphere { Geometry::Sphere { radius: EARTH_RADIUS } } else { Geometry::Cartesian };
-    Ok(Grid { axes, geometry, slab: (low, high) })
+    Ok(Grid { axes, geometry, slab })
 }
 
 fn describe(layout: &Layout, format: &str, files: usize, seconds: &[f64]) -> SourceDescription {

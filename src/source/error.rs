@@ -224,6 +224,9 @@ pub enum SourceError {
         /// What does not fit.
         what: String,
     },
+    /// A simulation that runs now.
+    #[error(transparent)]
+    Live(#[from] ridgewatch_wire::WireError),
     /// The I/O thread is gone.
     #[error("the reading thread ended before snapshot {index} of {count}: {what}")]
     ReaderStopped {
@@ -239,8 +242,11 @@ pub enum SourceError {
 impl SourceError {
     /// The setting at fault, where it is one.
     pub fn refused(&self) -> Option<Refused> {
-        let qualified =
-            |key: &str| if key == "tau" { "time.tau".to_owned() } else { format!("archive.{}", key.trim_start_matches("archive.")) };
+        let qualified = |key: &str| match key {
+            "tau" => "time.tau".to_owned(),
+            key if key.starts_with("live.") => key.to_owned(),
+            key => format!("archive.{}", key.trim_start_matches("archive.")),
+        };
         Some(match self {
             SourceError::Setting { key, found, accepted } => Refused::new(qualified(key), format_args!("is {found}"), accepted),
             SourceError::VariableNotFound { path, key, variable, nearest, present } => Refused::new(

@@ -22,6 +22,8 @@ pub enum SourceKind {
     Turbulence,
     /// NetCDF and HDF5 files (`[archive]`).
     Archive,
+    /// A simulation that runs now (`[live]`), with `ridgewatch attach`.
+    Live,
 }
 
 /// `[source]`. Parameters that the kind does not have are refused.
@@ -114,7 +116,7 @@ impl SourceSettings {
             require(k > 2.0, "source.k_max", k, "a number above 2, the smallest wave number")?;
         }
         match (kind, domain) {
-            (Archive | Turbulence, Some(_)) => fault(
+            (Archive | Turbulence | Live, Some(_)) => fault(
                 "domain",
                 "is given for gridded velocity",
                 "no [domain]: the grid is the domain (archives may be cropped with archive.region)",

@@ -1,4 +1,4 @@
-//! Where snapshots come from: NetCDF and HDF5 files, or memory (closed forms sampled on a grid).
+//! Where snapshots come from: NetCDF and HDF5 files, memory (closed forms sampled on a grid), or a simulation that runs now ([`live`]).
 //!
 //! In: settings and files. Out: snapshots in time order, read ahead by one I/O thread. Calls `field`.
 //!
@@ -23,6 +23,7 @@ mod inspect;
 mod kinds;
 mod layout;
 mod libraries;
+pub mod live;
 mod locator;
 mod memory;
 mod netcdf4;
@@ -166,6 +167,12 @@ pub fn time_gaps(times: &[f64]) -> Vec<TimeGap> {
 
 fn span(times: &[f64]) -> f64 {
     times.last().zip(times.first()).map_or(0.0, |(last, first)| last - first)
+}
+
+/// A flow in a plane is drawn as a slab: from 0 to a tenth of its longer edge.
+fn slab_of(axes: &[crate::field::Axis]) -> (f64, f64) {
+    let edge = axes[..2].iter().map(|a| a.last() - a.first()).fold(0.0, f64::max);
+    (0.0, edge / 10.0)
 }
 
 /// Median of the intervals; 0 with fewer than two times.

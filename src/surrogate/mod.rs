@@ -94,6 +94,10 @@ pub trait Predict: Send + Sync {
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]);
     /// Memory of what prediction reads, in bytes.
     fn bytes(&self) -> usize;
+    /// Itself, for engines that know how to predict on a device what this kind of surrogate predicts here; none: nobody does.
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        None
+    }
 }
 
 /// A memory of the log-stretch over the domain, which learns between or beside frames.

@@ -7,6 +7,7 @@ use crate::flow::{Extras, Traced, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use wide::{f32x8, i32x8};
 
 /// Seeds traced at once while a table is built: bounds the memory beside the table itself.
@@ -20,6 +21,14 @@ pub struct Table {
     /// x fastest. Shared with frozen copies; a slide writes into a place of its own.
     values: Arc<Vec<f32>>,
     not_finite: usize,
+    /// Of these values, and no others in this process.
+    stamp: u64,
+}
+
+/// A number that was not given before.
+fn fresh_stamp() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 impl Table {
@@ -27,7 +36,7 @@ impl Table {
     pub fn trace(tracer: &dyn Tracer, nodes: [usize; 3]) -> Self {
         let dimensions = tracer.domain().dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut table = Self { nodes, dimensions, values: Arc::new(vec![0.0; nodes.iter().product()]), not_finite: 0 };
+        let mut table = Self { nodes, dimensions, values: Arc::new(vec![0.0; nodes.iter().product()]), not_finite: 0, stamp: 0 };
         table.retrace(tracer);
         table
     }
@@ -42,6 +51,7 @@ impl Table {
         };
         let mut traced = Traced::default();
         self.not_finite = 0;
+        self.stamp = fresh_stamp();
         if Arc::get_mut(&mut self.values).is_none() {
             // A frame still renders with the old values, none of which is needed here.
             self.values = Arc::new(vec![0.0; self.values.len()]);
@@ -71,6 +81,12 @@ impl Table {
     /// Nodes whose trace was not finite; they hold 0.
     pub fn not_finite(&self) -> usize {
         self.not_finite
+    }
+
+    /// A number that tables in this process share only when they share their values: whoever keeps a copy elsewhere knows by it whether it
+    /// still holds.
+    pub fn stamp(&self) -> u64 {
+        self.stamp
     }
 
     /// Interpolates at eight points.
@@ -120,7 +136,7 @@ impl Table {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
         let values = checkpoint.values("table.values", self.values.len())?;
         let not_finite = checkpoint.number("table.not_finite")?;
-        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values: Arc::new(values), not_finite })
+        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values: Arc::new(values), not_finite, stamp: fresh_stamp() })
     }
 }
 
@@ -142,6 +158,10 @@ impl Predict for Table {
 
     fn bytes(&self) -> usize {
         self.values.len() * size_of::<f32>()
+    }
+
+    fn as_any(&self) -> Option<&dyn std::any::Any> {
+        Some(self)
     }
 }
 
@@ -237,10 +257,12 @@ mod tests {
         let mut table = Table::trace(&Plane(domain.clone(), -1.0), [3, 3, 1]);
         let frozen = table.clone();
         assert!(std::ptr::eq(frozen.values(), table.values()), "nothing is copied");
+        assert_eq!(frozen.stamp(), table.stamp());
         let before = frozen.values().to_vec();
         // The new window has no value in the left half.
         table.retrace(&Plane(domain, 0.4));
         assert_eq!(frozen.values(), before, "what a frame renders with stays");
+        assert_ne!(frozen.stamp(), table.stamp(), "other values, another stamp");
         assert_eq!((table.values()[0], table.values()[8]), (0.0, before[8]));
         let own = table.values().as_ptr();
         drop(frozen);

@@ -66,22 +66,46 @@ impl TrustedError {
         let n = residuals.len() as f64;
         // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
         let interval = if variance > 0.0 { [bound(1.96), bound(-1.96)] } else { [0.0, (square + 3.0 / n).min(1.0).sqrt()] };
-        let mut order: Vec<usize> = (0..residuals.len()).collect();
-        order.sort_unstable_by(|&a, &b| residuals[a].optical.total_cmp(&residuals[b].optical));
-        let mut below = 0.0;
-        let rank = order.iter().find(|&&i| {
-            below += weights[i];
-            below >= 0.99 * whole * (1.0 - 1e-12)
-        });
+        let mut pairs: Vec<(f32, f64)> = residuals.iter().map(|r| r.optical).zip(weights.iter().copied()).collect();
         Some(Self {
             points: residuals.len() as u64,
             optical_mean: mean(|r| f64::from(r.optical)),
             optical_rms: square.sqrt(),
             optical_rms_interval: interval,
-            optical_p99: rank.or(order.last()).map_or(0.0, |&i| f64::from(residuals[i].optical)),
-            log_stretch_rms: mean(|r| f64::from(r.log_stretch).powi(2)).sqrt(),
+            optical_p99: quantile(&mut pairs, 0.99 * whole * (1.0 - 1e-12)),
+            log_stretch_rms: log_stretch_rms(residuals, strata),
         })
     }
+}
+
+/// Root mean square residual of the log-stretch alone; NaN without residuals.
+pub fn log_stretch_rms(residuals: &[Residual], strata: &Strata) -> f64 {
+    let (mut sum, mut whole) = (0.0, 0.0);
+    for residual in residuals {
+        let weight = strata.weight(residual.point);
+        sum += weight * f64::from(residual.log_stretch).powi(2);
+        whole += weight;
+    }
+    (sum / whole).sqrt()
+}
+
+/// The least value of `(value, weight)` pairs up to which the weights add up to `share`; the largest where they never do. Selects instead of
+/// sorting (Hoare 1961), which takes linear time on average. 0 without pairs.
+fn quantile(pairs: &mut [(f32, f64)], share: f64) -> f64 {
+    let (mut rest, mut below) = (pairs, 0.0);
+    while rest.len() > 1 {
+        let middle = rest.len() / 2;
+        rest.select_nth_unstable_by(middle, |a, b| a.0.total_cmp(&b.0));
+        let (low, high) = rest.split_at_mut(middle);
+        let weight = low.iter().map(|pair| pair.1).sum::<f64>();
+        if below + weight >= share {
+            rest = low;
+        } else {
+            below += weight;
+            rest = high;
+        }
+    }
+    rest.first().map_or(0.0, |pair| f64::from(pair.0))
 }
 
 /// Inverse of Hall's transformation g(t) = t + gamma t^2 / 3 + gamma^2 t^3 / 27 + gamma / 6, with gamma = skewness / sqrt(n).
@@ -121,6 +145,27 @@ mod tests {
             .count();
         // 400 trials of 0.95: three standard errors are 3.3 %.
         assert!((367..=393).contains(&held), "{held} of 400");
+    }
+
+    #[test]
+    fn quantiles_are_those_of_the_sorted_pairs() {
+        let mut state = 9;
+        for n in [1, 2, 3, 10, 101] {
+            let pairs: Vec<(f32, f64)> = (0..n).map(|_| ((uniform(&mut state) * 20.0) as f32 as i32 as f32, uniform(&mut state))).collect();
+            let whole: f64 = pairs.iter().map(|pair| pair.1).sum();
+            let mut sorted = pairs.clone();
+            sorted.sort_by(|a, b| a.0.total_cmp(&b.0));
+            for share in [0.0, 0.3 * whole, 0.99 * whole, 2.0 * whole] {
+                let mut below = 0.0;
+                let rank = sorted.iter().find(|pair| {
+                    below += pair.1;
+                    below >= share
+                });
+                let expected = f64::from(rank.or(sorted.last()).unwrap().0);
+                assert_eq!(quantile(&mut pairs.clone(), share), expected, "{n} pairs, {share} of {whole}");
+            }
+        }
+        assert_eq!(quantile(&mut [], 1.0), 0.0);
     }
 
     #[test]

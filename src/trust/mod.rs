@@ -6,7 +6,7 @@
 mod error;
 mod map;
 
-pub use error::TrustedError;
+pub use error::{TrustedError, log_stretch_rms};
 pub use map::{Gate, Residual, Strata, TrustMap};
 
 use crate::setting::{Refused, count, positive, require};

@@ -1,7 +1,7 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
 use crate::scenes::{gpu, store, turbulence};
-use ridgewatch::engine::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, LookAhead, Traced, Tuning};
+use ridgewatch::engine::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, Traced, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{
@@ -34,7 +34,7 @@ impl LogStretch for OnHost {
 struct ThroughHost<'a>(&'a Gpu);
 
 impl DeviceAnswers for ThroughHost<'_> {
-    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError> {
+    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         use cudarc::driver::result;
         let doing = DeviceError::driver("answering on the host");
         let stream = self.0.work().cu_stream();
@@ -48,7 +48,7 @@ impl DeviceAnswers for ThroughHost<'_> {
         // SAFETY: as above; the host arrays outlive the synchronisation.
         unsafe {
             result::memcpy_htod_async(log_stretch, &values, stream).map_err(&doing)?;
-            result::memcpy_htod_async(traced, &flags, stream).map_err(&doing)?;
+            result::memcpy_htod_async(by, &flags, stream).map_err(&doing)?;
         }
         self.0.synchronize()
     }
@@ -74,7 +74,7 @@ fn scene(width: usize, height: usize, point_light: bool) -> Scene {
 fn on_gpu(device: &mut GpuRenderer, gpu: &Gpu, renderer: &mut Renderer, frame: u64, samples: Range<u32>) -> (Film, RenderStats) {
     // What a kernel reads before it has written it would show.
     device.poison().unwrap();
-    device.render_samples(renderer, frame, samples, &ThroughHost(gpu), None, &NEVER).unwrap()
+    device.render_samples(renderer, frame, samples, &mut ThroughHost(gpu), None, &NEVER).unwrap()
 }
 
 /// Films hold NaN where nothing was hit, so bits are compared.
@@ -160,7 +160,8 @@ fn traced_pictures_agree(source: VelocitySource, map: &FlowMap, scene: Scene, sa
     for (frame, samples) in [(0, 0..1), (1, 0..samples)] {
         let (expected, cpu_stats) = cpu.render_samples(frame, samples.clone(), &mut by_cpu, None, &NEVER).unwrap();
         device.poison().unwrap();
-        let (found, stats) = device.render_samples(&mut renderer, frame, samples.clone(), &Traced(tracer.device()), None, &NEVER).unwrap();
+        let (found, stats) =
+            device.render_samples(&mut renderer, frame, samples.clone(), &mut Traced(tracer.device()), None, &NEVER).unwrap();
         let comparison = compare_films(&found, &expected, tone_map).unwrap();
         let psnr = comparison.psnr.unwrap_or(f64::INFINITY);
         println!("frame {frame}, {} samples: {psnr:.1} dB, queries {} and {}", samples.end, stats.queries, cpu_stats.queries);
@@ -222,13 +223,14 @@ fn schedule_and_memory_leave_every_bit_alone() {
 #[test]
 #[ignore = "needs a GPU"]
 fn memory_is_flat_over_a_thousand_frames() {
-    let gpu = gpu();
+    // A handle of its own, so that no other test's memory counts.
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
     let mut renderer = Renderer::new(scene(32, 16, false), &domain(), 1.0).unwrap();
     let mut device = GpuRenderer::new(&gpu).unwrap();
     let free = || gpu.context().mem_get_info().unwrap().0;
     let mut after_first = (0, 0);
     for frame in 0..1000 {
-        device.render_samples(&mut renderer, frame, 0..1 + frame as u32 % 3, &ThroughHost(&gpu), None, &NEVER).unwrap();
+        device.render_samples(&mut renderer, frame, 0..1 + frame as u32 % 3, &mut ThroughHost(&gpu), None, &NEVER).unwrap();
         if frame == 9 {
             after_first = (gpu.memory().0, free());
         }
@@ -244,6 +246,6 @@ fn a_stopped_frame_has_no_half_finished_pixels() {
     let gpu = gpu();
     let mut renderer = Renderer::new(scene(64, 32, false), &domain(), 1.0).unwrap();
     let mut device = GpuRenderer::new(&gpu).unwrap();
-    let (film, stats) = device.render_samples(&mut renderer, 0, 0..100, &ThroughHost(&gpu), None, &AtomicBool::new(true)).unwrap();
+    let (film, stats) = device.render_samples(&mut renderer, 0, 0..100, &mut ThroughHost(&gpu), None, &AtomicBool::new(true)).unwrap();
     assert!(stats.stopped && film.samples.iter().all(|n| *n == 0.0));
 }

@@ -4,7 +4,8 @@
 #include <string>
 #include <vector>
 
-#include "gate.cuh"
+#include "answer.cuh"
+#include "table.cuh"
 #include "wavefront.cuh"
 
 using namespace rw;
@@ -21,10 +22,63 @@ template <class T> void give_one(const T& value) { fwrite(&value, sizeof(T), 1, 
 // The field of `Waves` in the test, evaluated in f32 with the same operations.
 static Answer waves(const float* p) {
     const float value = sinf(7.0f * p[0] + 3.0f * p[2]) * cosf(9.0f * p[1]);
-    return {p[0] > 1.8f && p[1] < 0.3f ? NAN : value, p[1] > 0.5f};
+    return {p[0] > 1.8f && p[1] < 0.3f ? NAN : value, (unsigned char)(p[1] > 0.5f ? TRACED : PREDICTED)};
 }
 
-static void frame() {
+// A table of the request, and the memory behind it.
+struct TakenTable {
+    std::vector<float> values;
+    Table table = {};
+    TakenTable() {
+        for (int& n : table.nodes) n = take_one<int>();
+        table.dimensions = take_one<int>();
+        values = take<float>(size_t(table.nodes[0]) * table.nodes[1] * table.nodes[2]);
+        table.values = values.data();
+    }
+};
+
+// Who answers, from the request: gate, land, table.
+struct Desk {
+    std::vector<unsigned char> trusted, empty;
+    std::vector<double> nodes[3];
+    Choice choice = {};
+    TakenTable table;
+
+    static Choice take_choice(Desk& desk) {
+        Choice choice = {};
+        choice.domain = take_one<UnitBox>();
+        choice.budget_spent = take_one<int>();
+        for (int& n : choice.gate.shape) n = take_one<int>();
+        desk.trusted = take<unsigned char>(size_t(choice.gate.shape[0]) * choice.gate.shape[1] * choice.gate.shape[2]);
+        choice.gate.trusted = desk.trusted.empty() ? nullptr : desk.trusted.data();
+        choice.land.dimensions = take_one<int>();
+        size_t cells = choice.land.dimensions ? 1 : 0;
+        for (int k = 0; k < choice.land.dimensions; ++k) {
+            LandAxis& axis = choice.land.axes[k];
+            axis.period = take_one<double>();
+            axis.count = take_one<int>();
+            desk.nodes[k] = take<double>(axis.count);
+            axis.nodes = desk.nodes[k].data();
+            choice.land.cells[k] = axis.period != 0.0 ? axis.count : axis.count - 1;
+            cells *= choice.land.cells[k];
+        }
+        desk.empty = take<unsigned char>(cells);
+        choice.land.empty = cells ? desk.empty.data() : nullptr;
+        return choice;
+    }
+    Desk() : choice(take_choice(*this)), table() {}
+
+    // As answer_split and answer_join do; what is traced has the value of `waves`.
+    Answer answer(const float* p) const {
+        float unit_point[3];
+        const Answerer who = choose(choice, p, unit_point);
+        if (who == NOBODY) return {NAN, PREDICTED};
+        if (who == RUNGE_KUTTA) return {sinf(7.0f * p[0] + 3.0f * p[2]) * cosf(9.0f * p[1]), TRACED};
+        return {look_up(table.table, unit_point), (unsigned char)(who == SURROGATE ? PREDICTED : OVER_BUDGET)};
+    }
+};
+
+template <class Answers> static void frame(const Answers& answers) {
     const FrameScene scene = take_one<FrameScene>();
     const size_t cells = size_t(scene.box.cells[0]) * scene.box.cells[1] * scene.box.cells[2];
     const auto majorants = take<float>(cells);
@@ -46,14 +100,14 @@ static void frame() {
 
     const size_t capacity = size_t(slot_count) * (ahead_camera > ahead_shadow ? ahead_camera : ahead_shadow);
     std::vector<float> points(3 * capacity), log_stretch(capacity);
-    std::vector<unsigned char> traced(capacity);
+    std::vector<unsigned char> by(capacity);
     std::vector<Four> hits[2] = {std::vector<Four>(capacity), std::vector<Four>(capacity)};
     std::vector<uint32_t> live(slot_count), next;
     for (uint32_t i = 0; i < slot_count; ++i) live[i] = i;
     Counts counts = {};
     for (uint32_t wave = 0; !live.empty(); ++wave) {
         uint32_t length = 0;
-        const Queue queue = {points.data(), hits[wave % 2].data(), &length, hits[1 - wave % 2].data(), log_stretch.data(), traced.data()};
+        const Queue queue = {points.data(), hits[wave % 2].data(), &length, hits[1 - wave % 2].data(), log_stretch.data(), by.data()};
         next.clear();
         // Backwards every other wave: the order in which slots come must not matter.
         for (size_t i = 0; i < live.size(); ++i) {
@@ -61,9 +115,9 @@ static void frame() {
             if (advance(scene, grid, watch, band, slots, queue, slot, wave == 0, ahead_camera, ahead_shadow, counts)) next.push_back(slot);
         }
         for (uint32_t i = 0; i < length; ++i) {
-            const Answer answer = waves(&points[3 * i]);
+            const Answer answer = answers(&points[3 * i]);
             log_stretch[i] = answer.log_stretch;
-            traced[i] = answer.traced;
+            by[i] = answer.by;
         }
         live.swap(next);
     }
@@ -111,16 +165,31 @@ int main(int, char** arguments) {
         const uint32_t n = take_one<uint32_t>();
         for (uint32_t i = 0; i < n; ++i) give_one<unsigned char>(trusts(gate, take<float>(3).data()));
     } else if (request == "table") {
-        Table table = {};
-        const auto nodes = take<int>(3);
-        for (int k = 0; k < 3; ++k) table.nodes[k] = nodes[k];
-        table.dimensions = take_one<int>();
-        const auto values = take<float>(size_t(nodes[0]) * nodes[1] * nodes[2]);
-        table.values = values.data();
+        const TakenTable taken;
         const uint32_t n = take_one<uint32_t>();
-        for (uint32_t i = 0; i < n; ++i) give_one(look_up(table, take<float>(3).data()));
+        for (uint32_t i = 0; i < n; ++i) {
+            const auto p = take<float>(3);
+            give_one(look_up(taken.table, {p[0], p[1], p[2]}));
+        }
+    } else if (request == "labels") {
+        const uint32_t shift = take_one<uint32_t>(), n = take_one<uint32_t>();
+        for (uint32_t i = 0; i < n; ++i) give_one<unsigned char>(keeps_label(take<float>(3).data(), shift));
+    } else if (request == "gated") {
+        const Desk desk;
+        frame([&](const float* p) { return desk.answer(p); });
+    } else if (request == "choices") {
+        // Who answers, and what the surrogate says.
+        const Desk desk;
+        const uint32_t n = take_one<uint32_t>();
+        for (uint32_t i = 0; i < n; ++i) {
+            const auto p = take<float>(3);
+            float unit_point[3] = {0.0f, 0.0f, 0.0f};
+            give_one<int>(choose(desk.choice, p.data(), unit_point));
+            for (float u : unit_point) give_one(u);
+            give_one(look_up(desk.table.table, unit_point));
+        }
     } else if (request == "frame") {
-        frame();
+        frame(waves);
     } else {
         return 2;
     }

@@ -18,6 +18,7 @@ macro_rules! kernel {
 
 /// The `.cu` files, by name.
 pub const SOURCES: &[(&str, &str)] = &[
+    kernel!("answer.cu"),
     kernel!("render.cu"),
     kernel!("sort.cu"),
     kernel!("table.cu"),
@@ -28,6 +29,7 @@ pub const SOURCES: &[(&str, &str)] = &[
 
 /// The headers that they include.
 pub const HEADERS: &[(&str, &str)] = &[
+    kernel!("answer.cuh"),
     kernel!("atomics.cuh"),
     kernel!("base.cuh"),
     kernel!("camera.cuh"),
@@ -38,12 +40,14 @@ pub const HEADERS: &[(&str, &str)] = &[
     kernel!("grid.cuh"),
     kernel!("grid_variant.cuh"),
     kernel!("integrate.cuh"),
+    kernel!("land.cuh"),
     kernel!("light.cuh"),
     kernel!("majorant.cuh"),
     kernel!("rng.cuh"),
     kernel!("space.cuh"),
     kernel!("sphere.cuh"),
     kernel!("stretch.cuh"),
+    kernel!("table.cuh"),
     kernel!("tracking.cuh"),
     kernel!("transfer.cuh"),
     kernel!("wavefront.cuh"),

@@ -115,6 +115,76 @@ pub struct TableFrame {
     pub extent: [f64; 3],
 }
 
+/// `Table` of `table.cuh`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct TableArgument {
+    pub nodes: [i32; 3],
+    pub dimensions: i32,
+    pub values: u64,
+}
+
+/// `LandAxis` of `land.cuh`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct LandAxis {
+    pub nodes: u64,
+    pub period: f64,
+    pub count: i32,
+    pub pad: i32,
+}
+
+/// `Land` of `land.cuh`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct LandArgument {
+    pub axes: [LandAxis; 3],
+    pub cells: [i32; 3],
+    pub dimensions: i32,
+    pub empty: u64,
+}
+
+impl LandArgument {
+    /// No land.
+    pub const NONE: Self = Self { axes: [LandAxis { nodes: 0, period: 0.0, count: 0, pad: 0 }; 3], cells: [0; 3], dimensions: 0, empty: 0 };
+}
+
+/// `Choice` of `answer.cuh`, its domain and gate included.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ChoiceArgument {
+    pub min: [f64; 3],
+    pub extent: [f64; 3],
+    pub gate_shape: [i32; 3],
+    pub gate_pad: i32,
+    pub trusted: u64,
+    pub land: LandArgument,
+    pub budget_spent: i32,
+    pub pad: i32,
+}
+
+/// `Lists` of `answer.cu`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct ListsArgument {
+    pub points: u64,
+    pub places: u64,
+    pub values: u64,
+    pub lengths: u64,
+    pub capacity: u32,
+    pub pad: u32,
+}
+
+/// `Labels` of `answer.cu`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct LabelsArgument {
+    pub at: u64,
+    pub length: u64,
+    pub capacity: u32,
+    pub shift: u32,
+}
+
 // SAFETY: plain numbers in C layout; addresses are used by kernels alone.
 unsafe impl DeviceRepr for Verdict {}
 // SAFETY: as above.
@@ -123,6 +193,14 @@ unsafe impl DeviceRepr for Outputs {}
 unsafe impl DeviceRepr for SortFrame {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for TableFrame {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for TableArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for ChoiceArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for ListsArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for LabelsArgument {}
 
 /// Eight-byte words of a kernel parameter whose type depends on the precision.
 pub type Words = [u64; 64];
@@ -149,5 +227,8 @@ mod tests {
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
         assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (48, 40, 12));
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
+        // static_asserts in the kernels' sources hold the other side of these.
+        assert_eq!((size_of::<TableArgument>(), size_of::<LandArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));
+        assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (40, 24));
     }
 }

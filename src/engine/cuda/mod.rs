@@ -6,12 +6,16 @@
 
 mod accelerator;
 mod ahead;
+mod answers;
 pub mod compile;
 mod device;
 mod error;
+mod frames;
 mod grid;
 #[cfg(test)]
 mod host_parity;
+mod labels;
+mod land;
 mod launch;
 mod layout;
 mod memory;
@@ -27,12 +31,15 @@ mod window;
 
 pub use super::device::Storage;
 pub use accelerator::CudaAccelerator;
+pub use answers::{DeviceAnswers, DevicePredict, Divided, Division, Panel, Traced};
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
+pub use labels::keeps_label;
+pub use land::DeviceLand;
 pub use launch::{launch, threads};
 pub use layout::Outputs;
 pub use memory::{Budget, Buffer};
-pub use render::{DeviceAnswers, GpuRenderer, LookAhead, Timeline, Traced};
+pub use render::{GpuRenderer, LookAhead, Timeline};
 pub use sort::{SortCells, Sorter};
 pub use table::DeviceTable;
 pub use trace::{DeviceTracer, Tuning};

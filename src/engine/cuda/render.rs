@@ -4,10 +4,10 @@
 //! an order that depends on the picture's size alone. The host derives majorants between frames, from what the device saw.
 
 use super::render_memory::{Control, Memory, Plan};
-use super::{DeviceError, DeviceTracer, Gpu, Outputs, launch, threads};
+use super::{DeviceAnswers, DeviceError, Gpu, launch, threads};
 use crate::engine::EngineError;
 use crate::render::{Film, FrameParameters, RenderStats, Renderer, SeenInCells};
-use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg, result};
+use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,32 +17,6 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const LOOK_AHEAD: LookAhead = LookAhead { camera: 4, shadow: 8 };
 /// Of the memory that is left when it begins, rendering takes at most one part in so many.
 const MEMORY_SHARE: u64 = 2;
-
-/// Answers log-stretch queries that lie on the device.
-pub trait DeviceAnswers {
-    /// Enqueues on the work stream: the log-stretch of `count` points (device address `points`, three f32 each, domain coordinates) goes
-    /// to `log_stretch` (f32 each; NaN where there is no value), and whether RK4 answered to `traced` (a byte each, 0 or 1).
-    ///
-    /// # Errors
-    /// What the device says.
-    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError>;
-}
-
-/// Every query traced.
-pub struct Traced<'a>(pub &'a DeviceTracer);
-
-impl DeviceAnswers for Traced<'_> {
-    fn answer(&self, points: u64, count: usize, log_stretch: u64, traced: u64) -> Result<(), DeviceError> {
-        let gpu = self.0.gpu();
-        let doing = DeviceError::driver("filling device memory");
-        gpu.context().bind_to_thread().map_err(&doing)?;
-        // SAFETY: the renderer's queue holds `count` entries at each address until the next wave, which is behind this on the stream.
-        unsafe {
-            result::memset_d8_async(traced, 1, count, gpu.work().cu_stream()).map_err(&doing)?;
-            self.0.trace(points, count, &Outputs { log_stretch, ..Outputs::default() })
-        }
-    }
-}
 
 /// How many collisions of a flight may be answered at once. The picture does not depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -60,7 +34,7 @@ pub struct Timeline {
     pub start: f64,
     /// Taking answers, flying on, queueing collisions.
     pub advance: f64,
-    /// Sorting and tracing.
+    /// Answers: choosing who answers, prediction, sorting and tracing.
     pub answer: f64,
     /// Sums to pixels, and the copy to the host.
     pub film: f64,
@@ -114,7 +88,7 @@ struct QueueArgument {
     length: u64,
     answered: u64,
     log_stretch: u64,
-    traced: u64,
+    by: u64,
 }
 
 // SAFETY: `repr(C)`, plain numbers and device addresses, laid out as the structs of `kernels/wavefront.cuh` and `kernels/majorant.cuh`.
@@ -141,6 +115,7 @@ pub struct GpuRenderer {
     allowed: u64,
     look_ahead: LookAhead,
     timeline: Timeline,
+    over_budget: u64,
 }
 
 /// The arguments that all waves of a band share.
@@ -169,6 +144,7 @@ impl GpuRenderer {
             memory: None,
             look_ahead: LOOK_AHEAD,
             timeline: Timeline::default(),
+            over_budget: 0,
         })
     }
 
@@ -198,6 +174,11 @@ impl GpuRenderer {
         self.timeline
     }
 
+    /// Queries of the latest frame that the surrogate answered where it is not trusted, since the tracing budget was spent.
+    pub fn over_budget(&self) -> u64 {
+        self.over_budget
+    }
+
     /// Renders a range of a frame's samples: what [`Renderer::render_samples`] does, with answers on the device.
     ///
     /// # Errors
@@ -207,7 +188,7 @@ impl GpuRenderer {
         renderer: &mut Renderer,
         frame: u64,
         samples: Range<u32>,
-        answers: &dyn DeviceAnswers,
+        answers: &mut dyn DeviceAnswers,
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError> {
@@ -236,12 +217,13 @@ impl GpuRenderer {
             }
         };
         // The film's memory is made ready while the device works on the first band.
-        let (tracked, film) = std::thread::scope(|scope| {
-            let making = scope.spawn(|| Film::resident(width, height));
-            let tracked = self.band(&parameters, band(0), answers, &report, stop);
-            (tracked, making.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+        let mut film = None;
+        let tracked = rayon::in_place_scope(|scope| {
+            scope.spawn(|_| film = Some(Film::resident(width, height)));
+            self.band(&parameters, band(0), answers, &report, stop)
         });
-        let (mut film, mut stopped) = (film, tracked?);
+        let mut film = film.unwrap_or_else(|| Film::new(width, height));
+        let mut stopped = tracked?;
         for first in (0..pixels).step_by(plan.band as usize) {
             if first > 0 {
                 stopped = self.band(&parameters, band(first), answers, &report, stop)?;
@@ -253,6 +235,7 @@ impl GpuRenderer {
             self.read_film(&parameters, band(first), &mut film)?;
         }
         let seen = self.end_frame(&mut stats)?;
+        answers.end()?;
         // The grid cannot have changed: the renderer was borrowed all the while.
         let known = renderer.absorb(&seen);
         debug_assert!(known);
@@ -282,7 +265,7 @@ impl GpuRenderer {
         &mut self,
         parameters: &FrameParameters,
         band: BandArgument,
-        answers: &dyn DeviceAnswers,
+        answers: &mut dyn DeviceAnswers,
         report: &dyn Fn(u64),
         stop: &AtomicBool,
     ) -> Result<bool, DeviceError> {
@@ -330,7 +313,7 @@ impl GpuRenderer {
                 self.timeline.add(&timeline);
                 return Ok(stopped && control.live != 0);
             }
-            answers.answer(queue.points, control.length as usize, queue.log_stretch, queue.traced)?;
+            answers.answer(queue.points, control.length as usize, queue.log_stretch, queue.by)?;
             answered = Some([ended, gpu.mark()?]);
             timeline.waves += 1;
             timeline.points += u64::from(control.length);
@@ -361,9 +344,8 @@ impl GpuRenderer {
     /// What the frame counted and saw.
     fn end_frame(&mut self, stats: &mut RenderStats) -> Result<SeenInCells, DeviceError> {
         let gpu = self.gpu.clone();
-        let memory = self.memory()?;
-        let (seen, control) = memory.end_frame(&gpu)?;
-        [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths] = control.totals;
+        let (seen, control) = self.memory()?.end_frame(&gpu)?;
+        [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, self.over_budget] = control.totals;
         Ok(seen)
     }
 }
@@ -443,7 +425,7 @@ impl Memory {
             length: self.at(l.control) + std::mem::offset_of!(Control, length) as u64,
             answered: self.at(l.hits[1 - number % 2]),
             log_stretch: self.at(l.log_stretch),
-            traced: self.at(l.traced),
+            by: self.at(l.by),
         }
     }
 }

@@ -75,7 +75,7 @@ pub(super) struct Layout {
     pub(super) points: u64,
     pub(super) hits: [u64; 2],
     pub(super) log_stretch: u64,
-    pub(super) traced: u64,
+    pub(super) by: u64,
     pub(super) film: u64,
     pub(super) majorants: u64,
     pub(super) may_miss: u64,
@@ -106,7 +106,7 @@ impl Layout {
             points: take(queue, 12),
             hits: [take(queue, 16), take(queue, 16)],
             log_stretch: take(queue, 4),
-            traced: take(queue, 1),
+            by: take(queue, 1),
             film: take(u64::from(plan.band), size_of::<PixelValue>() as u64),
             majorants: take(cells, 4),
             may_miss: take(cells, 1),
@@ -125,11 +125,8 @@ impl Layout {
 pub(super) struct Control {
     pub(super) live: u32,
     pub(super) length: u32,
-    pub(super) to_trace: u32,
-    pub(super) pad: u32,
-    /// Queries, traced, missing, exceeded, paths.
-    pub(super) totals: [u64; 5],
-    pub(super) pad_end: u64,
+    /// Queries, traced, missing, exceeded, paths, over budget.
+    pub(super) totals: [u64; 6],
 }
 
 // SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/render.cu`.
@@ -217,17 +214,17 @@ mod tests {
             (l.hits[0], 80_000),
             (l.hits[1], 80_000),
             (l.log_stretch, 20_000),
-            (l.traced, 5000),
+            (l.by, 5000),
             (l.film, 40_000),
             (l.majorants, 308),
             (l.may_miss, 77),
             (l.watch, 924),
-            (l.control, 64),
+            (l.control, 56),
         ];
         for pair in ends.windows(2) {
             assert!(pair[0].0 + pair[0].1 <= pair[1].0, "{pair:?}");
             assert_eq!(pair[1].0 % 256, 0);
         }
-        assert!(l.control + 64 <= l.end);
+        assert!(l.control + 56 <= l.end);
     }
 }

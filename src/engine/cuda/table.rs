@@ -1,10 +1,11 @@
 //! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
 
-use super::layout::{Outputs, TableFrame};
+use super::layout::{Outputs, TableArgument, TableFrame};
 use super::sort::{MOST, Sorter};
 use super::trace::DeviceTracer;
-use super::{Buffer, DeviceError, Gpu, launch, threads};
+use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
 use crate::field::Domain;
+use crate::surrogate::Table;
 use cudarc::driver::{CudaFunction, PushKernelArg};
 use std::sync::Arc;
 
@@ -31,13 +32,30 @@ impl DeviceTable {
     /// # Errors
     /// A table that does not fit, or has more nodes than 32 bits can count.
     pub fn trace(tracer: &DeviceTracer, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
-        let gpu = tracer.gpu();
+        let mut table = Self::empty(tracer.gpu(), domain, nodes)?;
+        table.retrace(tracer)?;
+        Ok(table)
+    }
+
+    /// A copy of a table on the host.
+    ///
+    /// # Errors
+    /// As for [`Self::trace`].
+    pub fn upload(gpu: &Arc<Gpu>, domain: &Domain, table: &Table) -> Result<Self, DeviceError> {
+        let mut copy = Self::empty(gpu, domain, table.nodes())?;
+        copy.values.write(table.values())?;
+        copy.not_finite = table.not_finite();
+        Ok(copy)
+    }
+
+    /// Its values unset.
+    fn empty(gpu: &Arc<Gpu>, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
         let dimensions = domain.dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|k| if k < dimensions { nodes[k].max(2) } else { 1 });
         let all = nodes.iter().try_fold(1usize, |all, n| all.checked_mul(*n)).filter(|all| *all < u32::MAX as usize);
         let Some(all) = all else { return Err(DeviceError::Unsupported { what: format!("a table of {nodes:?} nodes") }) };
         let kernel = |name| gpu.kernel("table.cu", &[], name);
-        let mut table = Self {
+        Ok(Self {
             gpu: gpu.clone(),
             frame: TableFrame { nodes: nodes.map(|n| n as i32), dimensions: dimensions as i32, min: domain.min, extent: domain.extent() },
             values: gpu.alloc("a table", all)?,
@@ -46,9 +64,7 @@ impl DeviceTable {
             mend: kernel("table_mend")?,
             lookup: kernel("table_lookup")?,
             scratch: Sorter::new(gpu)?,
-        };
-        table.retrace(tracer)?;
-        Ok(table)
+        })
     }
 
     /// Traces every node anew, after the window has slid. Waits for the result.
@@ -102,19 +118,18 @@ impl DeviceTable {
         self.values.read(&mut out)?;
         Ok(out)
     }
+}
 
-    /// Interpolates at `count` points, 3 f32 each in unit coordinates (clamped) at the address `points`, into f32 at `out`.
-    ///
-    /// # Safety
-    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
-    pub unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+impl DevicePredict for DeviceTable {
+    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
         if count == 0 {
             return Ok(());
         }
-        let (values, n) = (self.values.address(), count as u32);
+        let TableFrame { nodes, dimensions, .. } = self.frame;
+        let (table, n) = (TableArgument { nodes, dimensions, values: self.values.address() }, count as u32);
         let stream = self.gpu.work();
         let mut call = stream.launch_builder(&self.lookup);
-        call.arg(&self.frame).arg(&values).arg(&points).arg(&n).arg(&out);
+        call.arg(&table).arg(&points).arg(&n).arg(&out);
         // SAFETY: the caller's, and the arguments are as declared in table.cu.
         unsafe { launch(&mut call, threads(count, 256)) }
     }

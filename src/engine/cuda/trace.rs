@@ -48,7 +48,7 @@ pub struct DeviceTracer {
     cells: Option<SortCells>,
     sorter: Mutex<Option<Sorter>>,
     // Memory that the kernels read.
-    window: Option<DeviceWindow>,
+    _window: Option<DeviceWindow>,
     _memory: Vec<Buffer<u8>>,
 }
 
@@ -104,7 +104,7 @@ impl DeviceTracer {
                     verdict,
                     cells: None,
                     sorter: Mutex::new(None),
-                    window: None,
+                    _window: None,
                     _memory: vec![stages],
                     gpu: gpu.clone(),
                 })
@@ -137,17 +137,12 @@ impl DeviceTracer {
                     verdict,
                     cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
                     sorter: Mutex::new(None),
-                    window: Some(held),
+                    _window: Some(held),
                     _memory: memory,
                     gpu: gpu.clone(),
                 })
             }
         }
-    }
-
-    /// Whether some velocity of the window is missing, so that seeds may lie on land.
-    pub fn meets_land(&self) -> bool {
-        self.window.as_ref().is_some_and(|window| window.nodes().missing)
     }
 
     /// The device.

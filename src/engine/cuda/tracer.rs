@@ -2,9 +2,9 @@
 
 use super::layout::Outputs;
 use super::trace::{DeviceTracer, Tuning};
-use super::{Buffer, DeviceError, Gpu, SnapshotStore};
+use super::{Buffer, DeviceError, DeviceLand, Gpu, SnapshotStore};
 use crate::engine::accelerator::{Backed, DeviceTrace};
-use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, cpu_tracer};
+use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, Voids, cpu_tracer};
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
 
@@ -28,6 +28,7 @@ pub type CudaTracer = Backed<CudaTrace>;
 /// A flow map on the GPU, for seeds on the host.
 pub struct CudaTrace {
     device: DeviceTracer,
+    land: Option<DeviceLand>,
     double: bool,
     /// One call at a time.
     room: Mutex<Option<Room>>,
@@ -60,13 +61,22 @@ impl CudaTracer {
     ) -> Result<Self, CudaTracerError> {
         let host = cpu_tracer(source.clone(), map, t0)?;
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
-        let trace = CudaTrace { device, double: map.precision == Precision::F64, room: Mutex::new(None) };
+        let land = match &source {
+            VelocitySource::Analytic(..) => None,
+            VelocitySource::Window(window) => DeviceLand::new(gpu, &Voids::at(window, t0, map.interpolation))?,
+        };
+        let trace = CudaTrace { device, land, double: map.precision == Precision::F64, room: Mutex::new(None) };
         Ok(Self::with(trace, host, gpu.health().clone()))
     }
 
     /// The device's side, for callers whose seeds are there.
     pub fn device(&self) -> &DeviceTracer {
         &self.on_device().device
+    }
+
+    /// Where no particle can start, on the device; none where every one can.
+    pub fn land(&self) -> Option<&DeviceLand> {
+        self.on_device().land.as_ref()
     }
 }
 

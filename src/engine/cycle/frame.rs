@@ -1,6 +1,6 @@
 //! One frame: rendered with frozen weights while the live ones train, held against what it traced, and recorded.
 
-use super::{Cycle, KEEP_A_FRAME, Place, fixed_steps};
+use super::{Cycle, Place, fixed_steps};
 use crate::engine::answers::{Answers, Tally};
 use crate::engine::audit;
 use crate::engine::feed::Slide;
@@ -122,7 +122,7 @@ impl Cycle<'_> {
         // the warm-up was.
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
-        let flow_map = self.wants_flow_map();
+        let (flow_map, keep) = (self.wants_flow_map(), self.keep_a_frame());
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
@@ -145,14 +145,7 @@ impl Cycle<'_> {
                     }
                 });
                 let mut render = || -> Result<Rendered, EngineError> {
-                    let mut answers = Answers::new(
-                        tracer,
-                        front,
-                        gate,
-                        scene.trust.trace_budget,
-                        if front.is_some() { scene.training.ring / KEEP_A_FRAME } else { 0 },
-                    )
-                    .with_flow_map(flow_map);
+                    let mut answers = Answers::new(tracer, front, gate, scene.trust.trace_budget, keep).with_flow_map(flow_map);
                     let progress = std::sync::Mutex::new(&mut *sink);
                     let report = |share: f32| {
                         if let Ok(mut sink) = progress.lock() {
@@ -216,6 +209,7 @@ impl Cycle<'_> {
             slide: slide.index,
             time: slide.time,
             date: slide.date.clone(),
+            live: slide.live.clone(),
             tau: tracer.tau(),
             direction: self.plan.map.direction.name().into(),
             method: match self.plan.scene.render.method {

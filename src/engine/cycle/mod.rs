@@ -33,6 +33,8 @@ pub struct RunOptions {
     pub threads: usize,
     /// Where to write the trained surrogate at the end.
     pub checkpoint: Option<PathBuf>,
+    /// Writes it also after a frame when so many seconds have gone by since the last time: what is killed goes on from there.
+    pub checkpoint_seconds: Option<f64>,
     /// Samples a pixel of warm-up frames; none: the scene's.
     pub warmup_samples: Option<usize>,
     /// What traces.
@@ -119,6 +121,8 @@ struct Cycle<'a> {
     /// Largest log-stretch that audit points of this slide have met.
     peak: f32,
     began: Instant,
+    /// When the surrogate was last written.
+    saved: Instant,
 }
 
 /// Where a frame stands in the run.
@@ -247,6 +251,7 @@ impl<'a> Cycle<'a> {
             stop,
             peak: f32::NEG_INFINITY,
             began,
+            saved: Instant::now(),
         })
     }
 
@@ -307,12 +312,24 @@ impl<'a> Cycle<'a> {
             }
             let frame = self.frame(tracer, slide, place, sink)?;
             sink(Event::Frame(frame));
+            self.save_if_due();
             heed(self.stop)?;
             if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
                 return Err(Halt::TimeIsUp);
             }
         }
         Ok(())
+    }
+
+    /// A disk that refuses costs the checkpoint, not the run.
+    fn save_if_due(&mut self) {
+        let due = self.options.checkpoint_seconds.is_some_and(|seconds| self.saved.elapsed().as_secs_f64() >= seconds);
+        if let (true, Some(path), Some(live)) = (due, &self.options.checkpoint, &self.live) {
+            self.saved = Instant::now();
+            if let Err(error) = live.save(path) {
+                tracing::warn!("{error}");
+            }
+        }
     }
 
     fn finish(&mut self) -> Result<(), EngineError> {

@@ -75,8 +75,7 @@ impl Cycle<'_> {
     pub(super) fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let gate = Gate::uniform(false);
         let interruptible = Interruptible::new(tracer, self.stop);
-        let keep = if self.live.is_some() { self.plan.scene.training.ring / KEEP_A_FRAME } else { 0 };
-        let mut answers = Answers::new(&interruptible, None, &gate, None, keep).with_flow_map(self.wants_flow_map());
+        let mut answers = Answers::new(&interruptible, None, &gate, None, self.keep_a_frame()).with_flow_map(self.wants_flow_map());
         let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
         self.threads.render.install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
         heed(stop)?;
@@ -84,6 +83,12 @@ impl Cycle<'_> {
         self.probed += traced;
         self.learn_of(tracer, &samples, None);
         Ok(())
+    }
+
+    /// Traced samples that a frame keeps, at most: what training can use of them, or what trust can where nothing is trained.
+    pub(super) fn keep_a_frame(&self) -> usize {
+        let ring = self.plan.scene.training.ring / KEEP_A_FRAME;
+        self.live.as_ref().map_or(0, |live| if live.learns() { ring } else { ring.min(RENDER_RESIDUALS) })
     }
 
     /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.

@@ -1,5 +1,6 @@
 //! What the GPU traces in a second, and what bounds it: the table of docs/performance.md. Times are medians of device time between events;
-//! seeds and results stay on the device; every batch is sorted anew, and the sort counts. `cargo run --release --example gpu_bench [quick]`
+//! seeds and results stay on the device; every batch is sorted anew, and the sort counts.
+//! `cargo run --release --example gpu_bench [quick|collisions]`
 
 // It talks to its user on standard output.
 #![allow(clippy::print_stdout)]
@@ -11,14 +12,23 @@ fn main() {
 
 #[cfg(feature = "cuda")]
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    bench::run(std::env::args().any(|a| a == "quick"))
+    let told = |word: &str| std::env::args().any(|argument| argument == word);
+    bench::run(match (told("quick"), told("collisions")) {
+        (true, _) => bench::Rows::Quick,
+        (_, true) => bench::Rows::Collisions,
+        _ => bench::Rows::All,
+    })
 }
 
 #[cfg(feature = "cuda")]
+mod collisions;
+
+#[cfg(feature = "cuda")]
 mod bench {
+    use super::collisions::Collisions;
     use ridgewatch::engine::Storage;
     use ridgewatch::engine::cuda::{
-        Buffer, CudaTracer, DeviceError, DeviceTable, DeviceTracer, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
+        Buffer, CudaTracer, DeviceError, DevicePredict, DeviceTable, DeviceTracer, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
@@ -30,6 +40,14 @@ mod bench {
     use std::f64::consts::TAU;
     use std::sync::Arc;
     use std::time::Instant;
+
+    /// What is measured.
+    #[derive(Clone, Copy, PartialEq)]
+    pub enum Rows {
+        All,
+        Quick,
+        Collisions,
+    }
 
     const SHAPE: [usize; 3] = [600, 192, 192];
     const SNAPSHOTS: usize = 12;
@@ -78,12 +96,16 @@ mod bench {
 
     impl Batch {
         fn new(gpu: &Gpu, points: &[[f32; 3]]) -> Result<Self, DeviceError> {
-            let count = points.len();
+            Self::of(gpu, gpu.upload("seeds", points)?)
+        }
+
+        fn of(gpu: &Gpu, seeds: Buffer<[f32; 3]>) -> Result<Self, DeviceError> {
+            let count = seeds.len();
             let mut stretch = gpu.alloc("results", count)?;
             stretch.fill_bytes(0xff)?;
             let mut lived = gpu.alloc("results", count)?;
             lived.fill_bytes(0xff)?;
-            Ok(Self { seeds: gpu.upload("seeds", points)?, stretch, lived, count })
+            Ok(Self { seeds, stretch, lived, count })
         }
 
         /// Median milliseconds of a trace of the first `count` seeds.
@@ -221,7 +243,38 @@ mod bench {
             Ok(())
         }
 
-        fn turbulence(&self, name: &str, flow: &Turbulence, quick: bool) -> Outcome<()> {
+        /// The collision points of rays, which no generator of random numbers puts in the same places or order.
+        fn collisions(&self, name: &str, source: &VelocitySource) -> Outcome<()> {
+            let host = CudaTracer::new(&self.store, &self.gpu, source.clone(), &turbulent(22), 0.0, Tuning::default())?;
+            let Collisions { points, first_wave, waves, picture } = Collisions::new(&self.gpu, &host, 1 << 23)?;
+            println!(
+                "\n### Collision points of real rays, {name}: a reference frame of {picture:?} pixels, one sample; {first_wave} points in its first wave, \
+                 {} in {waves}\n",
+                points.len()
+            );
+            println!("| seeds | steps | kernel | M samples/s | ms |\n|---|---|---|---|---|");
+            let batch = Batch::of(&self.gpu, points)?;
+            let plain = Tuning { keep: false, ..Tuning::default() };
+            for (kind, tuning) in [
+                ("cell kept, sorted", Tuning::default()),
+                ("plain, sorted", plain),
+                ("plain, as they come", Tuning { sorted: false, ..plain }),
+            ] {
+                for steps in [6, 11, 22, 110] {
+                    let tracer = self.tracer(source, &turbulent(steps), tuning)?;
+                    for size in [18, 21, 23] {
+                        let count = 1usize << size;
+                        if count <= batch.count {
+                            let ms = batch.time(&tracer, count)?;
+                            println!("| 2^{size} | {steps} | {kind} | {:.0} | {ms:.2} |", count as f64 / ms / 1e3);
+                        }
+                    }
+                }
+            }
+            Ok(())
+        }
+
+        fn turbulence(&self, name: &str, flow: &Turbulence, rows: Rows) -> Outcome<()> {
             let grid = Turbulence::grid(SHAPE)?;
             let begun = Instant::now();
             let window = Arc::new(flow.window(&grid, SNAPSHOTS)?);
@@ -237,6 +290,9 @@ mod bench {
                  {registers} registers, {local} bytes of local memory a thread)\n",
                 begun.elapsed().as_secs_f64()
             );
+            if rows == Rows::Collisions {
+                return self.collisions(name, &source);
+            }
             let points = scattered(&domain, 1 << 24, 1);
             let batch = Batch::new(&self.gpu, &points)?;
             println!("| seeds | steps | kernel | M samples/s | ms | share of the floor (operations, bytes) |\n|---|---|---|---|---|---|");
@@ -249,7 +305,7 @@ mod bench {
                 ("plain, as they come", random),
                 ("cell kept, sorted, f16", half),
             ];
-            let sizes: &[u32] = if quick { &[23] } else { &[18, 21, 23, 24] };
+            let sizes: &[u32] = if rows == Rows::Quick || name == "Hard" { &[23] } else { &[18, 21, 23, 24] };
             for (kind, tuning) in kinds {
                 for steps in [6, 11, 22, 110] {
                     let tracer = self.tracer(&source, &turbulent(steps), tuning)?;
@@ -304,6 +360,9 @@ mod bench {
                 slow / fast,
                 slow / eleven
             );
+            if rows == Rows::All {
+                self.collisions(name, &source)?;
+            }
             self.tables(name, &source, &domain)
         }
 
@@ -354,7 +413,7 @@ mod bench {
     /// tangent 27, stage points and sums 48.
     const STAGE_OPERATIONS: f64 = 183.0;
 
-    pub fn run(quick: bool) -> Outcome<()> {
+    pub fn run(rows: Rows) -> Outcome<()> {
         let begun = Instant::now();
         let gpu = Gpu::open(0, &GpuSettings::default())?;
         println!("Device: {}, driver for CUDA {}, opened in {:.2} s", gpu.name(), gpu.driver(), begun.elapsed().as_secs_f64());
@@ -369,10 +428,12 @@ mod bench {
             copy / 1e12
         );
         let bench = Bench { store: SnapshotStore::new(&gpu), gpu, issue, copy };
-        bench.gyre()?;
-        bench.turbulence("Easy", &Turbulence::easy(SHAPE, 0), quick)?;
-        if !quick {
-            bench.turbulence("Hard", &Turbulence::hard(SHAPE, 0), true)?;
+        if rows != Rows::Collisions {
+            bench.gyre()?;
+        }
+        bench.turbulence("Easy", &Turbulence::easy(SHAPE, 0), rows)?;
+        if rows != Rows::Quick {
+            bench.turbulence("Hard", &Turbulence::hard(SHAPE, 0), rows)?;
         }
         let (used, cap) = bench.gpu.memory();
         println!("\nDevice memory held at the end: {} of {} MiB", used >> 20, cap >> 20);

@@ -1,0 +1,507 @@
+//! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` says what each function does.
+//!
+//! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`].
+
+use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, WireError};
+use std::cell::RefCell;
+use std::ffi::{CStr, c_char};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+/// What a call came to; the numbers of `rw_status`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// Done.
+    Ok = 0,
+    /// No handle, or no ring was asked for: nothing was done.
+    Off = 1,
+    /// A value that cannot be.
+    Argument = 2,
+    /// Another producer has this name.
+    InUse = 3,
+    /// No room for the ring.
+    NoSpace = 4,
+    /// The folder or file belongs to somebody else.
+    Foreign = 5,
+    /// The system refused.
+    System = 6,
+    /// The handle was opened by the parent process.
+    Forked = 7,
+    /// A fault of this library, which was caught.
+    Internal = 8,
+}
+
+const VERSION: u32 = 1;
+const DEFAULT_SLOTS: u32 = 4;
+
+/// A grid as far as it is described.
+#[derive(Debug)]
+pub struct RwDescription {
+    geometry: Geometry,
+    axes: Vec<Option<AxisDescription>>,
+    block: Option<BlockExtent>,
+    time_unit: String,
+    slots: u32,
+    wait: Duration,
+}
+
+/// An open ring.
+#[derive(Debug)]
+pub struct RwField {
+    producer: Producer,
+    dimensions: usize,
+    extent: [u64; 3],
+    published: AtomicU64,
+    overwrote: AtomicU64,
+}
+
+/// Longest message, with its closing zero.
+const MESSAGE: usize = 512;
+
+thread_local! {
+    /// Of fixed length: a failure of `rw_publish` takes no memory that is kept.
+    static ERROR: RefCell<[u8; MESSAGE]> = const { RefCell::new([0; MESSAGE]) };
+}
+
+/// Why a call came to nothing.
+enum Failure {
+    Off,
+    Argument(&'static str),
+    Wire(WireError),
+}
+
+impl From<WireError> for Failure {
+    fn from(error: WireError) -> Self {
+        Self::Wire(error)
+    }
+}
+
+impl Failure {
+    fn status(&self) -> Status {
+        match self {
+            Failure::Off => Status::Off,
+            Failure::Argument(_) => Status::Argument,
+            Failure::Wire(error) => match error {
+                WireError::InUse { .. } => Status::InUse,
+                WireError::NoSpace { .. } => Status::NoSpace,
+                WireError::Foreign { .. } => Status::Foreign,
+                WireError::Forked { .. } => Status::Forked,
+                WireError::Io { .. } => Status::System,
+                _ => Status::Argument,
+            },
+        }
+    }
+}
+
+/// Writes into a thread's message as much as fits.
+struct Message<'a>(&'a mut [u8; MESSAGE], usize);
+
+impl std::fmt::Write for Message<'_> {
+    fn write_str(&mut self, text: &str) -> std::fmt::Result {
+        let room = MESSAGE - 1 - self.1;
+        let mut length = text.len().min(room);
+        // Whole characters only.
+        while !text.is_char_boundary(length) {
+            length -= 1;
+        }
+        self.0[self.1..self.1 + length].copy_from_slice(&text.as_bytes()[..length]);
+        self.1 += length;
+        Ok(())
+    }
+}
+
+fn tell(text: std::fmt::Arguments) {
+    // A thread that is ending has no message any more.
+    let _ = ERROR.try_with(|error| {
+        if let Ok(mut error) = error.try_borrow_mut() {
+            let mut message = Message(&mut error, 0);
+            let _ = std::fmt::write(&mut message, text);
+            let end = message.1;
+            error[end] = 0;
+        }
+    });
+}
+
+/// Runs a body so that neither an error nor a panic leaves it but as a status.
+fn guarded(body: impl FnOnce() -> Result<(), Failure>) -> Status {
+    match catch_unwind(AssertUnwindSafe(body)) {
+        Ok(Ok(())) => {
+            tell(format_args!(""));
+            Status::Ok
+        }
+        Ok(Err(failure)) => {
+            match &failure {
+                Failure::Off => tell(format_args!("")),
+                Failure::Argument(what) => tell(format_args!("{what}")),
+                Failure::Wire(error) => tell(format_args!("{error}")),
+            }
+            failure.status()
+        }
+        Err(_) => {
+            tell(format_args!("an internal fault of the adapter, which was caught"));
+            Status::Internal
+        }
+    }
+}
+
+/// Version of the interface.
+#[unsafe(no_mangle)]
+pub extern "C" fn rw_version() -> u32 {
+    VERSION
+}
+
+/// Why this thread's last call failed.
+#[unsafe(no_mangle)]
+pub extern "C" fn rw_error() -> *const c_char {
+    ERROR.try_with(|error| error.as_ptr().cast::<c_char>().cast_const()).unwrap_or(c"".as_ptr())
+}
+
+/// Begins a description.
+#[unsafe(no_mangle)]
+pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
+    let mut made = std::ptr::null_mut();
+    guarded(|| {
+        if !(2..=3).contains(&dimensions) {
+            return Err(Failure::Argument("dimensions: accepted: 2 or 3"));
+        }
+        made = Box::into_raw(Box::new(RwDescription {
+            geometry: Geometry::Cartesian,
+            axes: vec![None; dimensions as usize],
+            block: None,
+            time_unit: "s".into(),
+            slots: DEFAULT_SLOTS,
+            wait: Duration::ZERO,
+        }));
+        Ok(())
+    });
+    made
+}
+
+/// Ends a description.
+///
+/// # Safety
+/// `description` is null, or came from [`rw_describe`] and was not freed.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
+    guarded(|| {
+        if !description.is_null() {
+            // SAFETY: the caller's promise.
+            drop(unsafe { Box::from_raw(description) });
+        }
+        Ok(())
+    });
+}
+
+/// # Safety
+/// `description` is null or points to a description that nobody else uses.
+unsafe fn describe(description: *mut RwDescription, change: impl FnOnce(&mut RwDescription) -> Result<(), Failure>) -> Status {
+    // SAFETY: the caller's promise.
+    guarded(|| change(unsafe { description.as_mut() }.ok_or(Failure::Argument("description: null"))?))
+}
+
+fn set_axis(description: &mut RwDescription, axis: u32, mut given: AxisDescription, period: f64) -> Result<(), Failure> {
+    const NAMES: [&str; 3] = ["x", "y", "z"];
+    given.period = (period != 0.0).then_some(period);
+    given.name = NAMES.get(axis as usize).copied().unwrap_or_default().into();
+    let place = description.axes.get_mut(axis as usize).ok_or(Failure::Argument("axis: accepted: below the number of dimensions"))?;
+    *place = Some(given);
+    Ok(())
+}
+
+/// Longest axis that is accepted.
+const AXIS_NODES: u64 = 1 << 20;
+
+/// A uniform axis.
+///
+/// # Safety
+/// `description` is null or a description that no other thread uses.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_uniform(
+    description: *mut RwDescription,
+    axis: u32,
+    first: f64,
+    last: f64,
+    nodes: u64,
+    period: f64,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, |d| set_axis(d, axis, AxisDescription::uniform("", "", first, last, nodes), period)) }
+}
+
+/// An axis with its own coordinates.
+///
+/// # Safety
+/// As [`rw_describe_uniform`]; `coordinates` points to `nodes` numbers.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_rectilinear(
+    description: *mut RwDescription,
+    axis: u32,
+    coordinates: *const f64,
+    nodes: u64,
+    period: f64,
+) -> Status {
+    let change = |d: &mut RwDescription| {
+        if coordinates.is_null() || nodes > AXIS_NODES {
+            return Err(Failure::Argument("coordinates: accepted: at most 1048576 numbers"));
+        }
+        // SAFETY: the caller's promise, for a number of nodes that was checked.
+        let coordinates = unsafe { std::slice::from_raw_parts(coordinates, nodes as usize) }.to_vec();
+        set_axis(d, axis, AxisDescription { name: String::new(), unit: String::new(), coordinates, period: None }, period)
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// Longitude and latitude on a sphere.
+///
+/// # Safety
+/// As [`rw_describe_uniform`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_sphere(description: *mut RwDescription, radius: f64) -> Status {
+    let change = |d: &mut RwDescription| {
+        d.geometry = Geometry::Sphere { radius };
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// A block of the global grid.
+///
+/// # Safety
+/// As [`rw_describe_uniform`]; `offset` and `extent` point to a number a dimension.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_block(
+    description: *mut RwDescription,
+    index: u32,
+    count: u32,
+    offset: *const u64,
+    extent: *const u64,
+) -> Status {
+    let change = |d: &mut RwDescription| {
+        if offset.is_null() || extent.is_null() {
+            return Err(Failure::Argument("offset, extent: null"));
+        }
+        let dimensions = d.axes.len();
+        let of = |numbers: *const u64, beyond: u64| {
+            std::array::from_fn(|k| {
+                if k >= dimensions {
+                    return beyond;
+                }
+                // SAFETY: a number a dimension, by the caller's promise.
+                unsafe { *numbers.add(k) }
+            })
+        };
+        d.block = Some(BlockExtent { index, count, offset: of(offset, 0), extent: of(extent, 1) });
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// Unit of the times.
+///
+/// # Safety
+/// As [`rw_describe_uniform`]; `unit` is null or ends with a zero.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, unit: *const c_char) -> Status {
+    let change = |d: &mut RwDescription| {
+        if unit.is_null() {
+            return Err(Failure::Argument("unit: null"));
+        }
+        // SAFETY: the caller's promise.
+        let unit = unsafe { CStr::from_ptr(unit) };
+        d.time_unit = unit.to_str().map_err(|_| Failure::Argument("unit: not UTF-8"))?.to_owned();
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// Steps that the ring holds.
+///
+/// # Safety
+/// As [`rw_describe_uniform`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_slots(description: *mut RwDescription, slots: u32) -> Status {
+    let change = |d: &mut RwDescription| {
+        d.slots = slots;
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// The waiting policy.
+///
+/// # Safety
+/// As [`rw_describe_uniform`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milliseconds: u32) -> Status {
+    let change = |d: &mut RwDescription| {
+        d.wait = Duration::from_millis(milliseconds.into());
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
+/// Opens a ring.
+///
+/// # Safety
+/// `ring` is null or ends with a zero; `description` is null or a description; `field` is null or may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
+    guarded(|| {
+        // SAFETY: the caller's promise.
+        let field = unsafe { field.as_mut() }.ok_or(Failure::Argument("field: null"))?;
+        *field = std::ptr::null_mut();
+        let ring = if ring.is_null() {
+            PathBuf::from(std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).ok_or(Failure::Off)?)
+        } else {
+            use std::os::unix::ffi::OsStrExt;
+            // SAFETY: the caller's promise.
+            PathBuf::from(std::ffi::OsStr::from_bytes(unsafe { CStr::from_ptr(ring) }.to_bytes()))
+        };
+        // SAFETY: the caller's promise.
+        let given = unsafe { description.as_ref() }.ok_or(Failure::Argument("description: null"))?;
+        let axes: Option<Vec<_>> = given.axes.iter().cloned().collect();
+        let axes = axes.ok_or(Failure::Argument("description: an axis is missing"))?;
+        let mut description = Description::whole(given.geometry, axes, &given.time_unit);
+        if let Some(block) = given.block {
+            description.block = block;
+        }
+        let (dimensions, extent) = (description.components(), description.block.extent);
+        let policy = if given.wait.is_zero() { Policy::NewestWins } else { Policy::Wait(given.wait) };
+        let producer = Producer::open(&ring, description, given.slots, policy)?;
+        let (published, overwrote) = (AtomicU64::new(0), AtomicU64::new(0));
+        *field = Box::into_raw(Box::new(RwField { producer, dimensions, extent, published, overwrote }));
+        Ok(())
+    })
+}
+
+/// # Safety
+/// `field` is null or open; the components and strides are those of the header.
+unsafe fn publish(
+    field: *const RwField,
+    step: u64,
+    time: f64,
+    components: [*const u8; 3],
+    element: Element,
+    strides: Option<*const i64>,
+) -> Status {
+    guarded(|| {
+        // SAFETY: the caller's promise.
+        let field = unsafe { field.as_ref() }.ok_or(Failure::Off)?;
+        let components = &components[..field.dimensions];
+        let mut values = Field::packed(components, element, field.extent);
+        if let Some(strides) = strides {
+            if strides.is_null() {
+                return Err(Failure::Argument("strides: null"));
+            }
+            for k in 0..field.dimensions {
+                // SAFETY: a stride a dimension, by the caller's promise.
+                values.strides[k] = unsafe { *strides.add(k) } as isize;
+            }
+        }
+        // SAFETY: the caller's promise.
+        let published = unsafe { field.producer.publish(step, time, &values) }?;
+        field.published.fetch_max(published.count, Ordering::Relaxed);
+        field.overwrote.fetch_add(u64::from(published.overwrote), Ordering::Relaxed);
+        Ok(())
+    })
+}
+
+/// Packed components, f32.
+///
+/// # Safety
+/// `field` is null or open; each component has a value a node of the block.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_publish_f32(field: *mut RwField, step: u64, time: f64, u: *const f32, v: *const f32, w: *const f32) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, None) }
+}
+
+/// Packed components, f64.
+///
+/// # Safety
+/// As [`rw_publish_f32`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_publish_f64(field: *mut RwField, step: u64, time: f64, u: *const f64, v: *const f64, w: *const f64) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, None) }
+}
+
+/// Any strides, f32.
+///
+/// # Safety
+/// As [`rw_publish_f32`], for the values that the strides speak of; a stride a dimension.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_publish_strided_f32(
+    field: *mut RwField,
+    step: u64,
+    time: f64,
+    u: *const f32,
+    v: *const f32,
+    w: *const f32,
+    strides: *const i64,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, Some(strides)) }
+}
+
+/// Any strides, f64.
+///
+/// # Safety
+/// As [`rw_publish_strided_f32`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_publish_strided_f64(
+    field: *mut RwField,
+    step: u64,
+    time: f64,
+    u: *const f64,
+    v: *const f64,
+    w: *const f64,
+    strides: *const i64,
+) -> Status {
+    // SAFETY: the caller's promise.
+    unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, Some(strides)) }
+}
+
+/// Steps published and overwritten.
+///
+/// # Safety
+/// `field` is null or open; the others are null or may be written.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u64, overwrote: *mut u64) -> Status {
+    guarded(|| {
+        // SAFETY: the caller's promise, here and below.
+        let field = unsafe { field.as_ref() }.ok_or(Failure::Off)?;
+        for (to, from) in [(published, &field.published), (overwrote, &field.overwrote)] {
+            // SAFETY: as above.
+            if let Some(to) = unsafe { to.as_mut() } {
+                *to = from.load(Ordering::Relaxed);
+            }
+        }
+        Ok(())
+    })
+}
+
+/// Ends a ring.
+///
+/// # Safety
+/// `field` is null, or open and in no other thread's hands.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_close(field: *mut RwField) -> Status {
+    guarded(|| {
+        if field.is_null() {
+            return Err(Failure::Off);
+        }
+        // SAFETY: the caller's promise.
+        drop(unsafe { Box::from_raw(field) });
+        Ok(())
+    })
+}

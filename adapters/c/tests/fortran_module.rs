@@ -1,0 +1,59 @@
+//! The Fortran module, compiled with gfortran and run: what arrives is what column-major arrays hold.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch_wire::{Following, Limits, Read, RingReader};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+fn fortran() -> bool {
+    Command::new("gfortran").arg("--version").output().is_ok_and(|out| out.status.success())
+}
+
+#[test]
+fn fortran_arrays_arrive_as_they_are() {
+    if !fortran() {
+        println!("NOT RUN: the Fortran module, since gfortran is not installed");
+        return;
+    }
+    let build = std::env::temp_dir().join(format!("rw-fortran-{}", std::process::id()));
+    std::fs::create_dir_all(&build).unwrap();
+    let ring = PathBuf::from("/dev/shm").join(format!("rw-fortran-{}", std::process::id()));
+    let library = std::env::current_exe().unwrap().parent().unwrap().to_owned();
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fortran");
+    let program = build.join("test");
+    let out = Command::new("gfortran")
+        .current_dir(&build)
+        .args(["-std=f2018", "-O1", "-fcheck=all", "-Wall", "-Wextra", "-Werror", "-Wno-error=unused-parameter"])
+        .arg(source.join("ridgewatch.f90"))
+        .arg(source.join("test.f90"))
+        .arg("-o")
+        .arg(&program)
+        .arg("-L")
+        .arg(&library)
+        .arg("-lridgewatch_adapter")
+        .output()
+        .unwrap();
+    assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+    let following = Following::begin(&ring).unwrap();
+    let out = Command::new(&program).env("LD_LIBRARY_PATH", &library).env("RIDGEWATCH_RING", &ring).output().unwrap();
+    assert!(out.status.success(), "{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+    let mut reader = RingReader::open(&ring, 0, &Limits::default()).unwrap();
+    let axes = &reader.header().description.axes;
+    assert_eq!((axes[1].coordinates.as_slice(), axes[2].period), (&[0.0, 1.0, 4.0][..], Some(5.0)));
+    let mut values = Vec::new();
+    for (step, time) in [(1, 0.5), (2, 1.5)] {
+        let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step {step}") };
+        assert_eq!((info.step, info.time), (step, time));
+        for c in 0..3usize {
+            for (i, j, k) in (0..24usize).map(|n| (n % 4, n / 4 % 3, n / 12)) {
+                let expected = (c + 1) * ((i + 1) + 10 * (j + 1) + 100 * (k + 1));
+                assert_eq!(values[c * 24 + i + 4 * (j + 3 * k)], expected as f32, "step {step}, component {c} at {i} {j} {k}");
+            }
+        }
+    }
+    assert_eq!(reader.read(&mut values).unwrap(), Read::Ended);
+    drop(following);
+    std::fs::remove_dir_all(&build).unwrap();
+    assert!(!ring.exists());
+}

@@ -1,0 +1,466 @@
+!> Publishes a Fortran solver's velocity to ridgewatch: a module over the C library (ridgewatch.h says what each call does).
+!>
+!>     use ridgewatch
+!>     type(rw_publisher) :: publisher
+!>     call publisher%begin(2)                             ! dimensions
+!>     call publisher%uniform(1, 0d0, 1d0, nx)             ! axis, first node, last node, nodes (and: period)
+!>     call publisher%uniform(2, 0d0, 1d0, ny)
+!>     call publisher%open(status)                         ! where RIDGEWATCH_RING says; rw_off where it is not set
+!>     call publisher%publish(step, time, u, v, status)    ! u(nx, ny), real32 or real64, any section of an array
+!>     call publisher%close()
+!>
+!> Errors never stop the solver: a call without `status` passes over them, and rw_message() has the words.
+module ridgewatch
+  use, intrinsic :: iso_c_binding
+  use, intrinsic :: iso_fortran_env, only: real32, real64, int64
+  implicit none
+  private
+  public :: rw_publisher, rw_message, rw_ok, rw_off, rw_argument, rw_in_use, rw_no_space, rw_foreign, rw_system, &
+            rw_forked, rw_internal
+
+  integer, parameter :: rw_ok = 0, rw_off = 1, rw_argument = 2, rw_in_use = 3, rw_no_space = 4, rw_foreign = 5, rw_system = 6, &
+                        rw_forked = 7, rw_internal = 8
+
+  !> A grid while it is described, then an open ring.
+  type :: rw_publisher
+    private
+    integer :: dimensions = 0
+    type(c_ptr) :: description = c_null_ptr, field = c_null_ptr
+    integer(c_int64_t) :: extent(3) = 1
+  contains
+    procedure :: begin => publisher_begin
+    procedure :: uniform => publisher_uniform
+    procedure :: rectilinear => publisher_rectilinear
+    procedure :: sphere => publisher_sphere
+    procedure :: block => publisher_block
+    procedure :: slots => publisher_slots
+    procedure :: wait => publisher_wait
+    procedure :: open => publisher_open
+    procedure :: close => publisher_close
+    procedure, private :: publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
+    generic :: publish => publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
+  end type
+
+  interface
+    function c_describe(dimensions) bind(c, name="rw_describe")
+      import
+      integer(c_int32_t), value :: dimensions
+      type(c_ptr) :: c_describe
+    end function
+    subroutine c_free(description) bind(c, name="rw_free_description")
+      import
+      type(c_ptr), value :: description
+    end subroutine
+    function c_uniform(description, axis, first, last, nodes, period) bind(c, name="rw_describe_uniform")
+      import
+      type(c_ptr), value :: description
+      integer(c_int32_t), value :: axis
+      real(c_double), value :: first, last, period
+      integer(c_int64_t), value :: nodes
+      integer(c_int) :: c_uniform
+    end function
+    function c_rectilinear(description, axis, coordinates, nodes, period) bind(c, name="rw_describe_rectilinear")
+      import
+      type(c_ptr), value :: description
+      integer(c_int32_t), value :: axis
+      real(c_double), intent(in) :: coordinates(*)
+      integer(c_int64_t), value :: nodes
+      real(c_double), value :: period
+      integer(c_int) :: c_rectilinear
+    end function
+    function c_sphere(description, radius) bind(c, name="rw_describe_sphere")
+      import
+      type(c_ptr), value :: description
+      real(c_double), value :: radius
+      integer(c_int) :: c_sphere
+    end function
+    function c_block(description, index, count, offset, extent) bind(c, name="rw_describe_block")
+      import
+      type(c_ptr), value :: description
+      integer(c_int32_t), value :: index, count
+      integer(c_int64_t), intent(in) :: offset(*), extent(*)
+      integer(c_int) :: c_block
+    end function
+    function c_slots(description, slots) bind(c, name="rw_describe_slots")
+      import
+      type(c_ptr), value :: description
+      integer(c_int32_t), value :: slots
+      integer(c_int) :: c_slots
+    end function
+    function c_wait(description, milliseconds) bind(c, name="rw_describe_wait")
+      import
+      type(c_ptr), value :: description
+      integer(c_int32_t), value :: milliseconds
+      integer(c_int) :: c_wait
+    end function
+    function c_open(ring, description, field) bind(c, name="rw_open")
+      import
+      type(c_ptr), value :: ring, description
+      type(c_ptr), intent(out) :: field
+      integer(c_int) :: c_open
+    end function
+    function c_strided_f32(field, step, time, u, v, w, strides) bind(c, name="rw_publish_strided_f32")
+      import
+      type(c_ptr), value :: field, u, v, w
+      integer(c_int64_t), value :: step
+      real(c_double), value :: time
+      integer(c_int64_t), intent(in) :: strides(*)
+      integer(c_int) :: c_strided_f32
+    end function
+    function c_strided_f64(field, step, time, u, v, w, strides) bind(c, name="rw_publish_strided_f64")
+      import
+      type(c_ptr), value :: field, u, v, w
+      integer(c_int64_t), value :: step
+      real(c_double), value :: time
+      integer(c_int64_t), intent(in) :: strides(*)
+      integer(c_int) :: c_strided_f64
+    end function
+    function c_close(field) bind(c, name="rw_close")
+      import
+      type(c_ptr), value :: field
+      integer(c_int) :: c_close
+    end function
+    function c_error() bind(c, name="rw_error")
+      import
+      type(c_ptr) :: c_error
+    end function
+    function c_strlen(text) bind(c, name="strlen")
+      import
+      type(c_ptr), value :: text
+      integer(c_size_t) :: c_strlen
+    end function
+  end interface
+
+contains
+
+  !> Why the last call of this thread failed.
+  function rw_message() result(message)
+    character(:), allocatable :: message
+    character(c_char), pointer :: letters(:)
+    type(c_ptr) :: text
+    integer :: i
+    text = c_error()
+    call c_f_pointer(text, letters, [c_strlen(text)])
+    allocate (character(size(letters)) :: message)
+    do i = 1, size(letters)
+      message(i:i) = letters(i)
+    end do
+  end function
+
+  subroutine give(found, status)
+    integer, intent(in) :: found
+    integer, intent(out), optional :: status
+    if (present(status)) status = found
+  end subroutine
+
+  !> Begins the description of a grid of 2 or 3 dimensions; an open ring is closed.
+  subroutine publisher_begin(self, dimensions, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: dimensions
+    integer, intent(out), optional :: status
+    call publisher_close(self)
+    self%description = c_describe(int(dimensions, c_int32_t))
+    self%dimensions = dimensions
+    call give(merge(rw_ok, rw_argument, c_associated(self%description)), status)
+  end subroutine
+
+  !> Axis 1, 2 or 3 of evenly spaced nodes of the global grid. period: length after which it repeats.
+  subroutine publisher_uniform(self, axis, first, last, nodes, period, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: axis, nodes
+    real(real64), intent(in) :: first, last
+    real(real64), intent(in), optional :: period
+    integer, intent(out), optional :: status
+    real(real64) :: repeats
+    repeats = 0
+    if (present(period)) repeats = period
+    call give(c_uniform(self%description, int(axis - 1, c_int32_t), first, last, int(nodes, c_int64_t), repeats), status)
+    if (axis >= 1 .and. axis <= 3) self%extent(axis) = nodes
+  end subroutine
+
+  !> Axis 1, 2 or 3 with its own coordinates, strictly ascending.
+  subroutine publisher_rectilinear(self, axis, coordinates, period, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: axis
+    real(real64), intent(in) :: coordinates(:)
+    real(real64), intent(in), optional :: period
+    integer, intent(out), optional :: status
+    real(real64) :: repeats
+    real(real64), allocatable :: packed(:)
+    repeats = 0
+    if (present(period)) repeats = period
+    allocate (packed, source=coordinates)
+    call give(c_rectilinear(self%description, int(axis - 1, c_int32_t), packed, size(packed, kind=c_int64_t), repeats), status)
+    if (axis >= 1 .and. axis <= 3) self%extent(axis) = size(packed)
+  end subroutine
+
+  !> Axes 1 and 2 are longitude and latitude in degrees.
+  subroutine publisher_sphere(self, radius, status)
+    class(rw_publisher), intent(inout) :: self
+    real(real64), intent(in) :: radius
+    integer, intent(out), optional :: status
+    call give(c_sphere(self%description, radius), status)
+  end subroutine
+
+  !> This process has nodes first .. first + extent - 1 (from 1) along each axis; it is block index (from 0) of count.
+  subroutine publisher_block(self, index, count, first, extent, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: index, count, first(:), extent(:)
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: offset(3), nodes(3)
+    if (size(first) < self%dimensions .or. size(extent) < self%dimensions) then
+      call give(rw_argument, status)
+      return
+    end if
+    offset = 0
+    nodes = 1
+    offset(:self%dimensions) = first(:self%dimensions) - 1
+    nodes(:self%dimensions) = extent(:self%dimensions)
+    self%extent = nodes
+    call give(c_block(self%description, int(index, c_int32_t), int(count, c_int32_t), offset, nodes), status)
+  end subroutine
+
+  !> Steps that the ring holds.
+  subroutine publisher_slots(self, slots, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: slots
+    integer, intent(out), optional :: status
+    call give(c_slots(self%description, int(slots, c_int32_t)), status)
+  end subroutine
+
+  !> Waits for ridgewatch so many milliseconds at most; 0: never.
+  subroutine publisher_wait(self, milliseconds, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(in) :: milliseconds
+    integer, intent(out), optional :: status
+    call give(c_wait(self%description, int(milliseconds, c_int32_t)), status)
+  end subroutine
+
+  !> Opens the ring in a folder; without one, where RIDGEWATCH_RING says, and rw_off where it is not set.
+  subroutine publisher_open(self, status, ring)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(out), optional :: status
+    character(*), intent(in), optional :: ring
+    character(kind=c_char), allocatable, target :: path(:)
+    integer :: i, found
+    if (present(ring)) then
+      allocate (path(len_trim(ring) + 1))
+      do i = 1, len_trim(ring)
+        path(i) = ring(i:i)
+      end do
+      path(size(path)) = c_null_char
+      found = c_open(c_loc(path), self%description, self%field)
+    else
+      found = c_open(c_null_ptr, self%description, self%field)
+    end if
+    call give(found, status)
+  end subroutine
+
+  !> Ends the ring; harmless where there is none.
+  subroutine publisher_close(self, status)
+    class(rw_publisher), intent(inout) :: self
+    integer, intent(out), optional :: status
+    integer :: found
+    found = rw_off
+    if (c_associated(self%field)) found = c_close(self%field)
+    call c_free(self%description)
+    self%field = c_null_ptr
+    self%description = c_null_ptr
+    call give(found, status)
+  end subroutine
+
+  ! Strides of an array section are the distances of its elements' addresses: no copy is made of it. An extent of 1 has no distance.
+
+  subroutine publish_2_real32(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer, intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:,:), v(:,:)
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: strides(3)
+    if (.not. c_associated(self%field)) then
+      call give(rw_off, status)
+      return
+    end if
+    if (self%dimensions /= 2 .or. any(shape(u) /= self%extent(:2)) .or. any(shape(v) /= self%extent(:2))) then
+      call give(rw_argument, status)
+      return
+    end if
+    strides = 1
+    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 4
+    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 4
+    if (size(v, 1) > 1) then
+      if (strides(1) /= (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 2) > 1) then
+      if (strides(2) /= (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    call give(c_strided_f32(self%field, int(step, c_int64_t), time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+  end subroutine
+
+  subroutine publish_2_real64(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer, intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:,:), v(:,:)
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: strides(3)
+    if (.not. c_associated(self%field)) then
+      call give(rw_off, status)
+      return
+    end if
+    if (self%dimensions /= 2 .or. any(shape(u) /= self%extent(:2)) .or. any(shape(v) /= self%extent(:2))) then
+      call give(rw_argument, status)
+      return
+    end if
+    strides = 1
+    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 8
+    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 8
+    if (size(v, 1) > 1) then
+      if (strides(1) /= (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 2) > 1) then
+      if (strides(2) /= (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    call give(c_strided_f64(self%field, int(step, c_int64_t), time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+  end subroutine
+
+  subroutine publish_3_real32(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer, intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: strides(3)
+    if (.not. c_associated(self%field)) then
+      call give(rw_off, status)
+      return
+    end if
+    if (self%dimensions /= 3 .or. any(shape(u) /= self%extent(:3)) .or. any(shape(v) /= self%extent(:3)) &
+        .or. any(shape(w) /= self%extent(:3))) then
+      call give(rw_argument, status)
+      return
+    end if
+    strides = 1
+    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(u, 3) > 1) strides(3) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(v, 1) > 1) then
+      if (strides(1) /= (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 2) > 1) then
+      if (strides(2) /= (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 3) > 1) then
+      if (strides(3) /= (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 1) > 1) then
+      if (strides(1) /= (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 2) > 1) then
+      if (strides(2) /= (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 3) > 1) then
+      if (strides(3) /= (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 4) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    call give(c_strided_f32(self%field, int(step, c_int64_t), time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
+        1)), strides), status)
+  end subroutine
+
+  subroutine publish_3_real64(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer, intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: strides(3)
+    if (.not. c_associated(self%field)) then
+      call give(rw_off, status)
+      return
+    end if
+    if (self%dimensions /= 3 .or. any(shape(u) /= self%extent(:3)) .or. any(shape(v) /= self%extent(:3)) &
+        .or. any(shape(w) /= self%extent(:3))) then
+      call give(rw_argument, status)
+      return
+    end if
+    strides = 1
+    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(u, 3) > 1) strides(3) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(v, 1) > 1) then
+      if (strides(1) /= (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 2) > 1) then
+      if (strides(2) /= (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(v, 3) > 1) then
+      if (strides(3) /= (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 1) > 1) then
+      if (strides(1) /= (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 2) > 1) then
+      if (strides(2) /= (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    if (size(w, 3) > 1) then
+      if (strides(3) /= (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 8) then
+        call give(rw_argument, status)
+        return
+      end if
+    end if
+    call give(c_strided_f64(self%field, int(step, c_int64_t), time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
+        1)), strides), status)
+  end subroutine
+
+  pure function address(pointer)
+    type(c_ptr), intent(in) :: pointer
+    integer(c_int64_t) :: address
+    address = transfer(pointer, address)
+  end function
+
+end module

@@ -1,0 +1,65 @@
+!> Each kind of call once, with values that the test behind it knows: u = i + 10 j + 100 k, v = 2 u, w = 3 u.
+program test
+  use, intrinsic :: iso_fortran_env, only: real32, real64
+  use ridgewatch
+  implicit none
+  type(rw_publisher) :: publisher, second
+  real(real32) :: u32(4, 3, 2), v32(4, 3, 2), w32(4, 3, 2)
+  real(real64) :: u64(0:5, 8, 2), v64(0:5, 8, 2), w64(0:5, 8, 2), plane(4, 3)
+  character(:), allocatable :: message
+  integer :: i, j, k, status
+
+  call publisher%begin(3)
+  call publisher%uniform(1, 0d0, 3d0, 4)
+  call publisher%rectilinear(2, [0d0, 1d0, 4d0])
+  call publisher%uniform(3, 0d0, 1d0, 2, period=5d0)
+  call publisher%slots(8)
+  call publisher%open(status)
+  call want(status == rw_ok, 1)
+  do k = 1, 2
+    do j = 1, 3
+      do i = 1, 4
+        u32(i, j, k) = i + 10 * j + 100 * k
+        ! Every second row, ghost cells beside.
+        u64(i, 2 * j, k) = u32(i, j, k)
+      end do
+    end do
+  end do
+  v32 = 2 * u32
+  w32 = 3 * u32
+  v64 = 2 * u64
+  w64 = 3 * u64
+  call publisher%publish(1, 0.5d0, u32, v32, w32, status)
+  call want(status == rw_ok, 2)
+  call publisher%publish(2, 1.5d0, u64(1:4, 2:6:2, :), v64(1:4, 2:6:2, :), w64(1:4, 2:6:2, :), status)
+  call want(status == rw_ok, 3)
+  ! Wrong shapes, wrong rank, different strides: refused, and nothing is read.
+  call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
+  call want(status == rw_argument, 4)
+  plane = 0
+  call publisher%publish(3, 2d0, plane, plane, status)
+  call want(status == rw_argument, 5)
+  call publisher%publish(3, 2d0, u64(1:4, 2:6:2, :), v64(1:4, 1:3, :), w64(1:4, 1:3, :), status)
+  call want(status == rw_argument, 6)
+  call second%begin(2)
+  call second%uniform(1, 0d0, 1d0, 4)
+  call second%uniform(2, 0d0, 1d0, 4)
+  call second%open(status)
+  message = rw_message()
+  call want(status == rw_in_use .and. index(message, "another producer") > 0, 7)
+  call second%publish(0, 0d0, plane, plane, status)
+  call want(status == rw_off, 8)
+  call second%close()
+  call publisher%close(status)
+  call want(status == rw_ok, 9)
+
+contains
+
+  subroutine want(holds, line)
+    logical, intent(in) :: holds
+    integer, intent(in) :: line
+    if (holds) return
+    print *, "check ", line, " failed: ", rw_message()
+    error stop 1
+  end subroutine
+end program

@@ -1,0 +1,52 @@
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Literal, Self
+
+import numpy as np
+import numpy.typing as npt
+
+Field = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+
+class RidgewatchError(Exception):
+    """The ring could not be opened, or a step was refused."""
+
+class Publisher:
+    def __init__(
+        self,
+        x: npt.ArrayLike,
+        y: npt.ArrayLike,
+        z: npt.ArrayLike | None = None,
+        *,
+        ring: str | None = None,
+        periods: Sequence[float | None] | None = None,
+        radius: float | None = None,
+        block: tuple[int, int, Sequence[int], Sequence[int]] | None = None,
+        slots: int = 4,
+        wait_ms: int = 0,
+        time_unit: str = "s",
+        order: Literal["zyx", "xyz"] = "zyx",
+    ) -> None:
+        """Opens a ring for the global grid of these coordinates (ascending; uneven ones are welcome).
+
+        ring: its folder; without it that of RIDGEWATCH_RING, and nothing is published where that is not set.
+        periods: length after which each axis repeats, None where it does not.
+        radius: x and y are longitude and latitude in degrees on a sphere of this radius.
+        block: (index, count, offset, extent) of this process's part, nodes along x, y, z.
+        slots: steps that the ring holds. wait_ms: how long to wait for ridgewatch; 0: never.
+        order: of the arrays' axes: "zyx" is [z, y, x], "xyz" is [x, y, z].
+        """
+
+    def publish(self, step: int, time: float, u: Field, v: Field, w: Field | None = None) -> bool:
+        """Copies a step into the ring; False where publishing is off. The arrays have one shape, dtype and strides."""
+
+    def close(self) -> None: ...
+    @property
+    def is_open(self) -> bool: ...
+    @property
+    def published(self) -> int: ...
+    @property
+    def overwrote(self) -> int:
+        """Steps that overwrote one that ridgewatch had not taken."""
+
+    def __enter__(self) -> Self: ...
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...

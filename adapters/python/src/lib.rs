@@ -1,0 +1,207 @@
+//! The Python module over [`ridgewatch_wire::Producer`]: arrays come in by the buffer protocol, without a copy.
+
+use pyo3::buffer::{Element as BufferElement, PyBuffer};
+use pyo3::exceptions::{PyException, PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE};
+use std::path::PathBuf;
+use std::time::Duration;
+
+pyo3::create_exception!(_core, RidgewatchError, PyException, "The ring could not be opened, or a step was refused.");
+
+fn refused(error: ridgewatch_wire::WireError) -> PyErr {
+    RidgewatchError::new_err(error.to_string())
+}
+
+/// Publishes into a ring.
+#[pyclass]
+struct Publisher {
+    producer: Option<Producer>,
+    dimensions: usize,
+    reversed: bool,
+    published: u64,
+    overwrote: u64,
+}
+
+/// One component as it lies in memory.
+struct Array {
+    /// As a number, so that other threads may run while it is read.
+    address: usize,
+    element: Element,
+    /// In elements, along x, y, z.
+    strides: [isize; 3],
+    /// Nodes along x, y, z.
+    shape: [u64; 3],
+    /// Keeps the array where it is.
+    _buffer: Held,
+}
+
+enum Held {
+    #[allow(dead_code)]
+    F32(PyBuffer<f32>),
+    #[allow(dead_code)]
+    F64(PyBuffer<f64>),
+}
+
+impl Array {
+    fn of<T: BufferElement>(buffer: PyBuffer<T>, element: Element, reversed: bool, held: impl FnOnce(PyBuffer<T>) -> Held) -> PyResult<Self> {
+        let count = buffer.dimensions();
+        if !(2..=3).contains(&count) {
+            return Err(PyValueError::new_err(format!("an array of {count} dimensions; accepted: 2 or 3")));
+        }
+        let (mut shape, mut strides) = ([1; 3], [0; 3]);
+        for k in 0..count {
+            let axis = if reversed { count - 1 - k } else { k };
+            shape[k] = buffer.shape()[axis] as u64;
+            let bytes = buffer.strides()[axis];
+            if bytes % size_of::<T>() as isize != 0 {
+                return Err(PyValueError::new_err("the array's strides are no whole numbers of its elements"));
+            }
+            strides[k] = bytes / size_of::<T>() as isize;
+        }
+        Ok(Self { address: buffer.buf_ptr() as usize, element, strides, shape, _buffer: held(buffer) })
+    }
+
+    fn new(given: &Bound<'_, PyAny>, reversed: bool) -> PyResult<Self> {
+        if let Ok(buffer) = PyBuffer::<f32>::get(given) {
+            return Self::of(buffer, Element::F32, reversed, Held::F32);
+        }
+        match PyBuffer::<f64>::get(given) {
+            Ok(buffer) => Self::of(buffer, Element::F64, reversed, Held::F64),
+            Err(_) => Err(PyTypeError::new_err("accepted: NumPy arrays of float32 or float64")),
+        }
+    }
+}
+
+fn coordinates(given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
+    if let Ok(buffer) = PyBuffer::<f64>::get(given) {
+        return buffer.to_vec(given.py());
+    }
+    given.try_iter()?.map(|item| item?.extract::<f64>()).collect()
+}
+
+#[pymethods]
+impl Publisher {
+    #[new]
+    #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, slots=4, wait_ms=0, time_unit="s", order="zyx"))]
+    #[allow(clippy::too_many_arguments)]
+    fn new(
+        x: &Bound<'_, PyAny>,
+        y: &Bound<'_, PyAny>,
+        z: Option<&Bound<'_, PyAny>>,
+        ring: Option<PathBuf>,
+        periods: Option<Vec<Option<f64>>>,
+        radius: Option<f64>,
+        block: Option<(u32, u32, Vec<u64>, Vec<u64>)>,
+        slots: u32,
+        wait_ms: u64,
+        time_unit: &str,
+        order: &str,
+    ) -> PyResult<Self> {
+        let reversed = match order {
+            "zyx" => true,
+            "xyz" => false,
+            other => return Err(PyValueError::new_err(format!("order {other:?}; accepted: \"zyx\", \"xyz\""))),
+        };
+        let given: Vec<&Bound<'_, PyAny>> = [Some(x), Some(y), z].into_iter().flatten().collect();
+        let mut axes = Vec::new();
+        for (name, given) in ["x", "y", "z"].into_iter().zip(&given) {
+            axes.push(AxisDescription { name: name.into(), unit: String::new(), coordinates: coordinates(given)?, period: None });
+        }
+        if let Some(periods) = periods {
+            if periods.len() != axes.len() {
+                return Err(PyValueError::new_err(format!("{} periods; accepted: {}, one an axis", periods.len(), axes.len())));
+            }
+            axes.iter_mut().zip(periods).for_each(|(axis, period)| axis.period = period);
+        }
+        let dimensions = axes.len();
+        let geometry = radius.map_or(Geometry::Cartesian, |radius| Geometry::Sphere { radius });
+        let mut description = Description::whole(geometry, axes, time_unit);
+        if let Some((index, count, offset, extent)) = block {
+            if offset.len() != dimensions || extent.len() != dimensions {
+                return Err(PyValueError::new_err(format!("block: accepted: {dimensions} offsets and extents")));
+            }
+            let of = |numbers: &[u64], beyond| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(beyond));
+            description.block = BlockExtent { index, count, offset: of(&offset, 0), extent: of(&extent, 1) };
+        }
+        let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+        let policy = if wait_ms == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(wait_ms)) };
+        let producer = match ring.or_else(named) {
+            Some(ring) => Some(Producer::open(&ring, description, slots, policy).map_err(refused)?),
+            None => None,
+        };
+        Ok(Self { producer, dimensions, reversed, published: 0, overwrote: 0 })
+    }
+
+    #[pyo3(signature = (step, time, u, v, w=None))]
+    fn publish(
+        &mut self,
+        py: Python<'_>,
+        step: u64,
+        time: f64,
+        u: &Bound<'_, PyAny>,
+        v: &Bound<'_, PyAny>,
+        w: Option<&Bound<'_, PyAny>>,
+    ) -> PyResult<bool> {
+        let Some(producer) = &self.producer else { return Ok(false) };
+        let given: Vec<&Bound<'_, PyAny>> = [Some(u), Some(v), w].into_iter().flatten().collect();
+        if given.len() != self.dimensions {
+            return Err(PyValueError::new_err(format!("{} components; accepted: {}, one an axis", given.len(), self.dimensions)));
+        }
+        let arrays = given.into_iter().map(|array| Array::new(array, self.reversed)).collect::<PyResult<Vec<_>>>()?;
+        let (extent, first) = (producer.description().block.extent, &arrays[0]);
+        for array in &arrays {
+            if array.shape != extent {
+                return Err(PyValueError::new_err(format!("an array of {:?} nodes along x, y, z; accepted: {extent:?}", array.shape)));
+            }
+            if array.strides != first.strides || array.element != first.element {
+                return Err(PyValueError::new_err("the components differ in dtype or strides; accepted: the same for all"));
+            }
+        }
+        let (addresses, element, strides): (Vec<usize>, _, _) = (arrays.iter().map(|a| a.address).collect(), first.element, first.strides);
+        // The buffers are held, so the arrays stay where they are; other threads of Python go on.
+        let published = py.detach(|| {
+            let components: Vec<*const u8> = addresses.iter().map(|address| *address as *const u8).collect();
+            // SAFETY: the buffers' shapes and strides were checked against the block's extent.
+            unsafe { producer.publish(step, time, &Field { components: &components, element, strides }) }
+        });
+        let published = published.map_err(refused)?;
+        self.published = published.count;
+        self.overwrote += u64::from(published.overwrote);
+        Ok(true)
+    }
+
+    fn close(&mut self) {
+        self.producer = None;
+    }
+
+    #[getter]
+    fn is_open(&self) -> bool {
+        self.producer.is_some()
+    }
+
+    #[getter]
+    fn published(&self) -> u64 {
+        self.published
+    }
+
+    #[getter]
+    fn overwrote(&self) -> u64 {
+        self.overwrote
+    }
+
+    fn __enter__(this: Py<Self>) -> Py<Self> {
+        this
+    }
+
+    #[pyo3(signature = (*_arguments))]
+    fn __exit__(&mut self, _arguments: &Bound<'_, pyo3::types::PyTuple>) {
+        self.close();
+    }
+}
+
+#[pymodule]
+fn _core(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Publisher>()?;
+    module.add("RidgewatchError", module.py().get_type::<RidgewatchError>())
+}

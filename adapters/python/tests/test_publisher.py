@@ -1,0 +1,86 @@
+"""The Python package, through the ring's bytes."""
+
+import os
+import shutil
+import struct
+import tempfile
+
+import numpy as np
+import pytest
+
+from ridgewatch_adapter import Publisher, RidgewatchError
+
+
+@pytest.fixture
+def ring(monkeypatch):
+    folder = tempfile.mkdtemp(prefix="rw-python-", dir="/dev/shm")
+    os.rmdir(folder)
+    monkeypatch.setenv("RIDGEWATCH_RING", folder)
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def newest(folder, shape):
+    """Number, time and components of the newest step, as docs/live.md lays the ring out."""
+    data = open(os.path.join(folder, "block-00000.ring"), "rb").read()
+    assert data[:8] == b"RIDGERNG"
+    slots, components, stride, first = struct.unpack_from("<IIQQ", data, 24)
+    (published,) = struct.unpack_from("<Q", data, 1024)
+    slot = first + (published - 1) % slots * stride
+    sequence, step, time = struct.unpack_from("<QQd", data, slot)
+    assert sequence == 2 * published
+    values = np.frombuffer(data, np.float32, components * int(np.prod(shape)), slot + 64)
+    return step, time, values.reshape(components, *shape)
+
+
+def test_arrays_arrive(ring):
+    x, y, z = np.linspace(0, 1, 4), np.array([0.0, 1.0, 4.0]), [0, 1]
+    field = np.random.default_rng(0).random((3, 2, 3, 4)).astype(np.float32)
+    with Publisher(x, y, z, periods=[4 / 3, None, None]) as publisher:
+        assert publisher.is_open
+        assert publisher.publish(7, 0.5, *field)
+        step, time, values = newest(ring, (2, 3, 4))
+        assert (step, time) == (7, 0.5) and np.array_equal(values, field)
+        # Doubles, interleaved, reversed.
+        double = np.ascontiguousarray(np.moveaxis(field.astype(np.float64), 0, -1))[::-1, :, :, :]
+        assert publisher.publish(8, 1.0, *(double[..., c] for c in range(3)))
+        assert np.array_equal(newest(ring, (2, 3, 4))[2], field[:, ::-1])
+        assert publisher.published == 2
+    assert not publisher.is_open and not os.path.exists(ring)
+
+
+def test_order_xyz(ring):
+    field = np.random.default_rng(1).random((2, 5, 3)).astype(np.float32)
+    with Publisher(np.arange(5.0), np.arange(3.0), order="xyz") as publisher:
+        publisher.publish(0, 0.0, field[0], field[1])
+        assert np.array_equal(newest(ring, (3, 5))[2], field.transpose(0, 2, 1))
+
+
+def test_refusals(ring):
+    x = np.arange(4.0)
+    good = np.zeros((4, 4), np.float32)
+    with pytest.raises(RidgewatchError, match="ascending"):
+        Publisher(x[::-1].copy(), x)
+    with pytest.raises(ValueError, match="order"):
+        Publisher(x, x, order="yx")
+    with Publisher(x, x) as publisher:
+        with pytest.raises(RidgewatchError, match="another producer"):
+            Publisher(x, x)
+        with pytest.raises(ValueError, match="components"):
+            publisher.publish(0, 0.0, good, good, good)
+        with pytest.raises(ValueError, match="accepted"):
+            publisher.publish(0, 0.0, good[:3], good[:3])
+        with pytest.raises(ValueError, match="differ"):
+            publisher.publish(0, 0.0, good, good.astype(np.float64))
+        with pytest.raises(TypeError, match="float32"):
+            publisher.publish(0, 0.0, good.astype(np.int32), good)
+        with pytest.raises(RidgewatchError, match="finite"):
+            publisher.publish(0, float("nan"), good, good)
+        assert publisher.published == 0
+
+
+def test_off_without_a_ring(monkeypatch):
+    monkeypatch.delenv("RIDGEWATCH_RING", raising=False)
+    with Publisher(np.arange(4.0), np.arange(4.0)) as publisher:
+        assert not publisher.is_open
+        assert publisher.publish(0, 0.0, np.zeros((4, 4)), np.zeros((4, 4))) is False

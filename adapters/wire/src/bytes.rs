@@ -1,0 +1,100 @@
+//! Little-endian values, one after another.
+
+use crate::WireError;
+
+/// Takes values from the front of some bytes.
+pub(crate) struct Parser<'a> {
+    what: &'static str,
+    bytes: &'a [u8],
+    at: usize,
+}
+
+impl<'a> Parser<'a> {
+    pub fn new(what: &'static str, bytes: &'a [u8]) -> Self {
+        Self { what, bytes, at: 0 }
+    }
+
+    pub fn take(&mut self, count: usize) -> Result<&'a [u8], WireError> {
+        let end = self.at.saturating_add(count);
+        let taken =
+            self.bytes.get(self.at..end).ok_or(WireError::Short { what: self.what, found: self.bytes.len() as u64, needed: end as u64 })?;
+        self.at = end;
+        Ok(taken)
+    }
+
+    pub fn array<const N: usize>(&mut self) -> Result<[u8; N], WireError> {
+        let mut array = [0; N];
+        array.copy_from_slice(self.take(N)?);
+        Ok(array)
+    }
+
+    pub fn u32(&mut self) -> Result<u32, WireError> {
+        self.array().map(u32::from_le_bytes)
+    }
+
+    pub fn u64(&mut self) -> Result<u64, WireError> {
+        self.array().map(u64::from_le_bytes)
+    }
+
+    pub fn f64(&mut self) -> Result<f64, WireError> {
+        self.array().map(f64::from_le_bytes)
+    }
+
+    pub fn three(&mut self) -> Result<[u64; 3], WireError> {
+        Ok([self.u64()?, self.u64()?, self.u64()?])
+    }
+
+    /// A short text: its length in bytes, then UTF-8.
+    pub fn text(&mut self, field: &'static str, longest: usize) -> Result<String, WireError> {
+        let length = self.u32()? as usize;
+        if length > longest {
+            return Err(WireError::field(field, format_args!("{length} bytes long"), format!("at most {longest} bytes")));
+        }
+        let text = std::str::from_utf8(self.take(length)?).map_err(|_| WireError::field(field, "not UTF-8", "UTF-8"))?;
+        match text.chars().find(|c| c.is_control()) {
+            Some(c) => Err(WireError::field(field, format_args!("{text:?} with {c:?}"), "text without control characters")),
+            None => Ok(text.to_owned()),
+        }
+    }
+
+    /// Nothing may be left.
+    pub fn end(&self) -> Result<(), WireError> {
+        if self.at == self.bytes.len() {
+            return Ok(());
+        }
+        Err(WireError::field("length", format_args!("{} bytes of {}", self.bytes.len(), self.what), format!("{} bytes", self.at)))
+    }
+}
+
+/// Puts values one after another.
+#[derive(Default)]
+pub(crate) struct Writer(pub Vec<u8>);
+
+impl Writer {
+    pub fn u32(&mut self, value: u32) {
+        self.0.extend_from_slice(&value.to_le_bytes());
+    }
+
+    pub fn u64(&mut self, value: u64) {
+        self.0.extend_from_slice(&value.to_le_bytes());
+    }
+
+    pub fn f64(&mut self, value: f64) {
+        self.0.extend_from_slice(&value.to_le_bytes());
+    }
+
+    pub fn three(&mut self, values: [u64; 3]) {
+        values.into_iter().for_each(|v| self.u64(v));
+    }
+
+    pub fn text(&mut self, text: &str) {
+        self.u32(text.len() as u32);
+        self.0.extend_from_slice(text.as_bytes());
+    }
+}
+
+/// FNV-1a, 64 bits: tells a torn header from a whole one. It is no protection against intent; owner and mode are.
+pub(crate) fn checksum(parts: &[&[u8]]) -> u64 {
+    let mix = |sum: u64, byte: &u8| (sum ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+    parts.iter().flat_map(|part| part.iter()).fold(0xcbf2_9ce4_8422_2325, mix)
+}

@@ -1,0 +1,174 @@
+//! From a solver's arrays into a slot: components apart or interleaved, any strides, f32 or f64.
+
+use crate::WireError;
+
+/// What the solver's arrays hold.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Element {
+    /// 4 bytes.
+    F32,
+    /// 8 bytes; rounded to f32 on the way.
+    F64,
+}
+
+impl Element {
+    fn bytes(self) -> usize {
+        match self {
+            Element::F32 => 4,
+            Element::F64 => 8,
+        }
+    }
+}
+
+/// Where a step lies in the solver's memory. Value (i, j, k) of component c is `components[c][i * strides[0] + j * strides[1] + k * strides[2]]`.
+#[derive(Debug, Clone, Copy)]
+pub struct Field<'a> {
+    /// u, v and, in three dimensions, w: each from its first value on.
+    pub components: &'a [*const u8],
+    /// Of all components.
+    pub element: Element,
+    /// In elements, along x, y, z; may be negative.
+    pub strides: [isize; 3],
+}
+
+impl<'a> Field<'a> {
+    /// Components one behind the other in x-fastest order: C's `u[k][j][i]`, Fortran's `u(i, j, k)`.
+    pub fn packed(components: &'a [*const u8], element: Element, extent: [u64; 3]) -> Self {
+        Self { components, element, strides: [1, extent[0] as isize, (extent[0] * extent[1]) as isize] }
+    }
+
+    /// What can be checked of pointers.
+    pub(crate) fn check(&self, components: usize) -> Result<(), WireError> {
+        if self.components.len() != components {
+            return Err(WireError::field("components", self.components.len(), format!("{components}, as many as axes")));
+        }
+        for pointer in self.components {
+            if pointer.is_null() {
+                return Err(WireError::field("component", "null", "the address of the first value"));
+            }
+            if pointer.align_offset(self.element.bytes()) != 0 {
+                return Err(WireError::field(
+                    "component",
+                    format_args!("{pointer:?}"),
+                    format!("an address divisible by {}", self.element.bytes()),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Copies all components to `to`, one behind the other, x fastest.
+    ///
+    /// # Safety
+    /// Every value that components, strides and `extent` speak of can be read; `to` has room for them, 4 bytes each, aligned, and
+    /// overlaps none of them.
+    pub(crate) unsafe fn copy_to(&self, extent: [u64; 3], to: *mut f32) {
+        let extent = extent.map(|n| n as usize);
+        let nodes: usize = extent.iter().product();
+        for (c, from) in self.components.iter().enumerate() {
+            // SAFETY: the caller's promise, component by component.
+            unsafe {
+                let to = to.add(c * nodes);
+                match self.element {
+                    Element::F32 => copy(from.cast::<f32>(), self.strides, extent, to, |v| v),
+                    Element::F64 => copy(from.cast::<f64>(), self.strides, extent, to, |v| v as f32),
+                }
+            }
+        }
+    }
+}
+
+/// # Safety
+/// That of [`Field::copy_to`], for one component.
+unsafe fn copy<T: Copy + 'static>(from: *const T, strides: [isize; 3], [nx, ny, nz]: [usize; 3], to: *mut f32, convert: impl Fn(T) -> f32) {
+    let packed = strides[0] == 1 && (ny == 1 || strides[1] == nx as isize) && (nz == 1 || strides[2] == (nx * ny) as isize);
+    // One run where the arrays allow it.
+    let (nx, ny, nz) = if packed { (nx * ny * nz, 1, 1) } else { (nx, ny, nz) };
+    let mut to = to;
+    for k in 0..nz {
+        for j in 0..ny {
+            // SAFETY: (0, j, k) is one of the values that the caller promised, and so are those along x.
+            unsafe {
+                let row = from.offset(j as isize * strides[1] + k as isize * strides[2]);
+                if strides[0] == 1 && size_of::<T>() == 4 {
+                    // f32: the only element of four bytes.
+                    stream(row.cast::<f32>(), to, nx);
+                } else if strides[0] == 1 {
+                    for i in 0..nx {
+                        to.add(i).write(convert(row.add(i).read()));
+                    }
+                } else {
+                    for i in 0..nx {
+                        to.add(i).write(convert(row.offset(i as isize * strides[0]).read()));
+                    }
+                }
+                to = to.add(nx);
+            }
+        }
+    }
+}
+
+/// From so many values on, a copy goes past the caches: what it would push out of them is the solver's, and lines that are overwritten whole need
+/// not be read first.
+#[cfg(any(test, target_arch = "x86_64"))]
+const STREAMED: usize = 1 << 18;
+
+/// Copies `count` values.
+///
+/// # Safety
+/// They can be read, there is room for them, and the two do not overlap.
+#[cfg(target_arch = "x86_64")]
+unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
+    use std::arch::x86_64::{__m128i, _mm_loadu_si128, _mm_sfence, _mm_stream_si128};
+    if count < STREAMED {
+        // SAFETY: the caller's promise.
+        return unsafe { std::ptr::copy_nonoverlapping(from, to, count) };
+    }
+    // Whole lines of the target, 16 values each; what lies before and behind them is copied as usual.
+    let before = (to as usize).wrapping_neg() % 64 / 4;
+    let lines = (count - before) / 16;
+    // SAFETY: all of it lies inside the `count` values; the target of the streaming stores is a multiple of 64.
+    unsafe {
+        std::ptr::copy_nonoverlapping(from, to, before);
+        let (mut source, mut target) = (from.add(before).cast::<__m128i>(), to.add(before).cast::<__m128i>());
+        for _ in 0..lines {
+            let line =
+                [_mm_loadu_si128(source), _mm_loadu_si128(source.add(1)), _mm_loadu_si128(source.add(2)), _mm_loadu_si128(source.add(3))];
+            for (k, part) in line.into_iter().enumerate() {
+                _mm_stream_si128(target.add(k), part);
+            }
+            (source, target) = (source.add(4), target.add(4));
+        }
+        // Streaming stores are not ordered by what follows: all of them before the sequence number.
+        _mm_sfence();
+        let done = before + 16 * lines;
+        std::ptr::copy_nonoverlapping(from.add(done), to.add(done), count - done);
+    }
+}
+
+/// Copies `count` values.
+///
+/// # Safety
+/// They can be read, there is room for them, and the two do not overlap.
+#[cfg(not(target_arch = "x86_64"))]
+unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
+    // SAFETY: the caller's promise.
+    unsafe { std::ptr::copy_nonoverlapping(from, to, count) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_copies_arrive_whole_wherever_they_begin() {
+        let from: Vec<f32> = (0..STREAMED + 100).map(|i| i as f32).collect();
+        for (skip, start, count) in [(0, 0, STREAMED), (1, 3, STREAMED + 5), (7, 16, STREAMED + 64), (3, 15, STREAMED + 17)] {
+            let mut to = vec![-1.0f32; STREAMED + 200];
+            // SAFETY: both ranges lie inside their vectors.
+            unsafe { stream(from[skip..].as_ptr(), to[start..].as_mut_ptr(), count) };
+            assert_eq!(to[start..start + count], from[skip..skip + count]);
+            assert!(to[..start].iter().chain(&to[start + count..]).all(|v| *v == -1.0), "nothing beside it");
+        }
+    }
+}

@@ -1,0 +1,178 @@
+//! Following blocks, wherever they come from: rings of this node, or relays of others.
+
+use crate::lock::{Following, blocks, producer_lives};
+use crate::reader::{Read, RingReader};
+use crate::{Description, Limits, WireError};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// How often new rings are looked for.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// What happened to a block.
+#[derive(Debug)]
+pub enum Event {
+    /// A producer was found, or took over from one that ended. Its description is checked.
+    Opened {
+        /// What it publishes.
+        description: Box<Description>,
+        /// When it was opened, nanoseconds since 1970.
+        generation: u64,
+    },
+    /// A step; its values are in the buffer.
+    Step {
+        /// Which block.
+        block: u32,
+        /// The solver's number.
+        step: u64,
+        /// Its time.
+        time: f64,
+        /// When it was published, nanoseconds since 1970.
+        published: u64,
+        /// Steps of the block that were overwritten before this one could be read.
+        missed: u64,
+    },
+    /// The producer closed the block, or its process ended; all that it left was read.
+    Ended {
+        /// Which block.
+        block: u32,
+        /// Whether it was closed; else its process ended without that.
+        closed: bool,
+    },
+    /// Something was refused; following goes on.
+    Refused(WireError),
+}
+
+/// One block's ring.
+struct Followed {
+    reader: RingReader,
+    /// Its end was told.
+    ended: bool,
+    looked: Instant,
+}
+
+/// Follows all rings of a folder, each from its oldest step on.
+pub struct RingFollower {
+    ring: PathBuf,
+    limits: Limits,
+    rings: BTreeMap<u32, Followed>,
+    /// Rings that were refused, with their words, so that each is told once.
+    refused: BTreeMap<u32, String>,
+    looked: Option<Instant>,
+    /// The block to be asked next, so that none is starved.
+    turn: u32,
+    #[allow(dead_code)]
+    following: Following,
+}
+
+impl RingFollower {
+    /// Begins; the folder is made where it is not there.
+    ///
+    /// # Errors
+    /// The folder is not this user's alone.
+    pub fn begin(ring: &Path, limits: Limits) -> Result<Self, WireError> {
+        let following = Following::begin(ring)?;
+        Ok(Self { ring: ring.into(), limits, rings: BTreeMap::new(), refused: BTreeMap::new(), looked: None, turn: 0, following })
+    }
+
+    /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
+    pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
+        if self.looked.is_none_or(|looked| looked.elapsed() > LOOK) {
+            if let Some(event) = self.look() {
+                return Some(event);
+            }
+            self.looked = Some(Instant::now());
+        }
+        let order: Vec<u32> = self.rings.range(self.turn..).chain(self.rings.range(..self.turn)).map(|(block, _)| *block).collect();
+        for block in order {
+            let Some(followed) = self.rings.get_mut(&block) else { continue };
+            let event = match followed.reader.read(values) {
+                Ok(Read::Step(info)) => {
+                    self.turn = block + 1;
+                    // A ring that cannot be written to is one that nobody waits for.
+                    let _ = followed.reader.acknowledge();
+                    Some(Event::Step { block, step: info.step, time: info.time, published: info.published, missed: info.missed })
+                }
+                Ok(Read::Ended) if !followed.ended => {
+                    followed.ended = true;
+                    Some(Event::Ended { block, closed: true })
+                }
+                Ok(Read::Nothing) if !followed.ended && followed.looked.elapsed() > LOOK => {
+                    followed.looked = Instant::now();
+                    // The lock may already be that of a producer that took the place of this one.
+                    let gone = !followed.reader.is_current() || !producer_lives(&self.ring, block);
+                    gone.then(|| {
+                        followed.ended = true;
+                        Event::Ended { block, closed: false }
+                    })
+                }
+                Ok(_) => None,
+                Err(error) => {
+                    self.rings.remove(&block);
+                    self.refused.insert(block, error.to_string());
+                    Some(Event::Refused(error))
+                }
+            };
+            if event.is_some() {
+                return event;
+            }
+        }
+        None
+    }
+
+    /// Tells producers that somebody follows, without taking anything: they wait as long as their policy lets them.
+    pub fn hold(&self) {
+        for followed in self.rings.values() {
+            let _ = followed.reader.acknowledge();
+        }
+    }
+
+    /// Looks for rings that are new, or that a new producer put in the place of an old one.
+    fn look(&mut self) -> Option<Event> {
+        for block in blocks(&self.ring) {
+            // What the old one left is read first.
+            if self.rings.get(&block).is_some_and(|followed| followed.reader.is_current() || !followed.ended) {
+                continue;
+            }
+            // A ring without a producer that was never followed is what a killed run left.
+            if !producer_lives(&self.ring, block) && !self.closed_in_order(block) {
+                continue;
+            }
+            match RingReader::open(&self.ring, block, &self.limits) {
+                Ok(reader) => {
+                    let known = self.rings.get(&block).map(|f| f.reader.header().producer);
+                    if known == Some(reader.header().producer) {
+                        continue;
+                    }
+                    if known.is_some() {
+                        // The old run's other blocks go with it, unless they live.
+                        let ring = &self.ring;
+                        self.rings.retain(|b, f| *b == block || (f.reader.is_current() && producer_lives(ring, *b)));
+                    }
+                    self.refused.remove(&block);
+                    let _ = reader.acknowledge();
+                    let header = reader.header();
+                    let event = Event::Opened { description: Box::new(header.description.clone()), generation: header.generation };
+                    self.rings.insert(block, Followed { reader, ended: false, looked: Instant::now() });
+                    return Some(event);
+                }
+                Err(WireError::Io { .. }) => {}
+                Err(error) => {
+                    let words = error.to_string();
+                    if self.refused.get(&block) != Some(&words) {
+                        self.refused.insert(block, words);
+                        return Some(Event::Refused(error));
+                    }
+                }
+            }
+        }
+        None
+    }
+
+    /// Whether a ring without a producer was closed and not killed: its last steps count.
+    fn closed_in_order(&self, block: u32) -> bool {
+        !self.rings.contains_key(&block)
+            && RingReader::open(&self.ring, block, &self.limits).and_then(|reader| reader.is_closed()).unwrap_or(false)
+    }
+}

@@ -1,0 +1,155 @@
+//! Who publishes under a name, and who follows: locks that the system takes back when their holder ends, however it ends.
+
+use crate::system::{create_private, foreign};
+use crate::{WireError, block_path, followers_path, lock_path, system};
+use std::fs::File;
+use std::io;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+/// A locked file.
+#[derive(Debug)]
+struct FileLock {
+    path: PathBuf,
+    file: File,
+}
+
+/// A lock over a whole file.
+fn whole(kind: libc::c_int) -> libc::flock {
+    // SAFETY: all of its fields are integers.
+    let mut lock: libc::flock = unsafe { std::mem::zeroed() };
+    lock.l_type = kind as libc::c_short;
+    lock.l_whence = libc::SEEK_SET as libc::c_short;
+    lock
+}
+
+impl FileLock {
+    /// Locks a file, made where it is not there; none when it is locked against that.
+    fn take(path: PathBuf, kind: libc::c_int) -> Result<Option<Self>, WireError> {
+        loop {
+            let file = create_private(&path, false).map_err(|e| match e.raw_os_error() {
+                Some(libc::ELOOP) => foreign(&path, "is a symbolic link".into()),
+                Some(libc::EACCES | libc::EPERM) => foreign(&path, "may not be opened by this user".into()),
+                Some(libc::ENOSPC) => WireError::NoSpace { path: path.clone(), needed: 4096 },
+                _ => WireError::io(&path, "cannot be made", e),
+            })?;
+            let about = file.metadata().map_err(|e| WireError::io(&path, "cannot be looked at", e))?;
+            system::check_private(&path, &about, system::user())?;
+            // SAFETY: the descriptor is open, and the lock outlives the call.
+            if unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &whole(kind)) } != 0 {
+                return match io::Error::last_os_error() {
+                    error if matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) => Ok(None),
+                    error => Err(WireError::io(&path, "cannot be locked", error)),
+                };
+            }
+            // Its last holder may have removed the file that was just locked.
+            match std::fs::metadata(&path) {
+                Ok(now) if (now.dev(), now.ino()) == (about.dev(), about.ino()) => return Ok(Some(Self { path, file })),
+                Ok(_) => {}
+                Err(error) if error.kind() == io::ErrorKind::NotFound => {}
+                Err(error) => return Err(WireError::io(&path, "cannot be looked at", error)),
+            }
+        }
+    }
+
+    /// Removes the file while it is still locked: whoever opened it finds that it is not the one at the path.
+    fn remove(self) {
+        let _ = std::fs::remove_file(&self.path);
+        drop(self.file);
+    }
+}
+
+/// Whether somebody's lock stands in the way of `kind`. False also where that cannot be told.
+fn locked(path: &Path, kind: libc::c_int) -> bool {
+    let Ok(file) = system::open_private(path, kind == libc::F_WRLCK) else { return false };
+    let mut lock = whole(kind);
+    // SAFETY: the descriptor is open, and the lock outlives the call.
+    let asked = unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_GETLK, &mut lock) };
+    asked == 0 && lock.l_type != libc::F_UNLCK as libc::c_short
+}
+
+/// A block's name, which is this producer's until it is dropped.
+#[derive(Debug)]
+pub(crate) struct NameLock(FileLock);
+
+impl NameLock {
+    /// Takes it; none when somebody has it.
+    pub fn take(ring: &Path, block: u32) -> Result<Option<Self>, WireError> {
+        Ok(FileLock::take(lock_path(ring, block), libc::F_WRLCK)?.map(Self))
+    }
+
+    /// Frees the name and removes its file.
+    pub fn remove(self) {
+        self.0.remove();
+    }
+}
+
+/// Whether a block's producer lives (its process runs, and has not closed the ring). False also where that cannot be told.
+pub fn producer_lives(ring: &Path, block: u32) -> bool {
+    locked(&lock_path(ring, block), libc::F_RDLCK)
+}
+
+/// Whether anybody follows the ring.
+pub(crate) fn is_followed(ring: &Path) -> bool {
+    locked(&followers_path(ring), libc::F_WRLCK)
+}
+
+/// Says that somebody follows the ring: a producer that ends leaves its last steps there. Dropping it removes the rings of producers that
+/// have ended, where nobody else follows.
+#[derive(Debug)]
+pub struct Following {
+    ring: PathBuf,
+    lock: Option<FileLock>,
+}
+
+impl Following {
+    /// Makes the ring's folder where it is not there.
+    ///
+    /// # Errors
+    /// A folder or file that is not this user's alone.
+    pub fn begin(ring: &Path) -> Result<Self, WireError> {
+        crate::producer::make_folder(ring)?;
+        // Nobody ever locks it against followers for longer than a look.
+        let lock = loop {
+            match FileLock::take(followers_path(ring), libc::F_RDLCK)? {
+                Some(lock) => break lock,
+                None => std::thread::sleep(std::time::Duration::from_millis(1)),
+            }
+        };
+        Ok(Self { ring: ring.to_owned(), lock: Some(lock) })
+    }
+}
+
+impl Drop for Following {
+    fn drop(&mut self) {
+        drop(self.lock.take());
+        // The last follower sweeps up.
+        let Ok(Some(last)) = FileLock::take(followers_path(&self.ring), libc::F_WRLCK) else { return };
+        for block in blocks(&self.ring) {
+            // Whoever has the name publishes.
+            if let Ok(Some(name)) = NameLock::take(&self.ring, block) {
+                let _ = std::fs::remove_file(block_path(&self.ring, block));
+                name.remove();
+            }
+        }
+        last.remove();
+        let _ = std::fs::remove_dir(&self.ring);
+    }
+}
+
+/// The blocks whose rings or locks are in the folder, ascending; at most 65536 are looked for.
+pub fn blocks(ring: &Path) -> Vec<u32> {
+    let Ok(entries) = std::fs::read_dir(ring) else { return Vec::new() };
+    let number = |name: &str| {
+        let name = name.strip_prefix("block-")?;
+        let digits = name.strip_suffix(".ring").or(name.strip_suffix(".lock"))?;
+        (digits.len() == 5).then(|| digits.parse().ok()).flatten()
+    };
+    let names = entries.take(1 << 18).flatten().filter_map(|e| e.file_name().to_str().and_then(number));
+    let mut blocks: Vec<u32> = names.collect();
+    blocks.sort_unstable();
+    blocks.dedup();
+    blocks.truncate(1 << 16);
+    blocks
+}

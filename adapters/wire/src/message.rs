@@ -1,0 +1,404 @@
+//! Signed messages between nodes, over TCP.
+//!
+//! Both sides know the key of a [`ConnectionFile`]. They greet each other with random numbers, prove the key, and derive a session key from both:
+//! a message of another session never fits. Each message is a head of fixed length with its signature (HMAC-SHA256), then the
+//! description (first, and when it changed) and the values, for whose BLAKE3 hash the head vouches. Its number rises strictly within the
+//! session. So nothing is believed, and no memory taken, before the signature has been checked.
+//!
+//! TCP with these frames and not ZeroMQ: the `zeromq` crate takes memory for any length that a peer announces, before a signature could be
+//! looked at, and has no limit on what waits for a slow peer. Here a slow peer just reads the ring more rarely.
+
+use crate::bytes::{Parser, Writer};
+use crate::header::DESCRIPTION_BYTES;
+use crate::system::{self, create_private, open_private};
+use crate::{Description, Limits, WireError};
+use hmac::{Hmac, Mac};
+use sha2::Sha256;
+use std::io::{Read, Write};
+use std::path::Path;
+
+#[cfg(target_endian = "big")]
+compile_error!("rings and messages are little-endian and are not converted");
+
+/// First bytes of either greeting.
+const GREETING: [u8; 12] = *b"RIDGEWIRE\0\0\0";
+/// First bytes of a message.
+const MAGIC: [u8; 4] = *b"RWMS";
+const VERSION: u32 = 1;
+/// Bytes of a message's head, and of its signature.
+const HEAD: usize = 100;
+const SIGNATURE: usize = 32;
+/// Longest connection file.
+const FILE_BYTES: u64 = 4096;
+/// Values go through the socket in pieces of so many bytes, so that a peer that stalls is noticed.
+const PIECE: usize = 1 << 20;
+
+/// What both sides know.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Key([u8; 32]);
+
+impl std::fmt::Debug for Key {
+    fn fmt(&self, f: &mut std::fmt::Formatter) -> std::fmt::Result {
+        f.write_str("Key(..)")
+    }
+}
+
+impl Key {
+    /// A new one.
+    ///
+    /// # Errors
+    /// The system has no random numbers.
+    pub fn random() -> Result<Self, WireError> {
+        system::random().map(Self).map_err(|e| WireError::io(Path::new("getrandom"), "no random numbers", e))
+    }
+
+    fn sign(&self, parts: &[&[u8]]) -> Hmac<Sha256> {
+        let Ok(mut mac) = Hmac::<Sha256>::new_from_slice(&self.0) else { unreachable!("HMAC takes keys of any length") };
+        parts.iter().for_each(|part| mac.update(part));
+        mac
+    }
+
+    fn signature(&self, parts: &[&[u8]]) -> [u8; SIGNATURE] {
+        self.sign(parts).finalize().into_bytes().into()
+    }
+
+    fn verify(&self, parts: &[&[u8]], signature: &[u8; SIGNATURE]) -> Result<(), WireError> {
+        // In constant time.
+        self.sign(parts).verify_slice(signature).map_err(|_| WireError::Signature)
+    }
+}
+
+/// Where a relay listens, and its key.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConnectionFile {
+    /// `HOST:PORT`.
+    pub address: String,
+    /// The key.
+    pub key: Key,
+}
+
+impl ConnectionFile {
+    /// Writes it, readable for this user alone; one that is there is replaced.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn write(&self, path: &Path) -> Result<(), WireError> {
+        let mut part = path.as_os_str().to_owned();
+        part.push(".part");
+        let part = Path::new(&part);
+        let _ = std::fs::remove_file(part);
+        let hex: String = self.key.0.iter().map(|byte| format!("{byte:02x}")).collect();
+        let text = format!("ridgewatch-connection = 1\naddress = {}\nkey = {hex}\n", self.address);
+        let mut file = create_private(part, true).map_err(|e| WireError::io(part, "cannot be made", e))?;
+        file.write_all(text.as_bytes()).map_err(|e| WireError::io(part, "cannot be written", e))?;
+        std::fs::rename(part, path).map_err(|e| WireError::io(path, "cannot be put in its place", e))
+    }
+
+    /// Reads it.
+    ///
+    /// # Errors
+    /// Not this user's alone, or not such a file.
+    pub fn read(path: &Path) -> Result<Self, WireError> {
+        let file = open_private(path, false)?;
+        let mut text = String::new();
+        file.take(FILE_BYTES).read_to_string(&mut text).map_err(|e| WireError::io(path, "cannot be read", e))?;
+        Self::parse(&text)
+    }
+
+    fn parse(text: &str) -> Result<Self, WireError> {
+        let value = |key: &'static str| {
+            let line = text.lines().find_map(|line| line.strip_prefix(key)?.trim_start().strip_prefix('='));
+            line.map(str::trim).ok_or_else(|| WireError::field(key, "missing", "a connection file as `ridgewatch relay` writes it"))
+        };
+        let version = value("ridgewatch-connection")?;
+        if version != "1" {
+            return Err(WireError::Version { found: version.parse().unwrap_or(0), known: 1 });
+        }
+        let address = value("address")?.to_owned();
+        let hex = value("key")?.as_bytes();
+        let digit = |c: u8| (c as char).to_digit(16).map(|d| d as u8);
+        let mut key = [0; 32];
+        let bad = || WireError::field("key", format_args!("{} characters", hex.len()), "64 hexadecimal digits");
+        if hex.len() != 64 {
+            return Err(bad());
+        }
+        for (byte, pair) in key.iter_mut().zip(hex.as_chunks::<2>().0) {
+            *byte = digit(pair[0]).zip(digit(pair[1])).map(|(high, low)| high * 16 + low).ok_or_else(bad)?;
+        }
+        Ok(Self { address, key: Key(key) })
+    }
+}
+
+/// What a message is about.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// A step of one block.
+    Step,
+    /// The producer of a block has closed it.
+    Ended,
+    /// Nothing new; the relay lives.
+    Pulse,
+}
+
+/// A message's facts; a step's values come with it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Facts {
+    /// What about.
+    pub kind: Kind,
+    /// Which block.
+    pub block: u32,
+    /// When its producer opened it.
+    pub generation: u64,
+    /// The solver's number of the step.
+    pub step: u64,
+    /// Its time.
+    pub time: f64,
+    /// When it was published, nanoseconds since 1970.
+    pub published: u64,
+    /// Steps of the block that were overwritten before the relay read them, since the last.
+    pub missed: u64,
+}
+
+/// One side's end of a session.
+pub struct Session {
+    key: Key,
+    number: u64,
+}
+
+fn failed(e: std::io::Error) -> WireError {
+    WireError::io(Path::new("connection"), "broke", e)
+}
+
+impl Session {
+    /// Greets as the relay.
+    ///
+    /// # Errors
+    /// The peer has another key or speaks another protocol, or the connection broke.
+    pub fn accept(stream: &mut (impl Read + Write), key: &Key) -> Result<Self, WireError> {
+        let mine: [u8; 32] = system::random().map_err(failed)?;
+        stream.write_all(&greeting(&mine)).map_err(failed)?;
+        let theirs = read_greeting(stream)?;
+        let mut signature = [0; SIGNATURE];
+        stream.read_exact(&mut signature).map_err(failed)?;
+        key.verify(&[b"follower", &mine, &theirs], &signature)?;
+        stream.write_all(&key.signature(&[b"relay", &mine, &theirs])).map_err(failed)?;
+        Ok(Self { key: Key(key.signature(&[b"session", &mine, &theirs])), number: 0 })
+    }
+
+    /// Greets as the follower.
+    ///
+    /// # Errors
+    /// Those of [`Session::accept`].
+    pub fn connect(stream: &mut (impl Read + Write), key: &Key) -> Result<Self, WireError> {
+        let mine: [u8; 32] = system::random().map_err(failed)?;
+        let theirs = read_greeting(stream)?;
+        stream.write_all(&greeting(&mine)).map_err(failed)?;
+        stream.write_all(&key.signature(&[b"follower", &theirs, &mine])).map_err(failed)?;
+        let mut signature = [0; SIGNATURE];
+        stream.read_exact(&mut signature).map_err(failed)?;
+        key.verify(&[b"relay", &theirs, &mine], &signature)?;
+        Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0 })
+    }
+
+    /// Sends a message; `description` first and when it changed, `values` with a step.
+    ///
+    /// # Errors
+    /// The connection broke, or the peer takes nothing any more.
+    pub fn send(&mut self, to: &mut impl Write, facts: &Facts, description: Option<&Description>, values: &[f32]) -> Result<(), WireError> {
+        let description = description.map(Description::encode).unwrap_or_default();
+        // SAFETY: floats without padding are bytes.
+        let values = unsafe { std::slice::from_raw_parts(values.as_ptr().cast::<u8>(), size_of_val(values)) };
+        self.number += 1;
+        let mut head = Writer(MAGIC.to_vec());
+        head.u32(VERSION);
+        head.u64(self.number);
+        head.u32(match facts.kind {
+            Kind::Step => 1,
+            Kind::Ended => 2,
+            Kind::Pulse => 3,
+        });
+        head.u32(facts.block);
+        head.u64(facts.generation);
+        head.u64(facts.step);
+        head.f64(facts.time);
+        head.u64(facts.published);
+        head.u64(facts.missed);
+        head.u32(description.len() as u32);
+        head.u64(values.len() as u64);
+        let mut hash = blake3::Hasher::new();
+        hash.update(&description).update(values);
+        // 192 of its 256 bits, under a signature.
+        head.0.extend_from_slice(&hash.finalize().as_bytes()[..HEAD - 76]);
+        to.write_all(&head.0).map_err(failed)?;
+        to.write_all(&self.key.signature(&[&head.0])).map_err(failed)?;
+        to.write_all(&description).map_err(failed)?;
+        values.chunks(PIECE).try_for_each(|piece| to.write_all(piece)).and_then(|()| to.flush()).map_err(failed)
+    }
+
+    /// Receives a message. `description` is the block's as it was last announced and is replaced when the message brings one;
+    /// a step's values are in `values` then, which keeps its memory from call to call.
+    ///
+    /// # Errors
+    /// Wrong key, a changed or replayed message, lengths that lie, a field larger than `limits`: the session is over.
+    pub fn receive(
+        &mut self,
+        from: &mut impl Read,
+        limits: &Limits,
+        known: &mut dyn FnMut(u32, Option<Description>) -> Option<u64>,
+        values: &mut Vec<f32>,
+    ) -> Result<Facts, WireError> {
+        let (mut head, mut signature) = ([0; HEAD], [0; SIGNATURE]);
+        from.read_exact(&mut head).map_err(failed)?;
+        from.read_exact(&mut signature).map_err(failed)?;
+        self.key.verify(&[&head], &signature)?;
+        let (facts, description_bytes, payload, hash) = self.check_head(&head)?;
+        let mut hasher = blake3::Hasher::new();
+        let mut description = vec![0; description_bytes as usize];
+        from.read_exact(&mut description).map_err(failed)?;
+        hasher.update(&description);
+        let announced = if description_bytes > 0 { Some(Description::decode(&description, limits)?) } else { None };
+        if let Some(announced) = &announced
+            && announced.block.index != facts.block
+        {
+            let found = format!("its description says block {}", announced.block.index);
+            return Err(WireError::Block { block: facts.block, found, accepted: "its own number".into() });
+        }
+        let bytes = known(facts.block, announced);
+        let expected = if facts.kind == Kind::Step { bytes } else { Some(0) };
+        if expected != Some(payload) || payload > limits.step_bytes {
+            let accepted = expected.map_or("a description first".to_owned(), |bytes| format!("{bytes}, as described"));
+            return Err(WireError::field("payload bytes", payload, accepted));
+        }
+        values.resize(payload as usize / 4, 0.0);
+        // SAFETY: any bytes are f32s, and the length is that of the values.
+        let bytes = unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast::<u8>(), values.len() * 4) };
+        from.read_exact(bytes).map_err(failed)?;
+        hasher.update(bytes);
+        if hasher.finalize().as_bytes()[..hash.len()] != hash {
+            return Err(WireError::Hash);
+        }
+        Ok(facts)
+    }
+
+    /// A head whose signature fits.
+    fn check_head(&mut self, head: &[u8; HEAD]) -> Result<(Facts, u32, u64, [u8; HEAD - 76]), WireError> {
+        let mut input = Parser::new("a message", head);
+        let magic: [u8; 4] = input.array()?;
+        if magic != MAGIC {
+            return Err(WireError::field("magic", format_args!("{magic:02x?}"), "a message of a relay"));
+        }
+        let version = input.u32()?;
+        if version != VERSION {
+            return Err(WireError::Version { found: version, known: VERSION });
+        }
+        let number = input.u64()?;
+        if number <= self.number {
+            return Err(WireError::Replayed { found: number, newest: self.number });
+        }
+        let kind = match input.u32()? {
+            1 => Kind::Step,
+            2 => Kind::Ended,
+            3 => Kind::Pulse,
+            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended) or 3 (pulse)")),
+        };
+        let (block, generation, step, time) = (input.u32()?, input.u64()?, input.u64()?, input.f64()?);
+        let (published, missed) = (input.u64()?, input.u64()?);
+        if !time.is_finite() {
+            return Err(WireError::field("time", time, "a finite number"));
+        }
+        let (description, payload) = (input.u32()?, input.u64()?);
+        if description > DESCRIPTION_BYTES {
+            return Err(WireError::TooLarge { what: "the description", needed: description.into(), limit: DESCRIPTION_BYTES.into() });
+        }
+        let hash = input.array()?;
+        input.end()?;
+        self.number = number;
+        Ok((Facts { kind, block, generation, step, time, published, missed }, description, payload, hash))
+    }
+}
+
+fn greeting(nonce: &[u8; 32]) -> Vec<u8> {
+    let mut out = Writer(GREETING.to_vec());
+    out.u32(VERSION);
+    out.0.extend_from_slice(nonce);
+    out.0
+}
+
+fn read_greeting(from: &mut impl Read) -> Result<[u8; 32], WireError> {
+    let mut bytes = [0; 48];
+    from.read_exact(&mut bytes).map_err(failed)?;
+    let mut input = Parser::new("the greeting", &bytes);
+    let found: [u8; 12] = input.array()?;
+    if found != GREETING {
+        return Err(WireError::field("greeting", format_args!("{found:02x?}"), "that of a ridgewatch relay or follower"));
+    }
+    let version = input.u32()?;
+    if version != VERSION {
+        return Err(WireError::Version { found: version, known: VERSION });
+    }
+    input.array()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{AxisDescription, Geometry};
+    use std::io::Cursor;
+
+    /// A peer that has the key and lies: heads and descriptions are changed, then hashed and signed as if they were meant so.
+    #[test]
+    fn lies_under_a_good_signature_are_refused_too() {
+        let cases: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(20_000);
+        let axis = |name, n| AxisDescription::uniform(name, "m", 0.0, 1.0, n);
+        let description = Description::whole(Geometry::Cartesian, vec![axis("x", 5), axis("y", 4)], "s");
+        let facts = Facts { kind: Kind::Step, block: 0, generation: 1, step: 2, time: 3.0, published: 4, missed: 0 };
+        let limits = Limits { step_bytes: 1 << 16 };
+        let mut state = 1u64;
+        let mut random = |n: usize| {
+            // SplitMix64.
+            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
+            let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+            let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+            ((z ^ (z >> 31)) % n as u64) as usize
+        };
+        let (mut taken, mut refused) = (0u64, [0u64; 4]);
+        let mut values = Vec::new();
+        for _ in 0..cases {
+            let (mut from, mut to) = (Session { key: Key([1; 32]), number: 7 }, Session { key: Key([1; 32]), number: 7 });
+            let mut message = Vec::new();
+            from.send(&mut message, &facts, Some(&description), &[0.5; 40]).unwrap();
+            let begin = HEAD + SIGNATURE;
+            for _ in 0..1 + random(3) {
+                // The head's plain part, or the description.
+                let place = if random(2) == 0 { random(76) } else { begin + random(message.len() - begin - 160) };
+                match random(3) {
+                    0 => message[place] ^= 1 << random(8),
+                    1 => message[place] = [0, 1, 2, 0x7f, 0x80, 0xff][random(6)],
+                    _ => message[place..place + 4].copy_from_slice(&[0u32, 1, 0x7fff_ffff, u32::MAX][random(4)].to_le_bytes()),
+                }
+            }
+            let hash = blake3::hash(&message[begin..]);
+            message[76..HEAD].copy_from_slice(&hash.as_bytes()[..HEAD - 76]);
+            let signature = from.key.signature(&[&message[..HEAD]]);
+            message[HEAD..begin].copy_from_slice(&signature);
+            let mut known = |_, announced: Option<Description>| announced.map(|d| d.block_bytes());
+            match to.receive(&mut Cursor::new(&message), &limits, &mut known, &mut values) {
+                Ok(facts) => {
+                    assert!(facts.time.is_finite() && values.len() <= 1 << 14);
+                    taken += 1;
+                }
+                Err(error) => {
+                    let kind = match error {
+                        WireError::Field { .. } | WireError::Block { .. } => 0,
+                        WireError::TooLarge { .. } => 1,
+                        WireError::Short { .. } | WireError::Io { .. } | WireError::Hash => 2,
+                        WireError::Replayed { .. } | WireError::Version { .. } => 3,
+                        other => panic!("{other}: the signature fits"),
+                    };
+                    refused[kind] += 1;
+                }
+            }
+        }
+        assert!(taken > cases / 20 && refused.iter().all(|n| *n > cases / 1000), "{taken} {refused:?}: the corpus is lopsided");
+    }
+}

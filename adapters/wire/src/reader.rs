@@ -1,0 +1,226 @@
+//! The follower's side: what is in the ring, checked.
+//!
+//! Everything is read through the file, not through a mapping: a ring that is cut short under the reader's hands gives an error and no
+//! signal, and what a producer writes meanwhile is seen by the sequence numbers.
+
+use crate::header::{DESCRIPTION, ENDED, FIXED, HEARTBEAT, Header, PUBLISHED, SLOT_HEADER, STATE, TAKEN};
+use crate::system::{self, open_private};
+use crate::{Limits, WireError, block_path};
+use std::fs::File;
+use std::os::unix::fs::{FileExt, MetadataExt};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{Ordering, fence};
+
+/// Bytes that can be read anywhere: a file, or memory in tests.
+pub trait ReadAt {
+    /// Bytes there.
+    fn length(&self) -> std::io::Result<u64>;
+    /// Fills `to` from `offset` on.
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()>;
+    /// Writes the follower's words.
+    fn write_at(&self, from: &[u8], offset: u64) -> std::io::Result<()>;
+}
+
+impl ReadAt for File {
+    fn length(&self) -> std::io::Result<u64> {
+        self.metadata().map(|about| about.len())
+    }
+
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+        self.read_exact_at(to, offset)
+    }
+
+    fn write_at(&self, from: &[u8], offset: u64) -> std::io::Result<()> {
+        self.write_all_at(from, offset)
+    }
+}
+
+/// What is known of a step besides its values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepInfo {
+    /// Its number among those published, from 0.
+    pub number: u64,
+    /// The solver's number.
+    pub step: u64,
+    /// The solver's time.
+    pub time: f64,
+    /// When it was published, nanoseconds since 1970.
+    pub published: u64,
+    /// Steps before it that were overwritten before they could be read.
+    pub missed: u64,
+}
+
+/// What a reader found.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Read {
+    /// A step; its values are in the buffer.
+    Step(StepInfo),
+    /// Nothing new yet.
+    Nothing,
+    /// All was read, and the producer has closed the ring.
+    Ended,
+}
+
+/// Follows the ring of one block.
+#[derive(Debug)]
+pub struct RingReader<F = File> {
+    path: PathBuf,
+    file: F,
+    header: Header,
+    first_slot: u64,
+    /// The next step wanted.
+    next: u64,
+    device_and_inode: (u64, u64),
+}
+
+impl RingReader<File> {
+    /// Opens a block's ring; reading begins with the oldest step that is there.
+    ///
+    /// # Errors
+    /// No ring, somebody else's, of another version, torn, larger than `limits`.
+    pub fn open(ring: &Path, block: u32, limits: &Limits) -> Result<Self, WireError> {
+        let path = block_path(ring, block);
+        let file = open_private(&path, true)?;
+        let about = file.metadata().map_err(|e| WireError::io(&path, "cannot be looked at", e))?;
+        let mut reader = Self::over(path, file, limits)?;
+        reader.device_and_inode = (about.dev(), about.ino());
+        let found = reader.header.description.block.index;
+        if found != block {
+            return Err(WireError::Block { block, found: format!("its ring says block {found}"), accepted: "its own number".into() });
+        }
+        Ok(reader)
+    }
+
+    /// Whether the file at the path is still this one: a producer that starts anew puts another in its place.
+    pub fn is_current(&self) -> bool {
+        std::fs::symlink_metadata(&self.path).is_ok_and(|now| (now.dev(), now.ino()) == self.device_and_inode)
+    }
+}
+
+impl<F: ReadAt> RingReader<F> {
+    /// A ring in any bytes; `path` appears in errors.
+    ///
+    /// # Errors
+    /// Those of [`RingReader::open`], but for owner and mode.
+    pub fn over(path: PathBuf, file: F, limits: &Limits) -> Result<Self, WireError> {
+        let failed = |e| WireError::io(&path, "cannot be read", e);
+        let length = file.length().map_err(failed)?;
+        let needed = (DESCRIPTION + FIXED) as u64;
+        if length < needed {
+            return Err(WireError::Short { what: "the ring", found: length, needed });
+        }
+        let mut fixed = [0; FIXED];
+        file.read_at(&mut fixed, 0).map_err(failed)?;
+        let bytes = Header::description_bytes(&fixed)?;
+        let needed = (DESCRIPTION + bytes) as u64;
+        // Before memory is taken for it.
+        if length < needed {
+            return Err(WireError::Short { what: "the ring", found: length, needed });
+        }
+        let mut description = vec![0; bytes];
+        file.read_at(&mut description, DESCRIPTION as u64).map_err(failed)?;
+        let (header, first_slot) = Header::decode(&fixed, &description, length, limits)?;
+        let mut reader = Self { path, file, header, first_slot, next: 0, device_and_inode: (0, 0) };
+        reader.next = reader.word(PUBLISHED)?.saturating_sub(u64::from(reader.header.slots));
+        Ok(reader)
+    }
+
+    /// What the ring says of itself.
+    pub fn header(&self) -> &Header {
+        &self.header
+    }
+
+    /// Where it is.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Reads the oldest step that was not read yet and is still there: its components, one behind the other, x fastest, in native f32.
+    /// `values` keeps its memory from call to call.
+    ///
+    /// # Errors
+    /// The file went away or was cut short; its counts run backwards.
+    pub fn read(&mut self, values: &mut Vec<f32>) -> Result<Read, WireError> {
+        let slots = u64::from(self.header.slots);
+        let began = self.next;
+        // Ended before the count is read: no step can come after it.
+        let ended = self.word(STATE)? == ENDED;
+        loop {
+            let published = self.word(PUBLISHED)?;
+            if published < began {
+                return Err(WireError::field("published", published, format!("at least {began}, which was seen before")));
+            }
+            self.next = self.next.max(published.saturating_sub(slots));
+            if self.next >= published {
+                // What was overwritten while it was read counts as missed by the step that comes.
+                let missed = self.next - began;
+                self.next = began;
+                return Ok(if missed == 0 && ended { Read::Ended } else { Read::Nothing });
+            }
+            if let Some(mut info) = self.try_slot(self.next, values)? {
+                info.missed = info.number - began;
+                self.next += 1;
+                return Ok(Read::Step(info));
+            }
+            // It was overwritten meanwhile.
+            self.next += 1;
+        }
+    }
+
+    /// Tells the producer that all steps before the next are taken, and that somebody follows.
+    pub fn acknowledge(&self) -> Result<(), WireError> {
+        let failed = |e| WireError::io(&self.path, "cannot be written", e);
+        self.file.write_at(&system::monotonic().to_ne_bytes(), HEARTBEAT as u64).map_err(failed)?;
+        self.file.write_at(&self.next.to_ne_bytes(), TAKEN as u64).map_err(failed)
+    }
+
+    /// Whether the producer has closed the ring.
+    pub fn is_closed(&self) -> Result<bool, WireError> {
+        Ok(self.word(STATE)? == ENDED)
+    }
+
+    /// Steps published so far.
+    pub fn published(&self) -> Result<u64, WireError> {
+        self.word(PUBLISHED)
+    }
+
+    fn try_slot(&self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
+        let slot = self.first_slot + number % u64::from(self.header.slots) * self.header.stride();
+        // At most what the limits allow: the header was checked.
+        let count = (self.header.description.block_bytes() / 4) as usize;
+        let whole = number.wrapping_mul(2).wrapping_add(2);
+        let mut head = [0; 32];
+        self.read_bytes(&mut head, slot)?;
+        fence(Ordering::Acquire);
+        let word = |k: usize| u64::from_ne_bytes(head.as_chunks::<8>().0[k]);
+        if word(0) != whole {
+            return Ok(None);
+        }
+        values.resize(count, 0.0);
+        // SAFETY: any bytes are f32s, and the length is that of the values.
+        let bytes = unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast::<u8>(), count * 4) };
+        self.read_bytes(bytes, slot + SLOT_HEADER as u64)?;
+        // All values before the second look at the number.
+        fence(Ordering::Acquire);
+        let mut after = [0; 8];
+        self.read_bytes(&mut after, slot)?;
+        if u64::from_ne_bytes(after) != whole {
+            return Ok(None);
+        }
+        let time = f64::from_bits(word(2));
+        if !time.is_finite() {
+            return Err(WireError::field("time", time, "a finite number"));
+        }
+        Ok(Some(StepInfo { number, step: word(1), time, published: word(3), missed: 0 }))
+    }
+
+    fn word(&self, offset: usize) -> Result<u64, WireError> {
+        let mut bytes = [0; 8];
+        self.read_bytes(&mut bytes, offset as u64)?;
+        Ok(u64::from_ne_bytes(bytes))
+    }
+
+    fn read_bytes(&self, to: &mut [u8], offset: u64) -> Result<(), WireError> {
+        self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, "cannot be read (was it cut short?)", e))
+    }
+}

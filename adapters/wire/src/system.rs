@@ -1,0 +1,154 @@
+//! What is asked of the system: files that nobody else may open, memory that is there before it is written, clocks, random numbers.
+
+use crate::WireError;
+use std::fs::{File, Metadata, OpenOptions};
+use std::io;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::Path;
+use std::time::{SystemTime, UNIX_EPOCH};
+
+/// The user that this process acts as.
+pub(crate) fn user() -> u32 {
+    // SAFETY: takes and touches nothing.
+    unsafe { libc::geteuid() }
+}
+
+/// Nanoseconds since 1970.
+pub(crate) fn since_1970() -> u64 {
+    SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |d| d.as_nanos() as u64)
+}
+
+/// Nanoseconds of the clock that never goes back, common to all processes of the node.
+pub(crate) fn monotonic() -> u64 {
+    let mut time = libc::timespec { tv_sec: 0, tv_nsec: 0 };
+    // SAFETY: `time` outlives the call.
+    unsafe { libc::clock_gettime(libc::CLOCK_MONOTONIC, &mut time) };
+    (time.tv_sec as u64).wrapping_mul(1_000_000_000).wrapping_add(time.tv_nsec as u64)
+}
+
+/// Random bytes.
+pub(crate) fn random<const N: usize>() -> io::Result<[u8; N]> {
+    let mut bytes = [0; N];
+    let mut filled = 0;
+    while filled < N {
+        // SAFETY: the pointer and the length are those of what is left of `bytes`.
+        let got = unsafe { libc::getrandom(bytes[filled..].as_mut_ptr().cast(), N - filled, 0) };
+        match got {
+            got if got > 0 => filled += got as usize,
+            _ => match io::Error::last_os_error() {
+                error if error.kind() == io::ErrorKind::Interrupted => {}
+                error => return Err(error),
+            },
+        }
+    }
+    Ok(bytes)
+}
+
+/// Makes a file that only this user may open.
+pub(crate) fn create_private(path: &Path, exclusive: bool) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).create(true).mode(0o600).custom_flags(libc::O_NOFOLLOW | libc::O_CLOEXEC);
+    if exclusive {
+        options.create_new(true);
+    }
+    options.truncate(false).open(path)
+}
+
+/// Opens a file of this user that nobody else may open.
+///
+/// # Errors
+/// It is a link, no regular file, another user's, or others have rights to it.
+pub(crate) fn open_private(path: &Path, write: bool) -> Result<File, WireError> {
+    let mut options = OpenOptions::new();
+    // Without O_NONBLOCK a pipe in its place would wait for its other end.
+    options.read(true).write(write).custom_flags(libc::O_NOFOLLOW | libc::O_CLOEXEC | libc::O_NONBLOCK);
+    let file = options.open(path).map_err(|e| match e.raw_os_error() {
+        Some(libc::ELOOP) => foreign(path, "is a symbolic link".into()),
+        // Under a sticky, foreign folder the system itself may refuse.
+        Some(libc::EACCES | libc::EPERM) => foreign(path, "may not be opened by this user".into()),
+        _ => WireError::io(path, "cannot be opened", e),
+    })?;
+    let about = file.metadata().map_err(|e| WireError::io(path, "cannot be looked at", e))?;
+    check_private(path, &about, user())?;
+    Ok(file)
+}
+
+/// Whether a file is this user's alone.
+pub(crate) fn check_private(path: &Path, about: &Metadata, user: u32) -> Result<(), WireError> {
+    if !about.is_file() {
+        return Err(foreign(path, "is no regular file".into()));
+    }
+    if about.uid() != user {
+        return Err(foreign(path, format!("belongs to user {}", about.uid())));
+    }
+    if about.mode() & 0o077 != 0 {
+        return Err(foreign(path, format!("has mode {:04o}", about.mode() & 0o7777)));
+    }
+    Ok(())
+}
+
+pub(crate) fn foreign(path: &Path, found: String) -> WireError {
+    WireError::Foreign { path: path.to_owned(), found, user: user() }
+}
+
+/// A file mapped for reading and writing, all its pages there.
+#[derive(Debug)]
+pub(crate) struct Map {
+    start: *mut u8,
+    length: usize,
+}
+
+// SAFETY: the mapping belongs to this value alone and no thread's state hangs on it.
+unsafe impl Send for Map {}
+// SAFETY: the callers of `start` say who writes where.
+unsafe impl Sync for Map {}
+
+impl Map {
+    /// Gives the file `length` bytes, all of them backed by memory, and maps it.
+    ///
+    /// # Errors
+    /// `NoSpace`: there is no room. Never leaves pages that could fail when they are written.
+    pub fn create(file: &File, path: &Path, length: u64) -> Result<Self, WireError> {
+        let no_space = || WireError::NoSpace { path: path.to_owned(), needed: length };
+        let size = libc::off_t::try_from(length).ok().zip(usize::try_from(length).ok());
+        let (offset, length) = size.ok_or_else(no_space)?;
+        loop {
+            // SAFETY: the descriptor is open. Unlike `ftruncate`, this reserves: a full file system answers here and not by SIGBUS later.
+            match unsafe { libc::posix_fallocate(file.as_raw_fd(), 0, offset) } {
+                0 => break,
+                libc::EINTR => {}
+                libc::ENOSPC | libc::EFBIG | libc::ENOMEM | libc::EDQUOT => return Err(no_space()),
+                code => return Err(WireError::io(path, "room cannot be reserved", io::Error::from_raw_os_error(code))),
+            }
+        }
+        let (rights, flags) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_SHARED | libc::MAP_POPULATE);
+        // SAFETY: a new mapping of an open file; the address is the system's choice.
+        let start = unsafe { libc::mmap(std::ptr::null_mut(), length, rights, flags, file.as_raw_fd(), 0) };
+        if start == libc::MAP_FAILED {
+            return Err(WireError::io(path, "cannot be mapped", io::Error::last_os_error()));
+        }
+        let map = Self { start: start.cast(), length };
+        // MAP_POPULATE maps for reading; a write to every page makes it this process's before the first step.
+        for page in (0..length).step_by(4096) {
+            // SAFETY: inside the mapping, which nobody else has seen yet.
+            unsafe { map.start.add(page).write_volatile(0) };
+        }
+        Ok(map)
+    }
+
+    pub fn start(&self) -> *mut u8 {
+        self.start
+    }
+
+    pub fn len(&self) -> usize {
+        self.length
+    }
+}
+
+impl Drop for Map {
+    fn drop(&mut self) {
+        // SAFETY: mapped by `create` and unmapped only here.
+        unsafe { libc::munmap(self.start.cast(), self.length) };
+    }
+}

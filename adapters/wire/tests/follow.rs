@@ -1,0 +1,203 @@
+//! Followers of rings and relays: restarts, kills, several blocks, connections that break.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch_wire::message::{ConnectionFile, Key, Session};
+use ridgewatch_wire::relay::{RelayCounts, RelayFollower, serve};
+use ridgewatch_wire::{AxisDescription, Description, Element, Event, Field, Geometry, Limits, Policy, Producer, RingFollower, WireError};
+use std::net::{TcpListener, TcpStream};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = PathBuf::from("/dev/shm").join(format!("rw-follow-{name}-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        Self(path)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+fn description(nodes: u64) -> Description {
+    let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, nodes);
+    Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s")
+}
+
+fn publish(producer: &Producer, step: u64) {
+    let plane = vec![step as f32; producer.description().block_nodes() as usize];
+    let pointers = [plane.as_ptr().cast::<u8>(); 2];
+    // SAFETY: a value a node.
+    unsafe { producer.publish(step, step as f64, &Field::packed(&pointers, Element::F32, producer.description().block.extent)).unwrap() };
+}
+
+/// Events in words, until `enough` or five seconds went by.
+fn events(poll: &mut dyn FnMut(&mut Vec<f32>) -> Option<Event>, enough: &str) -> Vec<String> {
+    let (mut seen, mut values, begin) = (Vec::new(), Vec::new(), Instant::now());
+    while begin.elapsed() < Duration::from_secs(5) {
+        let words = match poll(&mut values) {
+            Some(Event::Opened { description, .. }) => format!("opened {}", description.shape()[0]),
+            Some(Event::Step { step, time, missed, .. }) => {
+                assert!(time == step as f64 && values.iter().all(|v| *v == step as f32), "step {step}");
+                format!("step {step} missed {missed}")
+            }
+            Some(Event::Ended { closed, .. }) => format!("ended {closed}"),
+            Some(Event::Refused(error)) => format!("refused {error}"),
+            None => {
+                std::thread::sleep(Duration::from_millis(1));
+                continue;
+            }
+        };
+        let last = words.starts_with(enough);
+        seen.push(words);
+        if last {
+            break;
+        }
+    }
+    seen
+}
+
+#[test]
+fn a_solver_that_ends_and_one_that_starts_anew_are_followed() {
+    let folder = Folder::new("anew");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    (0..3).for_each(|n| publish(&producer, n));
+    assert_eq!(events(&mut poll, "step 2"), ["opened 4", "step 0 missed 0", "step 1 missed 0", "step 2 missed 0"]);
+    publish(&producer, 3);
+    drop(producer);
+    // Another grid, at once: what the first left is read first.
+    let producer = Producer::open(&folder.0, description(5), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    assert_eq!(events(&mut poll, "step 0"), ["step 3 missed 0", "ended true", "opened 5", "step 0 missed 0"]);
+    drop(producer);
+    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+    drop(follower);
+    assert!(!folder.0.exists());
+}
+
+#[test]
+fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
+    let folder = Folder::new("killed");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+    let killed = || {
+        // SAFETY: the child makes a producer and is killed in it; no other thread of it is needed.
+        let child = unsafe { libc::fork() };
+        if child == 0 {
+            let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+            publish(&producer, 7);
+            // SAFETY: as a machine that runs out of memory does it.
+            unsafe { libc::kill(libc::getpid(), libc::SIGKILL) };
+        }
+        let mut status = 0;
+        // SAFETY: waits for that child.
+        unsafe { libc::waitpid(child, &mut status, 0) };
+        assert!(libc::WIFSIGNALED(status));
+    };
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 1);
+    assert_eq!(events(&mut poll, "step 1").len(), 2);
+    drop(producer);
+    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+    killed();
+    // It was dead before it was seen: its ring is what a killed run left.
+    assert_eq!(events(&mut poll, "opened").len(), 0);
+    // A new one takes its place.
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 2);
+    assert_eq!(events(&mut poll, "step 2"), ["opened 4", "step 2 missed 0"]);
+}
+
+#[test]
+fn a_solver_that_is_killed_and_replaced_at_once_is_followed() {
+    let folder = Folder::new("replaced");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+    for round in 0..5 {
+        // SAFETY: the child makes a producer and waits to be killed; no other thread of it is needed.
+        let child = unsafe { libc::fork() };
+        if child == 0 {
+            let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+            publish(&producer, 10 * round);
+            loop {
+                std::thread::sleep(Duration::from_secs(1));
+            }
+        }
+        let seen = events(&mut poll, &format!("step {}", 10 * round));
+        assert_eq!(seen.last().unwrap(), &format!("step {} missed 0", 10 * round), "{seen:?}");
+        let mut status = 0;
+        // SAFETY: that child.
+        unsafe {
+            libc::kill(child, libc::SIGKILL);
+            libc::waitpid(child, &mut status, 0);
+        }
+        // Before the follower has had time to look.
+        let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+        publish(&producer, 10 * round + 1);
+        assert_eq!(events(&mut poll, "step"), ["ended false".to_owned(), "opened 4".into(), format!("step {} missed 0", 10 * round + 1)]);
+        drop(producer);
+        assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+    }
+}
+
+#[test]
+fn a_relay_ships_steps_to_those_who_have_the_key() {
+    let folder = Folder::new("relay");
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let (key, counts, stop) = (Key::random().unwrap(), Arc::new(RelayCounts::default()), Arc::new(AtomicBool::new(false)));
+    let relay = {
+        let (ring, key, counts, stop) = (folder.0.clone(), key.clone(), counts.clone(), stop.clone());
+        std::thread::spawn(move || serve(&ring, &listener, &key, &counts, &stop, Arc::new(|_| {})).unwrap())
+    };
+    let mut stranger = TcpStream::connect(address).unwrap();
+    assert!(matches!(Session::connect(&mut stranger, &Key::random().unwrap()), Err(WireError::Signature | WireError::Io { .. })));
+    let file = ConnectionFile { address: address.to_string(), key: key.clone() };
+    let mut follower = RelayFollower::begin(Box::new(move || Ok(file.clone())), Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    let producer = Producer::open(&folder.0, description(64), 4, Policy::NewestWins).unwrap();
+    // One after another, so that none is overwritten.
+    publish(&producer, 0);
+    assert_eq!(events(&mut poll, "step 0"), ["opened 64", "step 0 missed 0"]);
+    for n in 1..20 {
+        publish(&producer, n);
+        assert_eq!(events(&mut poll, "step"), [format!("step {n} missed 0")]);
+    }
+    // Far more than the ring and the wire hold: each step is seen or counted, and the newest comes.
+    (20..2000).for_each(|n| publish(&producer, n));
+    let seen = events(&mut poll, "step 1999");
+    let missed: usize = seen.iter().map(|words| words.rsplit(' ').next().unwrap().parse::<usize>().unwrap()).sum();
+    assert_eq!(seen.len() + missed, 1980);
+    drop(producer);
+    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+    let producer = Producer::open(&folder.0, description(8), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 5);
+    assert_eq!(events(&mut poll, "step 5"), ["opened 8", "step 5 missed 0"]);
+    assert_eq!((counts.accepted.load(Ordering::Relaxed), counts.refused.load(Ordering::Relaxed)), (1, 1));
+    stop.store(true, Ordering::Relaxed);
+    relay.join().unwrap();
+    // The relay is gone, and comes back at its old address: the follower finds it by itself.
+    assert!(events(&mut poll, "refused").last().unwrap().starts_with("refused"));
+    let listener = TcpListener::bind(address).unwrap();
+    let stop = Arc::new(AtomicBool::new(false));
+    let relay = {
+        let (ring, stop) = (folder.0.clone(), stop.clone());
+        std::thread::spawn(move || serve(&ring, &listener, &key, &counts, &stop, Arc::new(|_| {})).unwrap())
+    };
+    let seen = events(&mut poll, "step 5");
+    assert_eq!(seen.last().unwrap(), "step 5 missed 0", "{seen:?}");
+    publish(&producer, 6);
+    assert_eq!(events(&mut poll, "step 6"), ["step 6 missed 0"]);
+    stop.store(true, Ordering::Relaxed);
+    relay.join().unwrap();
+}

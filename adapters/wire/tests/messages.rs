@@ -1,0 +1,140 @@
+//! Messages over real sockets: keys, changes on the way, replays, lengths that lie.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch_wire::message::{ConnectionFile, Facts, Key, Kind, Session};
+use ridgewatch_wire::{AxisDescription, Description, Geometry, Limits, WireError};
+use std::io::{Cursor, Read, Write};
+use std::net::{TcpListener, TcpStream};
+
+fn description() -> Description {
+    let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, 4);
+    Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s")
+}
+
+fn facts(step: u64) -> Facts {
+    Facts { kind: Kind::Step, block: 0, generation: 5, step, time: step as f64, published: 1, missed: 0 }
+}
+
+/// Sessions of both sides, over a real connection.
+fn pair(relay: &Key, follower: &Key) -> (Result<Session, WireError>, Result<Session, WireError>) {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let key = follower.clone();
+    let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &key));
+    let server = Session::accept(&mut listener.accept().unwrap().0, relay);
+    (server, client.join().unwrap())
+}
+
+/// Two whole messages of a session, as bytes.
+fn two(session: &mut Session) -> (Vec<u8>, Vec<u8>) {
+    let values: Vec<f32> = (0..32).map(|v| v as f32).collect();
+    let (mut first, mut second) = (Vec::new(), Vec::new());
+    session.send(&mut first, &facts(1), Some(&description()), &values).unwrap();
+    session.send(&mut second, &facts(2), None, &values).unwrap();
+    (first, second)
+}
+
+fn receive(session: &mut Session, bytes: &[u8], known: &mut Option<Description>) -> Result<(Facts, Vec<f32>), WireError> {
+    let mut values = Vec::new();
+    let mut note = |_, announced: Option<Description>| {
+        if announced.is_some() {
+            *known = announced;
+        }
+        known.as_ref().map(Description::block_bytes)
+    };
+    let facts = session.receive(&mut Cursor::new(bytes), &Limits::default(), &mut note, &mut values)?;
+    Ok((facts, values))
+}
+
+#[test]
+fn messages_arrive_once_and_in_order() {
+    let key = Key::random().unwrap();
+    let (server, client) = pair(&key, &key);
+    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let (first, second) = two(&mut server);
+    let mut known = None;
+    let (facts_1, values) = receive(&mut client, &first, &mut known).unwrap();
+    assert_eq!((facts_1, values[31], known.clone()), (facts(1), 31.0, Some(description())));
+    assert_eq!(receive(&mut client, &second, &mut known).unwrap().0, facts(2));
+    for replay in [&first, &second] {
+        assert!(matches!(receive(&mut client, replay, &mut known), Err(WireError::Replayed { newest: 2, .. })));
+    }
+    // In another session of the same key.
+    let (_, other) = pair(&key, &key);
+    assert!(matches!(receive(&mut other.unwrap(), &first, &mut None), Err(WireError::Signature)));
+}
+
+#[test]
+fn wrong_keys_are_refused_by_either_side() {
+    let (server, client) = pair(&Key::random().unwrap(), &Key::random().unwrap());
+    assert!(matches!(server, Err(WireError::Signature)));
+    assert!(client.is_err());
+    // A relay that does not know the key cannot prove it, whatever it answers.
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &Key::random().unwrap()));
+    let (mut stream, _) = listener.accept().unwrap();
+    stream.write_all(b"RIDGEWIRE\0\0\0\x01\0\0\0").unwrap();
+    stream.write_all(&[7; 32]).unwrap();
+    let mut greeting = [0; 80];
+    stream.read_exact(&mut greeting).unwrap();
+    stream.write_all(&greeting[48..]).unwrap();
+    assert!(matches!(client.join().unwrap(), Err(WireError::Signature)), "its own proof, sent back");
+}
+
+#[test]
+fn every_changed_byte_is_noticed() {
+    let key = Key::random().unwrap();
+    let (server, client) = pair(&key, &key);
+    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let (first, _) = two(&mut server);
+    for place in 0..first.len() {
+        let mut changed = first.clone();
+        changed[place] ^= 1 << (place % 8);
+        let error = receive(&mut client, &changed, &mut None).map(|_| ()).unwrap_err();
+        match place {
+            0..132 => assert!(matches!(error, WireError::Signature), "{place}: {error}"),
+            // A message whose head was good has used up its number.
+            _ => {
+                let (mut fresh_server, mut fresh_client) = (pair(&key, &key), None::<Session>);
+                let session = fresh_server.0.as_mut().unwrap();
+                let (mut message, _) = two(session);
+                message[place] ^= 1 << (place % 8);
+                let client = fresh_client.insert(fresh_server.1.unwrap());
+                let error = receive(client, &message, &mut None).map(|_| ()).unwrap_err();
+                assert!(!matches!(error, WireError::Signature | WireError::Replayed { .. }), "{place}: {error}");
+            }
+        }
+    }
+    let (first, _) = two(&mut server);
+    for length in [0, 1, 50, 131, 132, 200, first.len() - 1] {
+        assert!(receive(&mut client, &first[..length], &mut None).is_err(), "{length}");
+    }
+}
+
+#[test]
+fn connection_files_are_private_and_checked() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = std::env::temp_dir().join(format!("rw-connection-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let path = folder.join("connection");
+    let file = ConnectionFile { address: "127.0.0.1:4711".into(), key: Key::random().unwrap() };
+    file.write(&path).unwrap();
+    assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+    assert_eq!(ConnectionFile::read(&path).unwrap(), file);
+    let text = std::fs::read_to_string(&path).unwrap();
+    for (changed, expected) in [
+        (text.replace("connection = 1", "connection = 2"), "version 2"),
+        (text.replace("key = ", "key = zz"), "66 characters"),
+        (text.replace("address", "adress"), "`address` is missing"),
+        (String::new(), "`ridgewatch-connection` is missing"),
+    ] {
+        std::fs::write(&path, changed).unwrap();
+        let error = ConnectionFile::read(&path).unwrap_err().to_string();
+        assert!(error.contains(expected), "{error}");
+    }
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o644)).unwrap();
+    assert!(matches!(ConnectionFile::read(&path), Err(WireError::Foreign { .. })));
+    std::fs::remove_dir_all(&folder).unwrap();
+}

@@ -1,0 +1,274 @@
+//! Mutated rings and messages against the parsers: no panic, and no memory beyond the stated limit. A short run by default; the number of cases
+//! is set by `RIDGEWATCH_MUTATIONS` (one million was run for the figures in docs/live.md).
+
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+use ridgewatch_wire::message::{Facts, Key, Kind, Session};
+use ridgewatch_wire::{
+    AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, Read, ReadAt, RingReader, block_path,
+};
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+use std::io::Cursor;
+
+/// Counts what this thread holds and its peak.
+struct Counting;
+
+thread_local! {
+    static HELD: Cell<isize> = const { Cell::new(0) };
+    static PEAK: Cell<isize> = const { Cell::new(0) };
+}
+
+// SAFETY: every request goes to the system's allocator unchanged.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        HELD.set(HELD.get() + layout.size() as isize);
+        PEAK.set(PEAK.get().max(HELD.get()));
+        // SAFETY: the caller's promise.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, pointer: *mut u8, layout: Layout) {
+        HELD.set(HELD.get() - layout.size() as isize);
+        // SAFETY: the caller's promise.
+        unsafe { System.dealloc(pointer, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// Most memory of one case: the step, the description and its parts, the words of an error.
+const STEP_BYTES: u64 = 1 << 16;
+const MEMORY: isize = STEP_BYTES as isize + (1 << 15);
+
+fn cases() -> u64 {
+    std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(20_000)
+}
+
+/// SplitMix64.
+struct Random(u64);
+
+impl Random {
+    fn next(&mut self) -> u64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        z ^ (z >> 31)
+    }
+
+    fn below(&mut self, n: usize) -> usize {
+        (self.next() % n.max(1) as u64) as usize
+    }
+}
+
+/// Changes bytes as damage and intent do: bits, numbers at the edges, pieces copied about, a cut, a tail.
+fn mutate(bytes: &mut Vec<u8>, places: &[std::ops::Range<usize>], random: &mut Random) {
+    const EDGES: [u64; 10] = [0, 1, 2, 0x7f, 0xff, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 40, u64::MAX];
+    for _ in 0..1 + random.below(4) {
+        let range = places[random.below(places.len())].clone();
+        let place = range.start + random.below(range.len());
+        if place + 8 > bytes.len() {
+            continue;
+        }
+        match random.below(8) {
+            0 | 1 => bytes[place] ^= 1 << random.below(8),
+            2 => bytes[place] = random.next() as u8,
+            3 => bytes[place..place + 4].copy_from_slice(&(EDGES[random.below(10)] as u32).to_le_bytes()),
+            4 => bytes[place..place + 8].copy_from_slice(&EDGES[random.below(10)].to_le_bytes()),
+            5 => bytes[place..place + 8].copy_from_slice(&f64::from_bits(random.next()).to_le_bytes()),
+            6 => {
+                let from = (range.start + random.below(range.len().saturating_sub(8))).min(bytes.len());
+                let length = 8.min(range.end.min(bytes.len()).saturating_sub(from));
+                let to = place.min(bytes.len() - length);
+                bytes.copy_within(from..from + length, to);
+            }
+            _ if random.below(4) == 0 => bytes.truncate(random.below(bytes.len())),
+            _ => bytes[place] = bytes[place].wrapping_add(1),
+        }
+    }
+}
+
+/// What was done to a ring's checksum: mutations behind it are of no use to anybody if it always catches them.
+fn repair(bytes: &mut [u8]) {
+    if bytes.len() < 8192 {
+        return;
+    }
+    let length = u32::from_le_bytes(bytes[12..16].try_into().unwrap()) as usize;
+    let Some(end) = 8192usize.checked_add(length).filter(|end| *end <= bytes.len()) else { return };
+    let mix = |sum: u64, byte: &u8| (sum ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+    let sum = bytes[..72].iter().chain(&bytes[8192..end]).fold(0xcbf2_9ce4_8422_2325, mix);
+    bytes[72..80].copy_from_slice(&sum.to_le_bytes());
+}
+
+struct Bytes<'a>(&'a [u8]);
+
+impl ReadAt for Bytes<'_> {
+    fn length(&self) -> std::io::Result<u64> {
+        Ok(self.0.len() as u64)
+    }
+
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+        let begin = usize::try_from(offset).ok().filter(|b| *b <= self.0.len()).ok_or(std::io::ErrorKind::UnexpectedEof)?;
+        let from = self.0[begin..].get(..to.len()).ok_or(std::io::ErrorKind::UnexpectedEof)?;
+        to.copy_from_slice(from);
+        Ok(())
+    }
+
+    fn write_at(&self, _: &[u8], _: u64) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+fn description() -> Description {
+    let axis = |name, n| AxisDescription::uniform(name, "m", 0.0, 1.0, n);
+    Description::whole(Geometry::Sphere { radius: 6.371e6 }, vec![axis("lon", 5), axis("lat", 4), axis("z", 3)], "s")
+}
+
+/// A ring with steps in it.
+fn ring() -> Vec<u8> {
+    let folder = std::path::PathBuf::from("/dev/shm").join(format!("rw-mutation-{}", std::process::id()));
+    let producer = Producer::open(&folder, description(), 3, Policy::NewestWins).unwrap();
+    let plane = [1.0f32; 60];
+    let pointers = [plane.as_ptr().cast::<u8>(); 3];
+    for n in 0..5 {
+        // SAFETY: 60 values, as described.
+        unsafe { producer.publish(n, n as f64, &Field::packed(&pointers, Element::F32, [5, 4, 3])).unwrap() };
+    }
+    std::fs::read(block_path(&folder, 0)).unwrap()
+}
+
+#[test]
+fn mutated_rings() {
+    let whole = ring();
+    let length = u32::from_le_bytes(whole[12..16].try_into().unwrap()) as usize;
+    let first = (8192 + length).div_ceil(4096) * 4096;
+    // Where it matters: the header, the counts, the description, the slots' heads.
+    let places = [0..80, 8192..8192 + length, 8192..8192 + length, 1024..1048, first..first + 32, first + 4096..first + 4128];
+    let limits = Limits { step_bytes: STEP_BYTES };
+    let mut random = Random(1);
+    let (mut refused, mut opened, mut read) = (0u64, 0u64, 0u64);
+    let mut bytes = Vec::with_capacity(whole.len());
+    for case in 0..cases() {
+        bytes.clear();
+        bytes.extend_from_slice(&whole);
+        mutate(&mut bytes, &places, &mut random);
+        if case % 4 != 0 {
+            repair(&mut bytes);
+        }
+        let held = HELD.get();
+        PEAK.set(held);
+        match RingReader::over("mutated".into(), Bytes(&bytes), &limits) {
+            Err(error) => {
+                assert!(!error.to_string().is_empty());
+                refused += 1;
+            }
+            Ok(mut reader) => {
+                opened += 1;
+                let mut values = Vec::new();
+                // As often as there are slots, and once more.
+                for _ in 0..4 {
+                    match reader.read(&mut values) {
+                        Ok(Read::Step(info)) => {
+                            assert!(info.time.is_finite());
+                            assert_eq!(values.len() as u64 * 4, reader.header().description.block_bytes());
+                            read += 1;
+                        }
+                        Ok(_) | Err(_) => break,
+                    }
+                }
+            }
+        }
+        assert!(PEAK.get() - held <= MEMORY, "case {case} took {} bytes", PEAK.get() - held);
+    }
+    println!("{} mutated rings: {refused} refused, {opened} opened, {read} steps read", cases());
+    assert!(refused > cases() / 4 && opened > cases() / 20 && read > opened, "{refused} {opened} {read}: the corpus is lopsided");
+}
+
+/// Ends of one session without a socket.
+struct Loop {
+    incoming: Cursor<Vec<u8>>,
+    outgoing: Vec<u8>,
+}
+
+impl std::io::Read for Loop {
+    fn read(&mut self, to: &mut [u8]) -> std::io::Result<usize> {
+        self.incoming.read(to)
+    }
+}
+
+impl std::io::Write for Loop {
+    fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
+        self.outgoing.extend_from_slice(from);
+        Ok(from.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn mutated_messages() {
+    // Signed by somebody who has the key and lies: mutations of the plain parts are signed anew, which needs the session's own `send`; so
+    // the session of one side is a socket pair away, and the mutated bytes are those behind the signature or the signature itself.
+    let key = Key::random().unwrap();
+    let (mut server, mut client) = sessions(&key);
+    let mut known: Option<Description> = None;
+    let mut random = Random(2);
+    let limits = Limits { step_bytes: STEP_BYTES };
+    let values = vec![0.5f32; 180];
+    let (mut refused, mut taken) = (0u64, 0u64);
+    for case in 0..cases() {
+        let facts = Facts { kind: Kind::Step, block: 0, generation: 1, step: case, time: case as f64, published: 0, missed: 0 };
+        let mut bytes = Vec::with_capacity(4096);
+        server.send(&mut bytes, &facts, Some(&description()), &values).unwrap();
+        // One in eight arrives as it was sent.
+        if case % 8 != 0 {
+            let length = bytes.len();
+            mutate(&mut bytes, &[0..132, 132..length - 700, length - 700..length], &mut random);
+        }
+        let held = HELD.get();
+        PEAK.set(held);
+        let mut to = Vec::new();
+        let mut note = |_, announced: Option<Description>| {
+            known = announced.or(known.take());
+            known.as_ref().map(Description::block_bytes)
+        };
+        match client.receive(&mut Cursor::new(&bytes), &limits, &mut note, &mut to) {
+            Ok(_) => taken += 1,
+            Err(_) => refused += 1,
+        }
+        drop(to);
+        assert!(PEAK.get() - held <= MEMORY, "case {case} took {} bytes", PEAK.get() - held);
+    }
+    println!("{} mutated messages: {refused} refused, {taken} taken", cases());
+    // A mutation may put back what was there.
+    assert!(taken >= cases() / 8 && refused > cases() * 3 / 4, "{refused} {taken}");
+}
+
+fn sessions(key: &Key) -> (Session, Session) {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let address = listener.local_addr().unwrap();
+    let other = key.clone();
+    let client = std::thread::spawn(move || Session::connect(&mut std::net::TcpStream::connect(address).unwrap(), &other).unwrap());
+    (Session::accept(&mut listener.accept().unwrap().0, key).unwrap(), client.join().unwrap())
+}
+
+#[test]
+fn mutated_greetings() {
+    let key = Key::random().unwrap();
+    // What a follower would send; it cannot fit the relay's fresh numbers, so nothing of it is ever accepted.
+    let mut good = b"RIDGEWIRE\0\0\0\x01\0\0\0".to_vec();
+    good.extend([9; 64]);
+    let mut random = Random(3);
+    for _ in 0..cases().min(100_000) {
+        let mut bytes = good.clone();
+        mutate(&mut bytes, &[0..16, 16..80], &mut random);
+        let mut stream = Loop { incoming: Cursor::new(bytes), outgoing: Vec::with_capacity(256) };
+        let held = HELD.get();
+        PEAK.set(held);
+        assert!(Session::accept(&mut stream, &key).is_err());
+        assert!(PEAK.get() - held <= 8192);
+    }
+}

@@ -1,0 +1,65 @@
+// Answers a wave's collisions: the surrogate where the gate trusts it, RK4 elsewhere.
+//
+// 1. answer_split: points to two lists, one for the surrogate and one for RK4; land is answered at once.
+// 2. The surrogate predicts its list (unit points), the tracer sorts and traces its own (domain points).
+// 3. answer_join: values to where their collisions are, and some of the traced ones to the labels.
+// The order within lists is that of the atomics and changes from run to run; no result depends on it.
+#include "answer.cuh"
+#include "tracking.cuh"
+
+using namespace rw;
+
+// Both lists in one array of `capacity` entries: the surrogate's from the front, the tracer's from the back.
+struct Lists {
+    float* points;  // three an entry
+    uint32_t* places;
+    float* values;
+    uint32_t* lengths;  // of the surrogate's, of the tracer's
+    uint32_t capacity;
+    uint32_t pad;
+};
+static_assert(sizeof(Lists) == 40, "layout");
+
+struct Labels {
+    Four* at;  // domain point, log-stretch
+    uint32_t* length;
+    uint32_t capacity;
+    uint32_t shift;
+};
+static_assert(sizeof(Labels) == 24, "layout");
+
+extern "C" __global__ void __launch_bounds__(256)
+answer_split(const __grid_constant__ Choice choice, const float* __restrict__ points, uint32_t count, float* __restrict__ log_stretch,
+             unsigned char* __restrict__ by, Lists lists) {
+    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
+    if (i >= count) return;
+    const float point[3] = {points[3 * (size_t)i], points[3 * (size_t)i + 1], points[3 * (size_t)i + 2]};
+    float unit_point[3];
+    const Answerer who = choose(choice, point, unit_point);
+    by[i] = who == RUNGE_KUTTA ? TRACED : who == SURROGATE_UNASKED ? OVER_BUDGET : PREDICTED;
+    if (who == NOBODY) {
+        log_stretch[i] = not_a_number();
+    } else if (who == RUNGE_KUTTA) {
+        const uint32_t at = lists.capacity - 1 - reserve(&lists.lengths[1]);
+        for (int k = 0; k < 3; ++k) lists.points[3 * (size_t)at + k] = point[k];
+        lists.places[at] = i;
+    } else {
+        const uint32_t at = reserve(&lists.lengths[0]);
+        for (int k = 0; k < 3; ++k) lists.points[3 * (size_t)at + k] = unit_point[k];
+        lists.places[at] = i;
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(256)
+answer_join(Lists lists, uint32_t predicted, uint32_t traced, float* __restrict__ log_stretch, Labels labels) {
+    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
+    if (i >= predicted + traced) return;
+    const uint32_t at = i < predicted ? i : lists.capacity - 1 - (i - predicted);
+    const float value = lists.values[at];
+    log_stretch[lists.places[at]] = value;
+    if (i < predicted || labels.capacity == 0u) return;
+    const float* point = lists.points + 3 * (size_t)at;
+    if (!keeps_label(point, labels.shift)) return;
+    const uint32_t label = reserve(labels.length);
+    if (label < labels.capacity) labels.at[label] = {point[0], point[1], point[2], value};
+}

@@ -1,0 +1,101 @@
+//! `ridgewatch attach`.
+
+use super::replay::{RunArguments, conduct};
+use super::{Common, Usage, located, messages};
+use anyhow::{Result, bail};
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::{EngineError, Setup};
+use ridgewatch::source::live::Live;
+use ridgewatch::source::{SourceError, SourceKind};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
+
+/// Seconds between two checkpoints of a run that may be killed.
+const CHECKPOINT_SECONDS: f64 = 30.0;
+
+/// Options of `attach`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), and where the simulation is: the ring's folder on this node, or connection files of relays. Without them: what
+    /// the scene file says, or the environment variable RIDGEWATCH_RING.
+    #[arg(value_name = "CONFIG | RING | CONNECTION")]
+    paths: Vec<PathBuf>,
+    /// Length of the integration, in the simulation's time; overrides the scene's.
+    #[arg(long, value_name = "TIME")]
+    tau: Option<String>,
+    /// Ends when the simulation ends; otherwise its restart is waited for.
+    #[arg(long)]
+    once: bool,
+    /// How far to step back for the simulation when both want the same core: 0 (not at all) to 19.
+    #[arg(long, default_value_t = 10, value_name = "N", value_parser = clap::value_parser!(i32).range(0..=19))]
+    nice: i32,
+    #[command(flatten)]
+    run: RunArguments,
+}
+
+/// Attaches.
+pub fn run(common: &Common, mut options: Options) -> Result<()> {
+    let mut scene = scene(common, &options)?;
+    // What was trained before a restart is gone on from.
+    if options.run.resume.is_none() && scene.training.resume.is_none() {
+        options.run.resume = options.run.checkpoint.clone().filter(|path| path.exists());
+        if let Some(path) = &options.run.resume {
+            messages::note(format_args!("going on from the weights in {}", path.display()));
+        }
+    }
+    options.run.apply(&mut scene)?;
+    // SAFETY: changes this process's priority and touches no memory. Threads that are started later have it too.
+    if options.nice > 0 && unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, options.nice) } != 0 {
+        messages::note(format_args!("priority stays as it is: {}", std::io::Error::last_os_error()));
+    }
+    let open = |scene: &SceneFile, stop: &AtomicBool| {
+        let refused = |error| located(scene, error, SourceError::refused);
+        let Some(live) = Live::connect(&scene.live, stop, &mut messages::note).map_err(refused)? else { return Ok(None) };
+        messages::note(format_args!("found {}", live.describe()));
+        Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, EngineError::refused))
+    };
+    conduct(common, &options.run, scene, Some(CHECKPOINT_SECONDS), open)
+}
+
+/// The scene that the paths mean.
+fn scene(common: &Common, options: &Options) -> Result<SceneFile> {
+    let is_config = |p: &&PathBuf| p.extension().is_some_and(|e| e == "toml");
+    let (configs, places): (Vec<&PathBuf>, Vec<&PathBuf>) = options.paths.iter().partition(is_config);
+    let mut overrides = common.overrides.clone();
+    if let Some(tau) = &options.tau {
+        // A number as such, words in quotes.
+        let value = if tau.parse::<f64>().is_ok() { tau.clone() } else { format!("{tau:?}") };
+        overrides.push(format!("time.tau={value}"));
+    }
+    if options.once {
+        overrides.push("live.at_end=\"stop\"".into());
+    }
+    match places.as_slice() {
+        [] => {}
+        [ring] if is_ring(ring) => overrides.push(format!("live.ring={:?}", ring.display().to_string())),
+        files => {
+            if let Some(ring) = files.iter().find(|path| is_ring(path)) {
+                bail!(Usage(format!("{} is a ring beside other paths: give one ring, or connection files", ring.display())));
+            }
+            let list: Vec<String> = files.iter().map(|path| format!("{:?}", path.display().to_string())).collect();
+            overrides.push(format!("live.connections=[{}]", list.join(", ")));
+        }
+    }
+    let mut scene = match configs.as_slice() {
+        [] => SceneFile::for_live(&overrides)?,
+        [one] => SceneFile::read(one, &overrides)?,
+        [_, second, ..] => bail!(Usage(format!("{} is a second scene file: give one", second.display()))),
+    };
+    if scene.source.kind != SourceKind::Live {
+        bail!(Usage("the scene's source.kind is not \"live\"; archives and closed forms are for `ridgewatch replay`".into()));
+    }
+    if let Some(seed) = common.seed {
+        scene.seed = seed;
+    }
+    Ok(scene)
+}
+
+/// A ring is a folder, which may not be there yet; a connection file is a file.
+fn is_ring(path: &Path) -> bool {
+    !path.is_file()
+}

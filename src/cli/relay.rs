@@ -1,0 +1,72 @@
+//! `ridgewatch relay`.
+
+use super::{Common, Usage, messages, print_json};
+use anyhow::{Context, Result, bail};
+use ridgewatch_wire::message::{ConnectionFile, Key};
+use ridgewatch_wire::relay::{RelayCounts, serve};
+use std::net::TcpListener;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Options of `relay`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// The ring's folder; without it that of the environment variable RIDGEWATCH_RING.
+    #[arg(value_name = "RING")]
+    ring: Option<PathBuf>,
+    /// Where to listen: HOST:PORT; port 0: any free one. Another node needs this node's name or address here.
+    #[arg(long, default_value = "127.0.0.1:0", value_name = "HOST:PORT")]
+    listen: String,
+    /// Writes the address and the key here (mode 0600), for `ridgewatch attach` on the other node.
+    #[arg(long, value_name = "FILE")]
+    connection: PathBuf,
+}
+
+/// Relays until it is told to stop.
+pub fn run(common: &Common, options: &Options) -> Result<()> {
+    if !common.overrides.is_empty() {
+        bail!(Usage("--set: relay takes no scene; accepted: RING, --listen, --connection".into()));
+    }
+    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+    let Some(ring) = options.ring.clone().or_else(named) else {
+        bail!(Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE)));
+    };
+    let listener = TcpListener::bind(&options.listen).with_context(|| format!("cannot listen at {}", options.listen))?;
+    let port = listener.local_addr()?.port();
+    let host = options.listen.rsplit_once(':').map_or("127.0.0.1", |(host, _)| host);
+    let key = Key::random()?;
+    super::check_folder(&options.connection)?;
+    ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;
+    messages::note(format_args!(
+        "relaying {} at {host}:{port}; on the other node: ridgewatch attach {}",
+        ring.display(),
+        options.connection.display()
+    ));
+    let (stop, counts) = (Arc::new(AtomicBool::new(false)), Arc::new(RelayCounts::default()));
+    let runtime =
+        tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
+    let served = runtime.block_on(async {
+        let signals = super::replay::watch_signals(stop.clone()).map(tokio::spawn);
+        let (flag, counts) = (stop.clone(), counts.clone());
+        let work = move || serve(&ring, &listener, &key, &counts, &flag, Arc::new(messages::note));
+        let served = tokio::task::spawn_blocking(work).await;
+        if let Some(signals) = signals {
+            signals.abort();
+        }
+        served
+    });
+    // Whoever reads it later would wait for nobody.
+    let _ = std::fs::remove_file(&options.connection);
+    served.context("the relay stopped unexpectedly")??;
+    if common.json {
+        let count = |c: &std::sync::atomic::AtomicU64| c.load(Ordering::Relaxed);
+        print_json(&serde_json::json!({
+            "accepted": count(&counts.accepted),
+            "refused": count(&counts.refused),
+            "steps": count(&counts.steps),
+            "bytes": count(&counts.bytes),
+        }))?;
+    }
+    Ok(())
+}

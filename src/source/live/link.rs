@@ -1,0 +1,72 @@
+//! Where blocks come from: the ring of this node, or relays of others.
+
+use super::LiveSettings;
+use crate::source::SourceError;
+use ridgewatch_wire::message::ConnectionFile;
+use ridgewatch_wire::relay::RelayFollower;
+use ridgewatch_wire::{Event, Limits, RING_VARIABLE, RingFollower};
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Pause of a thread that finds nothing new.
+const IDLE: Duration = Duration::from_millis(1);
+
+/// An open way to the simulation.
+pub(super) enum Link {
+    Ring(RingFollower),
+    Relays(Vec<RelayFollower>),
+}
+
+impl Link {
+    /// Opens it, with words on what a simulation must do to be seen.
+    pub fn open(settings: &LiveSettings, limits: Limits) -> Result<(Self, String), SourceError> {
+        if settings.connections.is_empty() {
+            let ring = ring_of(settings)?;
+            let follower = RingFollower::begin(&ring, limits).map_err(SourceError::Live)?;
+            return Ok((Self::Ring(follower), format!("waiting for a simulation: start it with {RING_VARIABLE}={}", ring.display())));
+        }
+        let mut relays = Vec::new();
+        for path in &settings.connections {
+            // A file that cannot be believed is refused now; later it is read before each connection.
+            ConnectionFile::read(path).map_err(SourceError::Live)?;
+            let path = path.clone();
+            relays.push(RelayFollower::begin(Box::new(move || ConnectionFile::read(&path)), limits).map_err(SourceError::Live)?);
+        }
+        Ok((Self::Relays(relays), format!("waiting for {} relay(s)", settings.connections.len())))
+    }
+
+    /// The next thing that happened, after a short wait for it.
+    pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
+        match self {
+            Link::Ring(ring) => {
+                let event = ring.poll(values);
+                if event.is_none() {
+                    std::thread::sleep(IDLE);
+                }
+                event
+            }
+            Link::Relays(relays) => {
+                // The first is waited for, the others just looked at; and each takes its turn as the first.
+                relays.rotate_left(1);
+                relays.iter_mut().enumerate().find_map(|(k, relay)| relay.poll(values, if k == 0 { IDLE } else { Duration::ZERO }))
+            }
+        }
+    }
+
+    /// Says that somebody is there, without taking anything.
+    pub fn hold(&self) {
+        if let Link::Ring(ring) = self {
+            ring.hold();
+        }
+    }
+}
+
+/// The ring's folder.
+pub fn ring_of(settings: &LiveSettings) -> Result<PathBuf, SourceError> {
+    let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+    settings.ring.clone().or_else(named).ok_or_else(|| SourceError::Setting {
+        key: "live.ring",
+        found: "missing".into(),
+        accepted: format!("a folder (it is made), or the environment variable {RING_VARIABLE}, or live.connections"),
+    })
+}

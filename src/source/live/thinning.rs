@@ -1,0 +1,133 @@
+//! Which steps the window keeps when memory does not hold all of them, and what that costs.
+
+use crate::field::Snapshot;
+use std::sync::Arc;
+
+/// Nodes at which the interpolation is measured.
+const PROBES: usize = 1 << 15;
+
+/// Keeps steps at least a spacing apart, and measures linear interpolation in time on one that was left out of each interval.
+#[derive(Debug)]
+pub(super) struct Thinning {
+    spacing: f64,
+    kept: Option<Arc<Snapshot>>,
+    left_out: Option<Snapshot>,
+    /// Of the newest interval.
+    pub error: Option<f64>,
+    /// Steps left out.
+    pub count: u64,
+}
+
+impl Thinning {
+    /// For a window over `tau` of at most `snapshots` (at least 3).
+    pub fn new(tau: f64, snapshots: usize) -> Self {
+        // From one at or before its oldest time to its newest.
+        let intervals = snapshots.saturating_sub(2).max(1);
+        Self { spacing: tau / intervals as f64, kept: None, left_out: None, error: None, count: 0 }
+    }
+
+    /// Least distance of two steps that are kept.
+    pub fn spacing(&self) -> f64 {
+        self.spacing
+    }
+
+    /// Whether a step of this time is kept. If not, `build` may be called for it.
+    pub fn keeps(&mut self, time: f64, build: impl FnOnce() -> Snapshot) -> bool {
+        let Some(kept) = &self.kept else { return true };
+        // What does not move forward is the window's to judge.
+        if time <= kept.time || time >= kept.time + self.spacing * (1.0 - 1e-9) {
+            return true;
+        }
+        self.count += 1;
+        // The first beyond the middle, where the error of the interpolation is largest; until then the newest.
+        let middle = kept.time + self.spacing / 2.0;
+        if self.left_out.as_ref().is_none_or(|last| last.time < middle) {
+            self.left_out = Some(build());
+        }
+        false
+    }
+
+    /// Tells of a step that was kept.
+    pub fn kept(&mut self, snapshot: &Arc<Snapshot>) {
+        if let (Some(before), Some(between)) = (&self.kept, self.left_out.take())
+            && before.time < between.time
+            && between.time < snapshot.time
+        {
+            self.error = interpolation_error(before, &between, snapshot).or(self.error);
+        }
+        if self.kept.as_ref().is_none_or(|kept| kept.time < snapshot.time) {
+            self.kept = Some(snapshot.clone());
+        }
+    }
+
+    /// Forgets everything but the spacing and the count.
+    pub fn restart(&mut self) {
+        (self.kept, self.left_out, self.error) = (None, None, None);
+    }
+}
+
+/// Root mean square of |v - interpolated v| over that of |v|, on up to 32768 nodes whose velocity is known at all three times.
+fn interpolation_error(before: &Snapshot, between: &Snapshot, after: &Snapshot) -> Option<f64> {
+    let share = ((between.time - before.time) / (after.time - before.time)) as f32;
+    let (mut difference, mut size) = (0.0, 0.0);
+    let count = between.nodes.len();
+    // An odd stride, so that it does not meet the same column of every row.
+    let stride = (count / PROBES).max(1) | 1;
+    for i in (0..count).step_by(stride) {
+        let (a, v, b) = (before.nodes[i], between.nodes[i], after.nodes[i]);
+        if a[3].is_nan() || v[3].is_nan() || b[3].is_nan() {
+            continue;
+        }
+        for k in 0..3 {
+            let interpolated = a[k] + share * (b[k] - a[k]);
+            difference += f64::from(v[k] - interpolated).powi(2);
+            size += f64::from(v[k]).powi(2);
+        }
+    }
+    (size > 0.0).then(|| (difference / size).sqrt())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Axis, Geometry, Grid};
+
+    fn at(time: f64) -> Snapshot {
+        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
+        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+        // Turns once in 2 pi: |v| = 1, and interpolation over an interval h loses 1 - cos(h / 2) at its middle.
+        Snapshot::from_components(time, grid, &[time.cos() as f32; 9], &[time.sin() as f32; 9], &[])
+    }
+
+    #[test]
+    fn what_thinning_costs_is_measured() {
+        let mut thinning = Thinning::new(6.0, 14);
+        assert_eq!(thinning.spacing(), 0.5);
+        let mut kept = Vec::new();
+        for n in 0..101 {
+            let time = f64::from(n) * 0.05;
+            if thinning.keeps(time, || at(time)) {
+                let snapshot = Arc::new(at(time));
+                thinning.kept(&snapshot);
+                kept.push(time);
+            }
+        }
+        assert_eq!(kept.len(), 11, "{kept:?}");
+        assert!(kept.windows(2).all(|w| (w[1] - w[0] - 0.5).abs() < 1e-9));
+        assert_eq!(thinning.count, 90);
+        let (error, expected) = (thinning.error.unwrap(), 1.0 - 0.25f64.cos());
+        assert!((error / expected - 1.0).abs() < 0.02, "{error} {expected}");
+    }
+
+    #[test]
+    fn steps_far_apart_are_all_kept() {
+        let mut thinning = Thinning::new(6.0, 14);
+        for n in 0..10 {
+            let time = f64::from(n) * 0.7;
+            assert!(thinning.keeps(time, || at(time)));
+            thinning.kept(&Arc::new(at(time)));
+        }
+        assert_eq!((thinning.count, thinning.error), (0, None));
+        assert!(thinning.keeps(-1.0, || at(-1.0)), "what goes back in time is the window's to judge");
+    }
+}

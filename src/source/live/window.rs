@@ -1,0 +1,393 @@
+//! The window that a thread of its own keeps.
+
+use super::thinning::Thinning;
+use super::{AtEnd, Follow, Live, memory};
+use crate::field::{Grid, Snapshot, Window, WindowFault};
+use crate::source::{SourceError, StillReading};
+use ridgewatch_wire::{Assembler, Event, Incomplete, Step};
+use serde::{Deserialize, Serialize};
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+/// Steps that may wait for their blocks at once.
+const PENDING: usize = 4;
+/// Warnings that are kept for the next frame; the rest is counted.
+const WARNINGS: usize = 16;
+/// Late steps in a row after which the simulation is taken to have been set back.
+const SET_BACK: u32 = 3;
+/// How often a thread that holds back looks up.
+const LOOK_UP: Duration = Duration::from_millis(50);
+
+/// What a frame's record says of the simulation.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct LiveRecord {
+    /// The simulation's number of the newest step in the window.
+    pub step: u64,
+    /// When that step was published, seconds since 1970.
+    pub published: f64,
+    /// Seconds from its publication until the cycle took the window.
+    pub age: f64,
+    /// Whole steps that came, in all.
+    pub steps: u64,
+    /// Blocks of steps that were overwritten before they were read, in all.
+    pub missed: u64,
+    /// Steps left out for want of memory, in all.
+    pub thinned: u64,
+    /// Least distance in time of the steps that are kept.
+    pub spacing: f64,
+    /// What leaving steps out costs: difference of one that was left out from linear interpolation, over its size (root mean squares); null where
+    /// none was.
+    pub interpolation_error: Option<f64>,
+    /// Steps given up because blocks were missing, in all.
+    pub incomplete: u64,
+    /// Times that the simulation was started or set back while it was followed.
+    pub restarts: u64,
+    /// Snapshots in the window.
+    pub snapshots: usize,
+}
+
+/// The window at one moment.
+#[derive(Debug)]
+pub struct Taken {
+    /// Full.
+    pub window: Window,
+    /// What was odd since the last one.
+    pub warnings: Vec<String>,
+    /// For the record.
+    pub live: LiveRecord,
+}
+
+/// What both threads see.
+struct State {
+    window: Window,
+    /// Snapshots that moved the window since it was last taken.
+    moved: usize,
+    /// Whether it was ever taken.
+    begun: bool,
+    warnings: Vec<String>,
+    more_warnings: u64,
+    live: LiveRecord,
+    /// No more steps will come.
+    ended: bool,
+}
+
+impl State {
+    fn warn(&mut self, text: String) {
+        tracing::info!("{text}");
+        if self.warnings.len() < WARNINGS { self.warnings.push(text) } else { self.more_warnings += 1 }
+    }
+
+    /// Whether a slide is due.
+    fn due(&self, stride: usize) -> bool {
+        self.window.is_full() && (!self.begun || self.moved >= stride)
+    }
+}
+
+struct Shared {
+    state: Mutex<State>,
+    changed: Condvar,
+    stop: AtomicBool,
+}
+
+impl Shared {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(|broken| broken.into_inner())
+    }
+}
+
+/// A window that fills while frames are made. Dropping it ends its thread.
+pub struct LiveWindow {
+    shared: Arc<Shared>,
+    stride: usize,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl LiveWindow {
+    pub(super) fn start(live: Live, tau: f64, stride: usize) -> Result<Self, SourceError> {
+        let snapshot = 16 * live.grid.nodes() as u64;
+        // The window, and the one that the frame in progress still uses.
+        let room = (memory(&live.settings) / (2 * snapshot).max(1)) as usize;
+        if room < 3 {
+            return Err(SourceError::Setting {
+                key: "live.memory_gib",
+                found: live.settings.memory_gib.to_string(),
+                accepted: format!("at least {:.3}: three snapshots, twice", 6.0 * snapshot as f64 / f64::from(1 << 30)),
+            });
+        }
+        let state = State {
+            window: Window::new(tau),
+            moved: 0,
+            begun: false,
+            warnings: Vec::new(),
+            more_warnings: 0,
+            live: LiveRecord::default(),
+            ended: false,
+        };
+        let shared = Arc::new(Shared { state: Mutex::new(state), changed: Condvar::new(), stop: AtomicBool::new(false) });
+        let mut reader = Reader::new(live, shared.clone(), Thinning::new(tau, room), tau, stride);
+        let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
+        let thread = thread.map_err(|e| SourceError::Inconsistent { what: format!("the live thread could not start: {e}") })?;
+        Ok(Self { shared, stride, thread: Some(thread) })
+    }
+
+    /// The window as it is once it is full and has moved by the stride; none when the simulation has ended and it will not.
+    ///
+    /// # Errors
+    /// Not within the limit: ask again.
+    pub fn next_within(&self, limit: Duration) -> Result<Option<Taken>, StillReading> {
+        let until = Instant::now() + limit;
+        let mut state = self.shared.lock();
+        loop {
+            if state.due(self.stride) {
+                break;
+            }
+            if state.ended || self.thread.as_ref().is_none_or(JoinHandle::is_finished) {
+                return Ok(None);
+            }
+            let now = Instant::now();
+            if now >= until {
+                return Err(StillReading);
+            }
+            state = self.shared.changed.wait_timeout(state, until - now).map_or_else(|broken| broken.into_inner().0, |(state, _)| state);
+        }
+        (state.moved, state.begun) = (0, true);
+        let mut warnings = std::mem::take(&mut state.warnings);
+        if std::mem::take(&mut state.more_warnings) > 0 {
+            warnings.push(format!("and more of that kind: only the first {WARNINGS} are named"));
+        }
+        let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
+        let mut live = state.live.clone();
+        live.age = (now - live.published).max(0.0);
+        live.snapshots = state.window.snapshots().len();
+        let window = state.window.clone();
+        drop(state);
+        self.shared.changed.notify_all();
+        Ok(Some(Taken { window, warnings, live }))
+    }
+
+    /// Share of tau that the window covers so far.
+    pub fn filled(&self) -> f64 {
+        let state = self.shared.lock();
+        let covered = state.window.newest().zip(state.window.oldest()).map_or(0.0, |(newest, oldest)| newest - oldest);
+        (covered / state.window.span()).min(1.0)
+    }
+}
+
+impl Drop for LiveWindow {
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Relaxed);
+        self.shared.changed.notify_all();
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// The thread that reads.
+struct Reader {
+    live: Live,
+    shared: Arc<Shared>,
+    assembler: Assembler,
+    thinning: Thinning,
+    tau: f64,
+    stride: usize,
+    /// Blocks whose steps are not taken, since they describe another field.
+    barred: BTreeSet<u32>,
+    /// Blocks that are open, with their generations.
+    open: BTreeMap<u32, u64>,
+    /// Blocks whose producers are gone.
+    gone: BTreeSet<u32>,
+    /// A producer was opened since the last whole step.
+    anew: bool,
+    late: u32,
+}
+
+impl Reader {
+    fn new(live: Live, shared: Arc<Shared>, thinning: Thinning, tau: f64, stride: usize) -> Self {
+        let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
+        let assembler = Assembler::new(&live.description, limit, PENDING);
+        Self {
+            live,
+            shared,
+            assembler,
+            thinning,
+            tau,
+            stride,
+            barred: BTreeSet::new(),
+            open: BTreeMap::new(),
+            gone: BTreeSet::new(),
+            anew: false,
+            late: 0,
+        }
+    }
+
+    fn run(&mut self) {
+        let (description, generation) = (self.live.description.clone(), self.live.generation);
+        self.opened(&description, generation);
+        self.anew = false;
+        let mut values = Vec::new();
+        while !self.shared.stop.load(Ordering::Relaxed) {
+            if self.live.settings.follow == Follow::Every && self.hold_back() {
+                continue;
+            }
+            match self.live.link.poll(&mut values) {
+                Some(Event::Opened { description, generation }) => self.opened(&description, generation),
+                Some(Event::Step { block, step, time, published, missed }) => self.block(block, step, time, published, missed, &values),
+                Some(Event::Ended { block, closed }) => self.ended(block, closed),
+                Some(Event::Refused(error)) => self.shared.lock().warn(format!("the simulation's data were refused: {error}")),
+                None => {}
+            }
+            let given_up = self.assembler.expire();
+            self.tell_incomplete(&given_up);
+        }
+    }
+
+    /// Waits while a slide is due that was not taken; whether it did.
+    fn hold_back(&mut self) -> bool {
+        let state = self.shared.lock();
+        if !state.due(self.stride) {
+            return false;
+        }
+        self.live.link.hold();
+        drop(self.shared.changed.wait_timeout(state, LOOK_UP));
+        true
+    }
+
+    fn opened(&mut self, description: &ridgewatch_wire::Description, generation: u64) {
+        let block = description.block.index;
+        let known = self.open.insert(block, generation);
+        self.gone.remove(&block);
+        match self.assembler.introduce(description) {
+            Ok(()) => {
+                self.barred.remove(&block);
+            }
+            Err(error) => {
+                self.barred.insert(block);
+                let text = format!("the simulation was not taken in: {error}; what has another grid needs a run of its own");
+                self.shared.lock().warn(text);
+                return;
+            }
+        }
+        // Blocks of one start come one by one; only one that was there before tells of a restart.
+        if known.is_some_and(|before| before != generation) && !self.anew {
+            self.anew = true;
+            self.assembler.restart();
+            let mut state = self.shared.lock();
+            state.live.restarts += 1;
+            state.ended = false;
+            state.warn("the simulation was started anew".to_owned());
+        }
+    }
+
+    fn block(&mut self, block: u32, step: u64, time: f64, published: u64, missed: u64, values: &[f32]) {
+        if self.barred.contains(&block) {
+            return;
+        }
+        self.shared.lock().live.missed += missed;
+        match self.assembler.block(block, step, time, published, values) {
+            Ok((whole, given_up)) => {
+                self.tell_incomplete(&given_up);
+                if let Some(whole) = whole {
+                    self.whole(whole);
+                }
+            }
+            Err(error) => self.shared.lock().warn(format!("a step was refused: {error}")),
+        }
+    }
+
+    /// Takes a whole step in.
+    fn whole(&mut self, step: Step) {
+        let grid = self.live.grid.clone();
+        let Step { step: number, time, published, values } = step;
+        let build = || snapshot(time, &grid, &values);
+        let mut state = self.shared.lock();
+        state.live.steps += 1;
+        if std::mem::take(&mut self.anew) && state.window.newest().is_some_and(|newest| time <= newest) {
+            let newest = state.window.newest().unwrap_or(time);
+            state.warn(format!("the simulation went back from time {newest} to {time}: the window begins anew"));
+            state.window = Window::new(self.tau);
+            self.thinning.restart();
+        }
+        // Conversion and the measurement take their time: frames are made meanwhile.
+        drop(state);
+        let keep = self.thinning.keeps(time, build);
+        let kept = keep.then(|| Arc::new(snapshot(time, &grid, &values)));
+        self.assembler.recycle(values);
+        if let Some(kept) = &kept {
+            self.thinning.kept(kept);
+        }
+        let mut state = self.shared.lock();
+        (state.live.thinned, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
+        state.live.interpolation_error = self.thinning.error;
+        let Some(kept) = kept else { return };
+        let newest = state.window.newest();
+        match state.window.push(kept.clone()) {
+            Ok(pushed) => {
+                self.late = 0;
+                if let Some(warning) = pushed.warning {
+                    state.warn(warning.to_string());
+                }
+            }
+            Err(fault @ WindowFault::Late { .. }) => {
+                self.late += 1;
+                state.warn(fault.to_string());
+                if self.late >= SET_BACK {
+                    self.late = 0;
+                    state.live.restarts += 1;
+                    state.warn(format!(
+                        "{SET_BACK} steps in a row were late: the simulation was set back, the window begins anew at time {time}"
+                    ));
+                    state.window = Window::new(self.tau);
+                    self.thinning.restart();
+                    self.thinning.kept(&kept);
+                    let _ = state.window.push(kept);
+                }
+            }
+            Err(fault) => state.warn(fault.to_string()),
+        }
+        // Only what moves the window counts toward its stride.
+        if state.window.newest() != newest {
+            state.moved += 1;
+            (state.live.step, state.live.published) = (number, published as f64 / 1e9);
+        }
+        drop(state);
+        self.shared.changed.notify_all();
+    }
+
+    fn ended(&mut self, block: u32, closed: bool) {
+        let mut state = self.shared.lock();
+        let how = if closed { "has ended" } else { "is gone: its process ended without closing the ring" };
+        state.warn(format!("the simulation {how} (block {block})"));
+        self.gone.insert(block);
+        if self.live.settings.at_end == AtEnd::Stop && self.gone.len() == self.live.description.block.count as usize {
+            state.ended = true;
+        }
+        drop(state);
+        self.shared.changed.notify_all();
+    }
+
+    fn tell_incomplete(&self, given_up: &[Incomplete]) {
+        if given_up.is_empty() {
+            return;
+        }
+        let mut state = self.shared.lock();
+        for one in given_up {
+            state.live.incomplete += 1;
+            state.warn(format!(
+                "step {} (time {}) was given up with {} of {} blocks: {}",
+                one.step, one.time, one.blocks, one.wanted, one.why
+            ));
+        }
+    }
+}
+
+/// A snapshot of components, one behind the other.
+fn snapshot(time: f64, grid: &Arc<Grid>, values: &[f32]) -> Snapshot {
+    let nodes = grid.nodes();
+    let (u, rest) = values.split_at(nodes);
+    let (v, w) = rest.split_at(nodes);
+    Snapshot::from_components(time, grid.clone(), u, v, w)
+}

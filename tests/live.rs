@@ -1,0 +1,243 @@
+//! `publish`, `attach` and `relay` through the front door.
+
+#![allow(clippy::unwrap_used)]
+
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Output, Stdio};
+use std::time::{Duration, Instant};
+
+/// Folders of one test: one for files, one for the ring.
+struct Place {
+    files: PathBuf,
+    ring: PathBuf,
+}
+
+impl Place {
+    fn new(name: &str) -> Self {
+        let name = format!("rw-attach-{name}-{}", std::process::id());
+        let place = Self { files: std::env::temp_dir().join(&name), ring: PathBuf::from("/dev/shm").join(&name) };
+        let _ = std::fs::remove_dir_all(&place.files);
+        let _ = std::fs::remove_dir_all(&place.ring);
+        std::fs::create_dir_all(&place.files).unwrap();
+        // The same scene twice: from the turbulence itself, and from whoever publishes it.
+        let common = "[time]\ntau = 4.0\ndirection = \"backward\"\n[flow]\nsteps = 16\nboundary = \"clamp\"\ninterpolation = \"linear\"\n\
+                      [render]\nwidth = 32\nheight = 24\nsamples = 2\nmethod = \"reference\"\n[publish]\nexr = \"every\"\n";
+        std::fs::write(place.archive(), format!("[source]\nkind = \"turbulence\"\nnodes = [16, 12, 8]\nsnapshots = 8\n{common}")).unwrap();
+        std::fs::write(place.live(), format!("[source]\nkind = \"live\"\n[live]\nmemory_gib = 0.25\n{common}")).unwrap();
+        place
+    }
+
+    fn archive(&self) -> PathBuf {
+        self.files.join("archive.toml")
+    }
+
+    fn live(&self) -> PathBuf {
+        self.files.join("live.toml")
+    }
+}
+
+impl Drop for Place {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.files);
+        let _ = std::fs::remove_dir_all(&self.ring);
+    }
+}
+
+/// A process that does not outlive its test.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+fn ridgewatch(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_ridgewatch"));
+    command.args(arguments).args(["--device", "cpu", "--threads", "2"]).env_remove("RIDGEWATCH_RING").env_remove("RIDGEWATCH_LOG");
+    command
+}
+
+fn start(command: &mut Command) -> Running {
+    Running(command.stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap())
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+fn wait(mut running: Running, limit: Duration) -> Output {
+    let begin = Instant::now();
+    while running.0.try_wait().unwrap().is_none() {
+        assert!(begin.elapsed() < limit, "it does not end");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    let read = |from: &mut dyn std::io::Read| {
+        let mut bytes = Vec::new();
+        from.read_to_end(&mut bytes).unwrap();
+        bytes
+    };
+    let status = running.0.wait().unwrap();
+    let stdout = read(running.0.stdout.as_mut().unwrap());
+    let stderr = read(running.0.stderr.as_mut().unwrap());
+    Output { status, stdout, stderr }
+}
+
+fn good(output: &Output) {
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+fn until(what: &str, mut holds: impl FnMut() -> bool) {
+    let begin = Instant::now();
+    while !holds() {
+        assert!(begin.elapsed() < Duration::from_secs(60), "{what} did not happen");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+fn records(run: &Path) -> Vec<serde_json::Value> {
+    let lines = std::fs::read_to_string(run.join("records.jsonl")).unwrap_or_default();
+    lines.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+}
+
+/// Bytes of the previews: pixels without anything of the clock.
+fn pictures(run: &Path) -> Vec<Vec<u8>> {
+    let count = records(run).len();
+    (0..count).map(|n| std::fs::read(run.join(format!("frames/frame_{n:06}.png"))).unwrap()).collect()
+}
+
+/// Attaches with every step taken, publishes in blocks, and returns the run folder's records and pictures.
+fn attached(place: &Place, name: &str, blocks: &str) -> (Vec<serde_json::Value>, Vec<Vec<u8>>) {
+    let run = place.files.join(name);
+    let ring = text(&place.ring);
+    let live = place.live();
+    let attach = start(&mut ridgewatch(&["attach", text(&live), ring, "--once", "--set", "live.follow=every", "--out", text(&run)]));
+    until("the ring's folder", || place.ring.join("followers.lock").exists());
+    let publish = ridgewatch(&["publish", text(&place.archive()), "--ring", ring, "--wait", "60000", "--blocks", blocks]).output().unwrap();
+    good(&publish);
+    good(&wait(attach, Duration::from_secs(120)));
+    (records(&run), pictures(&run))
+}
+
+#[test]
+fn a_film_of_a_live_run_is_that_of_its_archive_whole_or_in_blocks() {
+    let place = Place::new("film");
+    let run = place.files.join("archive");
+    good(&ridgewatch(&["replay", text(&place.archive()), "--out", text(&run)]).output().unwrap());
+    let (expected, film) = (records(&run), pictures(&run));
+    assert_eq!(expected.len(), 4);
+    for (name, blocks) in [("whole", "1x1x1"), ("blocks", "2x2x1")] {
+        let (records, pictures) = attached(&place, name, blocks);
+        assert_eq!(records.len(), expected.len(), "{blocks}");
+        for (found, expected) in records.iter().zip(&expected) {
+            for key in ["time", "queries", "traced", "frame", "slide"] {
+                assert_eq!(found[key], expected[key], "{blocks}: {key}");
+            }
+            assert_eq!(found["live"]["missed"], 0);
+        }
+        assert_eq!(pictures, film, "{blocks}");
+    }
+    assert!(!place.ring.exists(), "nothing stays in /dev/shm");
+}
+
+#[test]
+fn a_killed_simulation_and_a_killed_sidecar_are_survived() {
+    let place = Place::new("killed");
+    let (run, ring) = (place.files.join("run"), text(&place.ring).to_owned());
+    let (archive, live) = (place.archive(), place.live());
+    let publish = || start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "100", "--steps", "100000"]));
+    let attach = |out: &Path| start(&mut ridgewatch(&["attach", text(&live), &ring, "--out", text(out)]));
+    let sidecar = attach(&run);
+    let solver = publish();
+    until("the first frame", || !records(&run).is_empty());
+    // Dropping kills: SIGKILL.
+    drop(solver);
+    let before = records(&run).len();
+    let solver = publish();
+    until("frames of the new run", || records(&run).last().is_some_and(|r| r["live"]["restarts"] == 1));
+    assert!(records(&run).len() > before);
+    drop(sidecar);
+    let again = place.files.join("again");
+    let sidecar = attach(&again);
+    until("frames of the new sidecar", || records(&again).len() >= 2);
+    drop(solver);
+    drop(sidecar);
+    // What both left is swept up by the next who comes and goes.
+    let again = place.files.join("sweep");
+    let sidecar = attach(&again);
+    until("the sidecar", || place.ring.join("followers.lock").exists());
+    std::thread::sleep(Duration::from_millis(300));
+    // SAFETY: a signal to a child of this test.
+    unsafe { libc::kill(sidecar.0.id() as i32, libc::SIGTERM) };
+    let out = wait(sidecar, Duration::from_secs(20));
+    good(&out);
+    assert!(String::from_utf8_lossy(&out.stderr).contains("stopped before a simulation came"));
+    assert!(!place.ring.exists(), "{:?}", std::fs::read_dir(&place.ring).map(|d| d.flatten().map(|e| e.path()).collect::<Vec<_>>()));
+}
+
+#[test]
+fn a_relay_ships_the_ring_to_another_node() {
+    let place = Place::new("relay");
+    let (run, connection, ring) = (place.files.join("run"), place.files.join("connection"), text(&place.ring).to_owned());
+    let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection), "--json"]));
+    until("the connection file", || connection.exists());
+    let live = place.live();
+    let attach = start(&mut ridgewatch(&["attach", text(&live), text(&connection), "--seconds", "1", "--out", text(&run)]));
+    let archive = place.archive();
+    let solver =
+        start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000", "--blocks", "2x1x1"]));
+    good(&wait(attach, Duration::from_secs(60)));
+    assert!(records(&run).last().unwrap()["live"]["steps"].as_u64().unwrap() >= 5);
+    drop(solver);
+    // SAFETY: a signal to a child of this test.
+    unsafe { libc::kill(relay.0.id() as i32, libc::SIGTERM) };
+    let out = wait(relay, Duration::from_secs(20));
+    good(&out);
+    let counts: serde_json::Value = serde_json::from_slice(&out.stdout).unwrap();
+    assert!(counts["steps"].as_u64().unwrap() >= 10 && counts["accepted"] == 1 && counts["refused"] == 0, "{counts}");
+    assert!(!connection.exists() && !place.ring.exists());
+}
+
+#[test]
+fn weights_outlive_the_sidecar() {
+    let place = Place::new("weights");
+    let (checkpoint, ring) = (place.files.join("weights"), text(&place.ring).to_owned());
+    let (archive, live) = (place.archive(), place.live());
+    let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "20", "--steps", "100000"]));
+    let attach = |name: &str| {
+        let run = place.files.join(name);
+        let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", "2", "--checkpoint", text(&checkpoint)];
+        let more = ["--method", "gated", "--set", "training.seconds_per_frame=0.1", "--set", "surrogate.kind=network"];
+        ridgewatch(&arguments).args(more).output().unwrap()
+    };
+    let first = attach("first");
+    good(&first);
+    assert!(checkpoint.exists() && !String::from_utf8_lossy(&first.stderr).contains("going on from"));
+    let second = attach("second");
+    good(&second);
+    assert!(String::from_utf8_lossy(&second.stderr).contains("going on from the weights in"));
+}
+
+#[test]
+fn what_cannot_be_followed_is_said() {
+    let place = Place::new("refused");
+    let told = |arguments: &[&str], status: i32, text: &str| {
+        let out = ridgewatch(arguments).output().unwrap();
+        let error = String::from_utf8_lossy(&out.stderr).into_owned();
+        assert!(out.status.code() == Some(status) && error.contains(text), "{arguments:?}: {:?} {error}", out.status);
+    };
+    let (archive, live, ring) = (place.archive(), place.live(), text(&place.ring));
+    told(&["attach", text(&archive), ring], 2, "for `ridgewatch replay`");
+    told(&["replay", text(&live)], 2, "with `ridgewatch attach`");
+    told(&["attach", text(&live)], 2, "live.ring");
+    told(&["attach", ring], 2, "time.tau");
+    told(&["publish", text(&archive)], 2, "RIDGEWATCH_RING");
+    told(&["publish", text(&archive), "--ring", ring, "--blocks", "99x1x1"], 2, "16, 12, 8");
+    told(&["publish", text(&archive), "--ring", ring, "--slots", "1"], 1, "`slots` is 1");
+    // A connection file that others may read holds no key to be trusted.
+    let connection = place.files.join("connection");
+    told(&["relay", "--connection", text(&connection)], 2, "RIDGEWATCH_RING");
+    std::fs::write(&connection, "ridgewatch-connection = 1\n").unwrap();
+    told(&["attach", text(&live), text(&connection)], 1, "mode 0600");
+}

@@ -1,0 +1,274 @@
+//! The window of a simulation that runs now: each odd thing that a simulation can do has its result.
+
+#![allow(clippy::unwrap_used)]
+
+use ridgewatch::source::live::{AtEnd, Follow, Live, LiveSettings, LiveWindow, Taken};
+use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer};
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+use std::time::{Duration, Instant};
+
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = PathBuf::from("/dev/shm").join(format!("rw-live-{name}-{}", std::process::id()));
+        let _ = std::fs::remove_dir_all(&path);
+        Self(path)
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+fn plane(nodes: u64) -> Description {
+    let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, nodes);
+    Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s")
+}
+
+/// A producer that waits, so that no step is lost however slow the machine is.
+fn producer(folder: &Folder, description: Description) -> Producer {
+    Producer::open(&folder.0, description, 4, Policy::Wait(Duration::from_secs(20))).unwrap()
+}
+
+/// u = value everywhere, v = time.
+fn publish(producer: &Producer, step: u64, time: f64, value: f32) {
+    let nodes = producer.description().block_nodes() as usize;
+    let (u, v) = (vec![value; nodes], vec![time as f32; nodes]);
+    let pointers = [u.as_ptr().cast::<u8>(), v.as_ptr().cast()];
+    let field = Field::packed(&pointers, Element::F32, producer.description().block.extent);
+    // SAFETY: a value a node.
+    unsafe { producer.publish(step, time, &field).unwrap() };
+}
+
+fn settings(folder: &Folder) -> LiveSettings {
+    LiveSettings { ring: Some(folder.0.clone()), memory_gib: 0.01, incomplete_seconds: 0.2, ..LiveSettings::default() }
+}
+
+fn follow(settings: &LiveSettings, tau: f64) -> LiveWindow {
+    let live = Live::connect(settings, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
+    live.follow(tau, 1).unwrap()
+}
+
+/// The next window that `wanted` accepts, and the warnings on the way there.
+fn take(window: &LiveWindow, wanted: impl Fn(&Taken) -> bool) -> (Taken, Vec<String>) {
+    let (mut warnings, begin) = (Vec::new(), Instant::now());
+    loop {
+        assert!(begin.elapsed() < Duration::from_secs(10), "it never came; warnings: {warnings:?}");
+        if let Ok(Some(taken)) = window.next_within(Duration::from_millis(50)) {
+            warnings.extend(taken.warnings.clone());
+            if wanted(&taken) {
+                return (taken, warnings);
+            }
+        }
+    }
+}
+
+fn newest(taken: &Taken) -> f64 {
+    taken.window.newest().unwrap()
+}
+
+fn has(warnings: &[String], text: &str) -> bool {
+    warnings.iter().any(|warning| warning.contains(text))
+}
+
+#[test]
+fn the_window_fills_and_moves_with_the_simulation() {
+    let folder = Folder::new("fills");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    for n in 0..4 {
+        publish(&solver, n, n as f64 * 0.5, 1.0);
+    }
+    std::thread::sleep(Duration::from_millis(50));
+    assert!(window.next_within(Duration::from_millis(20)).is_err(), "1.5 of 2 is not full");
+    assert!((window.filled() - 0.75).abs() < 1e-9);
+    publish(&solver, 4, 2.0, 1.0);
+    let (taken, warnings) = take(&window, |_| true);
+    assert_eq!((taken.live.step, newest(&taken), taken.live.snapshots, taken.live.steps, taken.live.missed), (4, 2.0, 5, 5, 0));
+    assert!(taken.live.age < 5.0 && warnings.is_empty(), "{warnings:?}");
+    assert!(window.next_within(Duration::from_millis(20)).is_err(), "nothing new");
+    publish(&solver, 5, 2.5, 3.0);
+    let (taken, _) = take(&window, |_| true);
+    assert_eq!((taken.window.oldest(), newest(&taken)), (Some(0.5), 2.5));
+    assert_eq!(taken.window.snapshots().last().unwrap().nodes[63], [3.0, 2.5, 0.0, 0.0]);
+}
+
+#[test]
+fn memory_is_kept_to_by_leaving_steps_out() {
+    let folder = Folder::new("thin");
+    let solver = producer(&folder, plane(32));
+    // 32 * 32 nodes of 16 bytes, twice: 12 snapshots.
+    let settings = LiveSettings { memory_gib: 12.5 * 2.0 * 16_384.0 / f64::from(1 << 30), ..settings(&folder) };
+    let window = follow(&settings, 10.0);
+    for n in 0..=200 {
+        publish(&solver, n, n as f64 * 0.1, (n as f32 * 0.1).sin());
+    }
+    let (taken, _) = take(&window, |taken| newest(taken) > 19.0);
+    assert!(taken.live.snapshots <= 12 && taken.live.snapshots >= 10, "{}", taken.live.snapshots);
+    assert!((taken.live.spacing - 1.0).abs() < 1e-9 && taken.live.thinned > 150, "{:?}", taken.live);
+    // u = sin t, v = t: linear interpolation over 1 misses u by up to 1 / 8 of its amplitude; v exactly none.
+    let error = taken.live.interpolation_error.unwrap();
+    assert!(error > 1e-4 && error < 0.02, "{error}");
+}
+
+#[test]
+fn too_little_memory_is_refused_in_words() {
+    let folder = Folder::new("small");
+    let _solver = producer(&folder, plane(256));
+    let settings = LiveSettings { memory_gib: 0.005, ..settings(&folder) };
+    let live = Live::connect(&settings, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap();
+    let error = live.follow(1.0, 1).err().unwrap();
+    assert!(error.to_string().contains("live.memory_gib") && error.to_string().contains("three snapshots"), "{error}");
+}
+
+#[test]
+fn a_simulation_that_ends_and_starts_anew_is_gone_on_with() {
+    let folder = Folder::new("anew");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    (0..4).for_each(|n| publish(&solver, n, n as f64, 1.0));
+    take(&window, |taken| newest(taken) == 3.0);
+    drop(solver);
+    // From a checkpoint: its times go on.
+    let solver = producer(&folder, plane(8));
+    publish(&solver, 3, 3.5, 1.0);
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 3.5);
+    assert!(has(&warnings, "has ended") && has(&warnings, "started anew"), "{warnings:?}");
+    assert_eq!((taken.live.restarts, taken.window.oldest()), (1, Some(1.0)));
+    drop(solver);
+    // From the beginning: the window too.
+    let solver = producer(&folder, plane(8));
+    (0..3).for_each(|n| publish(&solver, n, n as f64, 2.0));
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 2.0);
+    assert!(has(&warnings, "went back from time 3.5 to 0"), "{warnings:?}");
+    assert_eq!((taken.window.oldest(), taken.live.restarts), (Some(0.0), 2));
+    assert!(taken.window.snapshots().all(|s| s.nodes[0][0] == 2.0), "nothing of the run before");
+}
+
+#[test]
+fn another_grid_in_mid_run_is_refused_and_the_old_one_taken_again() {
+    let folder = Folder::new("grid");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 1.0);
+    (0..2).for_each(|n| publish(&solver, n, n as f64, 1.0));
+    take(&window, |_| true);
+    drop(solver);
+    let other = producer(&folder, plane(9));
+    (2..4).for_each(|n| publish(&other, n, n as f64, 1.0));
+    std::thread::sleep(Duration::from_millis(300));
+    assert!(window.next_within(Duration::from_millis(50)).is_err());
+    drop(other);
+    let solver = producer(&folder, plane(8));
+    publish(&solver, 5, 5.0, 1.0);
+    let (_, warnings) = take(&window, |taken| newest(taken) == 5.0);
+    assert!(has(&warnings, "another grid needs a run of its own"), "{warnings:?}");
+}
+
+#[test]
+fn odd_times_and_missing_values_are_told() {
+    let folder = Folder::new("odd");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    (0..4).for_each(|n| publish(&solver, n, n as f64, 1.0));
+    take(&window, |taken| newest(taken) == 3.0);
+    // The same time again, one that is needed still, a burst of missing values.
+    publish(&solver, 4, 3.0, 5.0);
+    publish(&solver, 5, 2.5, 1.0);
+    publish(&solver, 6, 4.0, f32::NAN);
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 4.0);
+    assert!(
+        has(&warnings, "repeats time 3") && has(&warnings, "time 2.5 came after 3") && has(&warnings, "64 of 64 velocities"),
+        "{warnings:?}"
+    );
+    assert_eq!(taken.window.snapshots().last().unwrap().missing(), 64);
+    // Set back within one run: the first are late, then the window begins anew.
+    for n in 0..5 {
+        publish(&solver, 7 + n, n as f64 - 10.0, 1.0);
+    }
+    let (taken, warnings) = take(&window, |taken| newest(taken) < 0.0);
+    assert!(has(&warnings, "is late") && has(&warnings, "was set back"), "{warnings:?}");
+    assert_eq!((newest(&taken), taken.window.oldest()), (-6.0, Some(-8.0)));
+}
+
+#[test]
+fn blocks_meet_and_incomplete_steps_are_recorded() {
+    let folder = Folder::new("blocks");
+    let half = |index: u32| {
+        let mut description = plane(8);
+        description.block = BlockExtent { index, count: 2, offset: [4 * u64::from(index), 0, 0], extent: [4, 8, 1] };
+        description
+    };
+    let solvers = [producer(&folder, half(0)), producer(&folder, half(1))];
+    let window = follow(&settings(&folder), 2.0);
+    for n in 0..3 {
+        publish(&solvers[1], n, n as f64, 2.0);
+        publish(&solvers[0], n, n as f64, 1.0);
+    }
+    let (taken, _) = take(&window, |taken| newest(taken) == 2.0);
+    let nodes = &taken.window.snapshots().next().unwrap().nodes;
+    assert!(nodes.iter().enumerate().all(|(i, node)| node[0] == if i % 8 < 4 { 1.0 } else { 2.0 }));
+    // One that lacks a block goes after its time, and later ones come.
+    publish(&solvers[0], 3, 3.0, 1.0);
+    std::thread::sleep(Duration::from_millis(400));
+    for solver in &solvers {
+        publish(solver, 4, 4.0, 1.0);
+    }
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 4.0);
+    assert!(has(&warnings, "step 3 (time 3) was given up with 1 of 2 blocks: blocks did not come in time"), "{warnings:?}");
+    assert_eq!((taken.live.incomplete, taken.live.steps), (1, 4));
+}
+
+#[test]
+fn every_step_is_taken_when_asked_for_and_the_end_ends() {
+    let folder = Folder::new("every");
+    let settings = LiveSettings { follow: Follow::Every, at_end: AtEnd::Stop, ..settings(&folder) };
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings, 2.0);
+    let play = std::thread::spawn(move || (0..20).for_each(|n| publish(&solver, n, n as f64, 1.0)));
+    let mut times = Vec::new();
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(20) {
+        match window.next_within(Duration::from_millis(50)) {
+            // Slower than the simulation would be by itself.
+            Ok(Some(taken)) => {
+                times.push(newest(&taken));
+                assert_eq!(taken.live.missed, 0);
+                std::thread::sleep(Duration::from_millis(5));
+            }
+            Ok(None) => break,
+            Err(_) => {}
+        }
+    }
+    play.join().unwrap();
+    assert_eq!(times, (2..20).map(f64::from).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_simulation_that_never_waits_is_seen_at_its_newest() {
+    let folder = Folder::new("newest");
+    let solver = Producer::open(&folder.0, plane(64), 2, Policy::NewestWins).unwrap();
+    let window = follow(&settings(&folder), 50.0);
+    for n in 0..3000 {
+        publish(&solver, n, n as f64, 1.0);
+    }
+    let (taken, _) = take(&window, |taken| newest(taken) == 2999.0);
+    assert_eq!(taken.live.steps + taken.live.missed, 3000, "each step is taken or counted");
+    assert!(taken.window.is_full());
+}
+
+#[test]
+fn waiting_for_a_simulation_ends_when_told() {
+    let folder = Folder::new("nobody");
+    let stop = AtomicBool::new(true);
+    let mut told = Vec::new();
+    assert!(Live::connect(&settings(&folder), &stop, &mut |text| told.push(text)).unwrap().is_none());
+    assert!(told[0].contains("RIDGEWATCH_RING=/dev/shm/rw-live-nobody"), "{told:?}");
+    let nowhere = LiveSettings::default();
+    if std::env::var_os("RIDGEWATCH_RING").is_none() {
+        assert!(Live::connect(&nowhere, &stop, &mut |_| {}).err().unwrap().to_string().contains("live.ring"));
+    }
+}
