@@ -17,7 +17,12 @@ SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 # The collection of real archives that tests/archive_real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
-.PHONY: all demo test test-data test-long packages build check bench gpu-check clean
+# What `make adapters` builds goes here; where it is installed.
+ADAPTERS := out/adapters
+PREFIX ?= /usr/local
+VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
+
+.PHONY: all demo test test-data test-long packages build check bench gpu-check clean adapters install-adapters adapter-packages test-adapters python-adapter
 
 all: build
 
@@ -93,8 +98,8 @@ $(ADAPTERS)/venv/installed:
 
 install-adapters: adapters
 	install -d $(DESTDIR)$(PREFIX)/lib/pkgconfig $(DESTDIR)$(PREFIX)/include
-	install -m 644 $(ADAPTERS)/lib/* $(DESTDIR)$(PREFIX)/lib/
-	install -m 644 $(ADAPTERS)/include/* $(DESTDIR)$(PREFIX)/include/
+	install -m 644 $(ADAPTERS)/lib/libridgewatch_* $(DESTDIR)$(PREFIX)/lib/
+	install -m 644 $$(ls $(ADAPTERS)/include/*.h $(ADAPTERS)/include/*.mod 2>/dev/null) $(DESTDIR)$(PREFIX)/include/
 	sed -e 's|@PREFIX@|$(PREFIX)|' -e 's|@VERSION@|$(VERSION)|' adapters/c/ridgewatch.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/ridgewatch.pc
 
 # Only what is missing, and only for these tests.
