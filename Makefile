@@ -2,6 +2,7 @@
 # make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/); what needs real archives runs where they are
 # make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
 # make test-long   what takes minutes: subscribers that stall for a minute, in Rust and in Python
+# make vendored    builds with HDF5 and NetCDF inside, where their libraries cannot be had or the program is to run elsewhere
 # make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python; what is missing is installed where apt is, or named as NOT RUN
@@ -9,6 +10,9 @@
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
 PYTHON ?= python3
+# CMake for `vendored`, where there is none; of the last version that reads the build files of these libraries without complaint.
+CMAKE := target/cmake
+CMAKE_VERSION := 3.31.6
 # The compiler of the GPU kernels, for the test that they compile; of the CUDA version that cudarc is bound to.
 NVRTC := target/nvrtc
 NVRTC_VERSION := 13.0.88
@@ -17,20 +21,42 @@ SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 # The collection of real archives that tests/archive_real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
-.PHONY: all demo test test-data test-long packages build check bench gpu-check clean
+# What `make adapters` builds goes here; where it is installed.
+ADAPTERS := out/adapters
+PREFIX ?= /usr/local
+VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
+
+.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean adapters install-adapters adapter-packages test-adapters python-adapter
 
 all: build
 
-# Only what is missing is installed; where there is no apt, the names are printed.
+# $(call install,PACKAGES,ALTERNATIVE): where there is no apt, the names are printed.
+define install
+  if command -v apt-get >/dev/null; then \
+    echo "installing" $(1); $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $(1) >/dev/null; \
+  else \
+    echo "please install the equivalents of:" $(1) $(2); exit 1; \
+  fi
+endef
+
+# Only what is missing is installed.
 packages:
 	@missing=""; for p in $(PACKAGES); do dpkg -s $$p >/dev/null 2>&1 || missing="$$missing $$p"; done; \
-	if [ -n "$$missing" ]; then \
-	  if command -v apt-get >/dev/null; then \
-	    echo "installing$$missing"; $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null; \
-	  else \
-	    echo "please install the equivalents of:$$missing (or build with: cargo build --release --features vendored)"; exit 1; \
-	  fi; \
-	fi
+	if [ -n "$$missing" ]; then $(call install,$$missing,"(or: make vendored)"); fi
+
+# What fetches Python packages into target/ and .venv. Debian's python3 comes without pip and venv; others' have them.
+python-packages:
+	@$(PYTHON) -c 'import ensurepip, pip, venv' 2>/dev/null || { $(call install,python3-pip python3-venv); }
+
+# CMake and the C compiler build the libraries; nothing of them need be installed.
+vendored:
+	@command -v c++ >/dev/null && command -v make >/dev/null || { $(call install,g++ make); }
+	@command -v cmake >/dev/null || $(MAKE) --no-print-directory $(CMAKE)/done
+	PATH="$$PATH:$(CURDIR)/$(CMAKE)/cmake/data/bin" $(CARGO) build --release --features vendored
+
+$(CMAKE)/done: | python-packages
+	$(PYTHON) -m pip install -q --no-deps --target $(CMAKE) cmake==$(CMAKE_VERSION)
+	touch $@
 
 build: packages
 	$(CARGO) build --release
@@ -40,15 +66,15 @@ demo: build
 	@echo "pictures: out/demo/frames/*.png   figures: out/demo/records.jsonl, out/demo/summary.json"
 
 # One profile for everything: dependencies are built once, and numerics run optimised.
-test: packages
+test: packages python-packages
 	$(CARGO) test --release --workspace
 	@if $(MAKE) --no-print-directory $(NVRTC)/done; then \
 	  LD_LIBRARY_PATH="$(CURDIR)/$(NVRTC)/nvidia/cu13/lib:$$LD_LIBRARY_PATH" $(CARGO) test --release --test kernels_compile -- --ignored; else \
-	  echo "NOT RUN: whether the GPU kernels compile, since NVRTC could not be fetched (needs python3-pip and the network)"; fi
+	  echo "NOT RUN: whether the GPU kernels compile, since NVRTC could not be fetched (needs the network)"; fi
 	@if [ ! -d "$(RIDGEWATCH_DATA)" ]; then \
 	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; \
 	elif $(MAKE) --no-print-directory .venv/installed; then $(MAKE) --no-print-directory test-data; else \
-	  echo "NOT RUN: the tests on real archives, since their Python packages could not be fetched (needs python3-venv and the network)"; fi
+	  echo "NOT RUN: the tests on real archives, since their Python packages could not be fetched (needs the network)"; fi
 
 test-data: packages .venv/installed
 	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
@@ -56,12 +82,12 @@ test-data: packages .venv/installed
 test-long: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
 
-.venv/installed:
+.venv/installed: | python-packages
 	$(PYTHON) -m venv .venv
 	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq
 	touch $@
 
-$(NVRTC)/done:
+$(NVRTC)/done: | python-packages
 	$(PYTHON) -m pip install -q --no-deps --target $(NVRTC) nvidia-cuda-nvrtc==$(NVRTC_VERSION)
 	touch $@
 
@@ -93,8 +119,8 @@ $(ADAPTERS)/venv/installed:
 
 install-adapters: adapters
 	install -d $(DESTDIR)$(PREFIX)/lib/pkgconfig $(DESTDIR)$(PREFIX)/include
-	install -m 644 $(ADAPTERS)/lib/* $(DESTDIR)$(PREFIX)/lib/
-	install -m 644 $(ADAPTERS)/include/* $(DESTDIR)$(PREFIX)/include/
+	install -m 644 $(ADAPTERS)/lib/libridgewatch_* $(DESTDIR)$(PREFIX)/lib/
+	install -m 644 $$(ls $(ADAPTERS)/include/*.h $(ADAPTERS)/include/*.mod 2>/dev/null) $(DESTDIR)$(PREFIX)/include/
 	sed -e 's|@PREFIX@|$(PREFIX)|' -e 's|@VERSION@|$(VERSION)|' adapters/c/ridgewatch.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/ridgewatch.pc
 
 # Only what is missing, and only for these tests.

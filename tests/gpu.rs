@@ -9,6 +9,8 @@
 mod answers;
 #[path = "gpu/device.rs"]
 mod device;
+#[path = "gpu/lost.rs"]
+mod lost;
 #[path = "gpu/render.rs"]
 mod render;
 #[path = "gpu/scenes.rs"]

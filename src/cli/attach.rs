@@ -7,6 +7,7 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{EngineError, Setup};
 use ridgewatch::source::live::Live;
 use ridgewatch::source::{SourceError, SourceKind};
+use ridgewatch::surrogate::network::Size;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
 
@@ -37,7 +38,11 @@ pub struct Options {
 pub fn run(common: &Common, mut options: Options) -> Result<()> {
     let mut scene = scene(common, &options)?;
     // What was trained before a restart is gone on from.
-    if options.run.resume.is_none() && scene.training.resume.is_none() {
+    let fixed = scene.network.size == Size::Fixed;
+    if options.run.checkpoint.is_some() && !fixed {
+        messages::note("network.size is \"auto\": weights of an earlier run are not gone on from, since a checkpoint has one size");
+    }
+    if fixed && options.run.resume.is_none() && scene.training.resume.is_none() {
         options.run.resume = options.run.checkpoint.clone().filter(|path| path.exists());
         if let Some(path) = &options.run.resume {
             messages::note(format_args!("going on from the weights in {}", path.display()));

@@ -6,7 +6,10 @@ use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
 use crate::surrogate::{Predict, Samples};
 use crate::trust::{Gate, Residual, Strata, TrustedError, log_stretch_rms};
+use rayon::prelude::*;
 
+/// Points that a thread takes at a time.
+const CHUNK: usize = 1 << 12;
 /// Dimension that no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX;
 
@@ -14,16 +17,22 @@ const AUDIT_DIMENSION: u32 = u32::MAX;
 pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3]> {
     let cells = strata.shape;
     let key = [seed as u32, (seed >> 32) as u32];
-    let mut points = Vec::with_capacity(strata.total());
-    for (cell, &count) in strata.drawn.iter().enumerate() {
+    let mut first = 0;
+    let cell_starts: Vec<(usize, u32, u32)> = (strata.drawn.iter().enumerate())
+        .map(|(cell, &count)| {
+            first += count;
+            (cell, first - count, count)
+        })
+        .collect();
+    let in_cell = |&(cell, first, count): &(usize, u32, u32)| {
         let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
-        for _ in 0..count {
+        (first..first + count).map(move |number| -> [f32; 3] {
             // The last word keeps these draws apart from every pixel's.
-            let words = philox([points.len() as u32, stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION], key);
-            points.push(std::array::from_fn(|k| (index[k] as f32 + unit(words[k])) / cells[k] as f32));
-        }
-    }
-    points
+            let words = philox([number, stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION], key);
+            std::array::from_fn(|k| (index[k] as f32 + unit(words[k])) / cells[k] as f32)
+        })
+    };
+    cell_starts.par_iter().with_min_len(64).flat_map_iter(in_cell).collect()
 }
 
 /// Traced audit points, voids (land) left out.
@@ -39,17 +48,31 @@ pub struct Audit {
 /// Traces `unit` points.
 pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
     let domain = tracer.domain();
-    let points: Vec<[f32; 3]> = unit.iter().map(|&u| domain.from_unit(u)).collect();
+    let points: Vec<[f32; 3]> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
     let extras = Extras { arrival: flow_map, jacobian: flow_map };
     let mut traced = Traced::default();
     tracer.trace(&points, extras, &mut traced);
+    // Sums are those of the chunks in order, on any number of threads.
+    let parts: Vec<(Samples, f64)> = (points.par_chunks(CHUNK).enumerate())
+        .map(|(chunk, points)| {
+            let (mut samples, mut lived) = (Samples::default(), 0.0);
+            for (i, &point) in (chunk * CHUNK..).zip(points) {
+                if !tracer.is_void(point) {
+                    push_sample(&mut samples, domain, point, &traced, i, extras);
+                    lived += f64::from(traced.lived[i]);
+                }
+            }
+            (samples, lived)
+        })
+        .collect();
     let mut samples = Samples::default();
     let mut lived = 0.0;
-    for (i, &point) in points.iter().enumerate() {
-        if !tracer.is_void(point) {
-            push_sample(&mut samples, domain, point, &traced, i, extras);
-            lived += f64::from(traced.lived[i]);
-        }
+    for (mut part, part_lived) in parts {
+        samples.points.append(&mut part.points);
+        samples.log_stretch.append(&mut part.log_stretch);
+        samples.arrival.append(&mut part.arrival);
+        samples.jacobian.append(&mut part.jacobian);
+        lived += part_lived;
     }
     let lived_share = lived / samples.len().max(1) as f64;
     Audit { samples, drawn: points.len(), lived_share }
@@ -60,8 +83,9 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
     let mut predicted = vec![0.0; samples.len()];
     surrogate.predict(&samples.points, &mut predicted);
     let ramp = |s: f32| transfer.ramp(s / tau as f32);
-    let pairs = predicted.iter().zip(&samples.log_stretch).zip(&samples.points);
+    let pairs = predicted.par_iter().zip(&samples.log_stretch).zip(&samples.points);
     pairs
+        .with_min_len(CHUNK)
         .filter(|((_, traced), _)| traced.is_finite())
         .map(|((&predicted, &traced), &point)| {
             // A prediction that is no number is as wrong as can be.

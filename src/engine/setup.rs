@@ -37,8 +37,13 @@ impl Setup {
     /// Opens the source and settles what the scene leaves open.
     pub fn new(scene: Settings) -> Result<Self, EngineError> {
         scene.check()?;
-        let closed = closed_form(&scene.source);
-        let snapshots = if closed.is_some() { None } else { Some(open_snapshots(&scene)?) };
+        let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
+        Self::over(scene, snapshots)
+    }
+
+    /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
+    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
+        scene.check()?;
         Self::settle(scene, snapshots, None)
     }
 

@@ -8,7 +8,7 @@ use super::steps::Chosen;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{Chart, Closed, Velocity};
 use super::voids::Voids;
-use super::{FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
+use super::{Boundary, FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
 use crate::field::analytic::{ClosedForm, Form};
 use crate::field::{Domain, Geometry, Window};
 use crate::simd::{Gather, Lanes, Two};
@@ -166,11 +166,13 @@ impl<'a> Assembly<'a> {
                 // Rounding must not decide, so steps are chosen in double precision.
                 let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
                 let intervals = intervals(Chart::breaks(&tracer.field), from, to);
+                // A path that stops is cut to whole steps.
+                let a_cell = if matches!(self.map.boundary, Boundary::Stop | Boundary::Zero) { 2.0 } else { 1.0 };
                 let cells = match &self.source {
-                    VelocitySource::Window(window) => cells_crossed(window, from, to),
+                    VelocitySource::Window(window) => a_cell * cells_crossed(window, from, to),
                     VelocitySource::Analytic(..) => 0.0,
                 };
-                let chosen = steps::choose(tolerance, steps::Gridded { intervals, cells }, &self.domain, |steps, points, out| {
+                let chosen = steps::choose(tolerance, steps::Gridded { intervals, least: cells }, &self.domain, |steps, points, out| {
                     tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
                     tracer.trace(points, super::Extras::default(), out);
                 })?;

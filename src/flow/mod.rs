@@ -131,7 +131,7 @@ pub enum Interpolation {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Steps {
     /// The fewest whose log-stretch differs from twice as many by at most this root mean square, on a few thousand points; on grids at least
-    /// two a snapshot interval and one a cell that is crossed.
+    /// two a snapshot interval and one a cell that is crossed (two where paths stop at edges and land).
     Auto {
         /// Root mean square of the log-stretch.
         tolerance: f64,

@@ -11,8 +11,10 @@ const FEWEST: usize = 4;
 const MOST: usize = 16_384;
 /// Fewest steps a snapshot interval, at whose ends the change in time has a corner.
 const LEAST_AN_INTERVAL: usize = 2;
-/// Most steps a snapshot interval.
+/// Most steps a snapshot interval, but where so many cells are crossed.
 const MOST_AN_INTERVAL: usize = 32;
+/// Most steps a snapshot interval for cells that are crossed: a velocity may be any number.
+const MOST_FOR_CELLS: usize = 256;
 /// Share of the points, the most different ones, that does not count on grids.
 const TRIMMED: f64 = 0.02;
 /// Points that must have lived the whole span for the judgement to rest on them alone.
@@ -62,30 +64,30 @@ pub struct Chosen {
 pub struct Gridded {
     /// Snapshot intervals in tau; 0 for a closed form.
     pub intervals: usize,
-    /// Cells that a path crosses in tau.
-    pub cells: f64,
+    /// Steps that the cells crossed in tau ask for.
+    pub least: f64,
 }
 
 /// The fewest steps of a ladder (by halves upwards) whose log-stretch differs from that of twice as many by at most `tolerance`, root mean
-/// square. On grids the ladder begins at two steps a snapshot interval and one a cell: fewer may agree with one another and be wrong, and a
-/// path that stops at an edge or at land is cut to whole steps.
+/// square. On grids the ladder begins at two steps a snapshot interval and one a cell, two where paths stop at edges and land, which cuts
+/// them to whole steps: fewer may agree with one another and be wrong.
 ///
 /// On grids the gradient of the interpolant jumps at cell faces, and a few paths along a separatrix turn one way with n steps and the
 /// other with 2n, at any n: there the most different [`TRIMMED`] of the points is left out, and the ladder ends at [`MOST_AN_INTERVAL`]
 /// steps a snapshot interval, beyond which the data's own resolution decides. Not meeting the tolerance is then told, not refused.
 pub fn choose(
     tolerance: f64,
-    Gridded { intervals, cells }: Gridded,
+    Gridded { intervals, least }: Gridded,
     domain: &Domain,
     mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
 ) -> Result<Chosen, FlowError> {
     let points = points(domain, POINTS);
     let (mut once, mut twice) = (Traced::default(), Traced::default());
     let gridded = intervals > 0;
-    let most = if gridded { MOST_AN_INTERVAL * intervals } else { MOST };
     let trimmed = if gridded { TRIMMED } else { 0.0 };
-    let first = (cells.ceil() as usize).max(LEAST_AN_INTERVAL * intervals).next_multiple_of(intervals.max(1));
-    let mut steps = if gridded { first.min(most) } else { FEWEST };
+    let first = (least.ceil() as usize).clamp(LEAST_AN_INTERVAL * intervals, MOST_FOR_CELLS * intervals).next_multiple_of(intervals.max(1));
+    let mut steps = if gridded { first } else { FEWEST };
+    let most = if gridded { first.max(MOST_AN_INTERVAL * intervals) } else { MOST };
     let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
     while steps <= most {
         trace(steps, &points, &mut once);

@@ -48,21 +48,17 @@ impl Film {
     #[cfg(feature = "cuda")]
     pub(crate) fn resident(width: usize, height: usize) -> Self {
         use rayon::prelude::*;
-        /// A megabyte: many pages, and many pieces.
-        const PIECE: usize = 1 << 18;
-        fn layer(pixels: usize, value: f32) -> Vec<f32> {
-            // Zeros come without pages.
-            let mut values = vec![0.0_f32; pixels];
-            values.par_chunks_mut(PIECE).for_each(|piece| piece.fill(std::hint::black_box(value)));
-            values
+        /// Enough pages that a thread is worth waking.
+        const PIECE: usize = 1 << 16;
+        // Collected, since `vec![0.0; n]` has recycled memory zeroed by one thread.
+        fn layer<T: Copy + Send + Sync>(pixels: usize, value: T) -> Vec<T> {
+            rayon::iter::repeat_n(value, pixels).with_min_len(PIECE).collect()
         }
         let pixels = width * height;
-        let mut rgba = vec![[0.0_f32; 4]; pixels];
-        rgba.par_chunks_mut(PIECE / 4).for_each(|piece| piece.fill(std::hint::black_box([0.0; 4])));
         Self {
             width,
             height,
-            rgba,
+            rgba: layer(pixels, [0.0; 4]),
             ftle_mean: layer(pixels, f32::NAN),
             traced: layer(pixels, 0.0),
             variance: layer(pixels, f32::NAN),

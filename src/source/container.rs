@@ -32,6 +32,16 @@ impl NumberType {
         !matches!(self, Self::Text | Self::Other)
     }
 
+    /// Bytes of one in a file, at least.
+    fn bytes(self) -> u64 {
+        match self {
+            Self::I8 | Self::U8 | Self::Text | Self::Other => 1,
+            Self::I16 | Self::U16 => 2,
+            Self::I32 | Self::U32 | Self::F32 => 4,
+            Self::I64 | Self::U64 | Self::F64 => 8,
+        }
+    }
+
     pub(crate) fn is_float(self) -> bool {
         matches!(self, Self::F32 | Self::F64)
     }
@@ -241,7 +251,8 @@ impl Container {
             return Err(failed("it holds no numbers".into()));
         }
         let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
-        if total as u64 > self.length.saturating_mul(LARGEST_SHRINKAGE).max(ALWAYS_ALLOWED) {
+        let largest = self.length.saturating_mul(LARGEST_SHRINKAGE) / header.number.bytes();
+        if total as u64 > largest.max(ALWAYS_ALLOWED) {
             return Err(failed(format!(
                 "{total} values cannot come from a file of {} bytes: it is damaged or was never written",
                 self.length

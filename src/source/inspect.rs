@@ -294,7 +294,11 @@ impl fmt::Display for Inspection {
             writeln!(f, "{}{period}", if axis.descending_in_file { ", descending in the file" } else { "" })?;
         }
         if let Some(t) = &self.time {
-            writeln!(f, "\ntime\n  {} snapshots from {} to {}, every {} {}", t.snapshots, t.first, t.last, Short(t.interval), t.unit)?;
+            if t.snapshots == 1 {
+                writeln!(f, "\ntime\n  one snapshot, {}", t.first)?;
+            } else {
+                writeln!(f, "\ntime\n  {} snapshots from {} to {}, every {} {}", t.snapshots, t.first, t.last, Short(t.interval), t.unit)?;
+            }
             let calendar = self.source.as_ref().and_then(|s| s.calendar.as_deref()).unwrap_or("none");
             writeln!(f, "  calendar {calendar}, {} gap(s)", t.gaps.len())?;
             if let (Some(tau), Some(held), Some(bytes)) = (t.tau, t.window_snapshots, t.window_bytes) {

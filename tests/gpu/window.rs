@@ -47,6 +47,92 @@ fn a_slide_brings_only_what_is_new() {
     assert_eq!(gpu.health().failure(), None);
 }
 
+/// Waits until `count` snapshots came over in all.
+fn until_brought(store: &SnapshotStore, count: u64) {
+    let began = std::time::Instant::now();
+    while store.brought() < count {
+        assert!(began.elapsed().as_secs() < 20, "{} of {count} came over", store.brought());
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn what_is_expected_is_there_before_the_window_wants_it() {
+    for storage in [Storage::F32, Storage::F16] {
+        let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+        let store = SnapshotStore::new(&gpu);
+        let tuning = Tuning { storage, ..Tuning::default() };
+        let grid = cartesian(even(&[120, 90, 61]));
+        let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 12) };
+        // From the tenth on there are velocities that half precision cannot hold at the scale of those before.
+        let read: Vec<_> = (0..20).map(|t| snapshot(&grid, f64::from(t), if t < 9 { 0.05 } else { 1.0 }, false)).collect();
+        // Told of between the thirteenth and the fourteenth, and taken by no window.
+        let stray = snapshot(&grid, 0.0, 0.05, false);
+        let mut window = Window::new(3.0);
+        let mut taken = None;
+        for (i, next) in read.iter().enumerate() {
+            store.expect(next);
+            if i == 12 {
+                store.expect(&stray);
+            }
+            // The first four wait until there is a window; half precision is encoded anew for the tenth, by the window.
+            if i > 3 && (storage == Storage::F32 || i < 9) {
+                until_brought(&store, i as u64 + 1 + u64::from(i >= 12));
+            }
+            window.push(next.clone()).unwrap();
+            if i < 3 {
+                continue;
+            }
+            let (t0, source) = (i as f64 - 3.0, VelocitySource::Window(Arc::new(window.clone())));
+            let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, t0, tuning).unwrap();
+            let seeds = fresh(&grid.domain(), 2000);
+            let (mut out, exact) = (Traced::default(), on_cpu(&source, &map, t0, &seeds));
+            tracer.trace(&seeds, Extras::default(), &mut out);
+            let mut errors: Vec<f64> = (0..seeds.len()).map(|k| (out.log_stretch_f64[k] - exact.log_stretch_f64[k]).abs()).collect();
+            errors.sort_by(f64::total_cmp);
+            // Paths along a cell face, as in trace.rs; rounded velocities, as below.
+            let most = errors[errors.len() * 99 / 100];
+            assert!(most < if storage == Storage::F16 { 2e-2 } else { 2e-9 }, "snapshot {i}: {most}");
+            assert_eq!(gpu.health().failure(), None);
+            if storage == Storage::F32 {
+                assert_eq!(store.brought_ahead(), i as u64 - 3, "snapshot {i}");
+                // The stray one stays until the window has passed it by.
+                if i >= 6 && i != 12 {
+                    assert_eq!(*taken.get_or_insert(gpu.memory().0), gpu.memory().0, "memory is flat, snapshot {i}");
+                }
+            }
+        }
+        assert!(store.brought_ahead() >= 5, "{storage:?}");
+        drop(store);
+        assert_eq!(Arc::strong_count(&gpu), 1, "the thread has let go of the device");
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn nothing_comes_ahead_where_memory_is_short() {
+    let grid = cartesian(even(&[40, 40, 40]));
+    // A snapshot takes 1 MB, a window 4; there is room for a fifth beside the tracer, but others might need it.
+    let gpu = Gpu::open(0, &GpuSettings { memory_cap: Some(7 << 20), ..GpuSettings::default() }).unwrap();
+    let store = SnapshotStore::new(&gpu);
+    let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 6) };
+    let mut window = Window::new(3.0);
+    for t in 0..8_u32 {
+        let next = snapshot(&grid, f64::from(t), 0.5, false);
+        store.expect(&next);
+        if t > 3 {
+            std::thread::sleep(std::time::Duration::from_millis(50));
+        }
+        window.push(next).unwrap();
+        if t >= 3 {
+            let source = VelocitySource::Window(Arc::new(window.clone()));
+            CudaTracer::new(&store, &gpu, source, &map, f64::from(t) - 3.0, Tuning::default()).unwrap();
+        }
+    }
+    assert_eq!((store.brought(), store.brought_ahead()), (8, 0));
+}
+
 #[test]
 #[ignore = "needs a GPU"]
 fn half_precision_is_as_good_as_its_rounding() {

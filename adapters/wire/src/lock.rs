@@ -25,6 +25,19 @@ fn whole(kind: libc::c_int) -> libc::flock {
 }
 
 impl FileLock {
+    /// The same in a ring's folder, made where it is not there. Another process that ends may remove the empty folder in between.
+    fn take_in(ring: &Path, path: PathBuf, kind: libc::c_int) -> Result<Option<Self>, WireError> {
+        let mut attempts = 0;
+        loop {
+            attempts += 1;
+            let gone = |error: &io::Error| matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists);
+            match crate::producer::make_folder(ring).and_then(|()| Self::take(path.clone(), kind)) {
+                Err(WireError::Io { source, .. }) if gone(&source) && attempts < 100 => std::thread::yield_now(),
+                taken => return taken,
+            }
+        }
+    }
+
     /// Locks a file, made where it is not there; none when it is locked against that.
     fn take(path: PathBuf, kind: libc::c_int) -> Result<Option<Self>, WireError> {
         loop {
@@ -74,9 +87,9 @@ fn locked(path: &Path, kind: libc::c_int) -> bool {
 pub(crate) struct NameLock(FileLock);
 
 impl NameLock {
-    /// Takes it; none when somebody has it.
+    /// Takes it, and makes the ring's folder where it is not there; none when somebody has it.
     pub fn take(ring: &Path, block: u32) -> Result<Option<Self>, WireError> {
-        Ok(FileLock::take(lock_path(ring, block), libc::F_WRLCK)?.map(Self))
+        Ok(FileLock::take_in(ring, lock_path(ring, block), libc::F_WRLCK)?.map(Self))
     }
 
     /// Frees the name and removes its file.
@@ -109,10 +122,9 @@ impl Following {
     /// # Errors
     /// A folder or file that is not this user's alone.
     pub fn begin(ring: &Path) -> Result<Self, WireError> {
-        crate::producer::make_folder(ring)?;
         // Nobody ever locks it against followers for longer than a look.
         let lock = loop {
-            match FileLock::take(followers_path(ring), libc::F_RDLCK)? {
+            match FileLock::take_in(ring, followers_path(ring), libc::F_RDLCK)? {
                 Some(lock) => break lock,
                 None => std::thread::sleep(std::time::Duration::from_millis(1)),
             }

@@ -67,7 +67,6 @@ impl Producer {
             return Err(WireError::field("slots", slots, format!("2 to {SLOTS}")));
         }
         let block = description.block.index;
-        make_folder(ring)?;
         let path = block_path(ring, block);
         let Some(lock) = NameLock::take(ring, block)? else {
             return Err(WireError::InUse { pid: holder(&path), path });

@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use ridgewatch_wire::{
-    Assembler, AxisDescription, BlockExtent, Description, Element, Field, Following, Geometry, Limits, Policy, Producer, Read, RingReader,
-    WireError, block_path, blocks, producer_lives,
+    Assembler, AxisDescription, BlockExtent, Description, Element, Field, Following, Geometry, Limits, Policy, Producer, Read, ReadAt,
+    RingReader, WireError, block_path, blocks, producer_lives,
 };
 use std::os::unix::fs::{FileExt, PermissionsExt};
 use std::path::{Path, PathBuf};
@@ -207,6 +207,24 @@ fn the_end_is_told_and_the_last_follower_sweeps_up() {
 }
 
 #[test]
+fn producers_that_come_and_go_at_once_do_not_take_each_others_folder() {
+    let folder = Folder::new("crowd");
+    std::thread::scope(|scope| {
+        for index in 0..4 {
+            let ring = &folder.0;
+            scope.spawn(move || {
+                let mut description = cube([8, 2, 2]);
+                description.block = BlockExtent { index, count: 4, offset: [2 * u64::from(index), 0, 0], extent: [2, 2, 2] };
+                for _ in 0..300 {
+                    drop(Producer::open(ring, description.clone(), 2, Policy::NewestWins).unwrap());
+                }
+            });
+        }
+    });
+    assert!(!folder.0.exists());
+}
+
+#[test]
 fn waiting_is_bounded_and_happens_once() {
     let folder = Folder::new("wait");
     let limit = Duration::from_millis(80);
@@ -281,6 +299,46 @@ fn a_step_that_is_overwritten_while_it_is_read_is_never_seen() {
         reader.join().unwrap()
     });
     assert_eq!(seen.0 + seen.1, 3000, "each step is seen or counted");
+}
+
+/// A ring whose slots are overwritten by a newer step at the moment that their values are read.
+struct Racing(std::cell::RefCell<Vec<u8>>);
+
+impl ReadAt for Racing {
+    fn length(&self) -> std::io::Result<u64> {
+        Ok(self.0.borrow().len() as u64)
+    }
+
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+        let mut bytes = self.0.borrow_mut();
+        let begin = offset as usize;
+        let (half, end) = (to.len() / 2, begin + to.len());
+        to[..half].copy_from_slice(&bytes[begin..begin + half]);
+        if begin > 12288 && to.len() > 32 {
+            let slot = begin - 64;
+            let sequence = u64::from_ne_bytes(bytes[slot..slot + 8].try_into().unwrap()) + 3;
+            bytes[slot..slot + 8].copy_from_slice(&sequence.to_ne_bytes());
+            bytes[begin..end].fill(0x7f);
+        }
+        to[half..].copy_from_slice(&bytes[begin + half..end]);
+        Ok(())
+    }
+
+    fn write_at(&self, _: &[u8], _: u64) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn a_step_that_changes_between_two_looks_is_thrown_away() {
+    let folder = Folder::new("racing");
+    let producer = Producer::open(&folder.0, cube([4, 4, 4]), 3, Policy::NewestWins).unwrap();
+    for n in 0..3 {
+        publish(&producer, n, n as f64).unwrap();
+    }
+    let bytes = std::fs::read(block_path(&folder.0, 0)).unwrap();
+    let mut reader = RingReader::over("racing".into(), Racing(bytes.into()), &Limits::default()).unwrap();
+    assert_eq!(reader.read(&mut Vec::new()).unwrap(), Read::Nothing);
 }
 
 #[test]

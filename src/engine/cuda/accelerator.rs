@@ -20,6 +20,11 @@ impl CudaAccelerator {
     pub fn new(gpu: Arc<Gpu>, storage: Storage) -> Self {
         Self { snapshots: SnapshotStore::new(&gpu), gpu, storage }
     }
+
+    /// What is on the device of the velocity.
+    pub fn snapshots(&self) -> &SnapshotStore {
+        &self.snapshots
+    }
 }
 
 impl Accelerator for CudaAccelerator {

@@ -107,6 +107,8 @@ struct State {
     gone: Vec<Arc<Snapshot>>,
     brought: u64,
     brought_ahead: u64,
+    /// Whether the thread is there.
+    helped: bool,
     ended: bool,
 }
 
@@ -138,7 +140,9 @@ impl SnapshotStore {
             let Ok(started) = started else { return };
             *thread = Some(started);
         }
-        self.shared.state().ahead.expect(snapshot);
+        let mut state = self.shared.state();
+        state.helped = true;
+        state.ahead.expect(snapshot);
         self.shared.changed.notify_all();
     }
 
@@ -195,7 +199,9 @@ impl Shared {
         let (held, gone) = std::mem::take(&mut state.held).into_iter().partition(|s| wanted.iter().any(|w| Arc::ptr_eq(w, &s.host)));
         state.held = held;
         let gone: Vec<Arc<DeviceSnapshot>> = gone;
-        state.gone.extend(gone.iter().map(|s| s.host.clone()));
+        if state.helped {
+            state.gone.extend(gone.iter().map(|s| s.host.clone()));
+        }
         drop(gone);
         let fresh = |state: &State| -> Vec<Arc<Snapshot>> {
             wanted.iter().filter(|w| !state.held.iter().any(|s| Arc::ptr_eq(w, &s.host))).map(|w| Arc::clone(w)).collect()
@@ -249,8 +255,11 @@ impl Shared {
     fn bring_expected(&self) {
         let copiers = std::thread::available_parallelism().map_or(1, |n| n.get() / 4).clamp(1, COPIERS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(copiers).thread_name(|i| format!("ridgewatch-copy-{i}")).build();
-        let Ok(pool) = pool else { return };
         let mut state = self.state();
+        let Ok(pool) = pool else {
+            state.helped = false;
+            return;
+        };
         while !state.ended {
             let gone = std::mem::take(&mut state.gone);
             let next = state.form.and_then(|form| {

@@ -178,7 +178,11 @@ fn drive(
         None => plan.map.clone(),
     };
     let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
-    let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| cycle.later_slides(&mut feed, &map, sink));
+    let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| {
+        // They hold the first window, here and on the device.
+        drop((tracer, slide));
+        cycle.later_slides(&mut feed, &map, sink)
+    });
     // What was learned is kept whether or not the run was stopped.
     match ended {
         Err(Halt::Failed(error)) => Err(Halt::Failed(error)),

@@ -1,0 +1,94 @@
+//! A device that is lost in the middle of a frame, for real: a kernel that traps takes the whole context with it, so that this happens in
+//! a process of its own. (`tests/lost_device.rs` breaks a device at every call, without a GPU.)
+
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::{Device, DeviceChoice, EngineError, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::publish::compare_films;
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::AtomicBool;
+
+/// What the process of its own is told by: `cpu` or `stop`.
+const WHEN_LOST: &str = "RIDGEWATCH_TEST_WHEN_LOST";
+
+#[test]
+#[ignore = "needs a GPU"]
+fn the_run_goes_on_on_the_cpu_or_ends_as_configured() {
+    for when_lost in ["cpu", "stop"] {
+        let output = Command::new(std::env::current_exe().unwrap())
+            .args(["--ignored", "--exact", "lost::in_a_process_of_its_own", "--nocapture"])
+            .env(WHEN_LOST, when_lost)
+            .output()
+            .unwrap();
+        let said = format!("{}{}", String::from_utf8_lossy(&output.stdout), String::from_utf8_lossy(&output.stderr));
+        println!("{said}");
+        assert!(output.status.success(), "{when_lost}: {} {said}", output.status);
+        assert!(said.contains("the context is gone"), "{when_lost}: nothing was broken: {said}");
+    }
+}
+
+fn scene(when_lost: &str) -> SceneFile {
+    let text = format!(
+        "[source]\nkind = \"turbulence\"\nnodes = [48, 32, 32]\nsnapshots = 8\n[time]\ntau = 4\n[flow]\nsteps = 8\n[device]\nwhen_lost = \"{when_lost}\"\n\
+         [render]\nmethod = \"reference\"\nwidth = 96\nheight = 64\nsamples = 16\n"
+    );
+    SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap()
+}
+
+fn frames(scene: &SceneFile, choice: DeviceChoice, breaks: bool) -> (Vec<Frame>, Option<EngineError>) {
+    let device = Device::open(choice, &scene.device).unwrap();
+    let options = RunOptions { device, ..RunOptions::default() };
+    let (mut frames, mut broken) = (Vec::new(), !breaks);
+    let mut sink = |event: Event| match event {
+        Event::Frame(frame) => frames.push(frame),
+        // In the third frame, with some paths done.
+        Event::Progress(share) if frames.len() == 2 && share > 0.0 && !std::mem::replace(&mut broken, true) => trap(),
+        _ => {}
+    };
+    let error = run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).err();
+    assert!(broken, "the third frame told of its progress");
+    (frames, error)
+}
+
+/// Ends the context that the whole process shares.
+fn trap() {
+    use cudarc::driver::{CudaContext, LaunchConfig, PushKernelArg};
+    const PTX: &str = ".version 7.0\n.target sm_70\n.address_size 64\n.visible .entry fault(.param .u32 unused)\n{\n trap;\n}\n";
+    let context = CudaContext::new(0).unwrap();
+    let fault = context.load_module(cudarc::nvrtc::Ptx::from_src(PTX)).unwrap().load_function("fault").unwrap();
+    let stream = context.new_stream().unwrap();
+    let one = LaunchConfig { grid_dim: (1, 1, 1), block_dim: (1, 1, 1), shared_mem_bytes: 0 };
+    // SAFETY: the kernel reads no argument; that it faults is what is wanted.
+    unsafe { stream.launch_builder(&fault).arg(&0_u32).launch(one) }.unwrap();
+    let error = stream.synchronize().unwrap_err();
+    println!("the context is gone: {error:?}");
+}
+
+#[test]
+#[ignore = "needs a GPU; started by the test above"]
+fn in_a_process_of_its_own() {
+    let Ok(when_lost) = std::env::var(WHEN_LOST) else { return };
+    let scene = scene(&when_lost);
+    let (expected, error) = frames(&scene, DeviceChoice::Cpu, false);
+    assert!(error.is_none() && expected.len() == 4);
+    let (found, error) = frames(&scene, DeviceChoice::Cuda(0), true);
+    for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        let (record, lost) = (&found.record, i >= 2);
+        assert_eq!(record.device.starts_with("cuda:0"), !lost, "frame {i}: {}", record.device);
+        assert_eq!(record.warnings.iter().any(|w| w.contains("work on the GPU has ended")), i == 2, "frame {i}: {:?}", record.warnings);
+        let psnr = compare_films(&found.film, &expected.film, [1.0, 0.0, 1.0]).unwrap().psnr.unwrap_or(f64::INFINITY);
+        println!("{when_lost}, frame {i}: {}, {psnr:.1} dB, {} queries, CPU {}", record.device, record.queries, expected.record.queries);
+        println!("  {:?}", record.warnings);
+        // As in render.rs: answers that differ in their last places.
+        assert!(psnr > 50.0, "frame {i}: {psnr} dB");
+        assert!((record.queries as f64 / expected.record.queries as f64 - 1.0).abs() < 5e-3, "frame {i}: counted once");
+    }
+    match when_lost.as_str() {
+        "cpu" => assert!(error.is_none() && found.len() == 4, "{error:?} after {} frames", found.len()),
+        _ => {
+            assert!(matches!(&error, Some(EngineError::Device(_))), "{error:?}");
+            assert_eq!(found.len(), 2);
+            println!("ended with: {}", error.unwrap());
+        }
+    }
+}
