@@ -6,6 +6,7 @@ mod netcdf_fixture;
 use netcdf_fixture::*;
 use ridgewatch::field::{Geometry, Snapshot};
 use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, Staggering, inspect};
+use std::path::Path;
 use tempfile::tempdir;
 
 const CELLS: [usize; 3] = [6, 5, 4];
@@ -157,12 +158,17 @@ fn eastward(lon: f64, lat: f64) -> f64 {
 }
 
 fn ocean(along_grid: bool) -> Fixture {
+    ocean_at(along_grid, 0.0, 0.0)
+}
+
+/// The same `east` degrees further, `hours` later.
+fn ocean_at(along_grid: bool, east: f64, hours: f64) -> Fixture {
     let n = 49;
-    let points: Vec<(f64, f64)> = (0..n * n).map(|p| mesh(p % n, p / n, n)).collect();
+    let points: Vec<(f64, f64)> = (0..n * n).map(|p| mesh(p % n, p / n, n)).map(|(lon, lat)| (lon + east, lat)).collect();
     // An island of nine points; along the grid the flow is (1, 0) everywhere.
     let island = |p: usize| (10..13).contains(&(p % n)) && (10..13).contains(&(p / n));
-    let east = |p: usize| if along_grid { 1.0 } else { eastward(points[p].0, points[p].1) };
-    let u: Vec<f32> = (0..2 * n * n).map(|p| if island(p % (n * n)) { f32::NAN } else { east(p % (n * n)) as f32 }).collect();
+    let flow = |p: usize| if along_grid { 1.0 } else { eastward(points[p].0, points[p].1) };
+    let u: Vec<f32> = (0..2 * n * n).map(|p| if island(p % (n * n)) { f32::NAN } else { flow(p % (n * n)) as f32 }).collect();
     let v: Vec<f32> = (0..2 * n * n).map(|_| 0.0).collect();
     let names = if along_grid {
         ["sea_water_x_velocity", "sea_water_y_velocity"]
@@ -170,7 +176,7 @@ fn ocean(along_grid: bool) -> Fixture {
         ["eastward_sea_water_velocity", "northward_sea_water_velocity"]
     };
     Fixture::new(NETCDF4, &[("time", 2), ("y", n), ("x", n)])
-        .axis("time", "hours since 2000-01-01", &[0.0, 1.0])
+        .axis("time", "hours since 2000-01-01", &[hours, hours + 1.0])
         .variable("nav_lon", &["y", "x"], Data::F64(points.iter().map(|p| p.0).collect()))
         .with("units", "degrees_east")
         .variable("nav_lat", &["y", "x"], Data::F64(points.iter().map(|p| p.1).collect()))
@@ -215,6 +221,18 @@ fn curvilinear_grids_are_resampled_and_say_how_well() {
     let settings = NetCdfSettings { resolution: Some([1.0, 1.0]), ..NetCdfSettings::default() };
     let coarse = NetCdfArchive::open(&[file], &settings).unwrap();
     assert!(coarse.grid().nodes() < grid.nodes() / 4);
+}
+
+#[test]
+fn a_later_file_on_other_points_is_refused() {
+    let dir = tempdir().unwrap();
+    let first = ocean(false).write(&dir.path().join("first.nc"));
+    let later = ocean_at(false, 0.0, 2.0).write(&dir.path().join("later.nc"));
+    let moved = ocean_at(false, 30.0, 2.0).write(&dir.path().join("moved.nc"));
+    let open = |second: &Path| NetCdfArchive::open(&[first.clone(), second.to_owned()], &NetCdfSettings::default());
+    assert_eq!(open(&later).unwrap().times().len(), 4);
+    let said = open(&moved).err().unwrap().to_string();
+    assert!(said.contains("moved.nc") && said.contains("nav_lon") && said.contains("lie on one grid"), "{said}");
 }
 
 #[test]

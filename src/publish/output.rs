@@ -82,10 +82,17 @@ impl Output {
             peak_memory_bytes: peak_memory_bytes(),
             run,
         };
-        if let Some(folder) = folder
-            && let Err(error) = folder.write_summary(&summary)
-        {
-            tracing::warn!("{error}");
+        if let Some(mut folder) = folder {
+            // A run that failed before its first frame gives the folder back to the one that it was to replace.
+            let failed = self.frames == 0 && summary.run.contains_key("failed");
+            let given_back = failed
+                && folder.put_back().unwrap_or_else(|error| {
+                    tracing::warn!("{}: the run before cannot be put back: {error}", folder.path().display());
+                    false
+                });
+            if !given_back && let Err(error) = folder.write_summary(&summary) {
+                tracing::warn!("{error}");
+            }
         }
         summary
     }

@@ -11,6 +11,8 @@ use std::path::{Path, PathBuf};
 const FRAMES: &str = "frames";
 /// Records, one JSON object a line.
 const RECORDS: &str = "records.jsonl";
+/// Holds the files of the run that is about to be replaced.
+const PREVIOUS: &str = ".previous";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
 
@@ -39,6 +41,8 @@ pub struct RunFolder {
     /// Pictures that are there, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
+    /// Where the files of the run before wait until this one has a frame.
+    previous: Option<PathBuf>,
 }
 
 #[derive(Debug)]
@@ -73,6 +77,11 @@ impl RunFolder {
         let frames = path.join(FRAMES);
         fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
         let old = run_files(path).map_err(|e| refuse(path, e))?;
+        let aside = path.join(PREVIOUS);
+        if !old.is_empty() && aside.exists() {
+            // Left by a process that was killed.
+            fs::remove_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
+        }
         // A run that failed before its first frame left nothing that anybody could miss.
         let empty = old.iter().all(|file| match file.file_name().and_then(|name| name.to_str()) {
             Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
@@ -84,14 +93,44 @@ impl RunFolder {
                 let found = old.strip_prefix(path).unwrap_or(&old).display().to_string();
                 return Err(PublishError::Occupied { path: path.to_owned(), found });
             }
-            fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
+            if empty {
+                fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
+                continue;
+            }
+            // Kept until this run has a frame: one that fails before must not cost the one before.
+            fs::create_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
+            if let Some(name) = old.file_name() {
+                fs::rename(&old, aside.join(name)).map_err(|e| refuse(&old, e))?;
+            }
         }
         let probe = frames.join(".probe");
         fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)).map_err(|e| refuse(&frames, e))?;
         let file = path.join(RECORDS);
         // `create_new`: of two runs that start at once in one folder, one is told.
         let records = OpenOptions::new().append(true).create_new(true).open(&file).map_err(|e| refuse(&file, e))?;
-        Ok(Self { path: path.to_owned(), records, complete: 0, kept: VecDeque::new(), kept_bytes: 0 })
+        Ok(Self {
+            path: path.to_owned(),
+            records,
+            complete: 0,
+            kept: VecDeque::new(),
+            kept_bytes: 0,
+            previous: Some(aside).filter(|a| a.exists()),
+        })
+    }
+
+    /// Puts the files of the run before back in their places and gives this one's up; whether there were any.
+    ///
+    /// # Errors
+    /// Those of the system; what could not be put back lies in `.previous`.
+    pub fn put_back(&mut self) -> io::Result<bool> {
+        let Some(previous) = self.previous.take() else { return Ok(false) };
+        for entry in fs::read_dir(&previous)? {
+            let entry = entry?;
+            let folder = if entry.file_name().to_str().is_some_and(is_picture) { self.path.join(FRAMES) } else { self.path.clone() };
+            fs::rename(entry.path(), folder.join(entry.file_name()))?;
+        }
+        fs::remove_dir(&previous)?;
+        Ok(true)
     }
 
     /// The folder.
@@ -112,6 +151,11 @@ impl RunFolder {
         match self.records.write_all(&line) {
             Ok(()) => {
                 self.complete += line.len() as u64;
+                if let Some(previous) = self.previous.take()
+                    && let Err(error) = fs::remove_dir_all(&previous)
+                {
+                    tracing::warn!("{}: cannot be removed: {error}", previous.display());
+                }
                 Ok(())
             }
             Err(error) => {
@@ -243,6 +287,26 @@ mod tests {
         run.append_record(&frame(0).record).unwrap();
         drop(run);
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
+    }
+
+    #[test]
+    fn a_run_that_fails_before_its_first_frame_gives_the_earlier_one_back() {
+        let folder = tempfile::tempdir().unwrap();
+        let picture = folder.path().join(FRAMES).join("frame_000000.png");
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        run.append_record(&frame(0).record).unwrap();
+        fs::write(&picture, b"picture").unwrap();
+        drop(run);
+        let records = fs::read(folder.path().join(RECORDS)).unwrap();
+        let mut failed = RunFolder::create(folder.path(), true).unwrap();
+        assert!(!picture.exists());
+        assert!(failed.put_back().unwrap());
+        drop(failed);
+        assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
+        assert!(!folder.path().join(PREVIOUS).exists());
+        let mut run = RunFolder::create(folder.path(), true).unwrap();
+        run.append_record(&frame(0).record).unwrap();
+        assert!(!run.put_back().unwrap() && !picture.exists() && !folder.path().join(PREVIOUS).exists());
     }
 
     fn frame(number: u64) -> Frame {

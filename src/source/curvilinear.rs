@@ -138,23 +138,49 @@ impl Planner<'_> {
     /// The last two dimensions of a coordinate array; the first entry along all others.
     fn mesh(&self, [longitude, latitude]: Pair) -> Result<Mesh, SourceError> {
         let header = self.header();
-        let plane = |index: usize| -> Result<(Vec<f64>, [usize; 2]), SourceError> {
-            let variable = &header.variables[index];
-            let shape = header.shape(variable);
-            let count: Vec<usize> = shape.iter().enumerate().map(|(k, &n)| if k + 2 >= shape.len() { n } else { 1 }).collect();
-            let values = self.file.read(index, &vec![0; shape.len()], &count)?;
-            let packing = self.packing(index)?;
-            let radians = variable.units().is_some_and(|u| u.to_ascii_lowercase().starts_with("radian"));
-            let degrees = |v: f64| if radians { v.to_degrees() } else { v };
-            let values = values.into_iter().map(|v| degrees(packing.unpack(v))).collect();
-            Ok((values, [shape[shape.len() - 1], shape[shape.len() - 2]]))
-        };
-        let ((longitude_values, shape), (latitude_values, _)) = (plane(longitude)?, plane(latitude)?);
+        let shape = header.shape(&header.variables[longitude]);
+        let shape = [shape[shape.len() - 1], shape[shape.len() - 2]];
+        let (longitude_values, latitude_values) = (self.rows(longitude, None)?, self.rows(latitude, None)?);
         let odd = latitude_values.iter().copied().find(|l: &f64| l.abs() > 90.001);
         if let Some(odd) = odd {
             return Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90")));
         }
         Ok(Mesh { shape, longitude: longitude_values, latitude: latitude_values })
+    }
+
+    /// Degrees at all points of a two-dimensional coordinate, or at those of one row.
+    fn rows(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
+        let variable = &self.header().variables[index];
+        let shape = self.header().shape(variable);
+        let rank = shape.len();
+        let mut count: Vec<usize> = shape.iter().enumerate().map(|(k, &n)| if k + 2 >= rank { n } else { 1 }).collect();
+        let mut start = vec![0; rank];
+        if let Some(row) = row {
+            (start[rank - 2], count[rank - 2]) = (row, 1);
+        }
+        let packing = self.packing(index)?;
+        let radians = variable.units().is_some_and(|u| u.to_ascii_lowercase().starts_with("radian"));
+        let degrees = |v: f64| if radians { v.to_degrees() } else { v };
+        Ok(self.file.read(index, &start, &count)?.into_iter().map(|v| degrees(packing.unpack(v))).collect())
+    }
+
+    /// Refuses a later file whose points are not those of the first: its first and last row tell, and cost little to read.
+    fn on_the_same_points(&self, pairs: &[Pair], first: &Curvilinear) -> Result<(), SourceError> {
+        for (pair, mesh) in pairs.iter().zip(&first.meshes) {
+            for (&index, known) in pair.iter().zip([&mesh.longitude, &mesh.latitude]) {
+                for row in [0, mesh.shape[1] - 1] {
+                    let here = self.rows(index, Some(row))?;
+                    let there = &known[row * mesh.shape[0]..][..mesh.shape[0]];
+                    let other = here.iter().zip(there).find(|(a, b)| a != b && !(a.is_nan() && b.is_nan()));
+                    if let Some((a, b)) = other {
+                        let what =
+                            format!("it is {a} where that of the first file is {b} (row {row}); the files of an archive lie on one grid");
+                        return Err(self.misfit(index, what));
+                    }
+                }
+            }
+        }
+        Ok(())
     }
 
     /// Whether u and v run along the grid's own directions, and why that is thought.
@@ -249,6 +275,9 @@ impl Planner<'_> {
             let same = l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));
             l.resampling.clone().filter(|_| same).map(|r| (r, l.axes[..2].to_vec()))
         });
+        if let Some((Resampling::Curvilinear(first), _)) = known.as_ref().map(|(r, axes)| (&**r, axes)) {
+            self.on_the_same_points(&pairs[..components.len()], first)?;
+        }
         let (resampling, mut axes) = match known {
             Some(known) => known,
             None => self.resample(&pairs[..components.len()], u)?,
