@@ -148,6 +148,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let seeds = seeds(&*tracer, grid);
     let begun = std::time::Instant::now();
     let mut traced = Traced::default();
+    let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
     tracer.trace(&seeds, Extras::default(), &mut traced);
     device.check()?;
     if let Some(failure) = device.failure() {
@@ -159,8 +160,12 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
     let missing = seeds.iter().filter(|seed| tracer.is_void(**seed)).count();
+    if options.check || options.convergence {
+        spinner.set_message(format!("integrating {} seeds for comparison", seeds.len()));
+    }
     let check = if options.check { Some(check(plan, slide, &*tracer, &seeds, &ftle)?) } else { None };
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
+    spinner.finish_and_clear();
     if let Some(out) = &options.out {
         write(out, plan, slide, &*tracer, grid, &ftle, &traced.lived).with_context(|| format!("cannot write {}", out.display()))?;
     }

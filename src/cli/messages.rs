@@ -46,3 +46,12 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
     bar
 }
+
+/// A turning sign with the time that has passed, for work whose share is not known; drawn only when standard error is a terminal.
+pub fn spinner(text: String) -> ProgressBar {
+    let bar = progress(None);
+    bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
+    bar.set_message(text);
+    bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    bar
+}

@@ -59,7 +59,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         (settings.k_max, settings.amplitude) = (30.0, 8.0);
     }
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
+    let spinner = messages::spinner(format!("writing {} snapshots", settings.snapshots));
     let files = super::on_threads(common, || ridgewatch::source::synthesize(&settings, &options.out))??;
+    spinner.finish_and_clear();
     if common.json {
         return print_json(&files);
     }

@@ -83,9 +83,8 @@ impl Output {
             run,
         };
         if let Some(mut folder) = folder {
-            // A run that failed before its first frame gives the folder back to the one that it was to replace.
-            let failed = self.frames == 0 && summary.run.contains_key("failed");
-            let given_back = failed
+            // A run that ends before its first frame gives the folder back to the one that it was to replace.
+            let given_back = self.frames == 0
                 && folder.put_back().unwrap_or_else(|error| {
                     tracing::warn!("{}: the run before cannot be put back: {error}", folder.path().display());
                     false

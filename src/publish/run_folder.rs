@@ -78,16 +78,19 @@ impl RunFolder {
         fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
         let old = run_files(path).map_err(|e| refuse(path, e))?;
         let aside = path.join(PREVIOUS);
-        if !old.is_empty() && aside.exists() {
-            // Left by a process that was killed.
-            fs::remove_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
-        }
         // A run that failed before its first frame left nothing that anybody could miss.
         let empty = old.iter().all(|file| match file.file_name().and_then(|name| name.to_str()) {
             Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
             Some(name) => !is_picture(name),
             None => false,
         });
+        // `.previous` beside a run without a frame was left by a process that was killed: it holds the run that counts.
+        if aside.exists() && !overwrite {
+            return Err(PublishError::Occupied { path: path.to_owned(), found: PREVIOUS.into() });
+        }
+        if aside.exists() && !empty {
+            fs::remove_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
+        }
         for old in old {
             if !overwrite && !empty {
                 let found = old.strip_prefix(path).unwrap_or(&old).display().to_string();
@@ -304,6 +307,12 @@ mod tests {
         drop(failed);
         assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
         assert!(!folder.path().join(PREVIOUS).exists());
+        // Killed while it prepares: the earlier run is neither lost nor taken for nothing.
+        drop(RunFolder::create(folder.path(), true).unwrap());
+        assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
+        let mut second = RunFolder::create(folder.path(), true).unwrap();
+        assert!(second.put_back().unwrap() && picture.exists());
+        drop(second);
         let mut run = RunFolder::create(folder.path(), true).unwrap();
         run.append_record(&frame(0).record).unwrap();
         assert!(!run.put_back().unwrap() && !picture.exists() && !folder.path().join(PREVIOUS).exists());
