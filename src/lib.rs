@@ -5,7 +5,7 @@
 //! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`] ← [`config`] ← the command line.
 //!
 //! Each room defines and checks its own settings, with the words of [`setting`]; [`config`] reads them from one scene file and finds the
-//! line of a fault. [`simd`] and [`setting`] lie below all rooms.
+//! line of a fault. [`files`], [`setting`] and [`simd`] lie below all rooms.
 //!
 //! One cycle: take the newest snapshots, slide the window, render with the weights of the previous cycle, test every traced
 //! sample against the surrogate (this feeds the trust map), then train on it.

@@ -1,6 +1,6 @@
 //! What is said on standard error.
 
-use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressStyle};
 use std::io::IsTerminal;
 use tracing_subscriber::EnvFilter;
 
@@ -49,7 +49,8 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
 
 /// A turning sign with the time that has passed, for work whose share is not known; drawn only when standard error is a terminal.
 pub fn spinner(text: String) -> ProgressBar {
-    let bar = progress(None);
+    // Cleared however the work ends.
+    let bar = progress(None).with_finish(ProgressFinish::AndClear);
     bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
     bar.set_message(text);
     bar.enable_steady_tick(std::time::Duration::from_millis(200));

@@ -38,7 +38,7 @@ impl Setup {
     pub fn new(scene: Settings) -> Result<Self, EngineError> {
         scene.check()?;
         let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
-        Self::over(scene, snapshots)
+        Self::settle(scene, snapshots, None)
     }
 
     /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
@@ -54,7 +54,7 @@ impl Setup {
     }
 
     fn settle(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
-        let mut notes: Vec<String> = snapshots.as_ref().map(|s| s.describe().notes).unwrap_or_default();
+        let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
         let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));
@@ -93,6 +93,8 @@ impl Setup {
             }
             snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
         }
+        // A steady flow says so itself.
+        notes.extend(snapshots.iter().flat_map(|source| source.describe().notes));
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
             SourceKind::Archive | SourceKind::Live => Boundary::Stop,
             SourceKind::Turbulence => Boundary::Clamp,

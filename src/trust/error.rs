@@ -27,6 +27,8 @@ pub struct TrustedError {
 struct Sums {
     count: f64,
     square: f64,
+    /// Its part of the variance of the estimate, as its own points tell.
+    variance: f64,
 }
 
 impl TrustedError {
@@ -45,9 +47,9 @@ impl TrustedError {
         }
         let weights: Vec<f64> = residuals.iter().map(|r| strata.weight(r.point)).collect();
         let whole: f64 = weights.iter().sum();
+        let squared: fn(&Residual) -> f64 = |r| f64::from(r.optical).powi(2);
         let mean = |f: fn(&Residual) -> f64| residuals.iter().zip(&weights).map(|(r, w)| w * f(r)).sum::<f64>() / whole;
-        let squared = |r: &Residual| f64::from(r.optical).powi(2);
-        let square = mean(|r| f64::from(r.optical).powi(2));
+        let square = mean(squared);
         let mut cells = vec![Sums::default(); strata.drawn.len()];
         for residual in residuals {
             let cell = &mut cells[strata.cell(residual.point)];
@@ -56,30 +58,28 @@ impl TrustedError {
         }
         // Second and third moment of the estimate: the sums over points of the deviation from their cell's mean, each with its share of
         // the whole. Where a cell has one point only, the mean over all cells stands for its own.
-        let (mut variance, mut third) = (0.0, 0.0);
-        let mut of_cells = vec![0.0; cells.len()];
+        let mut third = 0.0;
         for (residual, weight) in residuals.iter().zip(&weights) {
-            let cell = cells[strata.cell(residual.point)];
+            let cell = &mut cells[strata.cell(residual.point)];
             let share = weight / whole;
             let (centre, correction) =
                 if cell.count > 1.0 { (cell.square / cell.count, cell.count / (cell.count - 1.0)) } else { (square, 1.0) };
             let deviation = squared(residual) - centre;
-            of_cells[strata.cell(residual.point)] += correction * (share * deviation).powi(2);
+            cell.variance += correction * (share * deviation).powi(2);
             third += (share * deviation).powi(3);
         }
         // Skewness is that of the points themselves; the variance below only grows.
-        let own: f64 = of_cells.iter().sum();
+        let own: f64 = cells.iter().map(|cell| cell.variance).sum();
         let gamma = if own > 0.0 { third / own.powf(1.5) } else { 0.0 };
         let fourth = mean(|r| f64::from(r.optical).powi(4));
         let of_region = (fourth - square * square).max(0.0);
-        for (cell, ((own, sums), &drawn)) in of_cells.into_iter().zip(&cells).zip(&strata.drawn).enumerate() {
-            let seen = strata.seen.get(cell).copied().unwrap_or_default();
-            let weight = seen.weight.min(sums.count);
-            let share = sums.count / (f64::from(drawn.max(1)) * whole).powi(2);
-            let known = sums.count * own + share * (weight * seen.variance + of_region);
-            variance += known / (sums.count + weight + 1.0);
-        }
-        let variance = variance.max(own);
+        let pooled = |(number, cell): (usize, &Sums)| {
+            let seen = strata.seen.get(number).copied().unwrap_or_default();
+            let weight = seen.weight.min(cell.count);
+            let share = cell.count / (f64::from(strata.drawn[number].max(1)) * whole).powi(2);
+            (cell.count * cell.variance + share * (weight * seen.variance + of_region)) / (cell.count + weight + 1.0)
+        };
+        let variance = cells.iter().enumerate().map(pooled).sum::<f64>().max(own);
         let bound = |z: f64| (square - variance.sqrt() * hall_inverse(z, gamma)).max(0.0).sqrt();
         let n = residuals.len() as f64;
         // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
