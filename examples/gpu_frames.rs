@@ -63,24 +63,28 @@ fn main() {
     let began = Instant::now();
     let Ok(gpu) = Gpu::open(0, &GpuSettings::default()) else { return println!("no GPU: nothing is measured") };
     let mut device = GpuRenderer::new(&gpu).unwrap();
-    println!("{}, driver {}; opened with rendering kernels after {:.2} s", gpu.name(), gpu.driver(), began.elapsed().as_secs_f64());
+    let opened = began.elapsed().as_secs_f64();
 
-    let began = Instant::now();
     let grid = Turbulence::grid(shape).unwrap();
     let turbulence = Turbulence::easy(shape, 0);
     let mut window: Window = turbulence.window(&grid, 12).unwrap();
     let next = Arc::new(turbulence.snapshot(12.0, &grid));
-    println!("easy turbulence {shape:?}, 12 snapshots, made on the CPU in {:.1} s", began.elapsed().as_secs_f64());
-
     let store = SnapshotStore::new(&gpu);
     let source = VelocitySource::Window(Arc::new(window.clone()));
     let began = Instant::now();
     drop(CudaTracer::new(&store, &gpu, source.clone(), &map(22), 0.0, Tuning::default()).unwrap());
     gpu.synchronize().unwrap();
-    println!("window on the device and tracing kernels ready after {:.2} s", began.elapsed().as_secs_f64());
+    let ready = began.elapsed().as_secs_f64();
 
-    println!("{width}x{height}, one sample a pixel, reference; milliseconds of device time a frame, median of 9 by wall clock");
-    println!("steps ahead | frame (wall) start advance sort+trace film | waves queries ahead M/s | frames/s");
+    println!("<!-- block frames -->");
+    println!(
+        "{width}x{height} pixels of {shape:?} nodes; device opened and rendering kernels ready after {opened:.2} s, window on the device and tracing"
+    );
+    println!("kernels ready after another {ready:.2} s.\n");
+    println!(
+        "| steps | ahead | frame (wall) | start | advance | sort and trace | film | waves | queries | traced ahead | traced, M/s | frames/s |"
+    );
+    println!("|---|---|---|---|---|---|---|---|---|---|---|---|");
     let mut frame_seconds = 0.0;
     for (steps, camera, shadow) in
         [(22, 1, 1), (22, 2, 4), (22, 4, 8), (22, 8, 8), (22, 2, 16), (22, 8, 32), (11, 4, 8), (44, 4, 8), (110, 4, 8)]
@@ -98,7 +102,7 @@ fn main() {
         frames.sort_by(|a, b| a.0.total_cmp(&b.0));
         let (wall, t, queries) = frames[4];
         println!(
-            "{steps:4} {camera:2},{shadow:2} | {:6.1} {:6.2} {:6.2} {:7.2} {:5.2} | {:4} {:9} {:5.1} % {:6.0} | {:.1}",
+            "| {steps} | {camera}, {shadow} | {:.1} | {:.2} | {:.2} | {:.2} | {:.2} | {} | {} | {:.1} % | {:.0} | {:.1} |",
             1e3 * wall,
             1e3 * t.start,
             1e3 * t.advance,
@@ -127,7 +131,7 @@ fn main() {
     renderer.window_slid();
     device.render_samples(&mut renderer, 1, 0..1, &mut Traced(slid.device()), None, &NEVER).unwrap();
     println!(
-        "a new snapshot: {:.1} ms until the tracer of the slid window stands, {:.1} ms with the first frame on it (a frame: {:.1} ms); \
+        "\nA new snapshot, brought on the slide: {:.1} ms until the tracer of the slid window stands, {:.1} ms with the first frame on it (a frame: {:.1} ms); \
          memory {} MiB before, {} MiB after",
         1e3 * seconds,
         1e3 * began.elapsed().as_secs_f64(),

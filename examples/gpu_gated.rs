@@ -70,7 +70,6 @@ fn main() {
     scene.transfer = Some(colours(&scene, &device));
     (scene.time.warmup_frames, scene.time.frames_per_slide) = (WARM_UP, FRAMES);
     let size = format!("{}x{}", scene.render.width, scene.render.height);
-    println!("{}; {size}, easy turbulence {nodes:?}, 22 steps; medians of {FRAMES} frames of one sample after {WARM_UP}", device.name());
 
     let mut truth = scene.clone();
     truth.seed = 77;
@@ -79,8 +78,10 @@ fn main() {
     (truth.time.warmup_frames, truth.time.frames_per_slide) = (1, 1);
     let (reference, records) = pictures(&truth, &device);
     let frame = &records[0];
+    println!("<!-- block gated -->");
+    println!("{size} pixels of {nodes:?} nodes, 22 steps; medians of {FRAMES} frames of one sample after {WARM_UP}.");
     println!(
-        "reference of {} samples, seed {}: {:.1} s, {} queries, {:.0} M traced a second of tracing\n",
+        "The reference of {} samples, seed {}: {:.1} s, {} queries, {:.0} M traced a second of tracing.\n",
         frame.samples_per_pixel,
         truth.seed,
         frame.seconds.total,

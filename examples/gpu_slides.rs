@@ -61,7 +61,7 @@ fn spread(values: impl Iterator<Item = f64>) -> String {
     values.sort_by(f64::total_cmp);
     match values.as_slice() {
         [] => "-".into(),
-        [.., last] => format!("{:.1} / {:.1}", 1e3 * values[values.len() / 2], 1e3 * last),
+        [.., last] => format!("{:.1}, {:.1}", 1e3 * values[values.len() / 2], 1e3 * last),
     }
 }
 
@@ -71,58 +71,50 @@ fn main() {
     let (width, height) = (value(0, 1920), value(1, 1080));
     let shape = [value(2, 600), value(3, 192), value(4, 192)];
     let Ok(gpu) = Gpu::open(0, &GpuSettings::default()) else { return println!("no GPU: nothing is measured") };
+    println!("<!-- block slides -->");
+    println!("{width}x{height} pixels of {shape:?} nodes, 22 steps, one sample; milliseconds, median and largest.\n");
     println!(
-        "{}, driver {}; {width}x{height}, one sample a pixel, easy turbulence {shape:?}; milliseconds, median / largest",
-        gpu.name(),
-        gpu.driver()
+        "| snapshots | slides | frames a slide | slide | its tracer | waiting for input | first frame of a slide | other frames | audits | \
+         frame to frame with a slide | without |"
     );
-    let cases = [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)];
-    for (what, ahead, slides, frames_per_slide) in cases {
+    println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    let mut memory = Vec::new();
+    for (what, ahead, slides, frames_per_slide) in
+        [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)]
+    {
         let device = Timed { inner: CudaAccelerator::new(gpu.clone(), Storage::F32), ahead, tracer_seconds: Mutex::default() };
         let device = Arc::new(device);
         let seen = stream(&gpu, &device, [width, height], shape, slides, frames_per_slide);
-        let first = |s: &&Seen| s.record.slide > 0 && s.record.seconds.slide > 0.0;
-        let other = |s: &&Seen| s.record.slide > 0 && s.record.seconds.slide == 0.0;
-        let of_slides = || seen.iter().filter(first);
+        let of = |with_slide: bool| seen.iter().filter(move |s| s.record.slide > 0 && (s.record.seconds.slide > 0.0) == with_slide);
+        let tracers = device.tracer_seconds.lock().unwrap();
+        let from_frame_to_frame = |with_slide: bool| spread(of(with_slide).map(|s| s.interval - s.record.seconds.waiting));
         println!(
-            "\n{what}: {} frames, {frames_per_slide} a slide; {} snapshots came over, {} of them ahead",
-            seen.len(),
-            device.inner.snapshots().brought(),
-            device.inner.snapshots().brought_ahead()
-        );
-        println!("  slide: {}", spread(of_slides().map(|s| s.record.seconds.slide)));
-        println!("    of it, the tracer of the slid window: {}", spread(device.tracer_seconds.lock().unwrap().iter().skip(1).copied()));
-        println!("  waiting for the snapshot to be read: {}", spread(of_slides().map(|s| s.record.seconds.waiting)));
-        for (name, wanted) in [("first frame of a slide", true), ("another frame", false)] {
-            let frames = || seen.iter().filter(|s| if wanted { first(s) } else { other(s) }).map(|s| &s.record.seconds);
-            println!(
-                "  {name}: {} (walking {}, tracing {}, audit {})",
-                spread(frames().map(|t| t.total)),
-                spread(frames().map(|t| t.render)),
-                spread(frames().map(|t| t.trace)),
-                spread(frames().map(|t| t.audit))
-            );
-        }
-        let from_frame_to_frame = |wanted: bool| {
-            spread(seen.iter().filter(|s| if wanted { first(s) } else { other(s) }).map(|s| s.interval - s.record.seconds.waiting))
-        };
-        println!(
-            "  from frame to frame, waiting left out: with a slide {}, without {}",
+            "| {what} | {slides} | {frames_per_slide} | {} | {} | {} | {} | {} | {} | {} | {} |",
+            spread(of(true).map(|s| s.record.seconds.slide)),
+            spread(tracers.iter().skip(1).copied()),
+            spread(of(true).map(|s| s.record.seconds.waiting)),
+            spread(of(true).map(|s| s.record.seconds.total)),
+            spread(of(false).map(|s| s.record.seconds.total)),
+            spread(seen.iter().map(|s| s.record.seconds.audit)),
             from_frame_to_frame(true),
             from_frame_to_frame(false)
         );
-        // From the second slide on, everything that is ever taken has been.
+        // From the third slide on, everything that is ever taken has been.
         let settled: Vec<&Seen> = seen.iter().filter(|s| s.record.slide >= 2).collect();
         let (least, most) = (settled.iter().map(|s| s.taken).min().unwrap_or(0), settled.iter().map(|s| s.taken).max().unwrap_or(0));
         let (begin, end) = (settled.first().map_or(0, |s| s.free), settled.last().map_or(0, |s| s.free));
-        println!(
-            "  device memory taken from the third slide on: {} to {} MiB; free at its begin {} MiB, at the end {} MiB",
+        memory.push(format!(
+            "{} frames, {} of {} snapshots ahead: {} to {} MiB taken from the third slide on; free at its begin {} MiB, at the end {} MiB.",
+            seen.len(),
+            device.inner.snapshots().brought_ahead(),
+            device.inner.snapshots().brought(),
             least >> 20,
             most >> 20,
             begin >> 20,
             end >> 20
-        );
+        ));
     }
+    println!("\n{}", memory.join("\n"));
 }
 
 /// Runs the cycle over snapshots that are ready in memory, so that reading costs nothing.

@@ -77,11 +77,50 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_tange
     return path;
 }
 
+// One step of one particle; whether all nodes were known.
+template <class Flow, int D> RW_FN bool runge_kutta(const Flow& flow, const typename Flow::Step& step, typename Flow::R h, const typename Flow::R (&x)[D],
+                                                   typename Flow::R (&end)[D], typename Flow::Memory& memory) {
+    using R = typename Flow::R;
+    const R half = h / 2, sixth = h / 6;
+    R k[D], at[D], sum[D];
+    bool known = flow.velocity(step, 0, x, k, memory);
+    RW_UNROLL for (int i = 0; i < D; i++) sum[i] = k[i];
+    RW_UNROLL for (int stage = 1; stage < 4; stage++) {
+        const R ahead = stage == 3 ? h : half, weight = stage == 3 ? R(1) : R(2);
+        RW_UNROLL for (int i = 0; i < D; i++) at[i] = fma_(ahead, k[i], x[i]);
+        known = flow.velocity(step, stage == 3 ? 2 : 1, at, k, memory) && known;
+        RW_UNROLL for (int i = 0; i < D; i++) sum[i] = fma_(weight, k[i], sum[i]);
+    }
+    RW_UNROLL for (int i = 0; i < D; i++) end[i] = fma_(sixth, sum[i], x[i]);
+    flow.settle(end);
+    return known;
+}
+
+// The gradient from where the particles of a seed ended, and the stretch.
+template <class Flow> RW_FN void compare(const Flow& flow, const typename Flow::R (&x)[2 * Flow::C][Flow::D], double gap, const double (&seed)[3],
+                                         Path<typename Flow::R, Flow::D, Flow::C>& path) {
+    using R = typename Flow::R;
+    constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
+    R m[D][C];
+    RW_UNROLL for (int c = 0; c < C; c++) {
+        R inverse = R(1) / flow.separation(seed, c, gap);
+        RW_UNROLL for (int i = 0; i < D; i++) m[i][c] = (x[2 * c][i] - x[2 * c + 1][i]) * inverse;
+    }
+    RW_UNROLL for (int i = 0; i < D; i++) {
+        R mean = 0;
+        RW_UNROLL for (int p = 0; p < P; p++) mean = fma_(R(0.5 / C), x[p][i], mean);
+        path.state[i] = mean;
+    }
+    flow.settle(path.state);
+    flow.metric(path.state, m, path.metric);
+    path.exponent = 0;
+    path.log_stretch = log_stretch<C, R>(path.metric);
+}
+
 // Two particles an axis, `gap` coordinate units before and behind the seed. All stop as soon as one of them does.
 template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences(const Flow& flow, int steps, typename Flow::R h, double gap, const double (&seed)[3]) {
     using R = typename Flow::R;
     constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
-    const R half = h / 2, sixth = h / 6;
     Path<R, D, C> path;
     R x[P][D];
     typename Flow::Memory memory{};
@@ -98,17 +137,7 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
         R end[P][D];
         bool known = true, inside = true;
         RW_UNROLL for (int p = 0; p < P; p++) {
-            R k[D], at[D], sum[D];
-            known = flow.velocity(step, 0, x[p], k, memory) && known;
-            RW_UNROLL for (int i = 0; i < D; i++) sum[i] = k[i];
-            RW_UNROLL for (int stage = 1; stage < 4; stage++) {
-                const R ahead = stage == 3 ? h : half, weight = stage == 3 ? R(1) : R(2);
-                RW_UNROLL for (int i = 0; i < D; i++) at[i] = fma_(ahead, k[i], x[p][i]);
-                known = flow.velocity(step, stage == 3 ? 2 : 1, at, k, memory) && known;
-                RW_UNROLL for (int i = 0; i < D; i++) sum[i] = fma_(weight, k[i], sum[i]);
-            }
-            RW_UNROLL for (int i = 0; i < D; i++) end[p][i] = fma_(sixth, sum[i], x[p][i]);
-            flow.settle(end[p]);
+            known = runge_kutta(flow, step, h, x[p], end[p], memory) && known;
             inside = inside && flow.inside(end[p]);
         }
         if (!(inside && known)) {
@@ -118,22 +147,50 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
         }
         RW_UNROLL for (int p = 0; p < P; p++) RW_UNROLL for (int i = 0; i < D; i++) x[p][i] = end[p][i];
     }
-    R m[D][C];
-    RW_UNROLL for (int c = 0; c < C; c++) {
-        R inverse = R(1) / flow.separation(seed, c, gap);
-        RW_UNROLL for (int i = 0; i < D; i++) m[i][c] = (x[2 * c][i] - x[2 * c + 1][i]) * inverse;
-    }
-    RW_UNROLL for (int i = 0; i < D; i++) {
-        R mean = 0;
-        RW_UNROLL for (int p = 0; p < P; p++) mean = fma_(R(0.5 / C), x[p][i], mean);
-        path.state[i] = mean;
-    }
-    flow.settle(path.state);
-    flow.metric(path.state, m, path.metric);
-    path.exponent = 0;
-    path.log_stretch = log_stretch<C, R>(path.metric);
+    compare(flow, x, gap, seed, path);
     return path;
 }
+
+#if RW_DEVICE
+// The same with a particle a lane, the particles of a seed in the lanes of `group` from lane `first` on: each keeps a cell of its own. All
+// lanes of the warp call this together; a lane without a seed has no `group`. The whole path is that of the first lane.
+template <class Flow>
+RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flow& flow, int steps, typename Flow::R h, double gap,
+                                                                      const double (&seed)[3], int particle, int first, uint32_t group) {
+    using R = typename Flow::R;
+    constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
+    constexpr uint32_t ALL = 0xffffffffu;
+    Path<R, D, C> path;
+    R x[D], end[D];
+    typename Flow::Memory memory{};
+    double there[3] = {seed[0], seed[1], seed[2]};
+    RW_UNROLL for (int k = 0; k < C; k++) if (k == particle / 2) there[k] += particle % 2 == 0 ? gap : -gap;
+    flow.start(there, x);
+    path.left = (__ballot_sync(ALL, flow.inside(x)) & group) != group;
+    bool going = group != 0 && !path.left;
+    path.steps = going ? steps : 0;
+    for (int n = 0; n < steps; n++) {
+        bool known = true, inside = true;
+        if (going) {
+            const typename Flow::Step step = flow.step(n);
+            known = runge_kutta(flow, step, h, x, end, memory);
+            inside = flow.inside(end);
+        }
+        const uint32_t in = __ballot_sync(ALL, inside), well = __ballot_sync(ALL, inside && known);
+        if (going && (well & group) != group) {
+            going = false;
+            path.steps = n;
+            path.left = (in & group) != group;
+        }
+        if (!__any_sync(ALL, going)) break;
+        if (going) RW_UNROLL for (int i = 0; i < D; i++) x[i] = end[i];
+    }
+    R all[P][D];
+    RW_UNROLL for (int p = 0; p < P; p++) RW_UNROLL for (int i = 0; i < D; i++) all[p][i] = __shfl_sync(ALL, x[i], first + p);
+    compare(flow, all, gap, seed, path);
+    return path;
+}
+#endif
 
 // What is given back for a seed. Any pointer but `log_stretch` may be null.
 struct Outputs {

@@ -37,7 +37,9 @@ fn variants(source: &str) -> Vec<Vec<String>> {
         "trace_grid.cu" => vec![
             grid(&[]),
             grid(&[("STORAGE", "1"), ("MARKS", "1"), ("SCALED", "1"), ("EVEN", "5"), ("WRAP", "2"), ("SEAM", "2")]),
-            grid(&[("REAL", "double"), ("KEEP", "0"), ("DIFFERENCES", "1")]),
+            grid(&[("REAL", "double"), ("KEEP", "0")]),
+            grid(&[("REAL", "double"), ("DIFFERENCES", "1")]),
+            grid(&[("AXES", "2"), ("MARKS", "1"), ("DIFFERENCES", "1")]),
             grid(&[("AXES", "2"), ("CUBIC", "1"), ("EVEN", "3")]),
             grid(&[("CUBIC", "1")]),
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),

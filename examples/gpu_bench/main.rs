@@ -1,6 +1,6 @@
-//! What the GPU traces in a second, and what bounds it: the table of docs/performance.md. Times are medians of device time between events;
+//! What the GPU traces in a second, and what bounds it: blocks of docs/performance.md. Times are medians of device time between events;
 //! seeds and results stay on the device; every batch is sorted anew, and the sort counts.
-//! `cargo run --release --example gpu_bench [quick|collisions]`
+//! `cargo run --release --example gpu_bench [quick|collisions|profile]`; `profile` launches each kernel once, for a profiler.
 
 // It talks to its user on standard output.
 #![allow(clippy::print_stdout)]
@@ -12,11 +12,12 @@ fn main() {
 
 #[cfg(feature = "cuda")]
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let told = |word: &str| std::env::args().any(|argument| argument == word);
-    bench::run(match (told("quick"), told("collisions")) {
-        (true, _) => bench::Rows::Quick,
-        (_, true) => bench::Rows::Collisions,
-        _ => bench::Rows::All,
+    bench::run(match std::env::args().nth(1).as_deref() {
+        None | Some("bench") => bench::Rows::All,
+        Some("quick") => bench::Rows::Quick,
+        Some("collisions") => bench::Rows::Collisions,
+        Some("profile") => bench::Rows::Profile,
+        Some(other) => return Err(format!("{other}: bench, quick, collisions or profile").into()),
     })
 }
 
@@ -47,12 +48,14 @@ mod bench {
         All,
         Quick,
         Collisions,
+        Profile,
     }
 
     const SHAPE: [usize; 3] = [600, 192, 192];
     const SNAPSHOTS: usize = 12;
     const ROUNDS: usize = 7;
     const M: f64 = 1e6;
+    const STEPS: [usize; 4] = [6, 11, 22, 110];
 
     type Outcome<T> = Result<T, Box<dyn Error>>;
 
@@ -108,23 +111,29 @@ mod bench {
             Ok(Self { seeds, stretch, lived, count })
         }
 
+        /// Queues a trace of the first `count` seeds.
+        fn trace(&self, tracer: &DeviceTracer, count: usize) -> Outcome<()> {
+            let out = Outputs { log_stretch: self.stretch.address(), lived: self.lived.address(), ..Outputs::default() };
+            // SAFETY: all buffers hold `self.count` entries, at least `count`.
+            unsafe { tracer.trace(self.seeds.address(), count.min(self.count), &out)? };
+            Ok(())
+        }
+
         /// Median milliseconds of a trace of the first `count` seeds.
         fn time(&self, tracer: &DeviceTracer, count: usize) -> Outcome<f64> {
             let gpu = tracer.gpu();
-            let out = Outputs { log_stretch: self.stretch.address(), lived: self.lived.address(), ..Outputs::default() };
             let mut times = Vec::new();
             for round in 0..=ROUNDS {
                 let begin = gpu.mark()?;
-                // SAFETY: all buffers hold `self.count` entries, at least `count`.
-                unsafe { tracer.trace(self.seeds.address(), count.min(self.count), &out)? };
+                self.trace(tracer, count)?;
                 let end = gpu.mark()?;
                 let milliseconds = f64::from(gpu.milliseconds(&begin, &end)?);
                 // The first round warms up.
                 if round > 0 {
                     times.push(milliseconds);
                 }
-                // Long ones vary little.
-                if milliseconds > 400.0 && round > 1 {
+                // Long ones vary little: three do.
+                if milliseconds > 400.0 && round > 2 {
                     break;
                 }
             }
@@ -177,7 +186,7 @@ mod bench {
                 let squares: f64 = found.iter().zip(&truth.log_stretch_f64).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum();
                 10.0 * (peak * peak / (squares / found.len() as f64)).log10()
             };
-            println!("\n### Steps and their error, {name}: PSNR against 880 steps in f64 on 2^18 points\n");
+            block(&format!("{name}-steps"));
             println!("| steps | storage | PSNR, dB |\n|---|---|---|");
             let held = Batch::new(&self.gpu, &points)?;
             for (steps, storage) in [(6, Storage::F32), (11, Storage::F32), (22, Storage::F32), (22, Storage::F16), (110, Storage::F32)] {
@@ -185,7 +194,7 @@ mod bench {
                 held.time(&tracer, points.len())?;
                 println!("| {steps} | {storage:?} | {:.1} |", psnr(&held.stretches()?));
             }
-            println!("\n### Tables, {name}, 22 steps\n");
+            block(&format!("{name}-tables"));
             println!(
                 "| nodes | traced in, s | M nodes/s | PSNR, dB | lookups in a random order, G/s | coherent lookups, G/s |\n|---|---|---|---|---|---|"
             );
@@ -247,31 +256,58 @@ mod bench {
         fn collisions(&self, name: &str, source: &VelocitySource) -> Outcome<()> {
             let host = CudaTracer::new(&self.store, &self.gpu, source.clone(), &turbulent(22), 0.0, Tuning::default())?;
             let Collisions { points, first_wave, waves, picture } = Collisions::new(&self.gpu, &host, 1 << 23)?;
-            println!(
-                "\n### Collision points of real rays, {name}: a reference frame of {picture:?} pixels, one sample; {first_wave} points in its first wave, \
-                 {} in {waves}\n",
-                points.len()
-            );
-            println!("| seeds | steps | kernel | M samples/s | ms |\n|---|---|---|---|---|");
+            block(&format!("{name}-collisions"));
+            println!("{} points in the first wave, {} in {waves}; {} x {} pixels.\n", first_wave, points.len(), picture[0], picture[1]);
             let batch = Batch::of(&self.gpu, points)?;
-            let plain = Tuning { keep: false, ..Tuning::default() };
-            for (kind, tuning) in [
-                ("cell kept, sorted", Tuning::default()),
-                ("plain, sorted", plain),
-                ("plain, as they come", Tuning { sorted: false, ..plain }),
-            ] {
-                for steps in [6, 11, 22, 110] {
-                    let tracer = self.tracer(source, &turbulent(steps), tuning)?;
-                    for size in [18, 21, 23] {
-                        let count = 1usize << size;
-                        if count <= batch.count {
-                            let ms = batch.time(&tracer, count)?;
-                            println!("| 2^{size} | {steps} | {kind} | {:.0} | {ms:.2} |", count as f64 / ms / 1e3);
-                        }
+            self.rows(source, &batch, &KERNELS[..3], &[18, 21, 23])
+        }
+
+        /// A line for each kernel and size, a column for each number of steps: millions of samples a second, and the share of the floor.
+        fn rows(&self, source: &VelocitySource, batch: &Batch, kernels: &[(&str, Tuning)], sizes: &[u32]) -> Outcome<()> {
+            println!("| kernel | seeds | {} |", STEPS.map(|n| format!("{n} steps")).join(" | "));
+            println!("|---|---|---|---|---|---|");
+            for &(kind, tuning) in kernels {
+                let tracers = STEPS.map(|steps| self.tracer(source, &turbulent(steps), tuning));
+                for &size in sizes {
+                    let count = 1usize << size;
+                    if count > batch.count {
+                        continue;
                     }
+                    let mut line = format!("| {kind} | 2^{size} |");
+                    for (steps, tracer) in STEPS.iter().zip(&tracers) {
+                        let ms = batch.time(tracer.as_ref().map_err(ToString::to_string)?, count)?;
+                        let share = 100.0 * self.floor(*steps, tuning.storage, count) / ms;
+                        line += &format!(" {:.0} ({share:.0} %) |", count as f64 / ms / 1e3);
+                    }
+                    println!("{line}");
                 }
             }
             Ok(())
+        }
+
+        /// Least milliseconds of a trace: the arithmetic of its stages at the device's rate of issue, or the window and the seeds read once at
+        /// the rate of a copy, whichever takes longer.
+        fn floor(&self, steps: usize, storage: Storage, count: usize) -> f64 {
+            let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue;
+            let node = if storage == Storage::F16 { 8.0 } else { 16.0 };
+            // Small batches do not touch it all: 16 nodes a seed and interval at most.
+            let nodes = (SHAPE.iter().product::<usize>() * SNAPSHOTS).min(16 * (SNAPSHOTS - 1) * count) as f64;
+            let bytes = (node * nodes + 20.0 * count as f64) / self.copy;
+            1e3 * operations.max(bytes)
+        }
+
+        /// Each kernel once, in the order of [`KERNELS`] and [`STEPS`], for a profiler that looks at the launches of `trace_sorted` and `trace`.
+        fn profile(&self, name: &str, flow: &Turbulence) -> Outcome<()> {
+            let grid = Turbulence::grid(SHAPE)?;
+            let source = VelocitySource::Window(Arc::new(flow.window(&grid, SNAPSHOTS)?));
+            let batch = Batch::new(&self.gpu, &scattered(&grid.domain(), 1 << 23, 1))?;
+            for (kind, tuning) in KERNELS {
+                for steps in STEPS {
+                    batch.trace(&self.tracer(&source, &turbulent(steps), tuning)?, batch.count)?;
+                    println!("{name}, {kind}, {steps} steps");
+                }
+            }
+            Ok(self.gpu.synchronize()?)
         }
 
         fn turbulence(&self, name: &str, flow: &Turbulence, rows: Rows) -> Outcome<()> {
@@ -281,85 +317,67 @@ mod bench {
             let made = begun.elapsed().as_secs_f64();
             let source = VelocitySource::Window(window);
             let domain = grid.domain();
-            let begun = Instant::now();
-            let first = self.tracer(&source, &turbulent(22), Tuning::default())?;
-            self.gpu.transfer().synchronize()?;
-            let (registers, local) = first.resources()?;
-            println!(
-                "\n## {name} turbulence, {SHAPE:?} x {SNAPSHOTS}, tau 11 (made on the CPU in {made:.1} s; brought over and kernels ready in {:.2} s; \
-                 {registers} registers, {local} bytes of local memory a thread)\n",
-                begun.elapsed().as_secs_f64()
-            );
             if rows == Rows::Collisions {
                 return self.collisions(name, &source);
             }
-            let points = scattered(&domain, 1 << 24, 1);
-            let batch = Batch::new(&self.gpu, &points)?;
-            println!("| seeds | steps | kernel | M samples/s | ms | share of the floor (operations, bytes) |\n|---|---|---|---|---|---|");
-            let random = Tuning { sorted: false, keep: false, ..Tuning::default() };
-            let plain = Tuning { keep: false, ..Tuning::default() };
-            let half = Tuning { storage: Storage::F16, ..Tuning::default() };
-            let kinds = [
-                ("cell kept, sorted", Tuning::default()),
-                ("plain, sorted", plain),
-                ("plain, as they come", random),
-                ("cell kept, sorted, f16", half),
-            ];
-            let sizes: &[u32] = if rows == Rows::Quick || name == "Hard" { &[23] } else { &[18, 21, 23, 24] };
-            for (kind, tuning) in kinds {
-                for steps in [6, 11, 22, 110] {
-                    let tracer = self.tracer(&source, &turbulent(steps), tuning)?;
-                    for &size in sizes {
-                        let count = 1usize << size;
-                        if size == 24 && (!tuning.sorted || steps == 110) {
-                            continue;
-                        }
-                        let ms = batch.time(&tracer, count)?;
-                        // Operations of a stage (multiply-adds count once; see docs/performance.md), and the window read once.
-                        let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue * 1e3;
-                        let storage = if tuning.storage == Storage::F16 { 8.0 } else { 16.0 };
-                        // Small batches do not touch it all: 16 nodes a seed and interval at most.
-                        let window = SHAPE.iter().product::<usize>() * SNAPSHOTS;
-                        let nodes = window.min(16 * (SNAPSHOTS - 1) * count) as f64;
-                        let bytes = (storage * nodes + 20.0 * count as f64) / self.copy * 1e3;
-                        println!(
-                            "| 2^{size} | {steps} | {kind} | {:.0} | {ms:.2} | {:.0} %, {:.0} % |",
-                            count as f64 / ms / 1e3,
-                            100.0 * operations / ms,
-                            100.0 * bytes / ms
-                        );
-                    }
-                }
-            }
-            println!("\nMean share of steps completed: {:.3}", batch.mean_lived(1 << 20)?);
+            let begun = Instant::now();
+            let first = self.tracer(&source, &turbulent(22), Tuning::default())?;
+            self.gpu.transfer().synchronize()?;
+            let (ready, (registers, local)) = (begun.elapsed().as_secs_f64(), first.resources()?);
+            block(&format!("{name}-rows"));
+            let batch = Batch::new(&self.gpu, &scattered(&domain, 1 << 24, 1))?;
+            self.rows(&source, &batch, &KERNELS, if rows == Rows::Quick { &[23] } else { &[18, 21, 23, 24] })?;
+            batch.trace(&first, batch.count)?;
+            println!(
+                "\nShare of steps completed, mean: {:.3}. Made on the CPU in {made:.1} s; on the device, kernels ready, after {ready:.2} s; \
+                 {registers} registers and {local} bytes of local memory a thread (cell kept).",
+                batch.mean_lived(1 << 20)?
+            );
 
-            println!("\n### Tangent against six-particle differences, {name}, 22 steps, sorted\n");
-            println!("| integrator | precision | seeds | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|");
+            block(&format!("{name}-differences"));
+            println!("| integrator | precision | gap, cells | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|");
             let count = 1 << 21;
-            let tangent = batch.time(&self.tracer(&source, &turbulent(22), Tuning::default())?, count)?;
-            println!("| tangent | f32 | 2^21 | {:.0} | 1 |", count as f64 / tangent / 1e3);
-            for (integrator, precision, gap, keep) in [
-                (Integrator::Tangent, Precision::F64, 1e-4, false),
-                (Integrator::Differences, Precision::F32, 0.05, true),
-                (Integrator::Differences, Precision::F32, 0.05, false),
-                (Integrator::Differences, Precision::F64, 1e-4, false),
+            let tangent = batch.time(&first, count)?;
+            println!("| tangent | f32 | - | {:.0} | 1 |", count as f64 / tangent / 1e3);
+            for (integrator, precision, gap, keep, spread) in [
+                (Integrator::Tangent, Precision::F64, 0.0, false, false),
+                (Integrator::Differences, Precision::F32, 0.05, true, true),
+                (Integrator::Differences, Precision::F32, 0.05, false, true),
+                (Integrator::Differences, Precision::F32, 0.05, true, false),
+                (Integrator::Differences, Precision::F32, 0.05, false, false),
+                (Integrator::Differences, Precision::F64, 1e-4, true, true),
+                (Integrator::Differences, Precision::F64, 1e-4, false, true),
+                (Integrator::Differences, Precision::F64, 1e-4, false, false),
             ] {
                 let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
-                let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, ..Tuning::default() })?, count)?;
+                let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, spread, ..Tuning::default() })?, count)?;
+                let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
+                let how = match (integrator, spread) {
+                    (Integrator::Tangent, _) => "",
+                    (_, true) => ", a lane each",
+                    (_, false) => ", one thread",
+                };
                 let kept = if keep { ", cell kept" } else { "" };
-                println!("| {integrator:?}{kept} | {precision:?} | 2^21 | {:.0} | {:.2} |", count as f64 / ms / 1e3, ms / tangent);
+                let precision = if precision == Precision::F32 { "f32" } else { "f64" };
+                let gap = if gap > 0.0 { gap.to_string() } else { "-".into() };
+                println!("| {what}{how}{kept} | {precision} | {gap} | {:.0} | {:.2} |", count as f64 / ms / 1e3, ms / tangent);
             }
+            let random = KERNELS[2].1;
             let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
             let count = 1 << 18;
             let slow = batch.time(&self.tracer(&source, &published, random)?, count)? / count as f64;
-            let fast = batch.time(&self.tracer(&source, &turbulent(22), Tuning::default())?, 1 << 23)? / (1 << 23) as f64;
-            let eleven = batch.time(&self.tracer(&source, &turbulent(11), Tuning::default())?, 1 << 23)? / (1 << 23) as f64;
             println!(
-                "\nThe published way (six particles, order as they come, 110 steps, f64, gap 1e-6): {:.2} M/s; tangent in f32, sorted: {:.0} times with 22 steps, {:.0} times with 11",
-                1e-3 / slow,
-                slow / fast,
-                slow / eleven
+                "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, gap of 1e-6 cells) traces {:.2} M/s.",
+                1e-3 / slow
             );
+            for (what, tuning) in [("f32", Tuning::default()), ("f32 from a window in f16", KERNELS[3].1)] {
+                let times = [22, 11, 6].map(|steps| -> Outcome<String> {
+                    let fast = batch.time(&self.tracer(&source, &turbulent(steps), tuning)?, 1 << 23)? / (1 << 23) as f64;
+                    Ok(format!("{:.0} times with {steps} steps", slow / fast))
+                });
+                let times: Outcome<Vec<String>> = times.into_iter().collect();
+                println!("Tangent in {what}, sorted, 2^23 seeds: {}.", times?.join(", "));
+            }
             if rows == Rows::All {
                 self.collisions(name, &source)?;
             }
@@ -371,7 +389,7 @@ mod bench {
             let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TAU / 10.0 };
             let source = VelocitySource::Analytic(flow.clone(), plane.clone());
             let batch = Batch::new(&self.gpu, &scattered(&plane, 1 << 24, 3))?;
-            println!("\n## Double gyre, tau 10, 100 steps, 2^24 seeds\n");
+            block("gyre");
             println!("| integrator | precision | M samples/s | registers |\n|---|---|---|---|");
             for (integrator, precision, gap) in [
                 (Integrator::Tangent, Precision::F32, 1e-4),
@@ -413,21 +431,44 @@ mod bench {
     /// tangent 27, stage points and sums 48.
     const STAGE_OPERATIONS: f64 = 183.0;
 
+    const KERNELS: [(&str, Tuning); 4] = {
+        let kept = Tuning { storage: Storage::F32, sorted: true, keep: true, spread: true };
+        [
+            ("cell kept, sorted", kept),
+            ("plain, sorted", Tuning { keep: false, ..kept }),
+            ("plain, as they come", Tuning { sorted: false, keep: false, spread: false, ..kept }),
+            ("cell kept, sorted, f16", Tuning { storage: Storage::F16, ..kept }),
+        ]
+    };
+
+    /// What follows, up to the next such line, is a block of docs/performance.md (see scripts/gpu-check-write).
+    fn block(name: &str) {
+        println!("<!-- block {} -->", name.to_lowercase());
+    }
+
     pub fn run(rows: Rows) -> Outcome<()> {
         let begun = Instant::now();
         let gpu = Gpu::open(0, &GpuSettings::default())?;
-        println!("Device: {}, driver for CUDA {}, opened in {:.2} s", gpu.name(), gpu.driver(), begun.elapsed().as_secs_f64());
+        let opened = begun.elapsed().as_secs_f64();
         let clock = gpu.top_clock_hz()?;
         let issue = f64::from(gpu.multiprocessors()) * 128.0 * clock;
         let copy = gpu.copy_rate(1 << 30)?;
-        println!(
-            "{} multiprocessors at up to {:.0} MHz: {:.1} T instructions/s over all lanes; a copy of 1 GiB on the device moves {:.2} TB/s, read and written",
-            gpu.multiprocessors(),
-            clock / M,
-            issue / 1e12,
-            copy / 1e12
-        );
+        if rows == Rows::All || rows == Rows::Quick {
+            block("rates");
+            println!(
+                "{} multiprocessors at up to {:.0} MHz issue {:.1} T instructions/s over all lanes; a copy of 1 GiB on the device moves {:.2} TB/s, read \
+                 and written. Opened in {opened:.2} s.",
+                gpu.multiprocessors(),
+                clock / M,
+                issue / 1e12,
+                copy / 1e12
+            );
+        }
         let bench = Bench { store: SnapshotStore::new(&gpu), gpu, issue, copy };
+        if rows == Rows::Profile {
+            bench.profile("easy", &Turbulence::easy(SHAPE, 0))?;
+            return bench.profile("hard", &Turbulence::hard(SHAPE, 0));
+        }
         if rows != Rows::Collisions {
             bench.gyre()?;
         }
@@ -435,8 +476,6 @@ mod bench {
         if rows != Rows::Quick {
             bench.turbulence("Hard", &Turbulence::hard(SHAPE, 0), rows)?;
         }
-        let (used, cap) = bench.gpu.memory();
-        println!("\nDevice memory held at the end: {} of {} MiB", used >> 20, cap >> 20);
         Ok(())
     }
 }

@@ -47,15 +47,16 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let wide = FlowMap { precision: Precision::F64, ..single.clone() };
     let exact = on_cpu(source, &wide, t0, &seeds);
     let theirs = on_cpu(source, &single, t0, &seeds);
-    for (sorted, keep) in [(true, true), (true, false), (false, true), (false, false)] {
-        let found = on_gpu(source, &single, t0, Tuning { storage: Storage::F32, sorted, keep }, &seeds);
+    for (sorted, keep, spread) in [(true, true, true), (true, false, true), (true, true, false), (false, true, true), (false, false, false)]
+    {
+        let found = on_gpu(source, &single, t0, Tuning { storage: Storage::F32, sorted, keep, spread }, &seeds);
         let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - found.lived[i]).abs() < 1e-6).collect();
         // Single precision decides more paths the other way: a step's rounding is 1e-7 of the domain.
         assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} lived alike", alike.len(), seeds.len());
         assert!(found.log_stretch.iter().all(|s| !s.is_nan()), "{name}: something was not written");
         let (ours, theirs) = (most(&exact, &found, &alike), most(&exact, &theirs, &alike));
         println!(
-            "{name}, sorted {sorted}, keep {keep}: single precision off by {ours:.1e}, the CPU's by {theirs:.1e}; {odd} odd, {died} stopped"
+            "{name}, sorted {sorted}, keep {keep}, spread {spread}: single precision off by {ours:.1e}, the CPU's by {theirs:.1e}; {odd} odd, {died} stopped"
         );
         assert!(ours < 3.0 * theirs + 2e-6, "{name}: single precision is off by {ours:e}, the CPU's by {theirs:e}");
     }
@@ -100,6 +101,8 @@ fn windows_in_the_plane() {
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);
     let backward = FlowMap { direction: Direction::Backward, boundary: Boundary::Periodic, ..stop };
     check("linear, periodic, backward", &smooth(&grid(), 0.6, false), &backward, 3.4);
+    let differences = FlowMap { integrator: Integrator::Differences, ..backward };
+    check("differences, backward", &smooth(&grid(), 0.6, false), &FlowMap { boundary: Boundary::Stop, ..differences }, 3.4);
 }
 
 #[test]
@@ -115,7 +118,9 @@ fn windows_in_space() {
     let mut around = even(&[11, 12, 10]);
     around[1] = around[1].clone().with_period(7.5);
     check("linear, around", &smooth(&cartesian(around), 0.5, false), &stop, 0.1);
-    check("differences", &smooth(&grid(), 0.5, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 0.1);
+    let differences = FlowMap { integrator: Integrator::Differences, ..stop };
+    check("differences", &smooth(&grid(), 0.5, false), &differences, 0.1);
+    check("differences, holes", &smooth(&grid(), 0.5, true), &differences, 0.1);
     check("turbulence", &turbulence([40, 24, 24], 6), &FlowMap { boundary: Boundary::Clamp, ..map(5.0, 10) }, 0.0);
 }
 

@@ -145,7 +145,7 @@ fn half_precision_is_as_good_as_its_rounding() {
         (squares / seeds.len() as f64).sqrt()
     };
     let half = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, ..Tuning::default() }, &seeds));
-    let plain = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, keep: false, sorted: false }, &seeds));
+    let plain = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, keep: false, sorted: false, ..Tuning::default() }, &seeds));
     println!("half precision: root mean square error of the log-stretch {half:.1e}");
     // Velocities are off by 2^-12 of themselves, their differences between nodes by some 1e-3; errors of single nodes average out along a
     // path. Log-stretches here are about 1.

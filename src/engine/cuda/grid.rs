@@ -130,8 +130,7 @@ impl GridArguments {
             format!("RW_STORAGE={}", u8::from(nodes.storage == Storage::F16)),
             flag("RW_CUBIC", cubic),
             flag("RW_MARKS", nodes.missing),
-            // In double precision the kept cell does not fit into the registers.
-            flag("RW_KEEP", keep && size_of::<R>() == size_of::<f32>()),
+            flag("RW_KEEP", keep),
             flag("RW_SCALED", scaled),
             format!("RW_EVEN={even}"),
             format!("RW_WRAP={wrap}"),

@@ -71,7 +71,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, stora
                 missing: window.snapshots().any(|s| s.missing() > 0),
             };
             let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
-            let arguments = GridArguments::new::<R>(&mut put, &nodes, &times, &grid, map, (t0, to), steps, true).unwrap();
+            let arguments = GridArguments::new::<R>(&mut put, &nodes, &times, &grid, map, (t0, to), steps, map.precision == Precision::F32).unwrap();
             (arguments.data, arguments.steps, arguments.defines)
         }
     };

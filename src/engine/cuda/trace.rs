@@ -19,13 +19,15 @@ pub struct Tuning {
     pub storage: Storage,
     /// Whether batches are sorted by cell.
     pub sorted: bool,
-    /// Whether the current cell stays in registers; otherwise every stage reads its corners (the plain kernel).
+    /// Whether the current cell stays in registers, where it fits; otherwise every stage reads its corners (the plain kernel).
     pub keep: bool,
+    /// Whether the particles of a seed's differences, sorted and in a window, are traced by a lane each; otherwise by one thread in turn.
+    pub spread: bool,
 }
 
 impl Default for Tuning {
     fn default() -> Self {
-        Self { storage: Storage::F32, sorted: true, keep: true }
+        Self { storage: Storage::F32, sorted: true, keep: true, spread: true }
     }
 }
 
@@ -38,6 +40,8 @@ pub struct DeviceTracer {
     gpu: Arc<Gpu>,
     plain: CudaFunction,
     sorted: CudaFunction,
+    /// Seeds that a warp of the sorted kernel traces.
+    seeds_a_warp: usize,
     block: u32,
     data: Words,
     /// Address of the steps (windows) or the stage constants (closed forms).
@@ -96,6 +100,7 @@ impl DeviceTracer {
                 Ok(Self {
                     plain: gpu.kernel("trace_closed.cu", &defines, "trace")?,
                     sorted: gpu.kernel("trace_closed.cu", &defines, "trace_sorted")?,
+                    seeds_a_warp: 32,
                     block: 256,
                     data: words(&closed_data::<R>(domain, map.boundary)),
                     times: stages.address(),
@@ -124,11 +129,15 @@ impl DeviceTracer {
                     memory.push(buffer);
                     Ok(address)
                 };
-                let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, tuning.keep)?;
+                let spread = tuning.spread && tuning.sorted && map.integrator == Integrator::Differences;
+                // In double precision the kept cell does not fit into the registers beside a tangent or several particles.
+                let keep = tuning.keep && (spread || map.precision == Precision::F32);
+                let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, keep)?;
                 let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
                 Ok(Self {
                     plain: kernel("trace")?,
-                    sorted: kernel("trace_sorted")?,
+                    sorted: kernel(if spread { "trace_particles" } else { "trace_sorted" })?,
+                    seeds_a_warp: if spread { 32 / (2 * grid.dimensions()) } else { 32 },
                     block: 128,
                     data: arguments.data,
                     times: arguments.steps,
@@ -177,7 +186,7 @@ impl DeviceTracer {
             // SAFETY: the caller's; the sorted points are read by the launch behind it on the same stream.
             unsafe {
                 let sorted = sorter.sort(seeds + 12 * first as u64, part, cells)?;
-                self.launch(&self.sorted, sorted, part, &shifted(out, first))?;
+                self.launch(&self.sorted, self.seeds_a_warp, sorted, part, &shifted(out, first))?;
             }
         }
         Ok(())
@@ -190,7 +199,7 @@ impl DeviceTracer {
     /// As for [`Self::trace`], with room for every index.
     pub(super) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         // SAFETY: the caller's.
-        unsafe { self.launch(&self.sorted, sorted, count, out) }
+        unsafe { self.launch(&self.sorted, self.seeds_a_warp, sorted, count, out) }
     }
 
     /// # Safety
@@ -198,14 +207,21 @@ impl DeviceTracer {
     unsafe fn in_given_order(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         for first in (0..count).step_by(MOST) {
             // SAFETY: the caller's.
-            unsafe { self.launch(&self.plain, seeds + 12 * first as u64, (count - first).min(MOST), &shifted(out, first))? };
+            unsafe { self.launch(&self.plain, 32, seeds + 12 * first as u64, (count - first).min(MOST), &shifted(out, first))? };
         }
         Ok(())
     }
 
     /// # Safety
     /// `seeds` is what the kernel reads, for `count` seeds; `out` has room.
-    unsafe fn launch(&self, kernel: &CudaFunction, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+    unsafe fn launch(
+        &self,
+        kernel: &CudaFunction,
+        seeds_a_warp: usize,
+        seeds: u64,
+        count: usize,
+        out: &Outputs,
+    ) -> Result<(), DeviceError> {
         if count == 0 {
             return Ok(());
         }
@@ -213,7 +229,7 @@ impl DeviceTracer {
         let mut call = self.gpu.work().launch_builder(kernel);
         call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.verdict).arg(&seeds).arg(&n).arg(out);
         // SAFETY: the caller's; all that the data points to is held by `self`.
-        unsafe { launch(&mut call, threads(count, self.block)) }
+        unsafe { launch(&mut call, threads(32 * count.div_ceil(seeds_a_warp), self.block)) }
     }
 }
 
