@@ -6,7 +6,7 @@
 # make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python; what is missing is installed where apt is, or named as NOT RUN
-# make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them
+# make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes docs/performance.md
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
 PYTHON ?= python3
@@ -94,7 +94,9 @@ $(NVRTC)/done: | python-packages
 # The second step is for the machine with the GPU: what travels is .gpu/check, and its `run` needs nothing else.
 gpu-check: packages
 	scripts/gpu-check-prepare .gpu/check
-	@if nvidia-smi >/dev/null 2>&1; then OUT=out/gpu-check .gpu/check/run; else echo "no GPU here: take .gpu/check to one and start .gpu/check/run"; fi
+	@if nvidia-smi >/dev/null 2>&1; then \
+	  OUT=out/gpu-check .gpu/check/run && scripts/gpu-check-write out/gpu-check; else \
+	  echo "no GPU here: take .gpu/check to one, start .gpu/check/run there, and give what it leaves to scripts/gpu-check-write"; fi
 
 # Rust and a C linker suffice for the library itself.
 adapters:

@@ -130,8 +130,7 @@ impl DeviceTracer {
                     Ok(address)
                 };
                 let spread = tuning.spread && tuning.sorted && map.integrator == Integrator::Differences;
-                // In double precision the kept cell does not fit into the registers: a lane a particle traces 105 M seeds a second without it and 74 M
-                // with it.
+                // In double precision the kept cell takes registers that other warps need, and is slower (docs/performance.md).
                 let keep = tuning.keep && map.precision == Precision::F32;
                 let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, keep)?;
                 let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
