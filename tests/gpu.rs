@@ -1,5 +1,5 @@
 //! What runs on a GPU, against the f64 reference on the CPU. Every test needs a device and is ignored elsewhere; `make gpu-check` runs
-//! them where one is. Inputs are other ones in every run, outputs are poisoned before.
+//! them where one is. inputs are other ones in every run; fresh device memory and outputs are poisoned.
 
 #![cfg(feature = "cuda")]
 // Helpers of a test may unwrap, and figures are printed for the record.

@@ -1,4 +1,4 @@
-//! A GPU that answers nothing any more, at any of the calls that are made of it: on machines without one, a device that computes on the
+//! A GPU that fails at any of the calls that are made of it, with a fault or by refusing what it took before: on machines without one, a device that computes on the
 //! CPU and breaks when it is told to stands for it. (`tests/gpu/lost.rs` breaks a real one.)
 
 #![cfg(feature = "cuda")]
@@ -24,7 +24,16 @@ use std::sync::{Arc, OnceLock};
 struct Line {
     calls: AtomicU64,
     breaks_at: u64,
+    how: How,
     broke_in: OnceLock<&'static str>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+enum How {
+    /// A driver call fails.
+    Fault,
+    /// There is no memory left.
+    Refusal,
 }
 
 impl Line {
@@ -33,7 +42,12 @@ impl Line {
             return Ok(());
         }
         self.broke_in.get_or_init(|| what);
-        Err(DeviceError::Driver { doing: what, reason: "broken by the test".into(), lost: true })
+        Err(match self.how {
+            How::Fault => DeviceError::Driver { doing: what, reason: "broken by the test".into() },
+            How::Refusal => {
+                DeviceError::OutOfMemory { what: what.into(), needed: 1 << 20, used: 0, cap: 0, cap_from: "broken by the test" }
+            }
+        })
     }
 }
 
@@ -46,8 +60,8 @@ struct Breaking {
 const NAME: &str = "a device that breaks";
 
 impl Breaking {
-    fn new(breaks_at: u64, when_lost: WhenLost) -> Arc<Self> {
-        let line = Line { calls: AtomicU64::new(0), breaks_at, broke_in: OnceLock::new() };
+    fn new(breaks_at: u64, how: How, when_lost: WhenLost) -> Arc<Self> {
+        let line = Line { calls: AtomicU64::new(0), breaks_at, how, broke_in: OnceLock::new() };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -189,7 +203,13 @@ fn has_ended(record: &FrameRecord) -> usize {
 fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
     let expected = made(scene, Device::CPU);
     assert!(expected.error.is_none() && expected.records.len() >= 4);
-    let whole = Breaking::new(u64::MAX, WhenLost::Cpu);
+    for how in [How::Fault, How::Refusal] {
+        break_at_every_call(scene, &expected, how, kinds);
+    }
+}
+
+fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&str]) {
+    let whole = Breaking::new(u64::MAX, how, WhenLost::Cpu);
     let unbroken = on(&whole, scene);
     assert!(unbroken.error.is_none() && unbroken.films == expected.films);
     assert!(unbroken.records.iter().all(|r| r.device == NAME && has_ended(r) == 0));
@@ -197,12 +217,17 @@ fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
 
     let mut broke_in = BTreeSet::new();
     for breaks_at in 0..calls {
-        let device = Breaking::new(breaks_at, WhenLost::Cpu);
+        let device = Breaking::new(breaks_at, how, WhenLost::Cpu);
         let found = on(&device, scene);
         // How often a trace is cut up depends on the machine's speed: the last calls may not come.
         let Some(what) = device.line.broke_in.get() else { continue };
         broke_in.insert(*what);
-        let case = format!("call {breaks_at} of {calls}, {what}");
+        let case = format!("{how:?} at call {breaks_at} of {calls}, {what}");
+        if how == How::Refusal && *what == "making a tracer" && found.films.is_empty() {
+            // What a device that was asked for by name refuses from the start is an error of the request.
+            assert!(matches!(found.error, Some(EngineError::Device(_))), "{case}: {:?}", found.error);
+            continue;
+        }
         assert!(found.error.is_none(), "{case}: {:?}", found.error);
         assert!(found.films == expected.films, "{case}: the films are the CPU's");
         for (found, expected) in found.records.iter().zip(&expected.records) {
@@ -220,12 +245,15 @@ fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
     }
     assert_eq!(broke_in, kinds.iter().copied().collect(), "kinds of calls that broke");
 
+    if how == How::Refusal {
+        return;
+    }
     let mut ended = 0;
     for breaks_at in 0..calls {
-        let device = Breaking::new(breaks_at, WhenLost::Stop);
+        let device = Breaking::new(breaks_at, how, WhenLost::Stop);
         let found = on(&device, scene);
         let Some(what) = device.line.broke_in.get() else { continue };
-        let case = format!("call {breaks_at} of {calls}, {what}");
+        let case = format!("{how:?} at call {breaks_at} of {calls}, {what}");
         match &found.error {
             Some(EngineError::Device(error)) => {
                 assert!(error.to_string().contains("broken by the test"), "{case}: {error}");

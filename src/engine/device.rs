@@ -71,7 +71,7 @@ pub enum Storage {
     F16,
 }
 
-/// What happens when a GPU answers nothing any more.
+/// What happens when work on a GPU fails.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum WhenLost {
@@ -90,7 +90,7 @@ pub struct DeviceSettings {
     pub storage: Storage,
     /// Most device memory that is taken, MiB; none: nine tenths of what is free at start.
     pub memory_mib: Option<u64>,
-    /// What happens when the device is lost.
+    /// What happens when work on the device fails, for whatever reason: it is not tried again in this run.
     pub when_lost: WhenLost,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
@@ -148,6 +148,7 @@ impl Device {
             cache: None,
             polite: settings.polite,
             when_lost: settings.when_lost,
+            poison: false,
         };
         match Gpu::open(ordinal, &wanted) {
             Ok(gpu) => {
@@ -231,19 +232,42 @@ impl Device {
             Self::Gpu { gpu, may_fall_back } if gpu.health().works() => match gpu.tracer(source.clone(), map, t0) {
                 Ok(tracer) => Ok((tracer, None)),
                 Err(CudaTracerError::Flow(error)) => Err(error.into()),
-                Err(CudaTracerError::Device(error)) => {
-                    let lost = error.is_lost();
-                    if lost {
-                        gpu.health().fail(error.clone());
-                        self.check()?;
-                    }
-                    if !(lost || *may_fall_back) {
-                        return Err(error.into());
-                    }
+                Err(CudaTracerError::Device(error)) if error.is_fault() => {
+                    gpu.health().fail(error);
+                    self.check()?;
+                    Ok((cpu_tracer(source, map, t0)?, None))
+                }
+                Err(CudaTracerError::Device(error)) if *may_fall_back => {
                     Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
                 }
+                Err(CudaTracerError::Device(error)) => Err(error.into()),
             },
             _ => Ok((cpu_tracer(source, map, t0)?, None)),
+        }
+    }
+
+    /// The same for a slide behind the first: what a GPU refuses then that it took before ends work on it, as every failure does, and
+    /// [`WhenLost`] says what follows.
+    ///
+    /// # Errors
+    /// What [`cpu_tracer`] refuses; the failure, where it is to end the run.
+    pub(super) fn next_tracer(
+        &self,
+        source: VelocitySource,
+        map: &FlowMap,
+        t0: f64,
+    ) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
+        match self {
+            #[cfg(feature = "cuda")]
+            Self::Gpu { gpu, .. } => match self.tracer(source.clone(), map, t0) {
+                Err(EngineError::Device(error)) => {
+                    gpu.health().fail(*error);
+                    self.check()?;
+                    self.tracer(source, map, t0)
+                }
+                result => result,
+            },
+            Self::Cpu { .. } => self.tracer(source, map, t0),
         }
     }
 }

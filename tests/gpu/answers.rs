@@ -1,13 +1,11 @@
 //! Frames that a surrogate answers where it is trusted, and scenes with land: walked, predicted and traced on the GPU, against the CPU.
 
-use crate::scenes::{cartesian, even, gpu, smooth, store, turbulence};
+use crate::scenes::{cartesian, device, even, gpu, opened, smooth, store, turbulence};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{
     CudaTracer, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Panel, SnapshotStore, Tuning,
 };
-use ridgewatch::engine::{
-    Answers, Device, DeviceChoice, DeviceSettings, Event, Frame, RunOptions, Setup, Tally, residuals, run, stratified_points, trace,
-};
+use ridgewatch::engine::{Answers, Device, Event, Frame, RunOptions, Setup, Tally, residuals, run, stratified_points, trace};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
@@ -274,7 +272,7 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
 #[ignore = "needs a GPU"]
 fn memory_is_flat_over_gated_frames() {
     // A handle of its own, so that no other test's memory counts.
-    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+    let gpu = opened(GpuSettings::default());
     let store = SnapshotStore::new(&gpu);
     let stage = turbulent_on(gpu, &store);
     let (mut renderer, mut side) = (stage.renderer(), Side::new(&stage.gpu));
@@ -323,9 +321,8 @@ samples = 8
 #[test]
 #[ignore = "needs a GPU"]
 fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
-    let device = || Device::open(DeviceChoice::Cuda(0), &DeviceSettings::default()).unwrap();
     for method in ["gated", "surrogate"] {
-        let (found, expected) = (frames(device(), method), frames(Device::CPU, method));
+        let (found, expected) = (frames(device(GpuSettings::default()), method), frames(Device::CPU, method));
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
             let (gpu, cpu) = (&found.record, &expected.record);
@@ -340,7 +337,8 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
             // Cells at the edge of the tolerance may fall to either side: other labels are kept.
             assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_share - cpu.trusted_share).abs() < 0.05);
             let psnr = compare_films(&found.film, &expected.film, found.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-            assert!(psnr > 30.0, "{psnr} dB");
+            // As in single frames of the same answers and gate, whatever rounding decides on the way.
+            assert!(psnr > 50.0, "{psnr} dB");
         }
     }
 }

@@ -1,6 +1,6 @@
 //! The device itself: kernels kept on disk, memory under a cap.
 
-use super::scenes::gpu;
+use super::scenes::{gpu, opened};
 use ridgewatch::engine::cuda::{DeviceError, Gpu, GpuSettings, probe};
 
 #[test]
@@ -30,8 +30,7 @@ fn kernels_are_kept_and_damaged_ones_compiled_again() {
 #[test]
 #[ignore = "needs a GPU"]
 fn memory_stays_under_the_cap() {
-    let settings = GpuSettings { memory_cap: Some(1 << 20), ..GpuSettings::default() };
-    let gpu = Gpu::open(0, &settings).unwrap();
+    let gpu = opened(GpuSettings { memory_cap: Some(1 << 20), ..GpuSettings::default() });
     let first = gpu.alloc::<u8>("a test", 1 << 19).unwrap();
     assert!(matches!(gpu.alloc::<u8>("a test", (1 << 19) + 1), Err(DeviceError::OutOfMemory { .. })));
     drop(first);
@@ -42,4 +41,18 @@ fn memory_stays_under_the_cap() {
     buffer.read(&mut back).unwrap();
     assert_eq!(back[..4], [0, 0, 0, 0xabab_abab]);
     assert_eq!(back[(1 << 18) - 1], 0xabab_abab);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn fresh_memory_is_poisoned_in_tests() {
+    let gpu = opened(GpuSettings::default());
+    // What was there before is overwritten too: the second buffer gets the first one's memory.
+    for _ in 0..2 {
+        let mut buffer = gpu.alloc::<f32>("a test", 1000).unwrap();
+        let mut back = vec![0.0; 1000];
+        buffer.read(&mut back).unwrap();
+        assert!(back.iter().all(|x| x.is_nan()));
+        buffer.zero_front(1000).unwrap();
+    }
 }

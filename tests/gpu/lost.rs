@@ -1,8 +1,10 @@
 //! A device that is lost in the middle of a frame, for real: a kernel that traps takes the whole context with it, so that this happens in
 //! a process of its own. (`tests/lost_device.rs` breaks a device at every call, without a GPU.)
 
+use crate::scenes::device;
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{Device, DeviceChoice, EngineError, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::engine::cuda::GpuSettings;
+use ridgewatch::engine::{Device, EngineError, Event, Frame, RunOptions, Setup, run};
 use ridgewatch::publish::compare_films;
 use std::path::Path;
 use std::process::Command;
@@ -35,8 +37,7 @@ fn scene(when_lost: &str) -> SceneFile {
     SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap()
 }
 
-fn frames(scene: &SceneFile, choice: DeviceChoice, breaks: bool) -> (Vec<Frame>, Option<EngineError>) {
-    let device = Device::open(choice, &scene.device).unwrap();
+fn frames(scene: &SceneFile, device: Device, breaks: bool) -> (Vec<Frame>, Option<EngineError>) {
     let options = RunOptions { device, ..RunOptions::default() };
     let (mut frames, mut broken) = (Vec::new(), !breaks);
     let mut sink = |event: Event| match event {
@@ -69,9 +70,9 @@ fn trap() {
 fn in_a_process_of_its_own() {
     let Ok(when_lost) = std::env::var(WHEN_LOST) else { return };
     let scene = scene(&when_lost);
-    let (expected, error) = frames(&scene, DeviceChoice::Cpu, false);
+    let (expected, error) = frames(&scene, Device::CPU, false);
     assert!(error.is_none() && expected.len() == 4);
-    let (found, error) = frames(&scene, DeviceChoice::Cuda(0), true);
+    let (found, error) = frames(&scene, device(GpuSettings { when_lost: scene.device.when_lost, ..GpuSettings::default() }), true);
     for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
         let (record, lost) = (&found.record, i >= 2);
         assert_eq!(record.device.starts_with("cuda:0"), !lost, "frame {i}: {}", record.device);

@@ -1,6 +1,6 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
-use crate::scenes::{gpu, store, turbulence};
+use crate::scenes::{gpu, opened, store, turbulence};
 use ridgewatch::engine::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, Traced, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
@@ -224,7 +224,7 @@ fn schedule_and_memory_leave_every_bit_alone() {
 #[ignore = "needs a GPU"]
 fn memory_is_flat_over_a_thousand_frames() {
     // A handle of its own, so that no other test's memory counts.
-    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+    let gpu = opened(GpuSettings::default());
     let mut renderer = Renderer::new(scene(32, 16, false), &domain(), 1.0).unwrap();
     let mut device = GpuRenderer::new(&gpu).unwrap();
     let free = || gpu.context().mem_get_info().unwrap().0;

@@ -1,6 +1,7 @@
 //! Flows that the tests trace, and the two ways to trace them.
 
-use ridgewatch::engine::cuda::{CudaTracer, Gpu, GpuSettings, SnapshotStore, Tuning};
+use ridgewatch::engine::Device;
+use ridgewatch::engine::cuda::{CudaAccelerator, CudaTracer, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
@@ -12,10 +13,20 @@ use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
 use std::sync::{Arc, OnceLock};
 
-/// The device of this process.
+/// The device that tests share.
 pub fn gpu() -> Arc<Gpu> {
     static GPU: OnceLock<Arc<Gpu>> = OnceLock::new();
-    GPU.get_or_init(|| Gpu::open(0, &GpuSettings::default()).unwrap()).clone()
+    GPU.get_or_init(|| opened(GpuSettings::default())).clone()
+}
+
+/// A handle of its own, for tests that count memory. Fresh device memory makes NaN here, so that what nothing has written shows.
+pub fn opened(settings: GpuSettings) -> Arc<Gpu> {
+    Gpu::open(0, &GpuSettings { poison: true, ..settings }).unwrap()
+}
+
+/// A device for whole runs.
+pub fn device(settings: GpuSettings) -> Device {
+    Device::Gpu { gpu: Arc::new(CudaAccelerator::new(opened(settings), Storage::F32)), may_fall_back: false }
 }
 
 /// Snapshots on it.

@@ -101,6 +101,7 @@ fn windows_in_the_plane() {
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);
     let backward = FlowMap { direction: Direction::Backward, boundary: Boundary::Periodic, ..stop };
     check("linear, periodic, backward", &smooth(&grid(), 0.6, false), &backward, 3.4);
+    check("cubic, zeros", &smooth(&grid(), 0.6, false), &FlowMap { boundary: Boundary::Zero, ..cubic }, 0.1);
     let differences = FlowMap { integrator: Integrator::Differences, ..backward };
     check("differences, backward", &smooth(&grid(), 0.6, false), &FlowMap { boundary: Boundary::Stop, ..differences }, 3.4);
 }
@@ -118,6 +119,8 @@ fn windows_in_space() {
     let mut around = even(&[11, 12, 10]);
     around[1] = around[1].clone().with_period(7.5);
     check("linear, around", &smooth(&cartesian(around), 0.5, false), &stop, 0.1);
+    let zero = FlowMap { boundary: Boundary::Zero, direction: Direction::Backward, ..stop.clone() };
+    check("linear, zeros, holes", &smooth(&grid(), 0.5, true), &zero, 3.4);
     let differences = FlowMap { integrator: Integrator::Differences, ..stop };
     check("differences", &smooth(&grid(), 0.5, false), &differences, 0.1);
     check("differences, holes", &smooth(&grid(), 0.5, true), &differences, 0.1);

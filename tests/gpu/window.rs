@@ -1,16 +1,16 @@
 //! Snapshots on the device.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, CudaTracerError, DeviceError, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
+use ridgewatch::engine::cuda::{CudaTracer, CudaTracerError, DeviceError, GpuSettings, SnapshotStore, Storage, Tuning};
 use ridgewatch::field::Window;
-use ridgewatch::flow::{Boundary, Extras, FlowMap, Precision, Traced, Tracer, VelocitySource};
+use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Steps, Traced, Tracer, VelocitySource};
 use std::sync::Arc;
 
 #[test]
 #[ignore = "needs a GPU"]
 fn a_slide_brings_only_what_is_new() {
     // A handle of its own, so that no other test's memory counts.
-    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+    let gpu = opened(GpuSettings::default());
     let store = SnapshotStore::new(&gpu);
     let grid = cartesian(even(&[40, 30, 20]));
     let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 12) };
@@ -60,7 +60,7 @@ fn until_brought(store: &SnapshotStore, count: u64) {
 #[ignore = "needs a GPU"]
 fn what_is_expected_is_there_before_the_window_wants_it() {
     for storage in [Storage::F32, Storage::F16] {
-        let gpu = Gpu::open(0, &GpuSettings::default()).unwrap();
+        let gpu = opened(GpuSettings::default());
         let store = SnapshotStore::new(&gpu);
         let tuning = Tuning { storage, ..Tuning::default() };
         let grid = cartesian(even(&[120, 90, 61]));
@@ -114,7 +114,7 @@ fn what_is_expected_is_there_before_the_window_wants_it() {
 fn nothing_comes_ahead_where_memory_is_short() {
     let grid = cartesian(even(&[40, 40, 40]));
     // A snapshot takes 1 MB, a window 4; there is room for a fifth beside the tracer, but others might need it.
-    let gpu = Gpu::open(0, &GpuSettings { memory_cap: Some(7 << 20), ..GpuSettings::default() }).unwrap();
+    let gpu = opened(GpuSettings { memory_cap: Some(7 << 20), ..GpuSettings::default() });
     let store = SnapshotStore::new(&gpu);
     let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 6) };
     let mut window = Window::new(3.0);
@@ -136,20 +136,31 @@ fn nothing_comes_ahead_where_memory_is_short() {
 #[test]
 #[ignore = "needs a GPU"]
 fn half_precision_is_as_good_as_its_rounding() {
-    let source = turbulence([48, 32, 32], 6);
-    let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(5.0, 20) };
-    let seeds = fresh(&domain(&source), 20_000);
-    let exact = on_cpu(&source, &FlowMap { precision: Precision::F64, ..map.clone() }, 0.0, &seeds);
-    let rms = |found: &Traced| {
-        let squares = (0..seeds.len()).map(|i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).powi(2)).sum::<f64>();
-        (squares / seeds.len() as f64).sqrt()
-    };
-    let half = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, ..Tuning::default() }, &seeds));
-    let plain = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, keep: false, sorted: false, ..Tuning::default() }, &seeds));
-    println!("half precision: root mean square error of the log-stretch {half:.1e}");
-    // Velocities are off by 2^-12 of themselves, their differences between nodes by some 1e-3; errors of single nodes average out along a
-    // path. Log-stretches here are about 1.
-    assert!(half < 5e-3 && half > 1e-6 && (plain - half).abs() < 0.1 * half, "{half} {plain}");
+    let linear = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(5.0, 20) };
+    let cubic = FlowMap { interpolation: Interpolation::Cubic, ..linear.clone() };
+    let region = smooth(&sphere((-30.0, 10.0, 21), (20.0, 60.0, 21), false), 0.8, false);
+    let shorter = |map: &FlowMap| FlowMap { tau: 3.2, steps: Steps::Fixed(16), ..map.clone() };
+    for (name, source, map) in [
+        ("linear", turbulence([48, 32, 32], 6), linear.clone()),
+        ("cubic", turbulence([48, 32, 32], 6), cubic.clone()),
+        ("cubic in the plane", smooth(&cartesian(even(&[40, 30])), 0.6, false), shorter(&cubic)),
+        ("sphere", region.clone(), shorter(&linear)),
+        ("sphere, cubic", region, shorter(&cubic)),
+    ] {
+        let seeds = fresh(&domain(&source), 20_000);
+        let exact = on_cpu(&source, &FlowMap { precision: Precision::F64, ..map.clone() }, 0.0, &seeds);
+        let rms = |found: &Traced| {
+            let squares = (0..seeds.len()).map(|i| (f64::from(found.log_stretch[i]) - exact.log_stretch_f64[i]).powi(2)).sum::<f64>();
+            (squares / seeds.len() as f64).sqrt()
+        };
+        let half = rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, ..Tuning::default() }, &seeds));
+        let plain =
+            rms(&on_gpu(&source, &map, 0.0, Tuning { storage: Storage::F16, keep: false, sorted: false, ..Tuning::default() }, &seeds));
+        println!("half precision, {name}: root mean square error of the log-stretch {half:.1e}");
+        // Velocities are off by 2^-12 of themselves, their differences between nodes by some 1e-3; errors of single nodes average out along
+        // a path. Log-stretches here are about 1.
+        assert!(half < 5e-3 && half > 1e-6 && (plain - half).abs() < 0.1 * half, "{name}: {half} {plain}");
+    }
 }
 
 #[test]
@@ -181,13 +192,35 @@ fn a_window_that_grows_beyond_half_precision_is_encoded_anew() {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_window_that_does_not_fit_is_refused_with_the_way_out() {
-    let settings = GpuSettings { memory_cap: Some(3 << 20), ..GpuSettings::default() };
-    let gpu = Gpu::open(0, &settings).unwrap();
+    let gpu = opened(GpuSettings { memory_cap: Some(3 << 20), ..GpuSettings::default() });
     let source = turbulence([40, 40, 40], 4);
     let map = FlowMap { boundary: Boundary::Clamp, ..map(3.0, 6) };
     let refused = CudaTracer::new(&SnapshotStore::new(&gpu), &gpu, source, &map, 0.0, Tuning::default()).err().unwrap();
     let CudaTracerError::Device(error) = refused else { panic!("{refused}") };
-    assert!(matches!(&error, DeviceError::WindowTooLarge { needed: 4_096_000, needed_f16: 2_048_000, .. }), "{error:?}");
+    assert!(
+        matches!(&error, DeviceError::WindowTooLarge { snapshots: 4, missing: 4, needed: 4_096_000, needed_f16: 2_048_000, .. }),
+        "{error:?}"
+    );
     assert!(error.to_string().contains("f16") && error.to_string().contains("region of interest"), "{error}");
     assert_eq!(gpu.memory().0, 0, "nothing is kept of it");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_slide_that_does_not_fit_names_the_whole_window_and_what_it_lacks() {
+    let gpu = opened(GpuSettings { memory_cap: Some(7 << 20), ..GpuSettings::default() });
+    let (store, grid) = (SnapshotStore::new(&gpu), cartesian(even(&[40, 40, 40])));
+    let mut window = Window::new(3.0);
+    for t in 0..4_u32 {
+        window.push(snapshot(&grid, f64::from(t), 0.5, false)).unwrap();
+    }
+    let _held = store.window(&window, Storage::F32).unwrap();
+    // Somebody takes what is left.
+    let _taken = gpu.alloc::<u8>("a test", gpu.memory_left() as usize).unwrap();
+    window.push(snapshot(&grid, 4.0, 0.5, false)).unwrap();
+    let error = store.window(&window, Storage::F32).err().unwrap();
+    assert!(
+        matches!(&error, DeviceError::WindowTooLarge { snapshots: 4, missing: 1, needed: 1_024_000, needed_f16: 2_048_000, .. }),
+        "{error:?}"
+    );
 }

@@ -23,8 +23,11 @@ pub struct GpuSettings {
     pub cache: Option<std::path::PathBuf>,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
-    /// What happens when the device is lost.
+    /// What happens when work on the device fails.
     pub when_lost: WhenLost,
+    /// Fills fresh device memory with bytes that make NaN and far indices, so that a kernel that reads what nothing has written shows. For
+    /// tests.
+    pub poison: bool,
 }
 
 /// A device that the driver finds.
@@ -132,7 +135,7 @@ impl Gpu {
             driver_version: driver_version()?,
             work,
             transfer,
-            budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64)),
+            budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64).filling(settings.poison.then_some(0xFF))),
             cache: KernelCache::new(settings.cache.clone()),
             modules: Mutex::new(HashMap::new()),
             health: Arc::new(Health::new(settings.when_lost)),

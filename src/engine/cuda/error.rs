@@ -62,8 +62,6 @@ pub enum DeviceError {
         doing: &'static str,
         /// What the driver says.
         reason: String,
-        /// Whether the device answers nothing any more (a fault in a kernel, a reset, a lost card).
-        lost: bool,
     },
     /// The memory cap, or the device's memory, would be exceeded.
     #[error("{what} needs {} MiB on the device; {} of {} MiB that may be used are taken ({cap_from})", needed >> 20, used >> 20, cap >> 20)]
@@ -81,20 +79,23 @@ pub enum DeviceError {
     },
     /// The velocity window does not fit.
     #[error(
-        "the window of {snapshots} snapshots of {nodes:?} nodes needs {} MiB on the device in {storage}; {} MiB are left. Ways out: \
-         storage f16 ({} MiB), a region of interest, a coarser grid, a shorter tau (fewer snapshots), or a larger memory cap",
+        "the window of {snapshots} snapshots of {nodes:?} nodes does not fit: {missing} of them are not on the device and need {} MiB in \
+         {storage}; {} MiB are left. Ways out: storage f16 ({} MiB for the whole window), a region of interest, a coarser grid, a shorter \
+         tau (fewer snapshots), or a larger memory cap",
         needed >> 20, left >> 20, needed_f16 >> 20
     )]
     WindowTooLarge {
-        /// Snapshots.
+        /// Snapshots of the window.
         snapshots: usize,
+        /// Of them, those that are not on the device.
+        missing: usize,
         /// Nodes along x, y, z.
         nodes: [usize; 3],
         /// `f32` or `f16`.
         storage: &'static str,
-        /// Bytes needed.
+        /// Bytes that the missing ones need.
         needed: u64,
-        /// Bytes needed with f16 storage.
+        /// Bytes that the whole window needs with f16 storage.
         needed_f16: u64,
         /// Bytes left.
         left: u64,
@@ -110,31 +111,15 @@ pub enum DeviceError {
 impl DeviceError {
     /// A failed driver call.
     pub fn driver(doing: &'static str) -> impl Fn(DriverError) -> Self {
-        use cudarc::driver::sys::CUresult as R;
         move |error| Self::Driver {
             doing,
             reason: error.error_string().map_or_else(|_| format!("{:?}", error.0), |text| text.to_string_lossy().into_owned()),
-            lost: matches!(
-                error.0,
-                R::CUDA_ERROR_ILLEGAL_ADDRESS
-                    | R::CUDA_ERROR_LAUNCH_FAILED
-                    | R::CUDA_ERROR_LAUNCH_TIMEOUT
-                    | R::CUDA_ERROR_ECC_UNCORRECTABLE
-                    | R::CUDA_ERROR_HARDWARE_STACK_ERROR
-                    | R::CUDA_ERROR_ILLEGAL_INSTRUCTION
-                    | R::CUDA_ERROR_MISALIGNED_ADDRESS
-                    | R::CUDA_ERROR_INVALID_PC
-                    | R::CUDA_ERROR_CONTEXT_IS_DESTROYED
-                    | R::CUDA_ERROR_DEVICE_UNAVAILABLE
-                    | R::CUDA_ERROR_NO_DEVICE
-                    | R::CUDA_ERROR_DEINITIALIZED
-                    | R::CUDA_ERROR_UNKNOWN
-            ),
         }
     }
 
-    /// Whether the device answers nothing any more.
-    pub fn is_lost(&self) -> bool {
-        matches!(self, Self::Driver { lost: true, .. })
+    /// Whether a driver call failed: faults of kernels, resets and lost cards, all of which leave the context unusable, cannot be told from
+    /// the rest for certain, so that no more is asked of a device after any of them. All other errors are refusals of what was asked for.
+    pub fn is_fault(&self) -> bool {
+        matches!(self, Self::Driver { .. })
     }
 }

@@ -1,7 +1,7 @@
 //! Device memory under a cap.
 
 use super::DeviceError;
-use cudarc::driver::{CudaSlice, CudaStream, DevicePtr, DevicePtrMut, DeviceRepr, result};
+use cudarc::driver::{CudaSlice, CudaStream, DevicePtr, DevicePtrMut, DeviceRepr, result, sys};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -11,6 +11,8 @@ pub struct Budget {
     cap: u64,
     cap_from: &'static str,
     used: AtomicU64,
+    /// Byte that fresh memory is filled with; none: memory comes as it is.
+    fill: Option<u8>,
 }
 
 impl Budget {
@@ -21,7 +23,12 @@ impl Budget {
             Some(_) => (total, "the device's memory"),
             None => (free / 10 * 9, "nine tenths of what was free at start"),
         };
-        Self { cap, cap_from, used: AtomicU64::new(0) }
+        Self { cap, cap_from, used: AtomicU64::new(0), fill: None }
+    }
+
+    /// The same with fresh memory filled with a byte.
+    pub fn filling(self, fill: Option<u8>) -> Self {
+        Self { fill, ..self }
     }
 
     /// Bytes that may be taken.
@@ -36,13 +43,12 @@ impl Budget {
 
     fn take(&self, what: &str, needed: u64) -> Result<(), DeviceError> {
         let add = |used: u64| used.checked_add(needed).filter(|sum| *sum <= self.cap);
-        self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, add).map(|_| ()).map_err(|used| DeviceError::OutOfMemory {
-            what: what.to_owned(),
-            needed,
-            used,
-            cap: self.cap,
-            cap_from: self.cap_from,
-        })
+        let taken = self.used.fetch_update(Ordering::Relaxed, Ordering::Relaxed, add);
+        taken.map(|_| ()).map_err(|used| self.refusal(what, needed, used, self.cap_from))
+    }
+
+    fn refusal(&self, what: &str, needed: u64, used: u64, cap_from: &'static str) -> DeviceError {
+        DeviceError::OutOfMemory { what: what.to_owned(), needed, used, cap: self.cap, cap_from }
     }
 
     fn give_back(&self, bytes: u64) {
@@ -67,12 +73,21 @@ impl<T: DeviceRepr> Buffer<T> {
         let len = len.max(1);
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         budget.take(what, bytes)?;
-        // SAFETY: the memory is unset; whoever reads it has written it before (each kernel says what it writes).
+        // SAFETY: the memory is unset; whoever reads it has written it before (each kernel says what it writes; tests fill it with NaN).
         let slice = unsafe { stream.alloc(len) }.map_err(|error| {
             budget.give_back(bytes);
-            DeviceError::driver("allocating device memory")(error)
+            match error.0 {
+                sys::CUresult::CUDA_ERROR_OUT_OF_MEMORY => {
+                    budget.refusal(what, bytes, budget.used(), "but others hold the rest of the device")
+                }
+                _ => DeviceError::driver("allocating device memory")(error),
+            }
         })?;
-        Ok(Self { slice, budget: budget.clone(), stream: stream.clone(), reader: None, bytes })
+        let mut buffer = Self { slice, budget: budget.clone(), stream: stream.clone(), reader: None, bytes };
+        if let Some(byte) = budget.fill {
+            buffer.fill_bytes(byte)?;
+        }
+        Ok(buffer)
     }
 
     /// The same, read by another stream. Whoever reads waits for an event behind the last write.

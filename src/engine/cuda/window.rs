@@ -227,11 +227,12 @@ impl Shared {
         let left = self.gpu.memory_left();
         if needed(storage.bytes()) > left {
             return Err(DeviceError::WindowTooLarge {
-                snapshots: missing.len(),
+                snapshots: wanted.len(),
+                missing: missing.len(),
                 nodes: window.grid().map_or([0; 3], |grid| grid.shape()),
                 storage: storage.name(),
                 needed: needed(storage.bytes()),
-                needed_f16: needed(Storage::F16.bytes()),
+                needed_f16: wanted.iter().map(|s| s.nodes.len() as u64).sum::<u64>() * Storage::F16.bytes(),
                 left,
             });
         }
@@ -294,7 +295,7 @@ impl Shared {
         match self.carry(snapshot, storage, scale) {
             Ok(there) => Some(there),
             Err(error) => {
-                if error.is_lost() {
+                if error.is_fault() {
                     self.gpu.health().fail(error);
                 }
                 None

@@ -292,7 +292,7 @@ impl<'a> Cycle<'a> {
             heed(self.stop)?;
             let Some(mut slide) = next else { return Ok(()) };
             let begun = Instant::now();
-            let (tracer, told) = self.options.device.tracer(slide.velocity.clone(), map, slide.time)?;
+            let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time)?;
             slide.warnings.extend(told);
             self.slid(&*tracer)?;
             self.probe(&*tracer, slide.index)?;
