@@ -31,7 +31,7 @@ template <class R> struct GridData {
     uint32_t row, plane;
     AxisData<R> axes[3];
     // From stored velocities to state units per time.
-    R rate[3];
+    R rate[4];
     // Where particles may go on.
     R low[3], high[3];
     // Mean spacing of axis i over that of axis j.
@@ -39,6 +39,8 @@ template <class R> struct GridData {
     // Sphere only (see sphere.cuh).
     R per_radian[2], origin[2], turn[2], poles[2];
     double middle;
+    // Radius, and mean distance between levels in radii.
+    double radius, level;
 };
 
 // Times of one step's start, middle and end: between two snapshots that follow one another, with weight[i] of the latter. Their addresses
@@ -82,9 +84,10 @@ template <bool EVEN, bool WRAP, class R> RW_FN Place<R> locate(const AxisData<R>
     return place;
 }
 
-// One node: velocity components and whether it is known.
+// One node: velocity components and whether it is known. The fourth, where there is one, is not a number in a node that is missing; elsewhere
+// its place holds that mark alone.
 template <class Config> struct Node {
-    float v[3];
+    float v[4];
     bool known;
 };
 
@@ -95,6 +98,7 @@ template <class Config> RW_FN Node<Config> node_at(const void* nodes, size_t ind
         node.v[0] = f.x;
         node.v[1] = f.y;
         node.v[2] = f.z;
+        node.v[3] = f.w;
         node.known = !Config::MARKS || !is_nan(f.w);
     } else {
         uint32_t low, high;
@@ -110,6 +114,7 @@ template <class Config> RW_FN Node<Config> node_at(const void* nodes, size_t ind
         node.v[0] = from_half(uint16_t(low & 0xffffu));
         node.v[1] = from_half(uint16_t(low >> 16));
         node.v[2] = from_half(uint16_t(high & 0xffffu));
+        node.v[3] = from_half(uint16_t(high >> 16));
         node.known = !Config::MARKS || (high >> 16 & 0x7fffu) <= 0x7c00u;
     }
     return node;
@@ -157,9 +162,9 @@ template <bool EVEN, bool SEAM, class R> RW_FN Stencil<R> stencil(const AxisData
 
 // Velocity and derivatives along the grid's axes, in state units.
 template <class R, int N> struct Sample {
-    R velocity[3];
+    R velocity[4];
     // slopes[axis][component]
-    R slopes[N][3];
+    R slopes[N][4];
 };
 
 // Config: N (axes), COMPONENTS, STORAGE, CUBIC, MARKS, KEEP, SCALED, EVEN, WRAP, SEAM (bit k: axis k).
@@ -272,7 +277,7 @@ template <class Config, class Real> struct Sampler {
         return fma_(b, weight, a);
     }
 
-    RW_FN bool value(const Step& step, int stage, const R (&x)[N], R (&v)[3], Memory& kept) const {
+    RW_FN bool value(const Step& step, int stage, const R (&x)[N], R (&v)[4], Memory& kept) const {
         if constexpr (Config::CUBIC && N == 3) {
             Sample<R, N> sample;
             const bool ok = stream<false>(step, stage, x, sample);
@@ -456,7 +461,7 @@ template <class Config, class Real> struct GridFlow {
     }
     RW_FN R separation(const double (&)[3], int axis, double gap) const { return R(2.0 * gap / data.axes[axis].spacing); }
     RW_FN bool velocity(const Step& step, int stage, const R (&x)[D], R (&v)[D], Memory& memory) const {
-        R all[3];
+        R all[4];
         const bool known = Field{data}.value(step, stage, x, all, memory);
         RW_UNROLL for (int i = 0; i < D; i++) v[i] = all[i];
         return known;

@@ -7,10 +7,12 @@
 using namespace rw;
 
 struct Config {
-    static constexpr int N = RW_AXES, COMPONENTS = RW_SPHERE ? 3 : RW_AXES, STORAGE = RW_STORAGE, EVEN = RW_EVEN, WRAP = RW_WRAP, SEAM = RW_SEAM;
+    static constexpr int N = RW_AXES, COMPONENTS = RW_SPHERE ? RW_AXES + 1 : RW_AXES, STORAGE = RW_STORAGE, EVEN = RW_EVEN, WRAP = RW_WRAP, SEAM = RW_SEAM;
     static constexpr bool CUBIC = RW_CUBIC, MARKS = RW_MARKS, KEEP = RW_KEEP, SCALED = RW_SCALED;
 };
-#if RW_SPHERE
+#if RW_SPHERE && RW_AXES == 3
+using Flow = LayeredSphereFlow<Config, RW_REAL>;
+#elif RW_SPHERE
 using Flow = SphereFlow<Config, RW_REAL>;
 #else
 using Flow = GridFlow<Config, RW_REAL>;

@@ -14,7 +14,7 @@ using Times = GridStep<RW_REAL>;
 static_assert(sizeof(Outputs) == 40 && sizeof(Verdict) == 12, "layout");
 #if !RW_CLOSED
 static_assert(sizeof(AxisData<float>) == 64 && sizeof(AxisData<double>) == 80, "layout");
-static_assert(sizeof(GridData<float>) == 312 && sizeof(GridData<double>) == 464, "layout");
+static_assert(sizeof(GridData<float>) == 336 && sizeof(GridData<double>) == 488, "layout");
 static_assert(sizeof(GridStep<float>) == 64 && sizeof(GridStep<double>) == 72, "layout");
 #else
 static_assert(sizeof(ClosedData<float>) == 48, "layout");

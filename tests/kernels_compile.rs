@@ -43,6 +43,7 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("AXES", "2"), ("CUBIC", "1"), ("EVEN", "3")]),
             grid(&[("CUBIC", "1")]),
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
+            grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
         _ => vec![Vec::new()],
     }

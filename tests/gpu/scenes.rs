@@ -145,3 +145,10 @@ pub fn sphere(longitudes: (f64, f64, usize), latitudes: (f64, f64, usize), aroun
     let lat = Axis::uniform("lat", "", latitudes.0, latitudes.1, latitudes.2).unwrap();
     Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) })
 }
+
+/// The same with levels of height.
+pub fn levels(longitudes: (f64, f64, usize), latitudes: (f64, f64, usize), heights: &[f64], around: bool) -> Arc<Grid> {
+    let mut axes = sphere(longitudes, latitudes, around).axes.clone();
+    axes.push(Axis::new("z", "", heights.to_vec()).unwrap());
+    Arc::new(Grid { axes, geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) })
+}

@@ -140,6 +140,20 @@ fn windows_on_the_sphere() {
 
 #[test]
 #[ignore = "needs a GPU"]
+fn levels_on_the_sphere() {
+    let heights = [0.0, 0.3, 0.7, 1.2, 1.8, 2.5, 3.4];
+    let globe = levels((-180.0, 170.0, 36), (-90.0, 90.0, 37), &heights, true);
+    let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
+    check("levels, globe", &smooth(&globe, 0.8, false), &around, 0.1);
+    let region = levels((-30.0, 10.0, 21), (20.0, 60.0, 21), &heights, false);
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    check("levels, region, holes", &smooth(&region, 0.5, true), &stop, 3.4);
+    check("levels, cubic", &smooth(&region, 0.5, false), &FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() }, 3.4);
+    check("levels, differences", &smooth(&region, 0.5, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);
+}
+
+#[test]
+#[ignore = "needs a GPU"]
 fn batches_of_every_size_are_written_whole() {
     let source = turbulence([24, 16, 16], 4);
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 6) };

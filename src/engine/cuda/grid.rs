@@ -80,9 +80,9 @@ impl GridArguments {
         let sphere = matches!(grid.geometry, Geometry::Sphere { .. });
         let spacing: [f64; 3] = std::array::from_fn(|k| axes[k].spacing);
         let scale = f64::from(nodes.scale);
-        let rate = match grid.geometry {
-            Geometry::Cartesian => spacing.map(|s| scale / s),
-            Geometry::Sphere { radius } => [scale / radius; 3],
+        let (rate, radius) = match grid.geometry {
+            Geometry::Cartesian => ([scale / spacing[0], scale / spacing[1], scale / spacing[2], 1.0], 1.0),
+            Geometry::Sphere { radius } => ([scale / radius, scale / radius, scale / radius, scale / spacing[2]], radius),
         };
         let ends: [[f64; 2]; 3] = std::array::from_fn(|k| maps[k.min(maps.len() - 1)].ends());
         // As on the CPU: an angle computed from a unit vector may miss by a few units in the last place.
@@ -109,6 +109,8 @@ impl GridArguments {
             turn: [real(cosine), real(sine)],
             poles: poles(latitude).map(real),
             middle,
+            radius,
+            level: spacing[2] / radius,
         };
         let stages: Vec<GridStep<R>> = stages(times, span.0, span.1, steps)
             .into_iter()
@@ -120,7 +122,7 @@ impl GridArguments {
             .collect();
         let steps = put(bytes_of(&stages))?;
         let one = R::from_f64(1.0);
-        let scaled = data.rate[..if sphere { 3 } else { grid.dimensions() }].iter().any(|r| *r != one);
+        let scaled = data.rate[..grid.dimensions() + usize::from(sphere)].iter().any(|r| *r != one);
         let cubic = map.interpolation == Interpolation::Cubic;
         let flag = |name: &str, value: bool| format!("{name}={}", u8::from(value));
         let defines = vec![

@@ -331,6 +331,37 @@ fn windows_on_the_sphere() {
 }
 
 #[test]
+fn levels_on_the_sphere() {
+    let grid = |lon: Axis, lat: Axis, heights: &[f64]| {
+        let levels = Axis::new("z", "", heights.to_vec()).unwrap();
+        Arc::new(Grid { axes: vec![lon, lat, levels], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) })
+    };
+    let even = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0];
+    let uneven = [0.0, 0.3, 0.7, 1.2, 1.8, 2.5, 3.4];
+    let globe = |heights: &[f64]| {
+        let lon = Axis::uniform("lon", "", -180.0, 170.0, 36).unwrap().with_period(360.0);
+        grid(lon, Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap(), heights)
+    };
+    let region = |heights: &[f64]| {
+        let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
+        grid(lon, Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap(), heights)
+    };
+    let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
+    check("globe", &smooth(&globe(&even), 0.8, false), &around, 0.1);
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    check("region, uneven levels, holes", &smooth(&region(&uneven), 0.5, true), &stop, 3.4);
+    let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
+    check("region, cubic", &smooth(&region(&uneven), 0.5, false), &cubic, 3.4);
+    check(
+        "region, differences",
+        &smooth(&region(&even), 0.5, false),
+        &FlowMap { integrator: Integrator::Differences, ..stop.clone() },
+        3.4,
+    );
+    check_halves("levels", &smooth(&region(&even), 0.5, true), &FlowMap { direction: Direction::Forward, ..stop });
+}
+
+#[test]
 fn half_precision_windows() {
     let even = |n: usize| ["x", "y", "z"][..n].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
     let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };

@@ -39,7 +39,7 @@ pub struct GridData<R> {
     pub row: u32,
     pub plane: u32,
     pub axes: [AxisData<R>; 3],
-    pub rate: [R; 3],
+    pub rate: [R; 4],
     pub low: [R; 3],
     pub high: [R; 3],
     pub ratios: [[R; 3]; 3],
@@ -48,6 +48,8 @@ pub struct GridData<R> {
     pub turn: [R; 2],
     pub poles: [R; 2],
     pub middle: f64,
+    pub radius: f64,
+    pub level: f64,
 }
 
 /// `GridStep`.
@@ -223,7 +225,7 @@ mod tests {
     fn sizes_are_those_of_cpp() {
         // As nvcc and g++ lay them out (static_asserts in tests/kernels_host.cpp hold the other side).
         assert_eq!((size_of::<AxisData<f32>>(), size_of::<AxisData<f64>>()), (64, 80));
-        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (312, 464));
+        assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (336, 488));
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
         assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (48, 40, 12));
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));

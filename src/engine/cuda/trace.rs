@@ -5,8 +5,8 @@ use super::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
 use super::sort::{MOST, SortCells, Sorter};
 use super::window::DeviceWindow;
 use super::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
+use crate::field::Domain;
 use crate::field::analytic::{Analytic, ClosedForm, Form};
-use crate::field::{Domain, Geometry};
 use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
 use crate::simd::Real;
 use cudarc::driver::{CudaFunction, PushKernelArg};
@@ -116,10 +116,6 @@ impl DeviceTracer {
             }
             VelocitySource::Window(window) => {
                 let grid = window.grid().ok_or_else(|| DeviceError::Unsupported { what: "an empty window".into() })?.clone();
-                if grid.dimensions() == 3 && matches!(grid.geometry, Geometry::Sphere { .. }) {
-                    let what = "levels on the sphere; they run on the CPU (on the GPU: one level, or the index metric)".into();
-                    return Err(DeviceError::Unsupported { what });
-                }
                 let held = store.window(window, tuning.storage)?;
                 let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
                 let mut memory = Vec::new();
