@@ -133,9 +133,12 @@ adapter-packages:
 
 test-adapters: adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-c -- --nocapture
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire --test ring -- --ignored; else \
+	  echo "NOT RUN: a ring on a full file system, since mounting a small one needs root"; fi
 	@if ls $(ADAPTERS)/wheel/*.whl >/dev/null 2>&1; then \
 	  $(ADAPTERS)/venv/bin/pip install --quiet --force-reinstall --no-deps $(ADAPTERS)/wheel/*.whl && $(ADAPTERS)/venv/bin/pytest -q adapters/python/tests; else \
 	  echo "NOT RUN: the tests of the Python package, since its wheel was not built"; fi
+	$(CARGO) build --release --bin ridgewatch --example live_window
 	scripts/live-mpi-check
 
 bench: packages

@@ -89,12 +89,31 @@ fn the_window_fills_and_moves_with_the_simulation() {
     publish(&solver, 4, 2.0, 1.0);
     let (taken, warnings) = take(&window, |_| true);
     assert_eq!((taken.live.step, newest(&taken), taken.live.snapshots, taken.live.steps, taken.live.missed), (4, 2.0, 5, 5, 0));
-    assert!(taken.live.age < 5.0 && warnings.is_empty(), "{warnings:?}");
+    assert!(taken.live.delay <= taken.live.age && taken.live.age < 5.0 && warnings.is_empty(), "{warnings:?}");
     assert!(window.next_within(Duration::from_millis(20)).is_err(), "nothing new");
     publish(&solver, 5, 2.5, 3.0);
     let (taken, _) = take(&window, |_| true);
     assert_eq!((taken.window.oldest(), newest(&taken)), (Some(0.5), 2.5));
     assert_eq!(taken.window.snapshots().last().unwrap().nodes[63], [3.0, 2.5, 0.0, 0.0]);
+}
+
+#[test]
+fn a_listener_hears_of_each_snapshot_before_the_window_has_it() {
+    let folder = Folder::new("listener");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    let heard = std::sync::Arc::new(std::sync::Mutex::new(Vec::new()));
+    let hears = heard.clone();
+    window.tell(Box::new(move |snapshot| hears.lock().unwrap().push(snapshot.clone())));
+    for n in 0..8 {
+        publish(&solver, n, n as f64 * 0.5, 1.0);
+        // In the window: whatever its newest snapshots are, they were announced, and as the very same ones.
+        if let Ok(Some(taken)) = window.next_within(Duration::from_secs(u64::from(n >= 4))) {
+            let heard = heard.lock().unwrap();
+            assert!(taken.window.snapshots().all(|s| heard.iter().any(|h| std::sync::Arc::ptr_eq(h, s))));
+        }
+    }
+    assert_eq!(heard.lock().unwrap().iter().map(|s| s.time).collect::<Vec<_>>(), (0..8).map(|n| f64::from(n) * 0.5).collect::<Vec<_>>());
 }
 
 #[test]

@@ -173,10 +173,13 @@ impl Feed {
         }
     }
 
-    /// `listener` hears of snapshots as they are read, some slides before they are needed.
+    /// `listener` hears of snapshots as they are read: of an archive some slides before they are needed, of a simulation as soon as they are
+    /// there.
     pub fn tell(&self, listener: Listener) {
-        if let Feed::Archive { reader, .. } = self {
-            reader.tell(listener);
+        match self {
+            Feed::Closed { .. } => {}
+            Feed::Archive { reader, .. } => reader.tell(listener),
+            Feed::Live { window, .. } => window.tell(listener),
         }
     }
 

@@ -1,7 +1,11 @@
 //! The velocity at one time.
 
 use super::{Geometry, Grid, is_pole};
+use rayon::prelude::*;
 use std::sync::Arc;
+
+/// Nodes that a thread makes at once.
+const PIECE: usize = 1 << 14;
 
 /// The velocity on a grid at one time.
 #[derive(Debug, Clone)]
@@ -25,7 +29,7 @@ pub const MISSING: [f32; 4] = [0.0, 0.0, 0.0, f32::NAN];
 impl Snapshot {
     /// A snapshot of finished nodes, one for each of the grid, as [`Self::nodes`] describes them.
     pub fn new(time: f64, grid: Arc<Grid>, nodes: Vec<[f32; 4]>) -> Self {
-        let missing = nodes.iter().filter(|n| n[3].is_nan()).count();
+        let missing = count_missing(&nodes);
         Self { time, grid, nodes, missing }
     }
 
@@ -36,44 +40,26 @@ impl Snapshot {
     /// # Panics
     /// When a component has not one value a node: readers check shapes before.
     pub fn from_components(time: f64, grid: Arc<Grid>, u: &[f32], v: &[f32], w: &[f32]) -> Self {
-        let count = grid.nodes();
-        assert!(u.len() == count && v.len() == count && (w.is_empty() || w.len() == count), "one value a node");
-        let [nx, ny, _] = grid.shape();
-        let turns = |axis: usize| -> Vec<(f64, f64)> {
-            if grid.geometry == Geometry::Cartesian {
-                Vec::new()
-            } else {
-                grid.axes[axis].coordinates().iter().map(|c| c.to_radians().sin_cos()).collect()
-            }
-        };
-        let (longitudes, latitudes) = (turns(0), turns(1));
-        let mut nodes = Vec::with_capacity(count);
-        for i in 0..count {
-            let up = if w.is_empty() { 0.0 } else { w[i] };
-            if !(u[i].is_finite() && v[i].is_finite() && up.is_finite()) {
-                nodes.push(MISSING);
-                continue;
-            }
-            nodes.push(match grid.geometry {
-                Geometry::Cartesian => [u[i], v[i], up, 0.0],
-                Geometry::Sphere { .. } => {
-                    let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitudes[i % nx], latitudes[i / nx % ny]);
-                    let (east, north) = (f64::from(u[i]), f64::from(v[i]));
-                    [
-                        (-east * sin_lon - north * sin_lat * cos_lon) as f32,
-                        (east * cos_lon - north * sin_lat * sin_lon) as f32,
-                        (north * cos_lat) as f32,
-                        if grid.dimensions() == 3 { up } else { 0.0 },
-                    ]
-                }
-            });
-        }
-        if grid.geometry != Geometry::Cartesian && grid.axes[0].period().is_some() {
-            for (y, _) in grid.axes[1].coordinates().iter().enumerate().filter(|(_, latitude)| is_pole(**latitude)) {
-                nodes.chunks_exact_mut(nx * ny).for_each(|level| make_one(&mut level[y * nx..(y + 1) * nx]));
-            }
-        }
+        let components = Components::new(&grid, u, v, w);
+        let mut nodes: Vec<[f32; 4]> = (0..grid.nodes()).map(|i| components.node(i)).collect();
+        components.join_poles(&mut nodes);
         Self::new(time, grid, nodes)
+    }
+
+    /// [`Self::from_components`] by all threads of the rayon pool that it is called in, into the memory of `nodes`: memory that is new to the
+    /// process costs more than what is written there.
+    ///
+    /// # Panics
+    /// Those of [`Self::from_components`].
+    pub fn from_components_into(mut nodes: Vec<[f32; 4]>, time: f64, grid: Arc<Grid>, u: &[f32], v: &[f32], w: &[f32]) -> Self {
+        let components = Components::new(&grid, u, v, w);
+        nodes.resize(grid.nodes(), MISSING);
+        nodes.par_chunks_mut(PIECE).enumerate().for_each(|(piece, nodes)| {
+            nodes.iter_mut().enumerate().for_each(|(i, node)| *node = components.node(piece * PIECE + i));
+        });
+        components.join_poles(&mut nodes);
+        let missing = nodes.par_chunks(PIECE).map(count_missing).sum();
+        Self { time, grid, nodes, missing }
     }
 
     /// Number of nodes whose velocity is missing.
@@ -84,6 +70,72 @@ impl Snapshot {
     /// Memory of the nodes, in bytes.
     pub fn bytes(&self) -> usize {
         size_of_val(self.nodes.as_slice())
+    }
+}
+
+fn count_missing(nodes: &[[f32; 4]]) -> usize {
+    nodes.iter().filter(|n| n[3].is_nan()).count()
+}
+
+/// The components that a snapshot's nodes are made from.
+struct Components<'a> {
+    grid: &'a Grid,
+    u: &'a [f32],
+    v: &'a [f32],
+    w: &'a [f32],
+    shape: [usize; 3],
+    /// Sine and cosine of each coordinate, on the sphere.
+    longitudes: Vec<(f64, f64)>,
+    latitudes: Vec<(f64, f64)>,
+}
+
+impl<'a> Components<'a> {
+    fn new(grid: &'a Grid, u: &'a [f32], v: &'a [f32], w: &'a [f32]) -> Self {
+        let count = grid.nodes();
+        assert!(u.len() == count && v.len() == count && (w.is_empty() || w.len() == count), "one value a node");
+        let turns = |axis: usize| -> Vec<(f64, f64)> {
+            if grid.geometry == Geometry::Cartesian {
+                Vec::new()
+            } else {
+                grid.axes[axis].coordinates().iter().map(|c| c.to_radians().sin_cos()).collect()
+            }
+        };
+        Self { grid, u, v, w, shape: grid.shape(), longitudes: turns(0), latitudes: turns(1) }
+    }
+
+    /// Node `i`, x fastest.
+    fn node(&self, i: usize) -> [f32; 4] {
+        let up = if self.w.is_empty() { 0.0 } else { self.w[i] };
+        let (u, v) = (self.u[i], self.v[i]);
+        if !(u.is_finite() && v.is_finite() && up.is_finite()) {
+            return MISSING;
+        }
+        match self.grid.geometry {
+            Geometry::Cartesian => [u, v, up, 0.0],
+            Geometry::Sphere { .. } => {
+                let [nx, ny, _] = self.shape;
+                let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (self.longitudes[i % nx], self.latitudes[i / nx % ny]);
+                let (east, north) = (f64::from(u), f64::from(v));
+                [
+                    (-east * sin_lon - north * sin_lat * cos_lon) as f32,
+                    (east * cos_lon - north * sin_lat * sin_lon) as f32,
+                    (north * cos_lat) as f32,
+                    if self.grid.dimensions() == 3 { up } else { 0.0 },
+                ]
+            }
+        }
+    }
+
+    /// Makes a row at a pole one vector.
+    fn join_poles(&self, nodes: &mut [[f32; 4]]) {
+        let axes = &self.grid.axes;
+        if self.grid.geometry == Geometry::Cartesian || axes[0].period().is_none() {
+            return;
+        }
+        let [nx, ny, _] = self.shape;
+        for (y, _) in axes[1].coordinates().iter().enumerate().filter(|(_, latitude)| is_pole(**latitude)) {
+            nodes.chunks_exact_mut(nx * ny).for_each(|level| make_one(&mut level[y * nx..(y + 1) * nx]));
+        }
     }
 }
 
@@ -115,7 +167,11 @@ mod tests {
         let mut v = vec![2.0f32; 12];
         u[8..].copy_from_slice(&[0.0, 3.0, 0.5, f32::NAN]);
         v[8..].copy_from_slice(&[-3.0, 0.0, 3.0, 0.0]);
-        let snapshot = Snapshot::from_components(0.0, grid, &u, &v, &[]);
+        let snapshot = Snapshot::from_components(0.0, grid.clone(), &u, &v, &[]);
+        // The same in memory that holds something else, too long at that.
+        let again = Snapshot::from_components_into(vec![[7.0; 4]; 20], 0.0, grid, &u, &v, &[]);
+        let bits = |s: &Snapshot| s.nodes.iter().flatten().map(|v| v.to_bits()).collect::<Vec<_>>();
+        assert_eq!((bits(&again), again.missing()), (bits(&snapshot), 1));
         let pole = &snapshot.nodes[8..];
         // (3, 0), (-3, 0) and (3, 0.5): the mean is (1, -0.5 / 3).
         assert!((pole[0][0] - 1.0).abs() < 1e-6 && (pole[0][1] + 0.5 / 3.0).abs() < 1e-6, "{pole:?}");

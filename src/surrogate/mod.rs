@@ -224,11 +224,11 @@ impl SurrogateSettings {
     }
 
     /// The same with the nodes of gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set; all axes are divided
-    /// alike where that would be more than 2^21 nodes.
-    pub fn at_resolution_of(&self, shape: [usize; 3]) -> Self {
+    /// alike where that would be more than 2^21 nodes, or more than `most`.
+    pub fn at_resolution_of(&self, shape: [usize; 3], most: usize) -> Self {
         let all: f64 = shape.iter().map(|&n| n as f64).product();
         let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
-        let share = (MOST_OWN_NODES as f64 / all).min(1.0).powf(1.0 / axes as f64);
+        let share = (most.min(MOST_OWN_NODES) as f64 / all).min(1.0).powf(1.0 / axes as f64);
         let own = shape.map(|n| ((n as f64 * share) as usize).max(2));
         Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
     }
@@ -317,11 +317,12 @@ mod tests {
     #[test]
     fn a_table_has_the_datas_own_nodes_up_to_a_bound() {
         let open = SurrogateSettings::default();
-        assert_eq!(open.at_resolution_of([81, 41, 1]).table_nodes, Some([81, 41, 2]));
+        assert_eq!(open.at_resolution_of([81, 41, 1], usize::MAX).table_nodes, Some([81, 41, 2]));
         let set = SurrogateSettings { table_nodes: Some([5, 6, 7]), ..open.clone() };
-        assert_eq!(set.at_resolution_of([81, 41, 1]), set);
-        let [x, y, z] = open.at_resolution_of([3000, 1500, 100]).table_nodes.unwrap();
+        assert_eq!(set.at_resolution_of([81, 41, 1], usize::MAX), set);
+        let [x, y, z] = open.at_resolution_of([3000, 1500, 100], usize::MAX).table_nodes.unwrap();
         assert!(x * y * z <= MOST_OWN_NODES && x * y * z > MOST_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
         assert!(x.abs_diff(2 * y) <= 2, "{x} x {y}: all axes are divided alike");
+        assert_eq!(open.at_resolution_of([128, 128, 128], 64 * 64 * 64).table_nodes, Some([64, 64, 64]));
     }
 }

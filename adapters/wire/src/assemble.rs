@@ -107,7 +107,8 @@ impl Assembler {
         Ok(())
     }
 
-    /// Takes one block of a step in; the whole step when it was the last that was missing.
+    /// Takes one block of a step in; the whole step when it was the last that was missing. Where one block is the whole field, its values are
+    /// taken out of `values`, which gets another buffer, and not copied.
     ///
     /// # Errors
     /// An unknown block, another number of values, or another time than the step's other blocks have.
@@ -117,7 +118,7 @@ impl Assembler {
         step: u64,
         time: f64,
         published: u64,
-        values: &[f32],
+        values: &mut Vec<f32>,
     ) -> Result<(Option<Step>, Vec<Incomplete>), WireError> {
         let refuse = |found: String, accepted: &str| Err(WireError::Block { block, found, accepted: accepted.into() });
         let Some((offset, extent)) = self.blocks.get(block as usize).copied().flatten() else {
@@ -132,6 +133,11 @@ impl Assembler {
         // The newest: what came before it and is not whole by now will not be asked for.
         if self.newest.is_some_and(|newest| step <= newest) {
             return Ok((None, given_up));
+        }
+        if self.blocks.len() == 1 {
+            self.newest = Some(step);
+            let values = std::mem::replace(values, self.spare.pop().unwrap_or_default());
+            return Ok((Some(Step { step, time, published, values }), given_up));
         }
         let place = match self.steps.iter().position(|p| p.step.step == step) {
             Some(place) => place,

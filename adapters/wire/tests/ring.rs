@@ -496,6 +496,51 @@ fn no_room_is_an_error_and_leaves_nothing() {
     assert_eq!(std::fs::read_dir(&folder.0).unwrap().count(), 0);
 }
 
+/// A file system of one megabyte that is gone when the test ends.
+struct SmallDisk(PathBuf);
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = std::process::Command::new("umount").arg("-l").arg(&self.0).status();
+        let _ = std::fs::remove_dir(&self.0);
+    }
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
+    let disk = SmallDisk(std::env::temp_dir().join(format!("rw-test-full-{}", std::process::id())));
+    std::fs::create_dir_all(&disk.0).unwrap();
+    let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m,mode=0700", "tmpfs"]).arg(&disk.0).status();
+    assert!(mounted.unwrap().success(), "mounting needs root");
+    let (first, second) = (disk.0.join("first"), disk.0.join("second"));
+    // 2 slots of 24^3 x 3 f32: 332 kB.
+    let producer = Producer::open(&first, cube([24, 24, 24]), 2, Policy::NewestWins).unwrap();
+    // Three times as much does not fit any more, and nothing of the attempt stays.
+    let error = Producer::open(&second, cube([24, 24, 24]), 6, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::NoSpace { needed, .. } if needed > 900_000), "{error}");
+    assert_eq!(std::fs::read_dir(&second).unwrap().count(), 0);
+    // Somebody else takes the rest, to the last page.
+    let mut ballast = std::fs::File::create(disk.0.join("ballast")).unwrap();
+    while std::io::Write::write_all(&mut ballast, &[1; 4096]).is_ok() {}
+    // What was reserved at opening holds: every slot is written, none faults, and a follower reads them.
+    let mut reader = RingReader::open(&first, 0, &Limits::default()).unwrap();
+    let mut buffer = Vec::new();
+    for n in 0..6 {
+        publish(&producer, n, n as f64).unwrap();
+        assert_eq!(step(&mut reader, &mut buffer).unwrap().step, n);
+        assert_eq!(buffer, values(producer.description(), n).concat());
+    }
+    assert!(matches!(
+        Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins),
+        Err(WireError::NoSpace { .. } | WireError::Io { .. })
+    ));
+    // With room again, the name that was refused is free.
+    drop(ballast);
+    std::fs::remove_file(disk.0.join("ballast")).unwrap();
+    Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+}
+
 #[test]
 fn blocks_meet_and_what_does_not_fit_is_refused() {
     let grid = cube([4, 3, 2]);
@@ -512,7 +557,7 @@ fn blocks_meet_and_what_does_not_fit_is_refused() {
     };
     let mut assembler = Assembler::new(&left, Duration::from_millis(30), 2);
     assembler.introduce(&left).unwrap();
-    assert!(assembler.block(1, 0, 0.0, 0, &cut(&right)).unwrap_err().to_string().contains("not introduced"));
+    assert!(assembler.block(1, 0, 0.0, 0, &mut cut(&right)).unwrap_err().to_string().contains("not introduced"));
     assert!(assembler.introduce(&part(1, 0, 3)).unwrap_err().to_string().contains("overlaps block 0"));
     assert!(assembler.introduce(&part(1, 2, 2)).unwrap_err().to_string().contains("18 of 24 nodes"));
     let mut stranger = right.clone();
@@ -520,27 +565,49 @@ fn blocks_meet_and_what_does_not_fit_is_refused() {
     assert!(assembler.introduce(&stranger).unwrap_err().to_string().contains("another field"));
     assembler.introduce(&right).unwrap();
     // Either order.
-    assert_eq!(assembler.block(1, 1, 0.5, 10, &cut(&right)).unwrap(), (None, vec![]));
-    let (step, given_up) = assembler.block(0, 1, 0.5, 9, &cut(&left)).unwrap();
+    assert_eq!(assembler.block(1, 1, 0.5, 10, &mut cut(&right)).unwrap(), (None, vec![]));
+    let (step, given_up) = assembler.block(0, 1, 0.5, 9, &mut cut(&left)).unwrap();
     let step = step.unwrap();
     assert_eq!((step.step, step.time, step.published, given_up.len()), (1, 0.5, 10, 0));
     assert_eq!(step.values, whole);
     // Another time, another length.
-    assembler.block(0, 2, 1.0, 0, &cut(&left)).unwrap();
-    assert!(assembler.block(1, 2, 1.5, 0, &cut(&right)).unwrap_err().to_string().contains("the time that its other blocks have"));
-    assert!(assembler.block(1, 2, 1.0, 0, &cut(&left)).unwrap_err().to_string().contains("18 values"));
+    assembler.block(0, 2, 1.0, 0, &mut cut(&left)).unwrap();
+    assert!(assembler.block(1, 2, 1.5, 0, &mut cut(&right)).unwrap_err().to_string().contains("the time that its other blocks have"));
+    assert!(assembler.block(1, 2, 1.0, 0, &mut cut(&left)).unwrap_err().to_string().contains("18 values"));
     // A step that lacks a block goes when a newer one is whole,
-    assembler.block(0, 3, 2.0, 0, &cut(&left)).unwrap();
-    let (step, given_up) = assembler.block(1, 3, 2.0, 0, &cut(&right)).unwrap();
+    assembler.block(0, 3, 2.0, 0, &mut cut(&left)).unwrap();
+    let (step, given_up) = assembler.block(1, 3, 2.0, 0, &mut cut(&right)).unwrap();
     assert_eq!(step.unwrap().step, 3);
     assert_eq!((given_up.len(), given_up[0].step, given_up[0].blocks, given_up[0].wanted), (1, 2, 1, 2));
-    assert_eq!(assembler.block(1, 2, 1.0, 0, &cut(&right)).unwrap(), (None, vec![]), "too late");
+    assert_eq!(assembler.block(1, 2, 1.0, 0, &mut cut(&right)).unwrap(), (None, vec![]), "too late");
     // when time is up,
-    assembler.block(0, 4, 3.0, 0, &cut(&left)).unwrap();
+    assembler.block(0, 4, 3.0, 0, &mut cut(&left)).unwrap();
     assert!(assembler.expire().is_empty());
     std::thread::sleep(Duration::from_millis(40));
     assert_eq!(assembler.expire()[0].why, "blocks did not come in time");
     // and when too many wait.
-    let given_up: Vec<_> = (5..9).flat_map(|n| assembler.block(0, n, n as f64, 0, &cut(&left)).unwrap().1).collect();
+    let given_up: Vec<_> = (5..9).flat_map(|n| assembler.block(0, n, n as f64, 0, &mut cut(&left)).unwrap().1).collect();
     assert_eq!(given_up.iter().map(|g| g.step).collect::<Vec<_>>(), [5, 6]);
+}
+
+#[test]
+fn a_block_that_is_the_whole_field_is_handed_on_and_not_copied() {
+    let grid = cube([4, 3, 2]);
+    let mut assembler = Assembler::new(&grid, Duration::from_secs(1), 2);
+    assembler.introduce(&grid).unwrap();
+    let mut buffer = values(&grid, 1).concat();
+    let (address, expected) = (buffer.as_ptr(), buffer.clone());
+    let (step, given_up) = assembler.block(0, 1, 0.5, 9, &mut buffer).unwrap();
+    let step = step.unwrap();
+    assert_eq!((step.step, step.time, step.published, given_up.len()), (1, 0.5, 9, 0));
+    assert_eq!(step.values, expected);
+    assert_eq!(step.values.as_ptr(), address);
+    assembler.recycle(step.values);
+    // What came already, and what has another length, stays with the caller.
+    let mut buffer = values(&grid, 2).concat();
+    assert_eq!(assembler.block(0, 1, 0.5, 9, &mut buffer).unwrap(), (None, vec![]));
+    assert!(assembler.block(0, 2, 0.5, 9, &mut vec![0.0; 7]).unwrap_err().to_string().contains("7 values"));
+    assert_eq!(buffer, values(&grid, 2).concat());
+    assembler.block(0, 2, 0.6, 9, &mut buffer).unwrap();
+    assert_eq!(buffer.as_ptr(), address, "the first step's buffer came back");
 }

@@ -12,7 +12,7 @@ use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup};
 use super::stop::{Halt, Interruptible, heed};
 use super::training::Threads;
-use super::{Device, EngineError, Frame};
+use super::{Device, EngineError, Frame, Settings};
 use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
 use crate::surrogate::network::Size;
@@ -206,7 +206,10 @@ impl<'a> Cycle<'a> {
         heed(stop)?;
         let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
         let surrogate = match &first.velocity {
-            VelocitySource::Window(window) => window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape())),
+            VelocitySource::Window(window) => {
+                let most = if first.live.is_some() { most_live_nodes(scene, &options.device) } else { usize::MAX };
+                window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape(), most))
+            }
             VelocitySource::Analytic(..) => None,
         };
         let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
@@ -338,6 +341,18 @@ impl<'a> Cycle<'a> {
         }
         self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
         Ok(())
+    }
+}
+
+/// Most nodes of a table that follows a simulation: every slide traces it anew while the simulation goes on. Where the CPU traces, one for each
+/// camera path of the slide's frames: with more, answering from the table would cost more than tracing.
+fn most_live_nodes(scene: &Settings, device: &Device) -> usize {
+    match device {
+        Device::Cpu { .. } => [scene.render.width, scene.render.height, scene.render.samples, scene.time.frames_per_slide]
+            .into_iter()
+            .fold(1, usize::saturating_mul),
+        #[cfg(feature = "cuda")]
+        Device::Gpu { .. } => usize::MAX,
     }
 }
 

@@ -3,6 +3,7 @@
 //! One thread reads, puts blocks together, thins in time where memory is short, and keeps the window; the cycle takes the window as it is
 //! at that moment. So frames are of the newest, however long they take, and the ring is read at the simulation's pace.
 
+mod conversion;
 mod link;
 mod settings;
 mod thinning;

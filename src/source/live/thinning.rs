@@ -11,7 +11,7 @@ const PROBES: usize = 1 << 15;
 pub(super) struct Thinning {
     spacing: f64,
     kept: Option<Arc<Snapshot>>,
-    left_out: Option<Snapshot>,
+    left_out: Option<Arc<Snapshot>>,
     /// Of the newest interval.
     pub error: Option<f64>,
     /// Steps left out.
@@ -32,7 +32,7 @@ impl Thinning {
     }
 
     /// Whether a step of this time is kept. If not, `build` may be called for it.
-    pub fn keeps(&mut self, time: f64, build: impl FnOnce() -> Snapshot) -> bool {
+    pub fn keeps(&mut self, time: f64, build: impl FnOnce() -> Arc<Snapshot>) -> bool {
         let Some(kept) = &self.kept else { return true };
         // What does not move forward is the window's to judge.
         if time <= kept.time || time >= kept.time + self.spacing * (1.0 - 1e-9) {
@@ -106,7 +106,7 @@ mod tests {
         let mut kept = Vec::new();
         for n in 0..101 {
             let time = f64::from(n) * 0.05;
-            if thinning.keeps(time, || at(time)) {
+            if thinning.keeps(time, || Arc::new(at(time))) {
                 let snapshot = Arc::new(at(time));
                 thinning.kept(&snapshot);
                 kept.push(time);
@@ -124,10 +124,10 @@ mod tests {
         let mut thinning = Thinning::new(6.0, 14);
         for n in 0..10 {
             let time = f64::from(n) * 0.7;
-            assert!(thinning.keeps(time, || at(time)));
+            assert!(thinning.keeps(time, || Arc::new(at(time))));
             thinning.kept(&Arc::new(at(time)));
         }
         assert_eq!((thinning.count, thinning.error), (0, None));
-        assert!(thinning.keeps(-1.0, || at(-1.0)), "what goes back in time is the window's to judge");
+        assert!(thinning.keeps(-1.0, || Arc::new(at(-1.0))), "what goes back in time is the window's to judge");
     }
 }

@@ -1,14 +1,15 @@
 //! The window that a thread of its own keeps.
 
+use super::conversion::Conversion;
 use super::thinning::Thinning;
 use super::{AtEnd, Follow, Live, memory};
-use crate::field::{Grid, Snapshot, Window, WindowFault};
-use crate::source::{SourceError, StillReading};
+use crate::field::{Window, WindowFault};
+use crate::source::{Listener, SourceError, StillReading};
 use ridgewatch_wire::{Assembler, Event, Incomplete, Step};
 use serde::{Deserialize, Serialize};
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -28,6 +29,8 @@ pub struct LiveRecord {
     pub step: u64,
     /// When that step was published, seconds since 1970.
     pub published: f64,
+    /// Seconds from its publication until the window had it: read, put together, converted.
+    pub delay: f64,
     /// Seconds from its publication until the cycle took the window.
     pub age: f64,
     /// Whole steps that came, in all.
@@ -90,6 +93,8 @@ struct Shared {
     state: Mutex<State>,
     changed: Condvar,
     stop: AtomicBool,
+    /// Hears of snapshots before the window has them.
+    listener: OnceLock<Listener>,
 }
 
 impl Shared {
@@ -108,13 +113,13 @@ pub struct LiveWindow {
 impl LiveWindow {
     pub(super) fn start(live: Live, tau: f64, stride: usize) -> Result<Self, SourceError> {
         let snapshot = 16 * live.grid.nodes() as u64;
-        // The window, and the one that the frame in progress still uses.
-        let room = (memory(&live.settings) / (2 * snapshot).max(1)) as usize;
+        // The window, the one that the frame in progress still uses, and one that is being made.
+        let room = ((memory(&live.settings) / snapshot.max(1)).saturating_sub(1) / 2) as usize;
         if room < 3 {
             return Err(SourceError::Setting {
                 key: "live.memory_gib",
                 found: live.settings.memory_gib.to_string(),
-                accepted: format!("at least {:.3}: three snapshots, twice", 6.0 * snapshot as f64 / f64::from(1 << 30)),
+                accepted: format!("at least {:.3}: three snapshots, twice, and one more", 7.0 * snapshot as f64 / f64::from(1 << 30)),
             });
         }
         let state = State {
@@ -126,11 +131,20 @@ impl LiveWindow {
             live: LiveRecord::default(),
             ended: false,
         };
-        let shared = Arc::new(Shared { state: Mutex::new(state), changed: Condvar::new(), stop: AtomicBool::new(false) });
-        let mut reader = Reader::new(live, shared.clone(), Thinning::new(tau, room), tau, stride);
+        let shared = Shared { state: Mutex::new(state), changed: Condvar::new(), stop: AtomicBool::new(false), listener: OnceLock::new() };
+        let shared = Arc::new(shared);
+        let conversion = Conversion::new(live.grid.clone())?;
+        let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), tau, stride);
         let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
         let thread = thread.map_err(|e| SourceError::Inconsistent { what: format!("the live thread could not start: {e}") })?;
         Ok(Self { shared, stride, thread: Some(thread) })
+    }
+
+    /// From now on `listener` hears of snapshots as they come, on the thread that reads, before the window has them. The first one that is set
+    /// stays.
+    pub fn tell(&self, listener: Listener) {
+        // A second one has nothing to add: the first hears of everything.
+        let _ = self.shared.listener.set(listener);
     }
 
     /// The window as it is once it is full and has moved by the stride; none when the simulation has ended and it will not.
@@ -158,9 +172,8 @@ impl LiveWindow {
         if std::mem::take(&mut state.more_warnings) > 0 {
             warnings.push(format!("and more of that kind: only the first {WARNINGS} are named"));
         }
-        let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
         let mut live = state.live.clone();
-        live.age = (now - live.published).max(0.0);
+        live.age = since(live.published);
         live.snapshots = state.window.snapshots().len();
         let window = state.window.clone();
         drop(state);
@@ -191,6 +204,7 @@ struct Reader {
     live: Live,
     shared: Arc<Shared>,
     assembler: Assembler,
+    conversion: Conversion,
     thinning: Thinning,
     tau: f64,
     stride: usize,
@@ -206,13 +220,14 @@ struct Reader {
 }
 
 impl Reader {
-    fn new(live: Live, shared: Arc<Shared>, thinning: Thinning, tau: f64, stride: usize) -> Self {
+    fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, tau: f64, stride: usize) -> Self {
         let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
         let assembler = Assembler::new(&live.description, limit, PENDING);
         Self {
             live,
             shared,
             assembler,
+            conversion,
             thinning,
             tau,
             stride,
@@ -235,7 +250,7 @@ impl Reader {
             }
             match self.live.link.poll(&mut values) {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
-                Some(Event::Step { block, step, time, published, missed }) => self.block(block, step, time, published, missed, &values),
+                Some(Event::Step { block, step, time, published, missed }) => self.block(block, step, time, published, missed, &mut values),
                 Some(Event::Ended { block, closed }) => self.ended(block, closed),
                 Some(Event::Refused(error)) => self.shared.lock().warn(format!("the simulation's data were refused: {error}")),
                 None => {}
@@ -282,7 +297,7 @@ impl Reader {
         }
     }
 
-    fn block(&mut self, block: u32, step: u64, time: f64, published: u64, missed: u64, values: &[f32]) {
+    fn block(&mut self, block: u32, step: u64, time: f64, published: u64, missed: u64, values: &mut Vec<f32>) {
         if self.barred.contains(&block) {
             return;
         }
@@ -300,9 +315,7 @@ impl Reader {
 
     /// Takes a whole step in.
     fn whole(&mut self, step: Step) {
-        let grid = self.live.grid.clone();
         let Step { step: number, time, published, values } = step;
-        let build = || snapshot(time, &grid, &values);
         let mut state = self.shared.lock();
         state.live.steps += 1;
         if std::mem::take(&mut self.anew) && state.window.newest().is_some_and(|newest| time <= newest) {
@@ -313,11 +326,14 @@ impl Reader {
         }
         // Conversion and the measurement take their time: frames are made meanwhile.
         drop(state);
-        let keep = self.thinning.keeps(time, build);
-        let kept = keep.then(|| Arc::new(snapshot(time, &grid, &values)));
+        let keep = self.thinning.keeps(time, || self.conversion.snapshot(time, &values));
+        let kept = keep.then(|| self.conversion.snapshot(time, &values));
         self.assembler.recycle(values);
         if let Some(kept) = &kept {
             self.thinning.kept(kept);
+            if let Some(tell) = self.shared.listener.get() {
+                tell(kept);
+            }
         }
         let mut state = self.shared.lock();
         (state.live.thinned, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
@@ -352,6 +368,7 @@ impl Reader {
         if state.window.newest() != newest {
             state.moved += 1;
             (state.live.step, state.live.published) = (number, published as f64 / 1e9);
+            state.live.delay = since(state.live.published);
         }
         drop(state);
         self.shared.changed.notify_all();
@@ -384,10 +401,8 @@ impl Reader {
     }
 }
 
-/// A snapshot of components, one behind the other.
-fn snapshot(time: f64, grid: &Arc<Grid>, values: &[f32]) -> Snapshot {
-    let nodes = grid.nodes();
-    let (u, rest) = values.split_at(nodes);
-    let (v, w) = rest.split_at(nodes);
-    Snapshot::from_components(time, grid.clone(), u, v, w)
+/// Seconds that have gone by since a moment, in seconds since 1970; 0 where it is yet to come.
+fn since(moment: f64) -> f64 {
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
+    (now - moment).max(0.0)
 }

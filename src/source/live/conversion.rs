@@ -1,0 +1,82 @@
+//! From a step's components to a snapshot, by a few threads and in memory that was used before.
+
+use crate::field::{Grid, Snapshot};
+use crate::source::SourceError;
+use std::sync::Arc;
+
+/// Threads that convert, at most: as many as keep the memory busy.
+const CONVERTERS: usize = 4;
+
+/// Makes snapshots. One that nobody holds any more lends its memory to a later one, so that a run at its pace takes none from the system.
+pub(super) struct Conversion {
+    grid: Arc<Grid>,
+    pool: rayon::ThreadPool,
+    /// Those that were made and may still be held.
+    made: Vec<Arc<Snapshot>>,
+    spare: Option<Vec<[f32; 4]>>,
+}
+
+impl Conversion {
+    /// For snapshots on `grid`. One core in four is taken, [`CONVERTERS`] at most: the others are the frames'.
+    ///
+    /// # Errors
+    /// The threads could not be started.
+    pub fn new(grid: Arc<Grid>) -> Result<Self, SourceError> {
+        let threads = std::thread::available_parallelism().map_or(1, |n| n.get() / 4).clamp(1, CONVERTERS);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("ridgewatch-convert-{i}")).build();
+        let pool = pool.map_err(|e| SourceError::Inconsistent { what: format!("the converting threads could not start: {e}") })?;
+        Ok(Self { grid, pool, made: Vec::new(), spare: None })
+    }
+
+    /// The snapshot of components, one behind the other.
+    pub fn snapshot(&mut self, time: f64, values: &[f32]) -> Arc<Snapshot> {
+        self.reclaim();
+        let (u, rest) = values.split_at(self.grid.nodes());
+        let (v, w) = rest.split_at(self.grid.nodes());
+        let (grid, nodes) = (self.grid.clone(), self.spare.take().unwrap_or_default());
+        let made = Arc::new(self.pool.install(|| Snapshot::from_components_into(nodes, time, grid, u, v, w)));
+        self.made.push(made.clone());
+        made
+    }
+
+    /// Takes back what nobody else holds: the memory of one is kept, the others' is given back.
+    fn reclaim(&mut self) {
+        for made in std::mem::take(&mut self.made) {
+            match Arc::try_unwrap(made) {
+                Ok(snapshot) => self.spare = Some(snapshot.nodes),
+                Err(held) => self.made.push(held),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::{Axis, Geometry};
+
+    #[test]
+    fn memory_goes_round_and_what_is_held_is_left_alone() {
+        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
+        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+        let values = |step: usize| -> Vec<f32> { (0..18).map(|i| (100 * step + i) as f32).collect() };
+        let expected = |step: usize| Snapshot::from_components(0.0, grid.clone(), &values(step)[..9], &values(step)[9..], &[]).nodes;
+        let mut conversion = Conversion::new(grid.clone()).unwrap();
+        // A window of three.
+        let mut held = std::collections::VecDeque::new();
+        let mut places = std::collections::BTreeSet::new();
+        for step in 0..20 {
+            let made = conversion.snapshot(step as f64, &values(step));
+            places.insert(made.nodes.as_ptr() as usize);
+            held.push_back((step, made));
+            if held.len() > 3 {
+                held.pop_front();
+            }
+            assert!(held.iter().all(|(step, made)| made.nodes == expected(*step) && made.time == *step as f64));
+        }
+        assert!(places.len() <= 4, "{places:?}: three are held, one is made");
+        held.clear();
+        conversion.snapshot(20.0, &values(20));
+        assert_eq!(conversion.made.len(), 1, "nothing is kept for its own sake");
+    }
+}
