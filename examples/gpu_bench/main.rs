@@ -383,6 +383,27 @@ mod bench {
             self.tables(name, &source, &domain)
         }
 
+        /// The whole sphere at one degree with 37 levels, a degree as long as the distance between levels.
+        fn levels(&self) -> Outcome<()> {
+            block("levels");
+            let shape = [360, 181, 37];
+            let longitude = Axis::uniform("lon", "degrees_east", 0.0, 359.0, shape[0])?.with_period(360.0);
+            let latitude = Axis::uniform("lat", "degrees_north", -90.0, 90.0, shape[1])?;
+            let axes = vec![longitude, latitude, Axis::uniform("height", "", 0.0, 36.0, shape[2])?];
+            let grid = Arc::new(Grid { axes, geometry: Geometry::Sphere { radius: 1f64.to_degrees() }, slab: (0.0, 1.0) });
+            let source = VelocitySource::Window(Arc::new(Turbulence::easy(shape, 0).window(&grid, SNAPSHOTS)?));
+            let batch = Batch::new(&self.gpu, &scattered(&grid.domain(), 1 << 23, 1))?;
+            println!("| kernel | steps | M samples/s | registers |\n|---|---|---|---|");
+            for (kind, tuning) in &KERNELS[..3] {
+                for steps in [11, 22] {
+                    let tracer = self.tracer(&source, &turbulent(steps), *tuning)?;
+                    let ms = batch.time(&tracer, batch.count)?;
+                    println!("| {kind} | {steps} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
+                }
+            }
+            Ok(())
+        }
+
         fn gyre(&self) -> Outcome<()> {
             let plane = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
             let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: TAU / 10.0 };
@@ -470,6 +491,7 @@ mod bench {
         }
         if rows != Rows::Collisions {
             bench.gyre()?;
+            bench.levels()?;
         }
         bench.turbulence("Easy", &Turbulence::easy(SHAPE, 0), rows)?;
         if rows != Rows::Quick {

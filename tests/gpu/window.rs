@@ -145,6 +145,11 @@ fn half_precision_is_as_good_as_its_rounding() {
         ("cubic", turbulence([48, 32, 32], 6), cubic.clone()),
         ("cubic in the plane", smooth(&cartesian(even(&[40, 30])), 0.6, false), shorter(&cubic)),
         ("sphere", region.clone(), shorter(&linear)),
+        (
+            "levels",
+            smooth(&levels((-30.0, 10.0, 21), (20.0, 60.0, 21), &[0.0, 0.5, 1.0, 1.5, 2.0, 2.5], false), 0.5, false),
+            shorter(&linear),
+        ),
         ("sphere, cubic", region, shorter(&cubic)),
     ] {
         let seeds = fresh(&domain(&source), 20_000);

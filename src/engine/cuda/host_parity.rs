@@ -118,7 +118,7 @@ fn halves(snapshot: &Snapshot) -> Vec<u8> {
         let magnitude = if a < 2f32.powi(-14) { steps } else { (((exponent + 15) as u16) << 10) + (steps - 1024) };
         magnitude | if x < 0.0 { 0x8000 } else { 0 }
     };
-    let node = |n: &[f32; 4]| [half(n[0] / HALF_SCALE), half(n[1] / HALF_SCALE), half(n[2] / HALF_SCALE), half(n[3])];
+    let node = |n: &[f32; 4]| [half(n[0] / HALF_SCALE), half(n[1] / HALF_SCALE), half(n[2] / HALF_SCALE), half(n[3] / HALF_SCALE)];
     snapshot.nodes.iter().flat_map(node).flat_map(u16::to_le_bytes).collect()
 }
 

@@ -306,6 +306,7 @@ impl Shared {
 
 /// Largest velocity component.
 fn peak(snapshot: &Snapshot) -> f32 {
-    let node = |n: &[f32; 4]| n[0].abs().max(n[1].abs()).max(n[2].abs());
+    // The mark of a missing node is no number, and counts for nothing.
+    let node = |n: &[f32; 4]| n[0].abs().max(n[1].abs()).max(n[2].abs()).max(n[3].abs());
     snapshot.nodes.par_iter().with_min_len(1 << 14).map(node).reduce(|| 0.0, f32::max)
 }
