@@ -7,6 +7,7 @@
 use super::Transfer;
 use super::parameters::SeenInCells;
 use crate::field::Domain;
+use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
 
 /// Ramp above the highest value seen that a cell's bound always keeps: what no sample showed must stay reachable, or it would be
@@ -182,18 +183,17 @@ impl MajorantGrid {
         self.commit(transfer);
         let [nx, ny, nz] = self.cells;
         let around = |i: usize, n: usize| i.saturating_sub(1)..(i + 2).min(n);
-        for z in 0..nz {
-            for y in 0..ny {
-                for x in 0..nx {
-                    let here = (z * ny + y) * nx + x;
-                    let mut joined = NOTHING;
-                    for (k, j) in around(z, nz).flat_map(|k| around(y, ny).map(move |j| (k, j))) {
-                        joined = around(x, nx).fold(joined, |all, i| all.join(self.current[(k * ny + j) * nx + i]));
-                    }
-                    self.previous[here] = Seen { count: self.current[here].count, ..joined };
+        let current = &self.current;
+        self.previous.par_chunks_mut(nx).enumerate().with_min_len(16).for_each(|(row, previous)| {
+            let (y, z) = (row % ny, row / ny);
+            for (x, previous) in previous.iter_mut().enumerate() {
+                let mut joined = NOTHING;
+                for (k, j) in around(z, nz).flat_map(|k| around(y, ny).map(move |j| (k, j))) {
+                    joined = around(x, nx).fold(joined, |all, i| all.join(current[(k * ny + j) * nx + i]));
                 }
+                *previous = Seen { count: current[row * nx + x].count, ..joined };
             }
-        }
+        });
         self.current.fill(NOTHING);
         self.derive(transfer);
     }

@@ -129,10 +129,10 @@ impl Renderer {
     /// Tells the majorants of log-stretch values known from elsewhere (a traced table, audit points; domain coordinates), from the next
     /// frame on. A renderer that has seen nothing makes several times the queries in its first frame.
     pub fn observe(&self, points: &[[f32; 3]], log_stretch: &[f32]) {
-        for (point, &s) in points.iter().zip(log_stretch) {
+        points.par_iter().with_min_len(1 << 12).zip(log_stretch).for_each(|(point, &s)| {
             let cell = self.majorants.cell_at(self.space.grid_of_domain(*point));
             if s.is_finite() { self.majorants.observe(cell, s * self.per_tau) } else { self.majorants.observe_missing(cell) }
-        }
+        });
     }
 
     /// To be called when the window slides: majorants loosen, since the field has changed.

@@ -11,6 +11,7 @@ use rayon::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 impl Storage {
     /// Bytes of a node.
@@ -37,6 +38,8 @@ const HALF_MOST: f32 = 60_000.0;
 const AHEAD: usize = 2;
 /// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
 const AHEAD_SHARE: u64 = 4;
+/// How long memory that others still hold is left alone before it is asked for again.
+const SOON: Duration = Duration::from_millis(20);
 /// Threads that copy expected snapshots to page-locked memory, at most: as many as keep the bus busy.
 const COPIERS: usize = 4;
 
@@ -103,7 +106,7 @@ struct State {
     ahead: Ahead<DeviceSnapshot>,
     /// How the latest window is held: storage and scale. None before the first.
     form: Option<(Storage, f32)>,
-    /// Host memory that nobody needs: giving it back takes milliseconds, which are the thread's.
+    /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's once nobody else holds it.
     gone: Vec<Arc<Snapshot>>,
     brought: u64,
     brought_ahead: u64,
@@ -175,6 +178,10 @@ impl Shared {
 
     fn wait<'a>(&self, state: MutexGuard<'a, State>) -> MutexGuard<'a, State> {
         self.changed.wait(state).unwrap_or_else(PoisonError::into_inner)
+    }
+
+    fn wait_at_most<'a>(&self, state: MutexGuard<'a, State>, time: Duration) -> MutexGuard<'a, State> {
+        self.changed.wait_timeout(state, time).unwrap_or_else(PoisonError::into_inner).0
     }
 
     fn carry(&self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<Arc<DeviceSnapshot>, DeviceError> {
@@ -262,17 +269,19 @@ impl Shared {
             return;
         };
         while !state.ended {
-            let gone = std::mem::take(&mut state.gone);
+            let (gone, held) = std::mem::take(&mut state.gone).into_iter().partition(|s| Arc::strong_count(s) == 1);
+            state.gone = held;
+            let gone: Vec<Arc<Snapshot>> = gone;
             let next = state.form.and_then(|form| {
                 let fits = |s: &Snapshot| s.nodes.len() as u64 * form.0.bytes() <= self.gpu.memory_left() / AHEAD_SHARE;
                 state.ahead.next(AHEAD, fits).map(|snapshot| (snapshot, form))
             });
             if gone.is_empty() && next.is_none() {
-                state = self.wait(state);
+                state = if state.gone.is_empty() { self.wait(state) } else { self.wait_at_most(state, SOON) };
                 continue;
             }
             drop(state);
-            drop(gone);
+            gone.into_iter().filter_map(Arc::into_inner).for_each(give_back);
             let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.bring_one(snapshot, *form));
             // A panic must not leave a window waiting for what will never come.
             let there = next.as_ref().and_then(|next| catch_unwind(AssertUnwindSafe(|| bring(next))).ok().flatten());
@@ -302,6 +311,26 @@ impl Shared {
             }
         }
     }
+}
+
+/// Gives a snapshot's memory on the host back. The system is busy with that for some twenty milliseconds, and were it told by unmapping alone,
+/// every thread that maps or unmaps memory meanwhile (the film of the frame before, say) would have to wait. So the pages go first, which a
+/// recent Linux does under a lock of this mapping's own.
+fn give_back(snapshot: Snapshot) {
+    let mut nodes = snapshot.nodes;
+    #[cfg(target_os = "linux")]
+    {
+        const PAGE: usize = 1 << 16; // a multiple of every page size in use
+        let bytes = nodes.as_mut_ptr().cast::<u8>();
+        let ahead = bytes.align_offset(PAGE);
+        let whole = (nodes.capacity() * size_of::<[f32; 4]>()).saturating_sub(ahead) / PAGE * PAGE;
+        if whole > 0 {
+            // SAFETY: whole pages inside the vector's own allocation, which reads as zeros from here on and is not read again. What the call
+            // returns does not matter: the memory goes with the vector in any case.
+            unsafe { libc::madvise(bytes.add(ahead).cast(), whole, libc::MADV_DONTNEED) };
+        }
+    }
+    drop(nodes);
 }
 
 /// Largest velocity component.
