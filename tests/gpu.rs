@@ -7,6 +7,8 @@
 
 #[path = "gpu/answers.rs"]
 mod answers;
+#[path = "gpu/audit.rs"]
+mod audit;
 #[path = "gpu/device.rs"]
 mod device;
 #[path = "gpu/lost.rs"]

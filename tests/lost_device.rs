@@ -7,23 +7,24 @@
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaTracerError, DeviceError};
 use ridgewatch::engine::{
-    Accelerator, Answers, Backed, Device, DeviceRenderer, DeviceTrace, EngineError, Event, FrameRecord, Health, RunOptions, Setup,
-    StageSeconds, Tally, WhenLost, run,
+    Accelerator, Answers, AuditFindings, AuditRequest, Backed, Device, DeviceNodes, DeviceRenderer, DeviceTrace, EngineError, Event,
+    FrameRecord, Health, RunOptions, Setup, StageSeconds, Tally, WhenLost, audit, run,
 };
-use ridgewatch::field::Snapshot;
+use ridgewatch::field::{Domain, Snapshot};
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
-use ridgewatch::surrogate::Samples;
+use ridgewatch::surrogate::{Predict, Samples, Table};
 use std::collections::BTreeSet;
 use std::path::Path;
-use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, OnceLock};
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, OnceLock};
 
 /// The way to the device, which breaks at one of the calls and stays broken.
 #[derive(Debug)]
 struct Line {
-    calls: AtomicU64,
-    breaks_at: u64,
+    /// What was asked for, call by call.
+    calls: Mutex<Vec<&'static str>>,
+    breaks_at: usize,
     how: How,
     broke_in: OnceLock<&'static str>,
 }
@@ -38,7 +39,9 @@ enum How {
 
 impl Line {
     fn call(&self, what: &'static str) -> Result<(), DeviceError> {
-        if self.calls.fetch_add(1, Ordering::SeqCst) < self.breaks_at {
+        let mut calls = self.calls.lock().unwrap();
+        calls.push(what);
+        if calls.len() <= self.breaks_at {
             return Ok(());
         }
         self.broke_in.get_or_init(|| what);
@@ -60,8 +63,8 @@ struct Breaking {
 const NAME: &str = "a device that breaks";
 
 impl Breaking {
-    fn new(breaks_at: u64, how: How, when_lost: WhenLost) -> Arc<Self> {
-        let line = Line { calls: AtomicU64::new(0), breaks_at, how, broke_in: OnceLock::new() };
+    fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
+        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in: OnceLock::new() };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -99,6 +102,10 @@ impl DeviceTrace for Trace {
     fn double(&self) -> bool {
         false
     }
+    fn trace_nodes(&self, _: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
+        self.line.call("tracing a table")?;
+        Ok(Some(Box::new(Nodes { line: self.line.clone(), table: Table::trace(&*self.host, nodes) })))
+    }
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         self.line.call("starting a trace")?;
         // What a device leaves behind that stops half way.
@@ -107,6 +114,32 @@ impl DeviceTrace for Trace {
         self.line.call("reading a trace back")?;
         self.host.trace(seeds, extras, out);
         Ok(())
+    }
+}
+
+/// A table that nobody reaches once the device is broken.
+#[derive(Debug)]
+struct Nodes {
+    line: Arc<Line>,
+    table: Table,
+}
+
+impl DeviceNodes for Nodes {
+    fn not_finite(&self) -> usize {
+        self.table.not_finite()
+    }
+    fn values(&self) -> Result<Vec<f32>, DeviceError> {
+        self.line.call("reading a table back")?;
+        Ok(self.table.values().to_vec())
+    }
+    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
+        self.line.call("looking up in a table")?;
+        self.table.predict(points, out);
+        Ok(())
+    }
+    fn as_any(&self) -> &dyn std::any::Any {
+        self
     }
 }
 
@@ -126,6 +159,19 @@ impl LogStretch for ByHost<'_> {
 }
 
 impl DeviceRenderer for Render {
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: &dyn Predict,
+    ) -> Result<Option<AuditFindings>, DeviceError> {
+        self.line.call("an audit")?;
+        let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
+        let table = surrogate.as_any().unwrap().downcast_ref::<Table>().unwrap();
+        let nodes = table.on_device().unwrap().as_any().downcast_ref::<Nodes>().unwrap();
+        Ok(Some(audit(request.clone(), &*traces.on_device().host, Some(&nodes.table))))
+    }
+
     fn render(
         &mut self,
         renderer: &mut Renderer,
@@ -209,14 +255,17 @@ fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
 }
 
 fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&str]) {
-    let whole = Breaking::new(u64::MAX, how, WhenLost::Cpu);
+    let whole = Breaking::new(usize::MAX, how, WhenLost::Cpu);
     let unbroken = on(&whole, scene);
     assert!(unbroken.error.is_none() && unbroken.films == expected.films);
     assert!(unbroken.records.iter().all(|r| r.device == NAME && has_ended(r) == 0));
-    let calls = whole.line.calls.load(Ordering::SeqCst);
+    let asked = whole.line.calls.lock().unwrap().clone();
+    let calls = asked.len();
+    // Of every kind of call some, from the first to the last: a few dozen runs instead of thousands.
+    let chosen = || kinds.iter().flat_map(|kind| some(&asked, kind));
 
     let mut broke_in = BTreeSet::new();
-    for breaks_at in 0..calls {
+    for breaks_at in chosen() {
         let device = Breaking::new(breaks_at, how, WhenLost::Cpu);
         let found = on(&device, scene);
         // How often a trace is cut up depends on the machine's speed: the last calls may not come.
@@ -249,7 +298,7 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
         return;
     }
     let mut ended = 0;
-    for breaks_at in 0..calls {
+    for breaks_at in chosen() {
         let device = Breaking::new(breaks_at, how, WhenLost::Stop);
         let found = on(&device, scene);
         let Some(what) = device.line.broke_in.get() else { continue };
@@ -268,6 +317,14 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
         assert!(found.records.iter().all(|r| r.device == NAME && has_ended(r) == 0), "{case}");
     }
     assert!(ended > 0);
+}
+
+/// Places of up to a dozen calls of a kind, evenly spread.
+fn some(asked: &[&str], kind: &str) -> Vec<usize> {
+    const MOST: usize = 12;
+    let places: Vec<usize> = (0..asked.len()).filter(|&i| asked[i] == kind).collect();
+    let count = places.len().min(MOST);
+    (0..count).map(|i| places[i * (places.len() - 1) / (count - 1).max(1)]).collect()
 }
 
 #[test]
@@ -330,6 +387,15 @@ samples = 2
     .unwrap();
     break_everywhere(
         &scene,
-        &["making a tracer", "making a renderer", "starting a trace", "reading a trace back", "bringing a snapshot over"],
+        &[
+            "making a tracer",
+            "making a renderer",
+            "tracing a table",
+            "looking up in a table",
+            "starting a trace",
+            "reading a trace back",
+            "an audit",
+            "bringing a snapshot over",
+        ],
     );
 }

@@ -2,6 +2,7 @@
 //! GPU, held to the reference on machines without one. Needs a C++ compiler (`c++`, or what CXX names).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
+use ridgewatch::engine::{residuals, stratified_points};
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
@@ -12,8 +13,8 @@ use ridgewatch::render::{
     Camera, CameraSettings, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, SeenInCells, Transfer,
     TransferSettings,
 };
-use ridgewatch::surrogate::{Predict, Table};
-use ridgewatch::trust::{Gate, Residual, Strata, TrustMap, TrustSettings};
+use ridgewatch::surrogate::{Predict, Samples, Table};
+use ridgewatch::trust::{Audited, Gate, Residual, Strata, TrustMap, TrustSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -389,7 +390,7 @@ fn some_gate() -> Gate {
             Residual { point, optical: if point[0] + point[1] > 1.0 { 0.2 } else { 0.001 }, log_stretch: 0.0 }
         })
         .collect();
-    map.observe(&[], &Strata::even(map.shape(), 0), &residuals);
+    map.observe(None, &residuals);
     let gate = map.gate();
     assert!(gate.share() > 0.1 && gate.share() < 0.9, "both kinds of cells: {}", gate.share());
     gate
@@ -436,6 +437,74 @@ fn the_same_one_answers_at_every_point() {
         let unused = if spent { 3 } else { 2 };
         assert!((0..4).all(|who| (seen[who] > 500) != (who == unused)), "{seen:?}");
     }
+}
+
+/// A surrogate that answers what it was told to.
+struct Told(Vec<f32>);
+
+impl Predict for Told {
+    fn name(&self) -> &'static str {
+        "told"
+    }
+    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) {
+        out.copy_from_slice(&self.0);
+    }
+    fn bytes(&self) -> usize {
+        0
+    }
+}
+
+#[test]
+fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
+    let shape = [5, 3, 7];
+    let mut random = uniform(11);
+    let strata = Strata::new(shape, (0..105).map(|_| (90.0 * random() * random()) as u32).collect());
+    let (seed, stream, tau) = (0x1234_5678_9abc_u64, (7_u64 << 33) + 5, 1.7);
+    let unit = stratified_points(&strata, seed, stream);
+    let settings = TransferSettings { low: Some(0.2), high: Some(0.9), ..TransferSettings::default() };
+    let transfer = Transfer::new(&settings, 1.0).unwrap();
+    let per_range = 1.0 / (0.9_f64 - 0.2) as f32;
+    let mut input = bytes(&shape.map(|n| n as i32));
+    input.extend(bytes(&[seed as u32, (seed >> 32) as u32, stream as u32, (stream >> 32) as u32, u32::MAX]));
+    input.extend(bytes(&[0.2_f32, per_range, tau as f32]));
+    let (mut samples, mut predicted) = (Samples::default(), Vec::new());
+    let mut number = 0;
+    for &drawn in &strata.drawn {
+        input.extend(bytes(&[drawn]));
+        for _ in 0..drawn {
+            // Some on land, some without a trace, some predictions that are no number.
+            let (land, lived) = (random() < 0.1, random());
+            let traced = if random() < 0.05 { f32::NAN } else { 2.0 * random() - 0.2 };
+            let said = if random() < 0.05 { f32::INFINITY } else { traced + 0.2 * random() * random() };
+            input.extend(bytes(&[f32::from(u8::from(land)), lived, said, traced]));
+            if !land {
+                samples.points.push(unit[number]);
+                samples.log_stretch.push(traced);
+                predicted.push(said);
+            }
+            number += 1;
+        }
+    }
+    let output = ask("audit", &input);
+    let mut output = &output[..];
+    let expected = Audited::of(&residuals(&Told(predicted), &samples, &transfer, tau), strata.clone());
+    let (mut number, mut points, mut peak) = (0, 0.0, f64::NEG_INFINITY);
+    for (cell, &drawn) in strata.drawn.iter().enumerate() {
+        for _ in 0..drawn {
+            assert_eq!(read::<[f32; 3]>(&mut output, 1)[0], unit[number], "point {number}");
+            number += 1;
+        }
+        // What is said of the points themselves stands behind the sums.
+        let found = read::<[f64; 10]>(&mut output, 1)[0];
+        let sums = expected.cells()[cell];
+        let sums = [sums.count, sums.optical, sums.square, sums.fourth, sums.second, sums.third, sums.log_square];
+        assert_eq!(found[..7].iter().map(|x| x.to_bits()).collect::<Vec<_>>(), sums.map(f64::to_bits), "cell {cell}");
+        points += found[7];
+        peak = peak.max(found[9]);
+    }
+    assert_eq!((points, number), (samples.len() as f64, strata.total()));
+    let highest = samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max);
+    assert_eq!(peak, f64::from(highest));
 }
 
 #[test]

@@ -4,11 +4,13 @@
 
 use super::EngineError;
 use super::answers::Answers;
+use super::audit::{AuditFindings, AuditRequest};
 use super::cuda::{CudaTracerError, DeviceError};
 use super::device::WhenLost;
 use crate::field::{Domain, Snapshot};
-use crate::flow::{Chosen, Extras, FlowMap, Traced, Tracer, VelocitySource};
+use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, VelocitySource};
 use crate::render::{Film, RenderStats, Renderer};
+use crate::surrogate::{Predict, Table};
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -53,6 +55,19 @@ pub trait DeviceRenderer: Send + Sync {
         progress: Option<&dyn Fn(f32)>,
         stop: &std::sync::atomic::AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError>;
+
+    /// A frame's audit, as [`audit`](super::audit()) does it; none where it cannot.
+    ///
+    /// # Errors
+    /// What the device says; the audit can be made again by other means.
+    fn audit(
+        &mut self,
+        _request: &AuditRequest<'_>,
+        _tracer: &dyn Tracer,
+        _surrogate: &dyn Predict,
+    ) -> Result<Option<AuditFindings>, DeviceError> {
+        Ok(None)
+    }
 }
 
 /// Whether a device works. The first failure ends all work on it.
@@ -105,20 +120,92 @@ pub trait DeviceTrace: Send + Sync + 'static {
 
     /// Whether [`Traced::log_stretch_f64`] is filled.
     fn double(&self) -> bool;
+
+    /// What [`Tracer::trace_nodes`] does; none where the device does not.
+    ///
+    /// # Errors
+    /// What the device says.
+    fn trace_nodes(&self, _domain: &Domain, _nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
+        Ok(None)
+    }
+}
+
+/// Values at nodes on a device, where any call may be the last: what [`TracedNodes`] is to the rest of the program.
+pub trait DeviceNodes: fmt::Debug + Send + Sync + 'static {
+    /// Nodes whose trace was not finite.
+    fn not_finite(&self) -> usize;
+
+    /// All values, x fastest.
+    ///
+    /// # Errors
+    /// What the device says.
+    fn values(&self) -> Result<Vec<f32>, DeviceError>;
+
+    /// Interpolates at unit points.
+    ///
+    /// # Errors
+    /// What the device says; `out` then holds anything.
+    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
+
+    /// Itself.
+    fn as_any(&self) -> &dyn std::any::Any;
+}
+
+/// Nodes on a device, with the CPU's tracer behind them, which traces them anew when the device is lost.
+struct BackedNodes {
+    device: Box<dyn DeviceNodes>,
+    nodes: [usize; 3],
+    host: Arc<dyn Tracer>,
+    health: Arc<Health>,
+}
+
+impl fmt::Debug for BackedNodes {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.device.fmt(f)
+    }
+}
+
+impl BackedNodes {
+    /// What the device says; none once it has failed.
+    fn ask<T>(&self, call: impl FnOnce(&dyn DeviceNodes) -> Result<T, DeviceError>) -> Option<T> {
+        if !self.health.works() {
+            return None;
+        }
+        // The cycle asks for the failure after each frame and records it.
+        call(&*self.device).map_err(|error| self.health.fail(error)).ok()
+    }
+}
+
+impl TracedNodes for BackedNodes {
+    fn not_finite(&self) -> usize {
+        self.device.not_finite()
+    }
+    fn values(&self) -> Vec<f32> {
+        self.ask(|device| device.values()).unwrap_or_else(|| match self.health.check() {
+            Ok(()) => Table::trace(&*self.host, self.nodes).values().to_vec(),
+            Err(_) => vec![f32::NAN; self.nodes.iter().product()],
+        })
+    }
+    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool {
+        self.ask(|device| device.interpolate(points, out)).is_some()
+    }
+    fn as_any(&self) -> &dyn std::any::Any {
+        self.device.as_any()
+    }
 }
 
 /// A device's tracer with the CPU's behind it: that one checks the settings, chooses the number of steps, and goes on when the device
 /// is lost. Where the run is to end then, what is asked afterwards is NaN, so that the run gets there soon.
 pub struct Backed<T> {
     device: T,
-    host: Box<dyn Tracer>,
+    host: Arc<dyn Tracer>,
     health: Arc<Health>,
 }
 
 impl<T: DeviceTrace> Backed<T> {
     /// `host` traces the same flow map.
     pub fn with(device: T, host: Box<dyn Tracer>, health: Arc<Health>) -> Self {
-        Self { device, host, health }
+        Self { device, host: host.into(), health }
     }
 
     /// The device's side.
@@ -145,6 +232,15 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
     }
     fn as_any(&self) -> Option<&dyn std::any::Any> {
         Some(self)
+    }
+
+    fn trace_nodes(&self, nodes: [usize; 3]) -> Option<Arc<dyn TracedNodes>> {
+        let traced = self.health.works().then(|| self.device.trace_nodes(self.domain(), nodes))?;
+        let device = traced.unwrap_or_else(|error| {
+            self.health.fail(error);
+            None
+        })?;
+        Some(Arc::new(BackedNodes { device, nodes, host: self.host.clone(), health: self.health.clone() }))
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {

@@ -5,7 +5,7 @@ use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
 use crate::surrogate::{Predict, Samples};
-use crate::trust::{Gate, Residual, Strata, TrustedError, log_stretch_rms};
+use crate::trust::{Audited, Gate, Residual, Strata, TrustedError};
 use rayon::prelude::*;
 
 /// Points that a thread takes at a time.
@@ -13,10 +13,15 @@ const CHUNK: usize = 1 << 12;
 /// Dimension that no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX;
 
-/// Uniform points in each cell of the unit cube, as many as `strata` says.
+/// Key and stream of the words that points are drawn with: [`philox`] of a point's number, the stream and a dimension that no path reaches.
+pub(super) fn draws(seed: u64, stream: u64) -> ([u32; 2], [u32; 3]) {
+    ([seed as u32, (seed >> 32) as u32], [stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION])
+}
+
+/// Uniform points in each cell of the unit cube, as many as `strata` says, cell by cell.
 pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3]> {
     let cells = strata.shape;
-    let key = [seed as u32, (seed >> 32) as u32];
+    let (key, [low, high, dimension]) = draws(seed, stream);
     let mut first = 0;
     let cell_starts: Vec<(usize, u32, u32)> = (strata.drawn.iter().enumerate())
         .map(|(cell, &count)| {
@@ -27,9 +32,13 @@ pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3
     let in_cell = |&(cell, first, count): &(usize, u32, u32)| {
         let index = [cell % cells[0], cell / cells[0] % cells[1], cell / (cells[0] * cells[1])];
         (first..first + count).map(move |number| -> [f32; 3] {
-            // The last word keeps these draws apart from every pixel's.
-            let words = philox([number, stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION], key);
-            std::array::from_fn(|k| (index[k] as f32 + unit(words[k])) / cells[k] as f32)
+            let words = philox([number, low, high, dimension], key);
+            std::array::from_fn(|k| {
+                let at = |offset: f32| (index[k] as f32 + offset) / cells[k] as f32;
+                let drawn = at(unit(words[k]));
+                // Rounding takes one point in a million over the edge of its cell.
+                if (drawn * cells[k] as f32) as usize == index[k] { drawn } else { at(0.5) }
+            })
         })
     };
     cell_starts.par_iter().with_min_len(64).flat_map_iter(in_cell).collect()
@@ -39,6 +48,8 @@ pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3
 pub struct Audit {
     /// As labelled samples for the ring.
     pub samples: Samples,
+    /// Which of the points drawn each of them is.
+    pub numbers: Vec<usize>,
     /// Points drawn, voids included.
     pub drawn: usize,
     /// Mean lived share over points that are not void.
@@ -53,21 +64,23 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
     let mut traced = Traced::default();
     tracer.trace(&points, extras, &mut traced);
     // Sums are those of the chunks in order, on any number of threads.
-    let parts: Vec<(Samples, f64)> = (points.par_chunks(CHUNK).enumerate())
+    let parts: Vec<(Samples, Vec<usize>, f64)> = (points.par_chunks(CHUNK).enumerate())
         .map(|(chunk, points)| {
-            let (mut samples, mut lived) = (Samples::default(), 0.0);
+            let (mut samples, mut numbers, mut lived) = (Samples::default(), Vec::new(), 0.0);
             for (i, &point) in (chunk * CHUNK..).zip(points) {
                 if !tracer.is_void(point) {
                     push_sample(&mut samples, domain, point, &traced, i, extras);
+                    numbers.push(i);
                     lived += f64::from(traced.lived[i]);
                 }
             }
-            (samples, lived)
+            (samples, numbers, lived)
         })
         .collect();
-    let mut samples = Samples::default();
+    let (mut samples, mut numbers) = (Samples::default(), Vec::new());
     let mut lived = 0.0;
-    for (mut part, part_lived) in parts {
+    for (mut part, mut part_numbers, part_lived) in parts {
+        numbers.append(&mut part_numbers);
         samples.points.append(&mut part.points);
         samples.log_stretch.append(&mut part.log_stretch);
         samples.arrival.append(&mut part.arrival);
@@ -75,10 +88,11 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
         lived += part_lived;
     }
     let lived_share = lived / samples.len().max(1) as f64;
-    Audit { samples, drawn: points.len(), lived_share }
+    Audit { samples, numbers, drawn: points.len(), lived_share }
 }
 
-/// Residuals of `surrogate` on traced samples that it has not seen. `tau` turns log-stretch into FTLE for the ramp.
+/// Residuals of `surrogate` on traced samples that it has not seen, NaN where the trace gave no number. `tau` turns log-stretch into FTLE
+/// for the ramp.
 pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer, tau: f64) -> Vec<Residual> {
     let mut predicted = vec![0.0; samples.len()];
     surrogate.predict(&samples.points, &mut predicted);
@@ -86,8 +100,10 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
     let pairs = predicted.par_iter().zip(&samples.log_stretch).zip(&samples.points);
     pairs
         .with_min_len(CHUNK)
-        .filter(|((_, traced), _)| traced.is_finite())
         .map(|((&predicted, &traced), &point)| {
+            if !traced.is_finite() {
+                return Residual { point, optical: f32::NAN, log_stretch: f32::NAN };
+            }
             // A prediction that is no number is as wrong as can be.
             let optical = if predicted.is_finite() { (ramp(predicted) - ramp(traced)).abs() } else { 1.0 };
             let log_stretch = if predicted.is_finite() { predicted - traced } else { traced.abs() };
@@ -96,17 +112,67 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
         .collect()
 }
 
-/// Error over the residuals whose points the gate trusts; they were drawn as `strata` says.
-pub fn trusted_error(residuals: &[Residual], strata: &Strata, gate: &Gate) -> Option<TrustedError> {
-    let trusted: Vec<Residual> = residuals.iter().copied().filter(|r| gate.trusts(r.point)).collect();
-    TrustedError::of(&trusted, strata)
+/// Error over the audit points in cells that the gate trusts.
+pub fn trusted_error(audited: &Audited, gate: &Gate) -> Option<TrustedError> {
+    TrustedError::of(audited, |cell| gate.trusts(audited.strata().centre(cell)))
 }
 
-/// PSNR in decibels of the surrogate's log-stretch over the points of `residuals`, for the largest traced value `peak`. None where
-/// either has no finite value.
-pub fn psnr(residuals: &[Residual], peak: f32, strata: &Strata) -> Option<f64> {
-    let error = log_stretch_rms(residuals, strata);
-    Some(20.0 * (f64::from(peak) / error).log10()).filter(|psnr| psnr.is_finite())
+/// PSNR in decibels of the surrogate's log-stretch over the audit points, for the largest traced value `peak`. None where either has no
+/// finite value.
+pub fn psnr(audited: &Audited, peak: f32) -> Option<f64> {
+    Some(20.0 * (f64::from(peak) / audited.log_stretch_rms()).log10()).filter(|psnr| psnr.is_finite())
+}
+
+/// What a frame's audit asks for.
+#[derive(Clone)]
+pub struct AuditRequest<'a> {
+    /// How many points are drawn in each cell.
+    pub strata: Strata,
+    /// What they are drawn with.
+    pub seed: u64,
+    /// As above; no two frames have the same.
+    pub stream: u64,
+    /// In whose ramp residuals are measured.
+    pub transfer: &'a Transfer,
+    /// Whether what was traced is wanted as samples to learn from, and with it arrival and Jacobian.
+    pub samples: Option<Extras>,
+}
+
+/// What a frame's audit found.
+pub struct AuditFindings {
+    /// Points drawn.
+    pub drawn: usize,
+    /// Of them, those that do not lie on land.
+    pub points: usize,
+    /// Mean lived share over these.
+    pub lived_share: f64,
+    /// Largest finite log-stretch; minus infinity where there is none.
+    pub peak: f32,
+    /// These points, where they were asked for.
+    pub samples: Samples,
+    /// Residuals of the surrogate; none without one.
+    pub errors: Option<Audited>,
+}
+
+/// Draws, traces and holds `surrogate` to what was traced, on the CPU (the tracer's device may be another).
+pub fn audit(request: AuditRequest<'_>, tracer: &dyn Tracer, surrogate: Option<&dyn Predict>) -> AuditFindings {
+    let unit = stratified_points(&request.strata, request.seed, request.stream);
+    let flow_map = request.samples.is_some_and(|extras| extras.jacobian);
+    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, flow_map);
+    AuditFindings {
+        drawn,
+        points: samples.len(),
+        lived_share,
+        peak: samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max),
+        errors: surrogate.map(|surrogate| {
+            let mut in_order = vec![(f32::NAN, f32::NAN); drawn];
+            for (number, residual) in numbers.into_iter().zip(residuals(surrogate, &samples, request.transfer, tracer.tau())) {
+                in_order[number] = (residual.optical, residual.log_stretch);
+            }
+            Audited::in_order(&in_order, request.strata)
+        }),
+        samples: if request.samples.is_some() { samples } else { Samples::default() },
+    }
 }
 
 #[cfg(test)]

@@ -3,9 +3,11 @@
 #[cfg(feature = "cuda")]
 use super::accelerator::{DeviceRenderer, Health};
 use super::answers::Answers;
+use super::audit::{AuditFindings, AuditRequest, audit};
 use super::{Device, EngineError};
 use crate::flow::Tracer;
 use crate::render::{Film, RenderStats, Renderer};
+use crate::surrogate::Predict;
 use std::sync::atomic::AtomicBool;
 
 /// Makes the films of a run.
@@ -22,6 +24,14 @@ pub(super) trait FrameRenderer: Send + Sync {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError>;
+
+    /// Draws and traces a frame's audit points and holds the surrogate to them.
+    fn audit(
+        &mut self,
+        request: AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: Option<&dyn Predict>,
+    ) -> Result<AuditFindings, EngineError>;
 }
 
 /// What renders on `device`. A GPU on which the kernels do not load has failed, with the CPU behind it.
@@ -55,6 +65,15 @@ impl FrameRenderer for OnCpu {
     ) -> Result<(Film, RenderStats), EngineError> {
         Ok(renderer.render(picture, answers, samples, progress, stop)?)
     }
+
+    fn audit(
+        &mut self,
+        request: AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: Option<&dyn Predict>,
+    ) -> Result<AuditFindings, EngineError> {
+        Ok(audit(request, tracer, surrogate))
+    }
 }
 
 /// Makes films on the GPU where it can do so alone; otherwise, and once it fails, as on the CPU.
@@ -87,5 +106,22 @@ impl FrameRenderer for OnGpu {
         }
         self.health.check()?;
         OnCpu.render(renderer, picture, samples, tracer, answers, progress, stop)
+    }
+
+    fn audit(
+        &mut self,
+        request: AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: Option<&dyn Predict>,
+    ) -> Result<AuditFindings, EngineError> {
+        if let Some(surrogate) = surrogate.filter(|_| self.health.works()) {
+            match self.device.audit(&request, tracer, surrogate) {
+                Ok(Some(done)) => return Ok(done),
+                Ok(None) => {}
+                Err(error) => self.health.fail(error),
+            }
+        }
+        self.health.check()?;
+        OnCpu.audit(request, tracer, surrogate)
     }
 }

@@ -21,9 +21,9 @@ mod training;
 
 pub use crate::trust::TrustedError;
 #[cfg(feature = "cuda")]
-pub use accelerator::{Accelerator, Backed, DeviceRenderer, DeviceTrace, Health};
+pub use accelerator::{Accelerator, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, Health};
 pub use answers::{Answers, Asked, Tally};
-pub use audit::{Audit, residuals, stratified_points, trace, trusted_error};
+pub use audit::{Audit, AuditFindings, AuditRequest, audit, residuals, stratified_points, trace, trusted_error};
 pub use cycle::{Event, RunOptions, RunReport, run};
 pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;

@@ -2,9 +2,9 @@
 
 use super::EngineError;
 use crate::field::Domain;
-use crate::flow::{Chosen, Extras, Traced, Tracer};
-use std::sync::Mutex;
+use crate::flow::{Chosen, Extras, Traced, TracedNodes, Tracer};
 use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
 /// Why preparing did not come to its end.
@@ -80,6 +80,11 @@ impl Tracer for Interruptible<'_> {
 
     fn is_void(&self, seed: [f32; 3]) -> bool {
         self.tracer.is_void(seed)
+    }
+
+    /// In one go: a device that traces all nodes does so in a second or two.
+    fn trace_nodes(&self, nodes: [usize; 3]) -> Option<Arc<dyn TracedNodes>> {
+        if self.stop.load(Ordering::Relaxed) { None } else { self.tracer.trace_nodes(nodes) }
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {

@@ -95,6 +95,12 @@ impl Transfer {
         (self.low, self.per_range, self.extinction_max, &self.albedo)
     }
 
+    /// What the ramp of a log-stretch over `tau` needs: low, 1 / (high - low), and tau.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn ramp_parts(&self, tau: f64) -> (f32, f32, f32) {
+        (self.low, self.per_range, tau as f32)
+    }
+
     /// saturate((FTLE - low) / (high - low)), in [0, 1]: the normalised extinction, in which optical residuals are measured. NaN
     /// stays NaN.
     #[inline]

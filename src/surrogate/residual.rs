@@ -132,6 +132,8 @@ impl Surrogate for Residual {
 
     fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
         let start = std::time::Instant::now();
+        // Training reads the table in pieces by many threads: it had better be here before they start.
+        self.table.values();
         if !samples.is_empty() && std::mem::take(&mut self.slid) && self.fitted_shrinkage(samples) < USELESS {
             self.trainer.forget_output();
         }

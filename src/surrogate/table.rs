@@ -3,11 +3,11 @@
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
 use super::{CheckpointError, Learned, Predict, Samples, Surrogate};
-use crate::flow::{Extras, Traced, Tracer};
+use crate::flow::{Extras, Traced, TracedNodes, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, OnceLock};
 use wide::{f32x8, i32x8};
 
 /// Seeds traced at once while a table is built: bounds the memory beside the table itself.
@@ -18,11 +18,19 @@ const TRACE_AT_ONCE: usize = 1 << 20;
 pub struct Table {
     nodes: [usize; 3],
     dimensions: usize,
-    /// x fastest. Shared with frozen copies; a slide writes into a place of its own.
-    values: Arc<Vec<f32>>,
+    values: Values,
     not_finite: usize,
     /// Of these values, and no others in this process.
     stamp: u64,
+}
+
+/// Values at the nodes, x fastest. Shared with frozen copies; a slide writes into a place of its own.
+#[derive(Debug, Clone)]
+enum Values {
+    /// On the host.
+    Here(Arc<Vec<f32>>),
+    /// With the device that traced them, and on the host once somebody there asked for them.
+    There(Arc<dyn TracedNodes>, Arc<OnceLock<Vec<f32>>>),
 }
 
 /// A number that was not given before.
@@ -36,7 +44,7 @@ impl Table {
     pub fn trace(tracer: &dyn Tracer, nodes: [usize; 3]) -> Self {
         let dimensions = tracer.domain().dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut table = Self { nodes, dimensions, values: Arc::new(vec![0.0; nodes.iter().product()]), not_finite: 0, stamp: 0 };
+        let mut table = Self { nodes, dimensions, values: Values::Here(Arc::default()), not_finite: 0, stamp: 0 };
         table.retrace(tracer);
         table
     }
@@ -52,11 +60,22 @@ impl Table {
         let mut traced = Traced::default();
         self.not_finite = 0;
         self.stamp = fresh_stamp();
-        if Arc::get_mut(&mut self.values).is_none() {
-            // A frame still renders with the old values, none of which is needed here.
-            self.values = Arc::new(vec![0.0; self.values.len()]);
+        // What a device holds goes first, so that old and new never need its memory together.
+        let mut here = match std::mem::replace(&mut self.values, Values::Here(Arc::default())) {
+            Values::Here(values) => values,
+            Values::There(..) => Arc::default(),
+        };
+        if let Some(there) = tracer.trace_nodes(nodes) {
+            self.not_finite = there.not_finite();
+            self.values = Values::There(there, Arc::default());
+            return;
         }
-        for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
+        let all = nodes.iter().product();
+        if Arc::get_mut(&mut here).is_none_or(|values| values.len() != all) {
+            // A frame still renders with the old values, none of which is needed here.
+            here = Arc::new(vec![0.0; all]);
+        }
+        for (part, values) in Arc::make_mut(&mut here).chunks_mut(TRACE_AT_ONCE).enumerate() {
             let first = part * TRACE_AT_ONCE;
             let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| tracer.domain().from_unit(unit(first + i))).collect();
             tracer.trace(&seeds, Extras::default(), &mut traced);
@@ -66,6 +85,7 @@ impl Table {
                 self.not_finite += usize::from(!traced.is_finite());
             }
         }
+        self.values = Values::Here(here);
     }
 
     /// Nodes along x, y, z.
@@ -73,9 +93,20 @@ impl Table {
         self.nodes
     }
 
-    /// Values at the nodes, x fastest.
+    /// Values at the nodes, x fastest. Those that a device holds are brought over at the first call.
     pub fn values(&self) -> &[f32] {
-        &self.values
+        match &self.values {
+            Values::Here(values) => values,
+            Values::There(there, copy) => copy.get_or_init(|| there.values()),
+        }
+    }
+
+    /// What holds the values, where that is a device.
+    pub fn on_device(&self) -> Option<&dyn TracedNodes> {
+        match &self.values {
+            Values::Here(_) => None,
+            Values::There(there, _) => Some(&**there),
+        }
     }
 
     /// Nodes whose trace was not finite; they hold 0.
@@ -90,7 +121,7 @@ impl Table {
     }
 
     /// Interpolates at eight points.
-    fn lookup<const D: usize>(&self, points: &[[f32; 3]; 8]) -> [f32; 8] {
+    fn lookup<const D: usize>(&self, values: &[f32], points: &[[f32; 3]; 8]) -> [f32; 8] {
         let (zero, one) = (f32x8::splat(0.0), f32x8::splat(1.0));
         let mut base = i32x8::splat(0);
         let mut fraction = [zero; D];
@@ -107,7 +138,7 @@ impl Table {
             step *= self.nodes[axis];
         }
         let base = base.to_array();
-        let corner = |offset: usize| f32x8::from(std::array::from_fn(|lane| self.values[base[lane] as usize + offset]));
+        let corner = |offset: usize| f32x8::from(std::array::from_fn(|lane| values[base[lane] as usize + offset]));
         let along = |low: f32x8, high: f32x8, axis: usize| (high - low).mul_add(fraction[axis], low);
         let plane = |offset: usize| {
             let low = along(corner(offset), corner(offset + stride[0]), 0);
@@ -117,32 +148,38 @@ impl Table {
         value.to_array()
     }
 
-    fn predict_chunk(&self, points: &[[f32; 3]], out: &mut [f32]) {
+    fn predict_chunk(&self, values: &[f32], points: &[[f32; 3]], out: &mut [f32]) {
         for (points, out) in points.chunks(8).zip(out.chunks_mut(8)) {
             let mut eight = [[0.0; 3]; 8];
             eight[..points.len()].copy_from_slice(points);
-            let values = if self.dimensions == 2 { self.lookup::<2>(&eight) } else { self.lookup::<3>(&eight) };
-            out.copy_from_slice(&values[..out.len()]);
+            let found = if self.dimensions == 2 { self.lookup::<2>(values, &eight) } else { self.lookup::<3>(values, &eight) };
+            out.copy_from_slice(&found[..out.len()]);
         }
     }
 
     pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
         checkpoint.note("table.nodes", format!("{:?}", self.nodes));
         checkpoint.note("table.not_finite", self.not_finite.to_string());
-        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], self.values.as_slice()));
+        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], self.values()));
     }
 
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
-        let values = checkpoint.values("table.values", self.values.len())?;
+        let values = checkpoint.values("table.values", self.nodes.iter().product())?;
         let not_finite = checkpoint.number("table.not_finite")?;
-        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values: Arc::new(values), not_finite, stamp: fresh_stamp() })
+        Ok(Self {
+            nodes: self.nodes,
+            dimensions: self.dimensions,
+            values: Values::Here(Arc::new(values)),
+            not_finite,
+            stamp: fresh_stamp(),
+        })
     }
 }
 
 impl Field for Table {
     fn values(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.predict_chunk(points, out);
+        self.predict_chunk(Table::values(self), points, out);
     }
 }
 
@@ -153,11 +190,16 @@ impl Predict for Table {
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         assert_eq!(points.len(), out.len(), "one value a point");
-        points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(points, out));
+        // Whether or not there is a copy by now, so that runs do not differ by it.
+        if self.on_device().is_some_and(|there| there.interpolate(points, out)) {
+            return;
+        }
+        let values = self.values();
+        points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(values, points, out));
     }
 
     fn bytes(&self) -> usize {
-        self.values.len() * size_of::<f32>()
+        self.nodes.iter().product::<usize>() * size_of::<f32>()
     }
 
     fn as_any(&self) -> Option<&dyn std::any::Any> {

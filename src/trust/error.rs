@@ -1,8 +1,11 @@
 //! What is said about the surrogate's error in the trusted region.
 
 #[cfg(test)]
+use super::Residual;
+use super::Strata;
+use super::audited::{Audited, CellErrors};
+#[cfg(test)]
 use super::map::Seen;
-use super::{Residual, Strata};
 use serde::{Deserialize, Serialize};
 
 /// Residuals of the surrogate over points that lie in trusted cells and decided nothing about which cells those are.
@@ -22,17 +25,8 @@ pub struct TrustedError {
     pub log_stretch_rms: f64,
 }
 
-/// Sums of one stratum.
-#[derive(Clone, Copy, Default)]
-struct Sums {
-    count: f64,
-    square: f64,
-    /// Its part of the variance of the estimate, as its own points tell.
-    variance: f64,
-}
-
 impl TrustedError {
-    /// Statistics of `residuals`, drawn as `strata` says; none when there are fewer than two.
+    /// Statistics of the points in those cells that count; none when there are fewer than two.
     ///
     /// Each residual counts for its cell's volume over the points drawn there, so that cells may get different numbers of points
     /// (stratified sampling, Cochran 1977, chapter 5). Squares of residuals are skewed: a few ridges carry most of the mean. The
@@ -41,89 +35,79 @@ impl TrustedError {
     /// variance at once; therefore the variance of a cell is pooled with that of the frame before's audit points there, which count for as
     /// many points at most as were drawn now, and with one point that varies like the whole region: a cell that has shown nothing may
     /// still hold something, and where few points were drawn that weighs most. The pooled variance may widen the interval, not narrow it.
-    pub fn of(residuals: &[Residual], strata: &Strata) -> Option<Self> {
-        if residuals.len() < 2 {
+    pub fn of(audited: &Audited, counts: impl Fn(usize) -> bool) -> Option<Self> {
+        let Strata { drawn, seen, .. } = audited.strata();
+        // What one point of a cell stands for, in cells.
+        let weight = |cell: usize| 1.0 / f64::from(drawn[cell].max(1));
+        let cells: Vec<(usize, &CellErrors)> =
+            audited.cells().iter().enumerate().filter(|&(number, cell)| cell.count > 0.0 && counts(number)).collect();
+        let n: f64 = cells.iter().map(|(_, cell)| cell.count).sum();
+        if n < 2.0 {
             return None;
         }
-        let weights: Vec<f64> = residuals.iter().map(|r| strata.weight(r.point)).collect();
-        let whole: f64 = weights.iter().sum();
-        let squared: fn(&Residual) -> f64 = |r| f64::from(r.optical).powi(2);
-        let mean = |f: fn(&Residual) -> f64| residuals.iter().zip(&weights).map(|(r, w)| w * f(r)).sum::<f64>() / whole;
-        let square = mean(squared);
-        let mut cells = vec![Sums::default(); strata.drawn.len()];
-        for residual in residuals {
-            let cell = &mut cells[strata.cell(residual.point)];
-            cell.count += 1.0;
-            cell.square += squared(residual);
-        }
+        let weighted = |f: fn(&CellErrors) -> f64| cells.iter().map(|&(number, cell)| weight(number) * f(cell)).sum::<f64>();
+        let whole = weighted(|cell| cell.count);
+        let square = weighted(|cell| cell.square) / whole;
         // Second and third moment of the estimate: the sums over points of the deviation from their cell's mean, each with its share of
         // the whole. Where a cell has one point only, the mean over all cells stands for its own.
-        let mut third = 0.0;
-        for (residual, weight) in residuals.iter().zip(&weights) {
-            let cell = &mut cells[strata.cell(residual.point)];
-            let share = weight / whole;
-            let (centre, correction) =
-                if cell.count > 1.0 { (cell.square / cell.count, cell.count / (cell.count - 1.0)) } else { (square, 1.0) };
-            let deviation = squared(residual) - centre;
-            cell.variance += correction * (share * deviation).powi(2);
-            third += (share * deviation).powi(3);
-        }
-        // Skewness is that of the points themselves; the variance below only grows.
-        let own: f64 = cells.iter().map(|cell| cell.variance).sum();
-        let gamma = if own > 0.0 { third / own.powf(1.5) } else { 0.0 };
-        let fourth = mean(|r| f64::from(r.optical).powi(4));
-        let of_region = (fourth - square * square).max(0.0);
-        let pooled = |(number, cell): (usize, &Sums)| {
-            let seen = strata.seen.get(number).copied().unwrap_or_default();
-            let weight = seen.weight.min(cell.count);
-            let share = cell.count / (f64::from(strata.drawn[number].max(1)) * whole).powi(2);
-            (cell.count * cell.variance + share * (weight * seen.variance + of_region)) / (cell.count + weight + 1.0)
+        let moments = |number: usize, cell: &CellErrors| {
+            let share = weight(number) / whole;
+            if cell.count > 1.0 {
+                (share.powi(2) * cell.second * cell.count / (cell.count - 1.0), share.powi(3) * cell.third)
+            } else {
+                let deviation = share * (cell.square - square);
+                (deviation.powi(2), deviation.powi(3))
+            }
         };
-        let variance = cells.iter().enumerate().map(pooled).sum::<f64>().max(own);
+        // Skewness is that of the points themselves; the variance below only grows.
+        let (own, third) = cells.iter().map(|&(number, cell)| moments(number, cell)).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
+        let gamma = if own > 0.0 { third / own.powf(1.5) } else { 0.0 };
+        let of_region = (weighted(|cell| cell.fourth) / whole - square * square).max(0.0);
+        let pooled = |&(number, cell): &(usize, &CellErrors)| {
+            let seen = seen.get(number).copied().unwrap_or_default();
+            let few = seen.weight.min(cell.count);
+            let share = cell.count * (weight(number) / whole).powi(2);
+            (cell.count * moments(number, cell).0 + share * (few * seen.variance + of_region)) / (cell.count + few + 1.0)
+        };
+        let variance = cells.iter().map(pooled).sum::<f64>().max(own);
         let bound = |z: f64| (square - variance.sqrt() * hall_inverse(z, gamma)).max(0.0).sqrt();
-        let n = residuals.len() as f64;
         // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
         let interval = if variance > 0.0 { [bound(1.96), bound(-1.96)] } else { [0.0, (square + 3.0 / n).min(1.0).sqrt()] };
-        let mut pairs: Vec<(f32, f64)> = residuals.iter().map(|r| r.optical).zip(weights.iter().copied()).collect();
+        let optical = || cells.iter().flat_map(|&(number, _)| audited.optical(number).map(move |optical| (optical, weight(number))));
         Some(Self {
-            points: residuals.len() as u64,
-            optical_mean: mean(|r| f64::from(r.optical)),
+            points: n as u64,
+            optical_mean: weighted(|cell| cell.optical) / whole,
             optical_rms: square.sqrt(),
             optical_rms_interval: interval,
-            optical_p99: quantile(&mut pairs, 0.99 * whole * (1.0 - 1e-12)),
-            log_stretch_rms: log_stretch_rms(residuals, strata),
+            optical_p99: quantile(optical, 0.99 * whole * (1.0 - 1e-12)),
+            log_stretch_rms: (weighted(|cell| cell.log_square) / whole).sqrt(),
         })
     }
 }
 
-/// Root mean square residual of the log-stretch alone; NaN without residuals.
-pub fn log_stretch_rms(residuals: &[Residual], strata: &Strata) -> f64 {
-    let (mut sum, mut whole) = (0.0, 0.0);
-    for residual in residuals {
-        let weight = strata.weight(residual.point);
-        sum += weight * f64::from(residual.log_stretch).powi(2);
-        whole += weight;
-    }
-    (sum / whole).sqrt()
-}
-
-/// The least value of `(value, weight)` pairs up to which the weights add up to `share`; the largest where they never do. Selects instead of
-/// sorting (Hoare 1961), which takes linear time on average. 0 without pairs.
-fn quantile(pairs: &mut [(f32, f64)], share: f64) -> f64 {
-    let (mut rest, mut below) = (pairs, 0.0);
-    while rest.len() > 1 {
-        let middle = rest.len() / 2;
-        rest.select_nth_unstable_by(middle, |a, b| a.0.total_cmp(&b.0));
-        let (low, high) = rest.split_at_mut(middle);
-        let weight = low.iter().map(|pair| pair.1).sum::<f64>();
-        if below + weight >= share {
-            rest = low;
-        } else {
-            below += weight;
-            rest = high;
-        }
-    }
-    rest.first().map_or(0.0, |pair| f64::from(pair.0))
+/// The least of non-negative `(value, weight)` pairs up to which the weights add up to `share`; the largest where they never do. The leading
+/// bits of a number that is not negative are in its own order: the weights of each pattern tell which of them holds the quantile, and only
+/// the values of that one are sorted. 0 without pairs.
+fn quantile<I: Iterator<Item = (f32, f64)>>(pairs: impl Fn() -> I, share: f64) -> f64 {
+    const LEADING: u32 = 12;
+    let pattern = |value: f32| (value.to_bits() >> (32 - LEADING)) as usize;
+    let mut weights = vec![0.0; 1 << LEADING];
+    pairs().for_each(|(value, weight)| weights[pattern(value)] += weight);
+    let mut below = 0.0;
+    let filled = || weights.iter().enumerate().filter(|(_, weight)| **weight > 0.0);
+    let reached = filled().find(|(_, weight)| {
+        let reached = below + **weight >= share;
+        below += if reached { 0.0 } else { **weight };
+        reached
+    });
+    let Some((wanted, _)) = reached.or_else(|| filled().next_back()) else { return 0.0 };
+    let mut values: Vec<(f32, f64)> = pairs().filter(|(value, _)| pattern(*value) == wanted).collect();
+    values.sort_unstable_by(|a, b| a.0.total_cmp(&b.0));
+    let at = values.iter().position(|(_, weight)| {
+        below += weight;
+        below >= share
+    });
+    at.map_or(values.last(), |at| values.get(at)).map_or(0.0, |pair| f64::from(pair.0))
 }
 
 /// Inverse of Hall's transformation g(t) = t + gamma t^2 / 3 + gamma^2 t^3 / 27 + gamma / 6, with gamma = skewness / sqrt(n).
@@ -150,6 +134,10 @@ mod tests {
         Residual { point: [0.5; 3], optical: optical as f32, log_stretch: optical as f32 }
     }
 
+    fn of(residuals: &[Residual], strata: &Strata) -> Option<TrustedError> {
+        TrustedError::of(&Audited::of(residuals, strata.clone()), |_| true)
+    }
+
     #[test]
     fn the_interval_holds_the_truth_in_about_95_percent() {
         let mut state = 1;
@@ -157,7 +145,7 @@ mod tests {
         let held = (0..400)
             .filter(|_| {
                 let sample: Vec<Residual> = (0..2000).map(|_| skewed(&mut state)).collect();
-                let [low, high] = TrustedError::of(&sample, &Strata::even([1; 3], sample.len() as u32)).unwrap().optical_rms_interval;
+                let [low, high] = of(&sample, &Strata::even([1; 3], sample.len() as u32)).unwrap().optical_rms_interval;
                 (low..=high).contains(&truth)
             })
             .count();
@@ -180,10 +168,10 @@ mod tests {
                     below >= share
                 });
                 let expected = f64::from(rank.or(sorted.last()).unwrap().0);
-                assert_eq!(quantile(&mut pairs.clone(), share), expected, "{n} pairs, {share} of {whole}");
+                assert_eq!(quantile(|| pairs.iter().copied(), share), expected, "{n} pairs, {share} of {whole}");
             }
         }
-        assert_eq!(quantile(&mut [], 1.0), 0.0);
+        assert_eq!(quantile(std::iter::empty, 1.0), 0.0);
     }
 
     #[test]
@@ -197,14 +185,14 @@ mod tests {
     #[test]
     fn figures_are_those_of_the_sample() {
         let sample: Vec<Residual> = (1..=100).map(|i| Residual { point: [0.0; 3], optical: i as f32, log_stretch: 2.0 }).collect();
-        let e = TrustedError::of(&sample, &Strata::even([1; 3], sample.len() as u32)).unwrap();
+        let e = of(&sample, &Strata::even([1; 3], sample.len() as u32)).unwrap();
         assert_eq!((e.points, e.optical_p99), (100, 99.0));
         // A hundred weighted terms are summed up in f64.
         assert!((e.optical_mean - 50.5).abs() < 1e-9 && (e.log_stretch_rms - 2.0).abs() < 1e-9);
         assert!((e.optical_rms - (338_350f64 / 100.0).sqrt()).abs() < 1e-9);
-        assert!(TrustedError::of(&sample[..1], &Strata::even([1; 3], 1)).is_none());
+        assert!(of(&sample[..1], &Strata::even([1; 3], 1)).is_none());
         let alike = [Residual { point: [0.0; 3], optical: 0.0, log_stretch: 0.0 }; 300];
-        assert_eq!(TrustedError::of(&alike, &Strata::even([1; 3], 300)).unwrap().optical_rms_interval, [0.0, 0.1]);
+        assert_eq!(of(&alike, &Strata::even([1; 3], 300)).unwrap().optical_rms_interval, [0.0, 0.1]);
     }
 
     /// A quarter of the cells holds nearly all of the error; they get most of the points, and the figures stay those of the whole.
@@ -224,7 +212,7 @@ mod tests {
                     sample.push(Residual { point: [(cell as f32 + 0.5) / 16.0, 0.5, 0.5], optical: optical as f32, log_stretch: 1.0 });
                 }
             }
-            let error = TrustedError::of(&sample, &strata).unwrap();
+            let error = of(&sample, &strata).unwrap();
             square += error.optical_rms.powi(2) / f64::from(trials);
             let [low, high] = error.optical_rms_interval;
             held += i32::from((low..=high).contains(&truth));
@@ -259,7 +247,7 @@ mod tests {
                         log_stretch: 0.0,
                     });
                 }
-                let [low, high] = TrustedError::of(&sample, &strata).unwrap().optical_rms_interval;
+                let [low, high] = of(&sample, &strata).unwrap().optical_rms_interval;
                 (low..=high).contains(&f64::sqrt(mean))
             });
             covered.count()

@@ -1,6 +1,6 @@
 //! The trust map: what each cell of the domain is known to err by.
 
-use super::TrustSettings;
+use super::{Audited, CellErrors, TrustSettings};
 use crate::field::Domain;
 
 /// A traced sample held against the surrogate's prediction, made with weights that had not seen it.
@@ -92,6 +92,12 @@ impl Cell {
         self.optical_fourth += square * square;
     }
 
+    fn take(&mut self, errors: &CellErrors) {
+        self.weight += errors.count;
+        self.optical_square += errors.square;
+        self.optical_fourth += errors.fourth;
+    }
+
     fn seen(&self) -> Seen {
         let weight = self.weight.max(f64::MIN_POSITIVE);
         let variance = (self.optical_fourth / weight - (self.optical_square / weight).powi(2)).max(0.0);
@@ -133,12 +139,10 @@ impl TrustMap {
         }
     }
 
-    /// Takes residuals in: those of points drawn over the whole domain as `strata` says, from which drift is read off, and those of
-    /// points drawn otherwise.
-    pub fn observe(&mut self, uniform: &[Residual], strata: &Strata, others: &[Residual]) {
-        if !uniform.is_empty() {
-            let whole = uniform.iter().map(|r| strata.weight(r.point)).sum::<f64>();
-            let mean = uniform.iter().map(|r| strata.weight(r.point) * f64::from(r.optical).powi(2)).sum::<f64>() / whole;
+    /// Takes residuals in: those of points drawn over the whole domain, from which drift is read off, and those of points drawn otherwise.
+    pub fn observe(&mut self, audited: Option<&Audited>, others: &[Residual]) {
+        let mean = audited.map(|audited| audited.mean(|cell| cell.square));
+        if let Some(mean) = mean.filter(|mean| !mean.is_nan()) {
             if self.just_slid
                 && let Some(before) = self.before_slide.filter(|b| *b > 0.0)
             {
@@ -147,11 +151,15 @@ impl TrustMap {
             self.before_slide = Some(mean);
             self.just_slid = false;
         }
-        for residual in uniform.iter().chain(others).filter(|r| r.optical.is_finite()) {
-            self.cells[cell_of(self.shape, residual.point)].add(residual);
+        if let Some(audited) = audited {
+            for (number, errors) in audited.cells().iter().enumerate() {
+                let cell = cell_of(self.shape, audited.strata().centre(number));
+                self.cells[cell].take(errors);
+                self.audited[cell].take(errors);
+            }
         }
-        for residual in uniform.iter().filter(|r| r.optical.is_finite()) {
-            self.audited[cell_of(self.shape, residual.point)].add(residual);
+        for residual in others.iter().filter(|r| r.optical.is_finite()) {
+            self.cells[cell_of(self.shape, residual.point)].add(residual);
         }
     }
 
@@ -233,7 +241,16 @@ impl TrustMap {
 impl Strata {
     /// As many points in every cell.
     pub fn even(shape: [usize; 3], per_cell: u32) -> Self {
-        Self { shape, drawn: vec![per_cell; shape.iter().product()], seen: Vec::new() }
+        Self::new(shape, vec![per_cell; shape.iter().product()])
+    }
+
+    /// So many points in each cell, x fastest.
+    ///
+    /// # Panics
+    /// When there are not as many numbers as cells.
+    pub fn new(shape: [usize; 3], drawn: Vec<u32>) -> Self {
+        assert_eq!(drawn.len(), shape.iter().product::<usize>(), "one number a cell");
+        Self { shape, drawn, seen: Vec::new() }
     }
 
     /// Points in all.
@@ -246,9 +263,11 @@ impl Strata {
         cell_of(self.shape, point)
     }
 
-    /// What one drawn point stands for, in cells.
-    pub(super) fn weight(&self, point: [f32; 3]) -> f64 {
-        1.0 / f64::from(self.drawn[self.cell(point)].max(1))
+    /// The middle of a cell, in unit coordinates.
+    pub fn centre(&self, cell: usize) -> [f32; 3] {
+        let [nx, ny, _] = self.shape;
+        let index = [cell % nx, cell / nx % ny, cell / (nx * ny)];
+        std::array::from_fn(|k| (index[k] as f32 + 0.5) / self.shape[k] as f32)
     }
 }
 
@@ -296,7 +315,7 @@ mod tests {
         }
         map.decay();
         let strata = Strata::even(map.shape(), per_cell as u32);
-        map.observe(&residuals, &strata, &[]);
+        map.observe(Some(&Audited::of(&residuals, strata)), &[]);
     }
 
     #[test]
@@ -326,10 +345,8 @@ mod tests {
         filled(&mut map, 0.01, 64);
         let bad = [0.51, 0.51, 0.0];
         map.decay();
-        let strata = Strata::even(map.shape(), 0);
         map.observe(
-            &[],
-            &strata,
+            None,
             &(0..100).map(|i| Residual { point: bad, optical: 0.01 * (i % 10) as f32, log_stretch: 0.0 }).collect::<Vec<_>>(),
         );
         let gate = map.gate();
@@ -369,7 +386,7 @@ mod tests {
         let ridge = [0.51, 0.51, 0.0];
         let some: Vec<Residual> =
             (0..200).map(|i| Residual { point: ridge, optical: if i % 20 == 0 { 0.05 } else { 0.001 }, log_stretch: 0.0 }).collect();
-        map.observe(&[], &Strata::even(map.shape(), 0), &some);
+        map.observe(None, &some);
         let gate = map.gate();
         assert!(gate.trusts(ridge));
         let strata = map.audit_strata(&gate, 8);

@@ -3,10 +3,12 @@
 //! In: residuals of traced samples that the surrogate had not been trained on. Out: which cells may be answered by it, and what
 //! error its answers have. Calls no other room: residuals come in already measured.
 
+mod audited;
 mod error;
 mod map;
 
-pub use error::{TrustedError, log_stretch_rms};
+pub use audited::{Audited, CellErrors};
+pub use error::TrustedError;
 pub use map::{Gate, Residual, Strata, TrustMap};
 
 use crate::setting::{Refused, count, positive, require};

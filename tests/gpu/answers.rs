@@ -13,7 +13,7 @@ use ridgewatch::flow::{
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::{Predict, Samples, Table};
-use ridgewatch::trust::{Gate, Strata, TrustMap, TrustSettings};
+use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -68,7 +68,7 @@ impl Stage {
         let measured = residuals(&table, &probes.samples, renderer.transfer(), map.tau);
         let gate = |i: i32| {
             let mut trust = trust(0.03 * 1.1_f64.powi(i));
-            trust.observe(&measured, &strata, &[]);
+            trust.observe(Some(&Audited::of(&measured, strata.clone())), &[]);
             trust.gate()
         };
         let gate = (0..40).map(gate).find(|gate| gate.share() > 0.33).unwrap();
@@ -321,7 +321,7 @@ samples = 8
 #[test]
 #[ignore = "needs a GPU"]
 fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
-    for method in ["gated", "surrogate"] {
+    for method in ["reference", "gated", "surrogate"] {
         let (found, expected) = (frames(device(GpuSettings::default()), method), frames(Device::CPU, method));
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
@@ -337,8 +337,14 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
             // Cells at the edge of the tolerance may fall to either side: other labels are kept.
             assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_share - cpu.trusted_share).abs() < 0.05);
             let psnr = compare_films(&found.film, &expected.film, found.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-            // As in single frames of the same answers and gate, whatever rounding decides on the way.
-            assert!(psnr > 50.0, "{psnr} dB");
+            println!("  {psnr:.1} dB; stated {:?} and {:?}", gpu.trusted, cpu.trusted);
+            if let (Some(gpu), Some(cpu)) = (gpu.trusted.filter(|_| method == "surrogate"), cpu.trusted) {
+                // The same points, unless rounding puts one more into a cell.
+                assert!((gpu.optical_rms / cpu.optical_rms - 1.0).abs() < 0.02, "{gpu:?} for {cpu:?}");
+            }
+            // Where rounding, or which labels were kept, turns a cell's trust, one side looks up what the other traces: an error within
+            // the tolerance in a part of the picture.
+            assert!(psnr > if method == "gated" { 40.0 } else { 50.0 }, "{method}: {psnr} dB");
         }
     }
 }

@@ -5,6 +5,7 @@
 #include <vector>
 
 #include "answer.cuh"
+#include "audit.cuh"
 #include "table.cuh"
 #include "wavefront.cuh"
 
@@ -174,6 +175,31 @@ int main(int, char** arguments) {
     } else if (request == "labels") {
         const uint32_t shift = take_one<uint32_t>(), n = take_one<uint32_t>();
         for (uint32_t i = 0; i < n; ++i) give_one<unsigned char>(keeps_label(take<float>(3).data(), shift));
+    } else if (request == "audit") {
+        // Points of every cell, and what given residuals add up to.
+        const AuditCells cells = take_one<AuditCells>();
+        const auto ramp = take<float>(3);
+        const uint32_t n = uint32_t(cells.shape[0] * cells.shape[1] * cells.shape[2]);
+        uint32_t number = 0;
+        for (uint32_t cell = 0; cell < n; ++cell) {
+            const uint32_t drawn = take_one<uint32_t>();
+            CellFindings sums = no_findings();
+            std::vector<float> optical;
+            for (uint32_t i = 0; i < drawn; ++i) {
+                float point[3];
+                audit_point(cells, cell, number++, point);
+                for (float u : point) give_one(u);
+                const auto x = take<float>(4);  // land, lived, predicted, traced
+                const bool land = x[0] != 0.0f;
+                const Residual found = land ? Residual{not_a_number(), not_a_number()} : residual(ramp[0], ramp[1], ramp[2], x[2], x[3]);
+                add_residual(sums, found);
+                add_point(sums, land, x[1], x[3]);
+                optical.push_back(found.optical);
+            }
+            const double mean = sums.square / sums.count;
+            for (float o : optical) add_deviation(sums, mean, o);
+            give_one(sums);
+        }
     } else if (request == "gated") {
         const Desk desk;
         frame([&](const float* p) { return desk.answer(p); });

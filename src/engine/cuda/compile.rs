@@ -19,6 +19,7 @@ macro_rules! kernel {
 /// The `.cu` files, by name.
 pub const SOURCES: &[(&str, &str)] = &[
     kernel!("answer.cu"),
+    kernel!("audit.cu"),
     kernel!("render.cu"),
     kernel!("sort.cu"),
     kernel!("table.cu"),
@@ -31,6 +32,7 @@ pub const SOURCES: &[(&str, &str)] = &[
 pub const HEADERS: &[(&str, &str)] = &[
     kernel!("answer.cuh"),
     kernel!("atomics.cuh"),
+    kernel!("audit.cuh"),
     kernel!("base.cuh"),
     kernel!("camera.cuh"),
     kernel!("closed.cuh"),

@@ -1,21 +1,20 @@
 //! Films of a run, made on the GPU alone where every query can be answered there.
 
+use super::audit::Audits;
 use super::{CudaTracer, DeviceError, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, Panel, Traced};
 use crate::engine::accelerator::DeviceRenderer;
-use crate::engine::{Answers, EngineError, Tally};
+use crate::engine::{Answers, AuditFindings, AuditRequest, EngineError, Tally};
 use crate::flow::Tracer;
 use crate::render::{Film, RenderStats, Renderer};
-use crate::surrogate::{Samples, Table};
+use crate::surrogate::{Predict, Samples, Table};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// Walks, traces and predicts on the GPU.
+/// Walks, traces, predicts and audits on the GPU.
 pub struct CudaFrames {
-    gpu: Arc<Gpu>,
     renderer: GpuRenderer,
     division: Division,
-    /// The table that frames were last answered from, by its stamp.
-    table: Option<(u64, DeviceTable)>,
+    audits: Audits,
 }
 
 impl CudaFrames {
@@ -24,18 +23,19 @@ impl CudaFrames {
     /// # Errors
     /// What the compiler or the device says.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
-        Ok(Self { gpu: gpu.clone(), renderer: GpuRenderer::new(gpu)?, division: Division::new(gpu)?, table: None })
+        Ok(Self { renderer: GpuRenderer::new(gpu)?, division: Division::new(gpu)?, audits: Audits::new(gpu)? })
     }
+}
 
-    /// The device's copy of `table`, brought over where it is not there yet.
-    fn copy_of(&mut self, table: &Table, tracer: &CudaTracer) -> Result<(), DeviceError> {
-        if self.table.as_ref().is_none_or(|(stamp, _)| *stamp != table.stamp()) {
-            // The old one goes first, so that both never need memory together.
-            self.table = None;
-            self.table = Some((table.stamp(), DeviceTable::upload(&self.gpu, tracer.domain(), table)?));
-        }
-        Ok(())
-    }
+/// The tracer, where it is one of this engine's.
+fn own(tracer: &dyn Tracer) -> Option<&CudaTracer> {
+    tracer.as_any()?.downcast_ref()
+}
+
+/// What predicts on the device what a surrogate predicts; none where nothing does.
+fn predictor(surrogate: &dyn Predict) -> Option<&dyn DevicePredict> {
+    let table = surrogate.as_any()?.downcast_ref::<Table>()?;
+    Some(DeviceTable::of(table)?)
 }
 
 /// What the renderer counted of the answers.
@@ -55,9 +55,9 @@ impl DeviceRenderer for CudaFrames {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError> {
-        let Some(tracer) = tracer.as_any().and_then(|any| any.downcast_ref::<CudaTracer>()) else { return Ok(None) };
+        let Some(tracer) = own(tracer) else { return Ok(None) };
         let asked = answers.asked();
-        let table = asked.surrogate.and_then(|surrogate| surrogate.as_any()).and_then(|any| any.downcast_ref::<Table>());
+        let table = asked.surrogate.and_then(predictor);
         if asked.flow_map || table.is_some() != asked.surrogate.is_some() {
             return Ok(None);
         }
@@ -68,14 +68,11 @@ impl DeviceRenderer for CudaFrames {
             answers.answered_elsewhere(Tally { trace_seconds: stats.evaluate_seconds, ..tally(&stats) }, Samples::default());
             return Ok(Some((film, stats)));
         }
-        if let Some(table) = table {
-            self.copy_of(table, tracer)?;
-        }
         let mut divided = self.division.begin(Panel {
             tracer: tracer.device(),
             domain: tracer.domain(),
             land: tracer.land(),
-            surrogate: table.and(self.table.as_ref()).map(|(_, table)| table as &dyn DevicePredict),
+            surrogate: table,
             gate: asked.gate,
             trace_budget: asked.trace_budget,
             keep: asked.keep,
@@ -89,5 +86,19 @@ impl DeviceRenderer for CudaFrames {
         };
         answers.answered_elsewhere(tally, divided.labels());
         Ok(Some((film, stats)))
+    }
+
+    /// Where the surrogate predicts on the device, unless flow maps are to come back.
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: &dyn Predict,
+    ) -> Result<Option<AuditFindings>, DeviceError> {
+        let flow_map = request.samples.is_some_and(|extras| extras.arrival || extras.jacobian);
+        match (own(tracer), predictor(surrogate)) {
+            (Some(tracer), Some(predictor)) if !flow_map => self.audits.audit(request, tracer, predictor).map(Some),
+            _ => Ok(None),
+        }
     }
 }

@@ -1,6 +1,7 @@
 //! Structures that kernels read, laid out as in `kernels/*.cuh`.
 
 use crate::simd::Real;
+use crate::trust::CellErrors;
 use cudarc::driver::DeviceRepr;
 
 /// A number type of the kernels.
@@ -187,8 +188,60 @@ pub struct LabelsArgument {
     pub shift: u32,
 }
 
+/// `AuditDraw` of `audit.cu`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct AuditDrawArgument {
+    pub shape: [i32; 3],
+    pub key: [u32; 2],
+    pub stream: [u32; 3],
+    pub min: [f64; 3],
+    pub extent: [f64; 3],
+    pub land: LandArgument,
+}
+
+/// `AuditBatch` of `audit.cu`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct AuditBatchArgument {
+    pub begins: u64,
+    pub first: u32,
+    pub count: u32,
+}
+
+/// `AuditPoints` of `audit.cu`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy)]
+pub struct AuditPointsArgument {
+    pub unit: u64,
+    pub points: u64,
+    pub land: u64,
+    pub traced: u64,
+    pub lived: u64,
+    pub predicted: u64,
+    pub optical: u64,
+}
+
+/// `CellFindings` of `audit.cuh`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default)]
+pub struct CellFindings {
+    pub errors: CellErrors,
+    pub points: f64,
+    pub lived: f64,
+    pub peak: f64,
+}
+
 // SAFETY: plain numbers in C layout; addresses are used by kernels alone.
 unsafe impl DeviceRepr for Verdict {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for AuditDrawArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for AuditBatchArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for AuditPointsArgument {}
+// SAFETY: as above.
+unsafe impl DeviceRepr for CellFindings {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for Outputs {}
 // SAFETY: as above.
@@ -232,5 +285,7 @@ mod tests {
         // static_asserts in the kernels' sources hold the other side of these.
         assert_eq!((size_of::<TableArgument>(), size_of::<LandArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));
         assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (40, 24));
+        assert_eq!((size_of::<AuditDrawArgument>(), size_of::<AuditBatchArgument>()), (176, 16));
+        assert_eq!((size_of::<AuditPointsArgument>(), size_of::<CellFindings>()), (56, 80));
     }
 }

@@ -7,6 +7,7 @@
 mod accelerator;
 mod ahead;
 mod answers;
+mod audit;
 pub mod compile;
 mod device;
 mod error;
@@ -32,6 +33,7 @@ mod window;
 pub use super::device::Storage;
 pub use accelerator::CudaAccelerator;
 pub use answers::{DeviceAnswers, DevicePredict, Divided, Division, Panel, Traced};
+pub use audit::Audits;
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use labels::keeps_label;

@@ -111,6 +111,11 @@ impl Sorter {
         self.scratch.as_mut().ok_or_else(|| DeviceError::Unsupported { what: "sorting without scratch memory".into() })
     }
 
+    /// Lets go of the scratch memory until it is needed again.
+    pub fn release(&mut self) {
+        self.scratch = None;
+    }
+
     /// Memory for at most `MOST` points `{x, y, z, index as bits}` in an order of the caller's making.
     pub fn buffer(&mut self, count: usize) -> Result<u64, DeviceError> {
         Ok(self.scratch(count, 1024)?.sorted.address())

@@ -4,6 +4,7 @@ use super::layout::{Outputs, TableArgument, TableFrame};
 use super::sort::{MOST, Sorter};
 use super::trace::DeviceTracer;
 use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
+use crate::engine::accelerator::DeviceNodes;
 use crate::field::Domain;
 use crate::surrogate::Table;
 use cudarc::driver::{CudaFunction, PushKernelArg};
@@ -25,6 +26,8 @@ pub struct DeviceTable {
 
 /// Nodes of a brick's edge in `table_bricks`.
 const EDGE: usize = 8;
+/// Points from the host that are looked up at once: bounds the memory of a call.
+const BATCH: usize = 1 << 22;
 
 impl DeviceTable {
     /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
@@ -46,6 +49,11 @@ impl DeviceTable {
         copy.values.write(table.values())?;
         copy.not_finite = table.not_finite();
         Ok(copy)
+    }
+
+    /// The device's own values of a table that was traced here; none where they are elsewhere.
+    pub fn of(table: &Table) -> Option<&Self> {
+        table.on_device()?.as_any().downcast_ref()
     }
 
     /// Its values unset.
@@ -97,6 +105,8 @@ impl DeviceTable {
         let mut count = [0u32];
         odd.read(&mut count)?;
         self.not_finite = count[0] as usize;
+        // Half as large as the table of a fine grid, and not needed before the next slide.
+        self.scratch.release();
         Ok(())
     }
 
@@ -132,5 +142,30 @@ impl DevicePredict for DeviceTable {
         call.arg(&table).arg(&points).arg(&n).arg(&out);
         // SAFETY: the caller's, and the arguments are as declared in table.cu.
         unsafe { launch(&mut call, threads(count, 256)) }
+    }
+}
+
+impl DeviceNodes for DeviceTable {
+    fn not_finite(&self) -> usize {
+        self.not_finite
+    }
+
+    fn values(&self) -> Result<Vec<f32>, DeviceError> {
+        Self::values(self)
+    }
+
+    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        for (points, out) in points.chunks(BATCH).zip(out.chunks_mut(BATCH)) {
+            let unit = self.gpu.upload("points to look up", points)?;
+            let values = self.gpu.alloc::<f32>("points to look up", points.len())?;
+            // SAFETY: both buffers hold as many entries as there are points, and reading waits for the stream.
+            unsafe { self.predict(unit.address(), points.len(), values.address()) }?;
+            values.read(out)?;
+        }
+        Ok(())
+    }
+
+    fn as_any(&self) -> &dyn std::any::Any {
+        self
     }
 }

@@ -2,8 +2,9 @@
 
 use super::layout::Outputs;
 use super::trace::{DeviceTracer, Tuning};
-use super::{Buffer, DeviceError, DeviceLand, Gpu, SnapshotStore};
-use crate::engine::accelerator::{Backed, DeviceTrace};
+use super::{Buffer, DeviceError, DeviceLand, DeviceTable, Gpu, SnapshotStore};
+use crate::engine::accelerator::{Backed, DeviceNodes, DeviceTrace};
+use crate::field::Domain;
 use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, Voids, cpu_tracer};
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
@@ -83,6 +84,10 @@ impl CudaTracer {
 impl DeviceTrace for CudaTrace {
     fn double(&self) -> bool {
         self.double
+    }
+
+    fn trace_nodes(&self, domain: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
+        Ok(Some(Box::new(DeviceTable::trace(&self.device, domain, nodes)?)))
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {

@@ -9,20 +9,20 @@ use crate::engine::stop::Interruptible;
 use crate::engine::{FrameRecord, TrustedError};
 use crate::flow::Tracer;
 use crate::surrogate::Predict;
-use crate::trust::{Gate, Residual, Strata};
+use crate::trust::{Audited, Gate, Strata};
 use std::sync::atomic::Ordering;
 
 impl Cycle<'_> {
     /// States the error of `front` from the audit points, which decided nothing in this frame, and only then lets them and the rendered
     /// samples decide the next one.
     pub(super) fn assess(&mut self, front: &dyn Predict, tracer: &dyn Tracer, gate: &Gate, work: &Rendered, record: &mut FrameRecord) {
-        let Some(audited) = &work.residuals else { return };
+        let Some(audited) = &work.audit.errors else { return };
         let tolerance = self.plan.scene.trust.tolerance;
         record.trusted_share = gate.share();
-        record.trusted = audit::trusted_error(audited, &work.strata, gate);
-        self.peak = work.audit.samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(self.peak, f32::max);
-        record.surrogate_psnr = audit::psnr(audited, self.peak, &work.strata);
-        record.over_tolerance = over_tolerance(&work.tally, record.trusted, audited, &work.strata, gate, tolerance);
+        record.trusted = audit::trusted_error(audited, gate);
+        self.peak = self.peak.max(work.audit.peak);
+        record.surrogate_psnr = audit::psnr(audited, self.peak);
+        record.over_tolerance = over_tolerance(&work.tally, record.trusted, audited, gate, tolerance);
         if work.tally.over_budget > 0 {
             record.warnings.push(format!(
                 "the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate",
@@ -33,14 +33,16 @@ impl Cycle<'_> {
         let transfer = self.renderer.transfer();
         let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
         self.trust.decay();
-        self.trust.observe(audited, &work.strata, &rendered);
+        self.trust.observe(Some(audited), &rendered);
         if let Some(sizing) = &mut self.sizing {
             // Over the whole domain: where nothing is trusted, the size is what is to be blamed.
-            let everywhere = audit::trusted_error(audited, &work.strata, &Gate::uniform(true));
+            let everywhere = audit::trusted_error(audited, &Gate::uniform(true));
             self.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, tolerance));
         }
-        self.ring.push(&work.samples);
-        self.ring.push(&work.audit.samples);
+        if self.learns() {
+            self.ring.push(&work.samples);
+            self.ring.push(&work.audit.samples);
+        }
     }
 
     /// The error of `front` in the trusted region on fresh points, where it was asked for; none when a stop cut it short, since it would
@@ -57,7 +59,7 @@ impl Cycle<'_> {
         let verified = self.threads.render.install(|| {
             let fresh = audit::trace(&interruptible, &unit, false);
             let residuals = audit::residuals(front, &fresh.samples, self.renderer.transfer(), tracer.tau());
-            audit::trusted_error(&residuals, &strata, gate)
+            audit::trusted_error(&Audited::of(&residuals, strata), gate)
         });
         verified.filter(|_| !self.stop.load(Ordering::Relaxed))
     }
@@ -65,24 +67,18 @@ impl Cycle<'_> {
 
 /// By how much the optical residual of a frame exceeds `tolerance`, or none when it does not. A frame whose tracing budget was spent is
 /// flagged whatever the points say: the surrogate answered where it is not trusted, so that those points speak for it.
-fn over_tolerance(
-    tally: &Tally,
-    trusted: Option<TrustedError>,
-    audited: &[Residual],
-    strata: &Strata,
-    gate: &Gate,
-    tolerance: f64,
-) -> Option<f64> {
+fn over_tolerance(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
     if tally.over_budget == 0 {
         return trusted.map(|e| e.optical_rms - tolerance).filter(|over| *over > 0.0);
     }
-    let untrusted: Vec<Residual> = audited.iter().copied().filter(|r| !gate.trusts(r.point)).collect();
-    Some(TrustedError::of(&untrusted, strata).map_or(0.0, |e| (e.optical_rms - tolerance).max(0.0)))
+    let untrusted = TrustedError::of(audited, |cell| !gate.trusts(audited.strata().centre(cell)));
+    Some(untrusted.map_or(0.0, |e| (e.optical_rms - tolerance).max(0.0)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::trust::Residual;
 
     /// Ten points left of the middle, trusted or not, whose residual is 0.01, ten right of it with 0.05.
     fn points() -> Vec<Residual> {
@@ -92,10 +88,9 @@ mod tests {
     }
 
     fn flagged(over_budget: u64, gate: &Gate, tolerance: f64) -> Option<f64> {
-        let strata = Strata::even([1; 3], 20);
-        let points = points();
-        let trusted = audit::trusted_error(&points, &strata, gate);
-        over_tolerance(&Tally { over_budget, ..Tally::default() }, trusted, &points, &strata, gate, tolerance)
+        let points = Audited::of(&points(), Strata::even([1; 3], 20));
+        let trusted = audit::trusted_error(&points, gate);
+        over_tolerance(&Tally { over_budget, ..Tally::default() }, trusted, &points, gate, tolerance)
     }
 
     #[test]

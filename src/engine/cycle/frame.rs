@@ -2,14 +2,14 @@
 
 use super::{Cycle, Place, fixed_steps};
 use crate::engine::answers::{Answers, Tally};
-use crate::engine::audit;
+use crate::engine::audit::{AuditFindings, AuditRequest};
 use crate::engine::feed::Slide;
 use crate::engine::training::{Until, train};
 use crate::engine::{EngineError, Event, Frame, FrameRecord, StageSeconds};
-use crate::flow::{Tracer, VelocitySource};
+use crate::flow::{Extras, Tracer, VelocitySource};
 use crate::render::{Film, Method, RenderStats};
 use crate::surrogate::{Learned, Predict, SampleRing, Samples, Surrogate};
-use crate::trust::{Gate, Residual, Strata};
+use crate::trust::{Gate, Strata};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -24,10 +24,7 @@ pub(super) struct Rendered {
     pub(super) stats: RenderStats,
     pub(super) tally: Tally,
     pub(super) samples: Samples,
-    pub(super) audit: audit::Audit,
-    pub(super) strata: Strata,
-    /// Of the audit points; none without a surrogate.
-    pub(super) residuals: Option<Vec<Residual>>,
+    pub(super) audit: AuditFindings,
     pub(super) render_seconds: f64,
     pub(super) audit_seconds: f64,
 }
@@ -57,7 +54,7 @@ impl Cycle<'_> {
         let (work, learned) = self.picture(tracer, front.as_deref(), &gate, place, sink)?;
         let mut record = self.record(tracer, &work, slide);
         record.surrogate = front.as_ref().map(|s| s.name().to_owned());
-        if work.audit.drawn > 0 && work.audit.samples.is_empty() {
+        if work.audit.drawn > 0 && work.audit.points == 0 {
             record.warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
         }
         let auditing = Instant::now();
@@ -126,6 +123,7 @@ impl Cycle<'_> {
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
         let (flow_map, keep) = (self.wants_flow_map(), self.keep_a_frame());
+        let samples = self.learns().then_some(Extras { arrival: flow_map, jacobian: flow_map });
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
@@ -166,7 +164,7 @@ impl Cycle<'_> {
                         &AtomicBool::new(false),
                     )?;
                     let render_seconds = walk.elapsed().as_secs_f64();
-                    let (tally, samples) = (answers.tally, answers.samples);
+                    let (tally, kept) = (answers.tally, answers.samples);
                     let auditing = Instant::now();
                     let strata = match front {
                         Some(_) => {
@@ -175,18 +173,15 @@ impl Cycle<'_> {
                         }
                         None => Strata::even(cells, 1),
                     };
-                    let unit = audit::stratified_points(&strata, seed, 2 * frame);
-                    let audit = audit::trace(tracer, &unit, flow_map);
-                    let residuals = front.map(|front| audit::residuals(front, &audit.samples, renderer.transfer(), tracer.tau()));
+                    let request = AuditRequest { strata, seed, stream: 2 * frame, transfer: renderer.transfer(), samples };
+                    let audit = frames.audit(request, tracer, front)?;
                     Ok(Rendered {
                         film,
                         samples_per_pixel,
                         stats,
                         tally,
-                        samples,
+                        samples: kept,
                         audit,
-                        strata,
-                        residuals,
                         render_seconds,
                         audit_seconds: auditing.elapsed().as_secs_f64(),
                     })
@@ -231,7 +226,7 @@ impl Cycle<'_> {
             integration_steps: fixed_steps(tracer).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
             probed: std::mem::take(&mut self.probed),
-            audited: work.audit.samples.len() as u64,
+            audited: work.audit.points as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
             traced_ahead: work.stats.ahead,

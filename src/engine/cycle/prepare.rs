@@ -11,7 +11,8 @@ use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Scene;
 use crate::surrogate::network::Target;
 use crate::surrogate::{Kind, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
-use crate::trust::{Gate, Strata};
+use crate::trust::{Audited, Gate, Strata};
+use rayon::prelude::*;
 
 /// Random stream of the first probe, apart from those of audit points.
 const PROBE_STREAM: u64 = 1 << 62;
@@ -49,7 +50,8 @@ impl Cycle<'_> {
             heed(self.stop)?;
             self.ring.revalidate(holding);
         }
-        self.renderer.window_slid();
+        let renderer = &mut self.renderer;
+        self.threads.render.install(|| renderer.window_slid());
         Ok(())
     }
 
@@ -64,8 +66,11 @@ impl Cycle<'_> {
         let interruptible = Interruptible::new(tracer, self.stop);
         let probe = self.threads.render.install(|| audit::trace(&interruptible, &unit, flow_map));
         heed(self.stop)?;
-        let points: Vec<[f32; 3]> = probe.samples.points.iter().map(|&unit| tracer.domain().from_unit(unit)).collect();
-        self.renderer.observe(&points, &probe.samples.log_stretch);
+        let domain = tracer.domain();
+        self.threads.render.install(|| {
+            let points: Vec<[f32; 3]> = probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
+            self.renderer.observe(&points, &probe.samples.log_stretch);
+        });
         self.probed += probe.drawn as u64;
         self.learn_of(tracer, &probe.samples, Some(&strata));
         Ok(())
@@ -99,10 +104,17 @@ impl Cycle<'_> {
         let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
         let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
         match strata {
-            Some(strata) => self.trust.observe(&residuals, strata, &[]),
-            None => self.trust.observe(&[], &Strata::even(self.trust.shape(), 0), &residuals),
+            Some(strata) => self.trust.observe(Some(&Audited::of(&residuals, strata.clone())), &[]),
+            None => self.trust.observe(None, &residuals),
         }
-        self.ring.push(samples);
+        if self.learns() {
+            self.ring.push(samples);
+        }
+    }
+
+    /// Whether the surrogate learns from samples.
+    pub(super) fn learns(&self) -> bool {
+        self.live.as_ref().is_some_and(|live| live.learns())
     }
 
     pub(super) fn wants_flow_map(&self) -> bool {

@@ -1,0 +1,209 @@
+//! A frame's audit on the device: points drawn, traced, predicted and added up there, so that only sums come back (and each point's optical
+//! residual, for the quantile; and the samples, where somebody learns from them).
+
+use super::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
+use super::pinned::Pinned;
+use super::{Buffer, CudaTracer, DeviceError, DeviceLand, DevicePredict, Gpu, launch, threads};
+use crate::engine::audit::{AuditFindings, AuditRequest, draws};
+use crate::flow::Tracer;
+use crate::surrogate::Samples;
+use crate::trust::Audited;
+use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Points that are traced together, at most, unless a single cell has more: bounds the memory.
+const MOST: usize = 1 << 22;
+/// Threads of a warp, each of which has a cell.
+const WARP: usize = 32;
+
+/// Makes audits. Keeps its memory from frame to frame.
+pub struct Audits {
+    gpu: Arc<Gpu>,
+    draw: CudaFunction,
+    measure: CudaFunction,
+    memory: Option<Memory>,
+}
+
+/// For points of one batch, and for all cells.
+struct Memory {
+    unit: Buffer<[f32; 3]>,
+    points: Buffer<[f32; 3]>,
+    land: Buffer<u8>,
+    traced: Buffer<f32>,
+    lived: Buffer<f32>,
+    predicted: Buffer<f32>,
+    optical: Buffer<f32>,
+    begins: Buffer<u32>,
+    findings: Buffer<CellFindings>,
+    optical_back: Pinned<f32>,
+    findings_back: Pinned<CellFindings>,
+}
+
+impl Memory {
+    fn new(gpu: &Gpu, points: usize, cells: usize) -> Result<Self, DeviceError> {
+        let what = "audit points";
+        Ok(Self {
+            unit: gpu.alloc(what, points)?,
+            points: gpu.alloc(what, points)?,
+            land: gpu.alloc(what, points)?,
+            traced: gpu.alloc(what, points)?,
+            lived: gpu.alloc(what, points)?,
+            predicted: gpu.alloc(what, points)?,
+            optical: gpu.alloc(what, points)?,
+            begins: gpu.alloc(what, cells + 1)?,
+            findings: gpu.alloc(what, cells)?,
+            optical_back: Pinned::new(gpu, points)?,
+            findings_back: Pinned::new(gpu, cells)?,
+        })
+    }
+
+    fn holds(&self, points: usize, cells: usize) -> bool {
+        self.unit.len() >= points && self.findings.len() >= cells
+    }
+}
+
+/// Consecutive cells with at most [`MOST`] points each time, `begins` being where each cell's points begin, and their end.
+fn batches(begins: &[u32]) -> Vec<Range<usize>> {
+    let cells = begins.len() - 1;
+    let mut batches = Vec::new();
+    let mut first = 0;
+    while first < cells {
+        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MOST;
+        let end = (first + 2..=cells).take_while(fits).last().unwrap_or(first + 1);
+        batches.push(first..end);
+        first = end;
+    }
+    batches
+}
+
+impl Audits {
+    /// Compiles the kernels, or takes them from the cache.
+    ///
+    /// # Errors
+    /// What the compiler or the device says.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
+        let kernel = |name| gpu.kernel("audit.cu", &[], name);
+        Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
+    }
+
+    /// What [`crate::engine::audit()`] does, to the last bit where both trace and predict the same; arrival and Jacobian do not come back.
+    ///
+    /// # Errors
+    /// Memory that is not there, or a device fault.
+    pub fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        predictor: &dyn DevicePredict,
+    ) -> Result<AuditFindings, DeviceError> {
+        let strata = &request.strata;
+        let cells = strata.drawn.len();
+        let mut begins = vec![0_u32];
+        for &drawn in &strata.drawn {
+            begins.push(begins[begins.len() - 1] + drawn);
+        }
+        let batches = batches(&begins);
+        let in_batch = |batch: &Range<usize>| (begins[batch.end] - begins[batch.start]) as usize;
+        let most = batches.iter().map(in_batch).max().unwrap_or(0);
+        if !self.memory.as_ref().is_some_and(|memory| memory.holds(most, cells)) {
+            // The old one goes first, so that both never need memory together.
+            self.memory = None;
+            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MOST.max(most)), cells)?);
+        }
+        let Some(memory) = &mut self.memory else {
+            return Err(DeviceError::Unsupported { what: "an audit without memory".into() });
+        };
+        memory.begins.write(&begins)?;
+        let gpu = &self.gpu;
+        let stream = gpu.work();
+        let (key, stream_words) = draws(request.seed, request.stream);
+        let domain = tracer.domain();
+        let draw = AuditDrawArgument {
+            shape: strata.shape.map(|n| n as i32),
+            key,
+            stream: stream_words,
+            min: domain.min,
+            extent: domain.extent(),
+            land: tracer.land().map_or(LandArgument::NONE, DeviceLand::argument),
+        };
+        let points = AuditPointsArgument {
+            unit: memory.unit.address(),
+            points: memory.points.address(),
+            land: memory.land.address(),
+            traced: memory.traced.address(),
+            lived: memory.lived.address(),
+            predicted: memory.predicted.address(),
+            optical: memory.optical.address(),
+        };
+        let (low, per_range, tau) = request.transfer.ramp_parts(tracer.tau());
+        let (mut optical, mut samples) = (Vec::with_capacity(strata.total()), Samples::default());
+        for batch in batches {
+            let count = in_batch(&batch);
+            let argument = AuditBatchArgument { begins: memory.begins.address(), first: batch.start as u32, count: batch.len() as u32 };
+            let warps = threads(batch.len() * WARP, 256);
+            let findings = memory.findings.address();
+            // SAFETY: the arguments of the kernels in audit.cu; all arrays hold the batch's points, and `begins` and `findings` every cell.
+            unsafe {
+                launch(stream.launch_builder(&self.draw).arg(&draw).arg(&argument).arg(&points), warps)?;
+                tracer.device().trace(
+                    points.points,
+                    count,
+                    &Outputs { log_stretch: points.traced, lived: points.lived, ..Outputs::default() },
+                )?;
+                predictor.predict(points.unit, count, points.predicted)?;
+                let mut call = stream.launch_builder(&self.measure);
+                launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
+                memory.optical_back.copy_from(gpu, points.optical, count)?;
+            }
+            if request.samples.is_some() {
+                keep(memory, count, &mut samples)?;
+            }
+            gpu.synchronize()?;
+            optical.extend_from_slice(&memory.optical_back.values()[..count]);
+        }
+        let from = memory.findings.address();
+        // SAFETY: every cell's findings lie there.
+        unsafe { memory.findings_back.copy_from(gpu, from, cells) }?;
+        gpu.synchronize()?;
+        let findings = &memory.findings_back.values()[..cells];
+        let points: f64 = findings.iter().map(|cell| cell.points).sum();
+        Ok(AuditFindings {
+            drawn: optical.len(),
+            points: points as usize,
+            lived_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
+            peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
+            samples,
+            errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),
+        })
+    }
+}
+
+/// Brings a batch's points over that do not lie on land.
+fn keep(memory: &Memory, count: usize, samples: &mut Samples) -> Result<(), DeviceError> {
+    fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
+        let mut values = vec![zero; count];
+        from.read(&mut values)?;
+        Ok(values)
+    }
+    let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
+    let land = back(&memory.land, 0, count)?;
+    let at_sea = || (0..count).filter(|&i| land[i] == 0);
+    samples.points.extend(at_sea().map(|i| unit[i]));
+    samples.log_stretch.extend(at_sea().map(|i| traced[i]));
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn batches_hold_whole_cells_and_all_of_them() {
+        let million = 1 << 20;
+        let begins = [0, 3 * million, 4 * million, 4 * million + 1, 4 * million + 2, 10 * million, 10 * million, 11 * million];
+        assert_eq!(batches(&begins), [0..2, 2..4, 4..5, 5..7]);
+        assert_eq!(batches(&[0, 5, 9]).len(), 1);
+        assert!(batches(&[0]).is_empty());
+    }
+}
