@@ -200,6 +200,24 @@ fn a_relay_ships_the_ring_to_another_node() {
 }
 
 #[test]
+fn a_frame_goes_out_before_the_rest_of_its_training() {
+    let place = Place::new("training");
+    let (run, ring) = (place.files.join("run"), text(&place.ring));
+    let (archive, live) = (place.archive(), place.live());
+    // Half a minute a frame, were it waited for: there are four.
+    let scene = ["live.follow=every", "training.seconds_per_frame=30", "surrogate.kind=network"];
+    let overrides = scene.iter().flat_map(|one| ["--set", one]);
+    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run)];
+    let attach = start(ridgewatch(&attach).args(overrides));
+    until("the ring's folder", || place.ring.join("followers.lock").exists());
+    good(&ridgewatch(&["publish", text(&archive), "--ring", ring, "--wait", "60000"]).output().unwrap());
+    good(&wait(attach, Duration::from_secs(25)));
+    let records = records(&run);
+    assert_eq!(records.len(), 4);
+    assert!(records.iter().skip(1).all(|r| r["training"]["steps"].as_u64().unwrap() > 0), "{records:?}");
+}
+
+#[test]
 fn weights_outlive_the_sidecar() {
     let place = Place::new("weights");
     let (checkpoint, ring) = (place.files.join("weights"), text(&place.ring).to_owned());

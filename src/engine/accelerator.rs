@@ -12,7 +12,7 @@ use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, Velocity
 use crate::render::{Film, RenderStats, Renderer};
 use crate::surrogate::{Predict, Table};
 use std::fmt;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 /// An opened GPU, as the engine sees it.
 pub trait Accelerator: fmt::Debug + Send + Sync {
@@ -155,7 +155,8 @@ pub trait DeviceNodes: fmt::Debug + Send + Sync + 'static {
 struct BackedNodes {
     device: Box<dyn DeviceNodes>,
     nodes: [usize; 3],
-    host: Arc<dyn Tracer>,
+    /// Lives as long as the frames of its slide are made. Not held beyond, since it holds that slide's window.
+    host: Weak<dyn Tracer>,
     health: Arc<Health>,
 }
 
@@ -181,9 +182,16 @@ impl TracedNodes for BackedNodes {
         self.device.not_finite()
     }
     fn values(&self) -> Vec<f32> {
-        self.ask(|device| device.values()).unwrap_or_else(|| match self.health.check() {
-            Ok(()) => Table::trace(&*self.host, self.nodes).values().to_vec(),
-            Err(_) => vec![f32::NAN; self.nodes.iter().product()],
+        let anew = || {
+            let host = self.host.upgrade().filter(|_| self.health.check().is_ok());
+            host.map(|host| Table::trace(&*host, self.nodes).values().to_vec())
+        };
+        let values = self.ask(|device| device.values()).or_else(anew);
+        values.unwrap_or_else(|| {
+            // The run is about to end: by the failure, or behind its last frame, where a checkpoint alone asks, and no run goes on from the
+            // values of a table.
+            tracing::warn!("the values of a table went with the device");
+            vec![f32::NAN; self.nodes.iter().product()]
         })
     }
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool {
@@ -240,7 +248,7 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
             self.health.fail(error);
             None
         })?;
-        Some(Arc::new(BackedNodes { device, nodes, host: self.host.clone(), health: self.health.clone() }))
+        Some(Arc::new(BackedNodes { device, nodes, host: Arc::downgrade(&self.host), health: self.health.clone() }))
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {

@@ -229,3 +229,23 @@ fn a_slide_that_does_not_fit_names_the_whole_window_and_what_it_lacks() {
         "{error:?}"
     );
 }
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_snapshot_that_others_hold_is_let_go_all_the_same() {
+    let gpu = opened(GpuSettings::default());
+    let (store, grid) = (SnapshotStore::new(&gpu), cartesian(even(&[16, 16, 16])));
+    let mut window = Window::new(3.0);
+    // A source that uses the memory of its snapshots again waits for the last of the others.
+    let made: Vec<_> = (0..12_u32).map(|t| snapshot(&grid, f64::from(t), 0.5, false)).collect();
+    for snapshot in &made {
+        store.expect(snapshot);
+        window.push(snapshot.clone()).unwrap();
+        store.window(&window, Storage::F32).unwrap();
+    }
+    let began = std::time::Instant::now();
+    while made[..8].iter().any(|snapshot| Arc::strong_count(snapshot) > 1) {
+        assert!(began.elapsed().as_secs() < 5, "still held");
+        std::thread::sleep(std::time::Duration::from_millis(5));
+    }
+}

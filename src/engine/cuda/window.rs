@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 impl Storage {
     /// Bytes of a node.
@@ -38,8 +38,9 @@ const HALF_MOST: f32 = 60_000.0;
 const AHEAD: usize = 2;
 /// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
 const AHEAD_SHARE: u64 = 4;
-/// How long memory that others still hold is left alone before it is asked for again.
+/// How often memory that others still hold is asked for again, and how long at most: beyond it they give it back, or use it again.
 const SOON: Duration = Duration::from_millis(20);
+const AT_MOST: Duration = Duration::from_millis(100);
 /// Threads that copy expected snapshots to page-locked memory, at most: as many as keep the bus busy.
 const COPIERS: usize = 4;
 
@@ -106,8 +107,8 @@ struct State {
     ahead: Ahead<DeviceSnapshot>,
     /// How the latest window is held: storage and scale. None before the first.
     form: Option<(Storage, f32)>,
-    /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's once nobody else holds it.
-    gone: Vec<Arc<Snapshot>>,
+    /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's as soon as nobody else holds it.
+    gone: Vec<(Arc<Snapshot>, Instant)>,
     brought: u64,
     brought_ahead: u64,
     /// Whether the thread is there.
@@ -207,7 +208,7 @@ impl Shared {
         state.held = held;
         let gone: Vec<Arc<DeviceSnapshot>> = gone;
         if state.helped {
-            state.gone.extend(gone.iter().map(|s| s.host.clone()));
+            state.gone.extend(gone.iter().map(|s| (s.host.clone(), Instant::now())));
         }
         drop(gone);
         let fresh = |state: &State| -> Vec<Arc<Snapshot>> {
@@ -269,9 +270,9 @@ impl Shared {
             return;
         };
         while !state.ended {
-            let (gone, held) = std::mem::take(&mut state.gone).into_iter().partition(|s| Arc::strong_count(s) == 1);
+            let over = |(snapshot, since): &(Arc<Snapshot>, Instant)| Arc::strong_count(snapshot) == 1 || since.elapsed() >= AT_MOST;
+            let (gone, held): (Vec<_>, Vec<_>) = std::mem::take(&mut state.gone).into_iter().partition(over);
             state.gone = held;
-            let gone: Vec<Arc<Snapshot>> = gone;
             let next = state.form.and_then(|form| {
                 let fits = |s: &Snapshot| s.nodes.len() as u64 * form.0.bytes() <= self.gpu.memory_left() / AHEAD_SHARE;
                 state.ahead.next(AHEAD, fits).map(|snapshot| (snapshot, form))
@@ -281,7 +282,7 @@ impl Shared {
                 continue;
             }
             drop(state);
-            gone.into_iter().filter_map(Arc::into_inner).for_each(give_back);
+            gone.into_iter().filter_map(|(snapshot, _)| Arc::into_inner(snapshot)).for_each(give_back);
             let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.bring_one(snapshot, *form));
             // A panic must not leave a window waiting for what will never come.
             let there = next.as_ref().and_then(|next| catch_unwind(AssertUnwindSafe(|| bring(next))).ok().flatten());

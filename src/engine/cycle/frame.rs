@@ -3,7 +3,7 @@
 use super::{Cycle, Place, fixed_steps};
 use crate::engine::answers::{Answers, Tally};
 use crate::engine::audit::{AuditFindings, AuditRequest};
-use crate::engine::feed::Slide;
+use crate::engine::feed::{Feed, Slide};
 use crate::engine::training::{Until, train};
 use crate::engine::{EngineError, Event, Frame, FrameRecord, StageSeconds};
 use crate::flow::{Extras, Tracer, VelocitySource};
@@ -16,6 +16,9 @@ use std::time::Instant;
 
 /// Number of the first warm-up picture, far beyond all others.
 const WARMUP_PICTURES: u64 = 1 << 40;
+
+/// Seconds of training after which the next window is looked for.
+const MEANWHILE: f64 = 0.05;
 
 /// What the rendering threads hand back.
 pub(super) struct Rendered {
@@ -51,7 +54,11 @@ impl Cycle<'_> {
         };
         // Frozen weights: what is rendered with has not seen this frame's samples.
         let front: Option<Arc<dyn Predict>> = self.live.as_ref().map(|live| live.freeze());
-        let (work, learned) = self.picture(tracer, front.as_deref(), &gate, place, sink)?;
+        let (work, learned) = self.picture(tracer, front.as_deref(), &gate, place, slide.live.is_some(), sink)?;
+        let learned = match (self.learned_meanwhile.take(), learned) {
+            (Some(before), Some(now)) => Some(before.and(now)),
+            (before, now) => now.or(before),
+        };
         let mut record = self.record(tracer, &work, slide);
         record.surrogate = front.as_ref().map(|s| s.name().to_owned());
         if work.audit.drawn > 0 && work.audit.points == 0 {
@@ -105,16 +112,19 @@ impl Cycle<'_> {
         Ok(Frame { record: Arc::new(record), film: Arc::new(work.film), tone_map: scene.render.tone_map })
     }
 
-    /// Renders and draws the audit points, while other threads train; and what they learned.
+    /// Renders and draws the audit points, while other threads train; and what they learned. Training goes on after the picture for what is left
+    /// of its seconds, but for a `live` run, whose frame goes out first (see [`Cycle::train_meanwhile`]).
     fn picture(
         &mut self,
         tracer: &dyn Tracer,
         front: Option<&dyn Predict>,
         gate: &Gate,
         place: Place,
+        live: bool,
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<(Rendered, Option<Learned>), EngineError> {
         let scene = &self.plan.scene;
+        let waits = !live || scene.training.steps_per_frame.is_some();
         let per_cell = scene.trust.audit_per_cell;
         let cells = self.trust.shape();
         let samples_per_pixel = self.options.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
@@ -136,7 +146,7 @@ impl Cycle<'_> {
                         Some([beside, all]) => Trainer::Beside(scope.spawn(move || {
                             let learned = beside.install(|| train(&mut **live, ring.samples(), settings, Until::Rendered(rendered), stop));
                             let left = settings.seconds_per_frame - learned.seconds;
-                            if settings.steps_per_frame.is_some() || left <= 0.0 {
+                            if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
                                 return learned;
                             }
                             // The picture is done: its threads are free.
@@ -190,14 +200,37 @@ impl Cycle<'_> {
                 rendered.store(true, Ordering::Release);
                 learned = match training {
                     Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
-                    Some(Trainer::After(live, ring)) => Some(threads.render.install(|| {
+                    Some(Trainer::After(live, ring)) if waits => Some(threads.render.install(|| {
                         train(&mut **live, ring.samples(), &scene.training, Until::Seconds(scene.training.seconds_per_frame), stop)
                     })),
-                    None => None,
+                    Some(Trainer::After(..)) | None => None,
                 };
             });
         }
         Ok((work.ok_or(EngineError::EndedEarly)??, learned))
+    }
+
+    /// What is left of a frame's training where a simulation is followed, after the frame has gone out: until the next window is there, but at
+    /// least `training.share` of the `seconds` that the frame took, so that a fast simulation does not end all learning.
+    pub(super) fn train_meanwhile(&mut self, feed: &Feed, seconds: f64) {
+        let settings = &self.plan.scene.training;
+        let Feed::Live { window, .. } = feed else { return };
+        let Some(live) = self.live.as_mut().filter(|live| live.learns() && !self.ring.is_empty()) else { return };
+        if settings.steps_per_frame.is_some() {
+            return;
+        }
+        let pool = self.threads.train.as_ref().map_or(&self.threads.render, |[_, all]| all);
+        let (ring, stop, begin) = (&self.ring, self.stop, Instant::now());
+        loop {
+            let gone = begin.elapsed().as_secs_f64();
+            let least = settings.share * seconds;
+            if gone >= settings.seconds_per_frame || stop.load(Ordering::Relaxed) || (gone >= least && !window.is_waited_for()) {
+                return;
+            }
+            let slice = (settings.seconds_per_frame - gone).min(MEANWHILE);
+            let learned = pool.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(slice), stop));
+            self.learned_meanwhile = Some(self.learned_meanwhile.take().unwrap_or_default().and(learned));
+        }
     }
 
     /// The figures that rendering alone decides.

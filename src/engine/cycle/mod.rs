@@ -16,7 +16,7 @@ use super::{Device, EngineError, Frame, Settings};
 use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
 use crate::surrogate::network::Size;
-use crate::surrogate::{Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
+use crate::surrogate::{Learned, Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
 use crate::trust::TrustMap;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -115,6 +115,8 @@ struct Cycle<'a> {
     pictures: u64,
     /// Whether a lost device was told of.
     told_of_failure: bool,
+    /// What was learned after the last frame had gone out; the next one's record tells of it.
+    learned_meanwhile: Option<Learned>,
     report: &'a mut RunReport,
     /// Set from outside when the run should end.
     stop: &'a AtomicBool,
@@ -250,6 +252,7 @@ impl<'a> Cycle<'a> {
             probed: 0,
             pictures: 0,
             told_of_failure: false,
+            learned_meanwhile: None,
             report,
             stop,
             peak: f32::NEG_INFINITY,
@@ -290,11 +293,14 @@ impl<'a> Cycle<'a> {
 
     /// Goes on until the source ends.
     fn later_slides(&mut self, feed: &mut Feed, map: &FlowMap, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
+        // The first slide's frames, with all that came before them.
+        let mut begun = self.began;
         loop {
+            self.train_meanwhile(feed, begun.elapsed().as_secs_f64());
             let next = feed.next_slide_unless(self.stop)?;
             heed(self.stop)?;
             let Some(mut slide) = next else { return Ok(()) };
-            let begun = Instant::now();
+            begun = Instant::now();
             let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time)?;
             slide.warnings.extend(told);
             self.slid(&*tracer)?;
@@ -336,6 +342,7 @@ impl<'a> Cycle<'a> {
     }
 
     fn finish(&mut self) -> Result<(), EngineError> {
+        self.report.train_steps += self.learned_meanwhile.take().map_or(0, |learned| learned.steps);
         if let (Some(path), Some(live)) = (&self.options.checkpoint, &self.live) {
             live.save(path)?;
         }

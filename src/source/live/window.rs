@@ -181,6 +181,12 @@ impl LiveWindow {
         Ok(Some(Taken { window, warnings, live }))
     }
 
+    /// Whether [`Self::next_within`] would have to wait: nothing new is there yet, and something may come.
+    pub fn is_waited_for(&self) -> bool {
+        let state = self.shared.lock();
+        !state.due(self.stride) && !state.ended && self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
+
     /// Share of tau that the window covers so far.
     pub fn filled(&self) -> f64 {
         let state = self.shared.lock();
