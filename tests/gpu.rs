@@ -13,6 +13,9 @@ mod audit;
 mod device;
 #[path = "gpu/lost.rs"]
 mod lost;
+#[path = "gpu/network.rs"]
+mod network;
+mod network_support;
 #[path = "gpu/render.rs"]
 mod render;
 #[path = "gpu/scenes.rs"]

@@ -5,6 +5,8 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
+use ridgewatch::engine::cuda::network_defines;
+use ridgewatch::surrogate::network::{Architecture, Encoding, NetworkSettings};
 
 /// Macros in which the gridded kernel is compiled here.
 fn grid(changes: &[(&str, &str)]) -> Vec<String> {
@@ -26,6 +28,19 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
     usual.iter().map(|(name, usual)| format!("RW_{name}={}", value(name, usual))).collect()
 }
 
+/// Encodings, widths and depths: what fills the registers, and what has no second feature or no tables.
+fn networks() -> Vec<Vec<String>> {
+    let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
+    let settings = [
+        (usual.clone(), &[0, 1, 2][..]),
+        (NetworkSettings { width: 128, features: 4, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { levels: 5, features: 1, width: 21, hidden_layers: 1, ..usual.clone() }, &[1]),
+        (NetworkSettings { levels: 16, features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
+        (NetworkSettings { encoding: Encoding::Frequency, ..usual }, &[0, 1, 2]),
+    ];
+    settings.iter().map(|(settings, axes)| network_defines(&Architecture::new(settings, axes, [1.0; 3]).unwrap()).unwrap()).collect()
+}
+
 fn variants(source: &str) -> Vec<Vec<String>> {
     match source {
         "trace_closed.cu" => ["0", "1", "2"]
@@ -45,6 +60,7 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
+        "network.cu" => networks(),
         _ => vec![Vec::new()],
     }
 }

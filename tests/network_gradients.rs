@@ -4,138 +4,13 @@
 
 mod network_support;
 
+use network_support::reference::{Reference, labels, norm};
 use network_support::uniform_points;
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
     Architecture, Average, Encoding, Fused, Loss, Model, NetworkSettings, Objective, Pick, Step, Target, autodiff_gradient, operation_step,
     stock_step,
 };
-
-/// The same network in f64, written from the definition: no tiles, no panels, no burn.
-struct Reference<'a> {
-    shape: &'a Architecture,
-    tables: Vec<f64>,
-    layers: Vec<f64>,
-}
-
-impl Reference<'_> {
-    /// Outputs and their derivatives along the axes: `[1 + axes][outputs]`.
-    fn outputs(&self, point: [f32; 3]) -> Vec<Vec<f64>> {
-        let shape = self.shape;
-        let x: Vec<f32> = shape.axes.iter().map(|&a| point[a]).collect();
-        let d = x.len();
-        let mut rows = vec![Vec::new(); 1 + d];
-        match shape.encoding {
-            Encoding::HashGrid => {
-                for level in &shape.levels {
-                    let mut cell = vec![0_u32; d];
-                    let mut share = vec![0.0_f64; d];
-                    for a in 0..d {
-                        // The cell is found in f32 as everywhere: a point on an edge must not fall to the other side.
-                        let position = x[a] * level.cells[a] as f32;
-                        cell[a] = (position as u32).min(level.cells[a] - 1);
-                        share[a] = f64::from(position - cell[a] as f32);
-                    }
-                    for f in 0..shape.features {
-                        for (group, row) in rows.iter_mut().enumerate() {
-                            let mut sum = 0.0;
-                            for corner in 0..1_u32 << d {
-                                let side = |a: usize| (corner >> a) & 1;
-                                let node: Vec<u32> = (0..d).map(|a| cell[a] + side(a)).collect();
-                                let index = if level.hashed {
-                                    let primes = [1_u32, 2_654_435_761, 805_459_861];
-                                    let hash = (0..d).fold(0, |h, a| h ^ node[a].wrapping_mul(primes[a]));
-                                    hash as usize % level.entries
-                                } else {
-                                    (0..d).rev().fold(0, |i, a| i * (level.cells[a] as usize + 1) + node[a] as usize)
-                                };
-                                let weight: f64 = (0..d)
-                                    .map(|a| match (group == a + 1, side(a)) {
-                                        (true, 1) => f64::from(level.cells[a]),
-                                        (true, _) => -f64::from(level.cells[a]),
-                                        (false, 1) => share[a],
-                                        (false, _) => 1.0 - share[a],
-                                    })
-                                    .product();
-                                sum += weight * self.tables[(level.offset + index) * shape.features + f];
-                            }
-                            row.push(sum);
-                        }
-                    }
-                }
-            }
-            Encoding::Frequency => {
-                for a in 0..d {
-                    for octave in 0..shape.octaves {
-                        let k = std::f64::consts::FRAC_PI_2 * f64::from(1 << octave);
-                        let angle = k * (2.0 * f64::from(x[a]) - 1.0);
-                        rows[0].extend([angle.sin(), angle.cos()]);
-                        for along in 0..d {
-                            let slope = if along == a { 2.0 * k } else { 0.0 };
-                            rows[1 + along].extend([slope * angle.cos(), -slope * angle.sin()]);
-                        }
-                    }
-                }
-            }
-        }
-        for (number, layer) in shape.layers.iter().enumerate() {
-            let linear = |row: &[f64], bias: bool| -> Vec<f64> {
-                (0..layer.outputs)
-                    .map(|o| {
-                        let start = if bias { self.layers[layer.biases + o] } else { 0.0 };
-                        (0..layer.inputs).fold(start, |sum, i| sum + row[i] * self.layers[layer.weights + i * layer.outputs + o])
-                    })
-                    .collect()
-            };
-            rows = rows.iter().enumerate().map(|(group, row)| linear(row, group == 0)).collect();
-            if number + 1 < shape.layers.len() {
-                let passed: Vec<bool> = rows[0].iter().map(|&z| z > 0.0).collect();
-                for row in &mut rows {
-                    row.iter_mut().zip(&passed).for_each(|(z, &p)| *z = if p { *z } else { 0.0 });
-                }
-            }
-        }
-        rows
-    }
-
-    fn loss(&self, objective: &Objective, samples: &Samples) -> f64 {
-        let count = samples.len() as f64;
-        let outputs = self.shape.outputs();
-        let (mut loss, mut linear) = (0.0, 0.0);
-        for i in 0..samples.len() {
-            let rows = self.outputs(samples.points[i]);
-            if objective.target == Target::Ftle {
-                let y = f64::from(samples.log_stretch[i]);
-                let target = match objective.loss {
-                    Loss::MeanSquare => (y - f64::from(objective.scale.mean[0])) / f64::from(objective.scale.deviation[0]),
-                    Loss::Published => {
-                        let y = y / f64::from(objective.tau);
-                        linear += (rows[0][0].abs().exp() - 1.0).copysign(rows[0][0]) - y;
-                        (1.0 + y.abs()).ln().copysign(y)
-                    }
-                };
-                loss += (rows[0][0] - target).powi(2) / count;
-            } else {
-                for (o, &axis) in self.shape.axes.iter().enumerate() {
-                    let deviation = f64::from(objective.scale.deviation[o]);
-                    let moved = f64::from(samples.arrival[i][axis] - samples.points[i][axis]);
-                    let target = (moved - f64::from(objective.scale.mean[o])) / deviation;
-                    loss += (rows[0][o] - target).powi(2) / (count * outputs as f64);
-                    for (a, &along) in self.shape.axes.iter().enumerate() {
-                        let identity = if axis == along { 1.0 } else { 0.0 };
-                        let target = (f64::from(samples.jacobian[i][3 * axis + along]) - identity) / deviation;
-                        let weight = f64::from(objective.jacobian_weight) / self.shape.axes.len() as f64;
-                        loss += weight * (rows[1 + a][o] - target).powi(2) / (count * outputs as f64);
-                    }
-                }
-            }
-        }
-        if objective.loss == Loss::Published && objective.target == Target::Ftle {
-            loss += f64::from(objective.mean_penalty) * (linear / count).powi(2);
-        }
-        loss
-    }
-}
 
 struct Case {
     name: &'static str,
@@ -183,20 +58,6 @@ fn cases() -> Vec<Case> {
     ]
 }
 
-/// Smooth labels, not those of any flow: the gradients do not care.
-fn labels(count: usize, seed: u64) -> Samples {
-    let points = uniform_points(seed, count);
-    let value = |p: &[f32; 3]| 1.5 * (4.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2] - 0.4;
-    let arrival = |p: &[f32; 3]| [p[0] + 0.2 * (3.0 * p[1]).sin(), p[1] - 0.3 * p[0] * p[2], p[2] + 0.1 * p[0]];
-    let jacobian = |p: &[f32; 3]| [1.0, 0.6 * (3.0 * p[1]).cos(), 0.0, -0.3 * p[2], 1.0, -0.3 * p[0], 0.1, 0.0, 1.0];
-    Samples {
-        log_stretch: points.iter().map(value).collect(),
-        arrival: points.iter().map(arrival).collect(),
-        jacobian: points.iter().map(jacobian).collect(),
-        points,
-    }
-}
-
 fn prepare(case: &Case) -> (Model, Objective, Samples) {
     let extent = [2.0, 1.0, 1.5];
     let shape = Architecture::new(&case.settings, case.axes, extent).unwrap();
@@ -238,10 +99,6 @@ fn gradients(model: &Model) -> Vec<f64> {
     all
 }
 
-fn norm(values: &[f64]) -> f64 {
-    values.iter().map(|v| v * v).sum::<f64>().sqrt()
-}
-
 #[test]
 fn gradients_equal_finite_differences_in_f64() {
     for case in cases() {
@@ -251,8 +108,7 @@ fn gradients_equal_finite_differences_in_f64() {
         let stock_loss = stock_step(&mut stock, &objective, &samples, 300, 1e-9);
         let (fused, stock) = (gradients(&fused), gradients(&stock));
 
-        let wide = |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };
-        let mut reference = Reference { shape: &model.shape, tables: wide(model.tables()), layers: wide(model.layers()) };
+        let mut reference = Reference::new(&model);
         let expected = reference.loss(&objective, &samples);
         // f32 sums of a few hundred terms.
         assert!((loss / expected - 1.0).abs() < 1e-4, "{}: fused loss {loss}, f64 {expected}", case.name);
@@ -362,8 +218,7 @@ fn predictions_of_all_ways_agree() {
         let tensor = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [points.len(), case.axes.len()]), &Default::default());
         let stock = model.module.forward(&shape, tensor.clone()).into_data().to_vec::<f32>().unwrap();
         let fused = model.module.forward_fused(&shape, tensor).into_data().to_vec::<f32>().unwrap();
-        let wide = |values: Vec<f32>| -> Vec<f64> { values.into_iter().map(f64::from).collect() };
-        let reference = Reference { shape: &model.shape, tables: wide(model.tables()), layers: wide(model.layers()) };
+        let reference = Reference::new(&model);
         for (i, &point) in points.iter().enumerate() {
             for (o, expected) in reference.outputs(point)[0].iter().enumerate() {
                 let at = i * model.shape.outputs() + o;

@@ -98,6 +98,27 @@ pub trait Predict: Send + Sync {
     fn as_any(&self) -> Option<&dyn std::any::Any> {
         None
     }
+    /// The network in it as numbers, for engines that evaluate networks on a device; none where there is none.
+    fn network(&self) -> Option<NetworkState<'_>> {
+        None
+    }
+}
+
+/// A network that does not change, and what it stands on.
+#[derive(Clone, Copy)]
+pub struct NetworkState<'a> {
+    /// Of these parameters, and no others in this process.
+    pub stamp: u64,
+    /// What is stored where.
+    pub shape: &'a network::Architecture,
+    /// What the outputs mean.
+    pub objective: &'a network::Objective,
+    /// Hash-grid tables; empty for the frequency encoding.
+    pub tables: &'a [f32],
+    /// Weights and biases of all layers.
+    pub layers: &'a [f32],
+    /// A table below, and the factor on the network above it.
+    pub base: Option<(&'a Table, f32)>,
 }
 
 /// A memory of the log-stretch over the domain, which learns between or beside frames.

@@ -6,7 +6,7 @@
 use super::checkpoint::Checkpoint;
 use super::network::HELD_OUT;
 use super::trainer::{FrozenNetwork, Trainer};
-use super::{CheckpointError, Learned, NetworkSettings, Predict, Samples, Surrogate, SurrogateError, Table};
+use super::{CheckpointError, Learned, NetworkSettings, NetworkState, Predict, Samples, Surrogate, SurrogateError, Table};
 use crate::flow::Tracer;
 use std::path::Path;
 use std::sync::Arc;
@@ -118,6 +118,10 @@ impl Predict for Frozen {
 
     fn bytes(&self) -> usize {
         self.table.bytes() + self.network.bytes()
+    }
+
+    fn network(&self) -> Option<NetworkState<'_>> {
+        Some(NetworkState { base: Some((&self.table, self.shrinkage)), ..self.network.network()? })
     }
 }
 

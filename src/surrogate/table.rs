@@ -34,7 +34,7 @@ enum Values {
 }
 
 /// A number that was not given before.
-fn fresh_stamp() -> u64 {
+pub(super) fn fresh_stamp() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }

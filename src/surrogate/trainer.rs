@@ -7,7 +7,8 @@
 
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, Pick, Predictor, Step};
-use super::{CheckpointError, Learned, Predict, Samples, SurrogateError};
+use super::table::fresh_stamp;
+use super::{CheckpointError, Learned, NetworkState, Predict, Samples, SurrogateError};
 use crate::field::Domain;
 use std::time::Instant;
 
@@ -78,7 +79,9 @@ pub(super) struct FrozenNetwork {
     shape: Architecture,
     objective: Objective,
     tables: Vec<f32>,
+    layers: Vec<f32>,
     predictor: Predictor,
+    stamp: u64,
 }
 
 impl Predict for FrozenNetwork {
@@ -92,6 +95,11 @@ impl Predict for FrozenNetwork {
 
     fn bytes(&self) -> usize {
         self.shape.parameters() * size_of::<f32>()
+    }
+
+    fn network(&self) -> Option<NetworkState<'_>> {
+        let Self { shape, objective, tables, layers, stamp, .. } = self;
+        Some(NetworkState { stamp: *stamp, shape, objective, tables, layers, base: None })
     }
 }
 
@@ -136,7 +144,9 @@ impl Trainer {
             shape: self.model.shape.clone(),
             objective: self.objective.clone(),
             tables: self.average.tables.clone(),
+            layers: self.average.layers.clone(),
             predictor: Predictor::new(&self.model.shape, &self.average.layers),
+            stamp: fresh_stamp(),
         }
     }
 

@@ -1,6 +1,8 @@
 //! A scalar Runge-Kutta tracer of the double gyre with its tangent flow, in f64: slow, short, and independent of the program's own.
 #![allow(dead_code)]
 
+pub mod reference;
+
 use rayon::prelude::*;
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Extras, Traced, Tracer};

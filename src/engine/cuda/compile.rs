@@ -20,6 +20,7 @@ macro_rules! kernel {
 pub const SOURCES: &[(&str, &str)] = &[
     kernel!("answer.cu"),
     kernel!("audit.cu"),
+    kernel!("network.cu"),
     kernel!("render.cu"),
     kernel!("sort.cu"),
     kernel!("table.cu"),
@@ -45,6 +46,7 @@ pub const HEADERS: &[(&str, &str)] = &[
     kernel!("land.cuh"),
     kernel!("light.cuh"),
     kernel!("majorant.cuh"),
+    kernel!("network.cuh"),
     kernel!("rng.cuh"),
     kernel!("space.cuh"),
     kernel!("sphere.cuh"),

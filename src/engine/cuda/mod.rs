@@ -1,4 +1,4 @@
-//! The GPU engine: device, window ring, sorted tracing and tables on CUDA.
+//! The GPU engine: device, window ring, sorted tracing, tables and networks on CUDA.
 //!
 //! In: a velocity source, a flow map and seeds, on the host (as a [`crate::flow::Tracer`]) or on the device. Out: what the CPU's tracer
 //! gives. Kernels are in `kernels/`, compiled at start for the device found. Everything here returns [`DeviceError`]; nothing panics where
@@ -20,6 +20,9 @@ mod land;
 mod launch;
 mod layout;
 mod memory;
+mod network;
+mod network_layout;
+mod network_training;
 mod pinned;
 mod render;
 mod render_memory;
@@ -41,6 +44,8 @@ pub use land::DeviceLand;
 pub use launch::{launch, threads};
 pub use layout::Outputs;
 pub use memory::{Budget, Buffer};
+pub use network::{DeviceNetwork, network_defines};
+pub use network_training::{DeviceSamples, DeviceStep, DeviceTraining};
 pub use render::{GpuRenderer, LookAhead, Timeline};
 pub use sort::{SortCells, Sorter};
 pub use table::DeviceTable;

@@ -10,15 +10,15 @@ pub(super) const BETA_2: f32 = 0.999;
 
 /// The factors of one step.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Adam {
-    rate: f32,
-    epsilon: f32,
-    correction: f32,
+pub(crate) struct Adam {
+    pub(crate) rate: f32,
+    pub(crate) epsilon: f32,
+    pub(crate) correction: f32,
 }
 
 impl Adam {
     /// The factors of step number `time`, counted from 1.
-    pub(super) fn at(time: usize, rate: f64, epsilon: f32) -> Self {
+    pub(crate) fn at(time: usize, rate: f64, epsilon: f32) -> Self {
         // 1 - 0.999^t is 1 in f32 long before i32 runs out.
         let time = time.min(1 << 30) as i32;
         let second = (1.0 - BETA_2.powi(time)).sqrt();

@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 /// Lanes that weight rows are padded to: two AVX registers of f32.
 pub(super) const PANEL: usize = 16;
 /// Multipliers of the spatial hash for the second and third axis (Teschner et al. 2003, as in Müller et al. 2022).
-pub(super) const HASH: [u32; 3] = [1, 2_654_435_761, 805_459_861];
+pub(crate) const HASH: [u32; 3] = [1, 2_654_435_761, 805_459_861];
 
 /// One level of the hash grid.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]

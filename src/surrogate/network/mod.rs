@@ -21,6 +21,10 @@ mod predictor;
 mod tile;
 mod train;
 
+#[cfg(feature = "cuda")]
+pub(crate) use adam::Adam;
+#[cfg(feature = "cuda")]
+pub(crate) use architecture::HASH;
 pub use architecture::{Architecture, Layer, Level};
 pub use model::Model;
 pub use module::Network;

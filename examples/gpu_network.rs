@@ -1,0 +1,331 @@
+//! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
+//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [seconds]`
+//!
+//! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
+//! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled) and stands still
+//! while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform points, against f64 with
+//! 220 steps.
+
+#![allow(clippy::print_stdout)] // a measurement, which prints
+
+#[cfg(not(feature = "cuda"))]
+fn main() {
+    println!("built without the feature `cuda`");
+}
+
+#[cfg(feature = "cuda")]
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let told: Vec<String> = std::env::args().skip(1).collect();
+    let asked = |word: &str| told.is_empty() || told.iter().any(|t| t == word);
+    let seconds = told.iter().find_map(|t| t.parse().ok()).unwrap_or(10.0);
+    if asked("speed") {
+        bench::speed()?;
+    }
+    for (word, field) in [("easy", bench::Field::Easy), ("hard", bench::Field::Hard)] {
+        if asked(word) {
+            bench::quality(word, field, seconds)?;
+        }
+    }
+    Ok(())
+}
+
+#[cfg(feature = "cuda")]
+mod bench {
+    use ridgewatch::engine::cuda::{
+        Buffer, CudaTracer, DeviceError, DeviceNetwork, DevicePredict, DeviceSamples, DeviceStep, DeviceTable, DeviceTracer,
+        DeviceTraining, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
+    };
+    use ridgewatch::field::Domain;
+    use ridgewatch::field::turbulence::Turbulence;
+    use ridgewatch::flow::{
+        Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
+    };
+    use ridgewatch::surrogate::network::{Architecture, Encoding, Model, NetworkSettings, Objective, Scale};
+    use std::error::Error;
+    use std::sync::Arc;
+    use std::time::Instant;
+
+    type Outcome<T> = Result<T, Box<dyn Error>>;
+
+    const ROUNDS: usize = 9;
+
+    /// Median milliseconds of device time.
+    fn time(gpu: &Gpu, mut work: impl FnMut() -> Result<(), DeviceError>) -> Result<f64, DeviceError> {
+        let mut times = Vec::new();
+        for round in 0..=ROUNDS {
+            let begin = gpu.mark()?;
+            work()?;
+            let milliseconds = f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?);
+            // The first round warms up.
+            if round > 0 {
+                times.push(milliseconds);
+            }
+        }
+        times.sort_by(f64::total_cmp);
+        Ok(times[ROUNDS / 2])
+    }
+
+    fn hash(levels: usize, features: usize, growth: f32, log2_table: u32, width: usize) -> NetworkSettings {
+        NetworkSettings { levels, features, growth, log2_table, width, ..NetworkSettings::default() }
+    }
+
+    fn step(count: usize, drawn: u64, rate: f64) -> DeviceStep {
+        DeviceStep { count, drawn: Some((1, drawn)), hold_out: false, rate, average_share: 0.0, lazy: true }
+    }
+
+    pub fn speed() -> Outcome<()> {
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
+        println!("<!-- block network-speed -->");
+        println!("| network | parameters, M | predicted, G/s | trained, M/s, batch 2^20 | 2^18 | 2^14 |");
+        println!("|---|---|---|---|---|---|");
+        let frequency =
+            |hidden_layers, width| NetworkSettings { encoding: Encoding::Frequency, hidden_layers, width, ..Default::default() };
+        for (name, settings) in [
+            ("hash 8x2, growth 2, T = 2^19, 2x64", hash(8, 2, 2.0, 19, 64)),
+            ("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)),
+            ("hash 6x4, growth 1.6, T = 2^21, 2x64 (the default)", NetworkSettings::default()),
+            ("hash 8x2, growth 2, T = 2^19, 2x128", hash(8, 2, 2.0, 19, 128)),
+            ("hash 8x2, growth 2, T = 2^19, 2x16", hash(8, 2, 2.0, 19, 16)),
+            ("frequency 10, 4x64", frequency(4, 64)),
+            ("frequency 10, 2x128", frequency(2, 128)),
+        ] {
+            let shape = Architecture::new(&settings, &[0, 1, 2], cube.extent())?;
+            let objective = Objective::new(&settings, &shape, cube.extent(), 1.0);
+            let parameters = shape.parameters() as f64 * 1e-6;
+            let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
+            let mut points = gpu.alloc("points", 1 << 24)?;
+            let values = gpu.upload("values", &vec![0.5f32; 1 << 24])?;
+            let mut pool = training.ring(1 << 26)?;
+            for part in 0..4 {
+                training.draw_points(&cube, 3, part << 24, &mut points)?;
+                // SAFETY: both buffers hold 2^24 entries and outlive the work below.
+                unsafe { training.append(&mut pool, &cube, points.address(), values.address(), 1 << 24, None)? };
+            }
+            let network = training.frozen(None)?;
+            // SAFETY: as above.
+            let predicted = time(&gpu, || unsafe { network.predict(points.address(), 1 << 24, values.address()) })?;
+            let mut row = format!("| {name} | {parameters:.2} | {:.2} ", (1 << 24) as f64 / predicted * 1e-6);
+            for batch in [1 << 20, 1 << 18, 1 << 14] {
+                const STEPS: u64 = 16;
+                let mut drawn = 0;
+                let milliseconds = time(&gpu, || {
+                    let steps: Vec<DeviceStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-2)).collect();
+                    drawn += STEPS * batch as u64;
+                    training.train_steps(&pool, &steps).map(|_| ())
+                })?;
+                row += &format!("| {:.0} ", STEPS as f64 * batch as f64 / milliseconds * 1e-3);
+            }
+            println!("{row}|");
+        }
+        println!();
+        Ok(())
+    }
+
+    #[derive(Clone, Copy)]
+    pub enum Field {
+        Easy,
+        Hard,
+    }
+
+    const SHAPE: [usize; 3] = [600, 192, 192];
+    const SNAPSHOTS: usize = 12;
+    /// Labels traced between two rounds of training, steps of a round, samples of a step, and labels kept.
+    const CHUNK: usize = 1 << 21;
+    const STEPS: usize = 32;
+    const BATCH: usize = 1 << 18;
+    const KEPT: usize = 1 << 28;
+    const TESTED: usize = 1 << 20;
+
+    fn map(steps: usize, precision: Precision) -> FlowMap {
+        FlowMap {
+            tau: SNAPSHOTS as f64 - 1.0,
+            direction: Direction::Forward,
+            integrator: Integrator::Tangent,
+            precision,
+            steps: Steps::Fixed(steps),
+            gap: 0.05,
+            boundary: Boundary::Clamp,
+            normalisation: Normalisation::Tau,
+            interpolation: Interpolation::Linear,
+        }
+    }
+
+    /// Points, and room for what is found at them.
+    struct Batch {
+        points: Buffer<[f32; 3]>,
+        values: Buffer<f32>,
+    }
+
+    impl Batch {
+        fn new(gpu: &Gpu, count: usize) -> Result<Self, DeviceError> {
+            Ok(Self { points: gpu.alloc("points", count)?, values: gpu.alloc("values", count)? })
+        }
+
+        fn trace(&self, tracer: &DeviceTracer) -> Result<(), DeviceError> {
+            let out = Outputs { log_stretch: self.values.address(), ..Outputs::default() };
+            // SAFETY: both buffers hold as many entries.
+            unsafe { tracer.trace(self.points.address(), self.points.len(), &out) }
+        }
+
+        /// By something that takes unit coordinates.
+        fn predict(&self, surrogate: &dyn DevicePredict) -> Result<Vec<f32>, DeviceError> {
+            // SAFETY: both buffers hold as many entries.
+            unsafe { surrogate.predict(self.points.address(), self.points.len(), self.values.address()) }?;
+            self.found()
+        }
+
+        fn found(&self) -> Result<Vec<f32>, DeviceError> {
+            let mut found = vec![0.0; self.values.len()];
+            self.values.read(&mut found)?;
+            Ok(found)
+        }
+    }
+
+    fn psnr(found: &[f32], exact: &[f32]) -> f64 {
+        let peak = exact.iter().fold(0.0_f64, |m, &s| m.max(f64::from(s)));
+        let square = found.iter().zip(exact).map(|(a, b)| f64::from(a - b).powi(2)).sum::<f64>() / exact.len() as f64;
+        20.0 * (peak / square.sqrt()).log10()
+    }
+
+    pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let turbulence = match field {
+            Field::Easy => Turbulence::easy(SHAPE, 0),
+            Field::Hard => Turbulence::hard(SHAPE, 0),
+        };
+        let window = Arc::new(turbulence.window(&Turbulence::grid(SHAPE)?, SNAPSHOTS)?);
+        let source = VelocitySource::Window(window);
+        let store = SnapshotStore::new(&gpu);
+        let steps = match field {
+            Field::Easy => 22,
+            Field::Hard => 44,
+        };
+        let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
+        let exact = CudaTracer::new(&store, &gpu, source, &map(220, Precision::F64), 0.0, Tuning::default())?;
+        let domain = tracer.domain().clone();
+        println!("<!-- block network-{name} -->");
+
+        // The test's points, twice: for the tracer, and in unit coordinates.
+        let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+        let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
+        let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
+        let drawer = DeviceTraining::new(&gpu, &Model::new(shape.clone(), 1, false), &Objective::new(&any, &shape, domain.extent(), 1.0))?;
+        let (mut seeds, mut tested) = (Batch::new(&gpu, TESTED)?, Batch::new(&gpu, TESTED)?);
+        drawer.draw_points(&domain, 99, 0, &mut seeds.points)?;
+        drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
+        seeds.trace(exact.device())?;
+        let truth = seeds.found()?;
+        seeds.trace(tracer.device())?;
+        println!("Labels, traced with {steps} steps: {:.1} dB. Tables, by their nodes:\n", psnr(&seeds.found()?, &truth));
+
+        let mut table = DeviceTable::trace(tracer.device(), &domain, SHAPE)?;
+        let begin = gpu.mark()?;
+        table.retrace(tracer.device())?;
+        let traced = f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+        println!("| table | MB | traced in, s | PSNR, dB |\n|---|---|---|---|");
+        let row = |table: &DeviceTable, seconds: f64| -> Outcome<()> {
+            let nodes = table.nodes();
+            let megabytes = 4e-6 * nodes.iter().product::<usize>() as f64;
+            println!("| {nodes:?} | {megabytes:.0} | {seconds:.3} | {:.1} |", psnr(&tested.predict(table)?, &truth));
+            Ok(())
+        };
+        row(&table, traced)?;
+        for nodes in [SHAPE.map(|n| n * 5 / 4), SHAPE.map(|n| 2 * n)] {
+            let begin = gpu.mark()?;
+            let finer = DeviceTable::trace(tracer.device(), &domain, nodes)?;
+            row(&finer, f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3)?;
+        }
+        println!();
+        let table = Arc::new(table);
+
+        println!("| | network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|---|");
+        for (kind, base) in [("alone", None), ("above the first table", Some(&table))] {
+            for (name, settings) in [
+                ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
+                ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64)),
+                ("8x4, growth 1.8, T = 2^24", hash(8, 4, 1.8, 24, 64)),
+                ("4x4, growth 1.6, base 128, T = 2^24", NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }),
+            ] {
+                let row = learn(&gpu, &domain, tracer.device(), base, traced, &settings, seconds, |network| {
+                    Ok(psnr(&tested.predict(network)?, &truth))
+                })?;
+                println!("| {kind} | {name} {row}");
+            }
+        }
+        println!();
+        Ok(())
+    }
+
+    /// Trains for some seconds; one row of the table. `before`: seconds that the clock starts at, where there is a table to be traced.
+    fn learn(
+        gpu: &Arc<Gpu>,
+        domain: &Domain,
+        tracer: &DeviceTracer,
+        base: Option<&Arc<DeviceTable>>,
+        before: f64,
+        settings: &NetworkSettings,
+        seconds: f64,
+        measure: impl Fn(&DeviceNetwork) -> Outcome<f64>,
+    ) -> Outcome<String> {
+        const RATE: f64 = 1e-2;
+        let below = base.map(|table| &**table);
+        let shape = Architecture::new(settings, &[0, 1, 2], domain.extent())?;
+        let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
+        let model = Model::new(shape, 1, base.is_some());
+        let mut chunk = Batch::new(gpu, CHUNK)?;
+        // How large the labels are; the clock does not run, since a few thousand of them would do.
+        let scout = DeviceTraining::new(gpu, &model, &objective)?;
+        scout.draw_points(domain, 5, 0, &mut chunk.points)?;
+        chunk.trace(tracer)?;
+        let mut pool = scout.ring(CHUNK)?;
+        // SAFETY: both buffers hold `CHUNK` entries.
+        unsafe { scout.append(&mut pool, domain, chunk.points.address(), chunk.values.address(), CHUNK, below)? };
+        objective.scale = scale(&pool, base.is_some())?;
+        drop((scout, pool));
+        let mut training = DeviceTraining::new(gpu, &model, &objective)?;
+        let mut ring = training.ring(KEPT)?;
+        gpu.synchronize()?;
+
+        let mut clock = if base.is_some() { before } else { 0.0 };
+        let (mut labels, mut trained, mut marks) = (0_u64, 0_u64, vec![1.0, 2.0, 5.0, 10.0]);
+        let mut row = String::new();
+        while clock < seconds && !marks.is_empty() {
+            let start = Instant::now();
+            training.draw_points(domain, 7, labels, &mut chunk.points)?;
+            chunk.trace(tracer)?;
+            // SAFETY: as above.
+            unsafe { training.append(&mut ring, domain, chunk.points.address(), chunk.values.address(), CHUNK, below)? };
+            labels += CHUNK as u64;
+            let done = training.steps();
+            let steps: Vec<DeviceStep> = (0..STEPS)
+                .map(|i| {
+                    // The mean runs over the last tenth of the steps.
+                    let number = done + i + 1;
+                    let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
+                    DeviceStep { average_share, ..step(BATCH, trained + (i * BATCH) as u64, RATE) }
+                })
+                .collect();
+            training.train_steps(&ring, &steps)?;
+            trained += (STEPS * BATCH) as u64;
+            clock += start.elapsed().as_secs_f64();
+            if clock >= marks[0] {
+                marks.remove(0);
+                let network = training.frozen(base.map(|table| (table.clone(), 1.0)))?;
+                row += &format!("| {:.1} ", measure(&network)?);
+            }
+        }
+        let bytes = training.frozen(None)?.bytes() as f64 * 1e-6;
+        Ok(format!("| {bytes:.0} {row}| {:.0} | {:.0} |", labels as f64 * 1e-6, trained as f64 * 1e-6))
+    }
+
+    /// Mean and deviation of the targets so far; a residual keeps the mean 0.
+    fn scale(pool: &DeviceSamples, centred: bool) -> Outcome<Scale> {
+        let values = pool.values()?;
+        let count = values.len() as f64;
+        let mean = if centred { 0.0 } else { values.iter().map(|v| f64::from(v[3])).sum::<f64>() / count };
+        let square = values.iter().map(|v| (f64::from(v[3]) - mean).powi(2)).sum::<f64>() / count;
+        Ok(Scale { mean: [mean as f32; 3], deviation: [square.sqrt() as f32; 3] })
+    }
+}

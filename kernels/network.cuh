@@ -1,0 +1,323 @@
+// The network on matrix units: encodings, and products of tiles of 16 samples with the layers. As src/surrogate/network/ on the CPU.
+//
+// A warp carries 16 samples through the network in registers. Between layers the values lie as the matrix instruction wants its left
+// operand (rows are samples, columns neurons): lane 4g + q holds, of samples g and g + 8, the columns 2q and 2q + 1 of every 8. So the lane
+// that gathers a pair of features is the one that needs them, and the one that gets their gradient back. Values are half precision, sums
+// single precision.
+//
+// Macros: RW_AXES (axes of the unit point that are inputs), RW_DIMS of them; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH
+// and RW_HIDDEN, neurons of and number of hidden layers;
+// RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, the shared memory of prediction and of training.
+#pragma once
+#include "base.cuh"
+
+namespace rw {
+
+constexpr int DIMS = RW_DIMS, LEVELS = RW_LEVELS, FEATURES = RW_FEATURES, OCTAVES = RW_OCTAVES, WIDTH = RW_WIDTH, HIDDEN = RW_HIDDEN;
+constexpr int ENCODED = LEVELS > 0 ? LEVELS * FEATURES : 2 * DIMS * OCTAVES;
+constexpr int CORNERS = 1 << DIMS;
+// In blocks of 16, as the matrix instruction takes them; what is beyond the network is 0.
+constexpr int ENCODED_BLOCKS = (ENCODED + 15) / 16, WIDTH_BLOCKS = (WIDTH + 15) / 16;
+// Eight further halves a row spread its columns over the banks of shared memory.
+constexpr int SKEW = 8;
+constexpr int STRIDE = 16 * WIDTH_BLOCKS + SKEW;
+constexpr int HEAD_STRIDE = 8 + SKEW;
+
+// One level of the hash grid.
+struct Level {
+    float cells[3];
+    uint32_t last_cell[3];
+    uint32_t factor[3];  // multiplier of each axis' node: of the hash, or the stride of a dense level
+    uint32_t mask;       // entries - 1 of a hashed level
+    uint32_t hashed;
+    uint32_t entries;
+    uint32_t offset;     // first entry in padded tables, a multiple of 64
+    uint32_t start;      // first entry in burn's tables
+};
+static_assert(sizeof(Level) == 56, "layout");
+
+struct Grid {
+    Level levels[LEVELS > 0 ? LEVELS : 1];
+};
+
+// The cell around a point: entries of its corners in padded tables, and multilinear weights.
+struct Cell {
+    uint32_t index[CORNERS];
+    float weight[CORNERS];
+};
+
+RW_FN Cell locate(const Level& level, const float (&point)[DIMS]) {
+    uint32_t node[DIMS][2];
+    float share[DIMS][2];
+    RW_UNROLL for (int axis = 0; axis < DIMS; ++axis) {
+        const float position = min_(max_(point[axis], 0.0f), 1.0f) * level.cells[axis];
+        const uint32_t whole = uint32_t(position), cell = whole < level.last_cell[axis] ? whole : level.last_cell[axis];
+        const float fraction = position - float(cell);
+        node[axis][0] = cell * level.factor[axis];
+        node[axis][1] = node[axis][0] + level.factor[axis];
+        share[axis][0] = 1.0f - fraction;
+        share[axis][1] = fraction;
+    }
+    Cell cell;
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
+        uint32_t sum = node[0][corner & 1], hash = sum;
+        float weight = share[0][corner & 1];
+        RW_UNROLL for (int axis = 1; axis < DIMS; ++axis) {
+            const uint32_t other = node[axis][corner >> axis & 1];
+            sum += other;
+            hash ^= other;
+            weight *= share[axis][corner >> axis & 1];
+        }
+        cell.index[corner] = level.offset + (level.hashed ? hash & level.mask : sum);
+        cell.weight[corner] = weight;
+    }
+    return cell;
+}
+
+#if RW_DEVICE
+
+RW_FN uint32_t pack(float low, float high) {
+    uint32_t both;
+    asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+    return both;
+}
+RW_FN float2 unpack(uint32_t both) { return make_float2(from_half(uint16_t(both)), from_half(uint16_t(both >> 16))); }
+
+// d += a b, of 16x16 with 16x8.
+RW_FN void multiply(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
+    asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
+        : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
+        : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+}
+
+// Four 8x8 blocks of shared memory; lane i names row i % 8 of block i / 8. Lane 4g + q gets columns 2q, 2q + 1 of row g of each.
+RW_FN void read_blocks(uint32_t (&to)[4], const uint16_t* row) {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+                 : "r"(uint32_t(__cvta_generic_to_shared(row)))
+                 : "memory");
+}
+// The same of the transposed blocks.
+RW_FN void read_turned(uint32_t (&to)[4], const uint16_t* row) {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
+                 : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+                 : "r"(uint32_t(__cvta_generic_to_shared(row)))
+                 : "memory");
+}
+RW_FN void read_turned(uint32_t (&to)[2], const uint16_t* row) {
+    asm volatile("ldmatrix.sync.aligned.m8n8.x2.trans.shared.b16 {%0, %1}, [%2];"
+                 : "=r"(to[0]), "=r"(to[1])
+                 : "r"(uint32_t(__cvta_generic_to_shared(row)))
+                 : "memory");
+}
+
+RW_FN uint32_t lane() { return threadIdx.x & 31u; }
+
+// Rows of 16 samples, `BLOCKS` times 16 columns.
+template <int BLOCKS> struct Rows {
+    uint32_t block[BLOCKS][4];
+};
+// Sums, as the matrix instruction gives them: `BLOCKS` times 8 columns.
+template <int BLOCKS> struct Sums {
+    float block[BLOCKS][4];
+};
+
+// The layers in shared memory, half precision, a row an input.
+struct alignas(16) Weights {
+    uint16_t first[16 * ENCODED_BLOCKS][STRIDE];
+    uint16_t hidden[HIDDEN > 1 ? HIDDEN - 1 : 1][16 * WIDTH_BLOCKS][STRIDE];
+    uint16_t head[16 * WIDTH_BLOCKS][HEAD_STRIDE];
+    float biases[HIDDEN][16 * WIDTH_BLOCKS];
+    float head_bias;
+};
+
+// First parameter of a layer of the flat vector: inputs * outputs weights, input-major, then biases (Architecture::layers).
+RW_FN constexpr int layer_start(int layer) {
+    return layer == 0 ? 0 : (ENCODED + 1) * WIDTH + (layer - 1) * (WIDTH + 1) * WIDTH;
+}
+
+// By the whole block; ends with a barrier.
+RW_FN void read_layers(Weights& weights, const float* __restrict__ layers) {
+    auto matrix = [&](uint16_t* to, int rows, int columns, int stride, const float* from, int inputs, int outputs) {
+        for (int i = threadIdx.x; i < rows * columns; i += blockDim.x) {
+            const int row = i / columns, column = i % columns;
+            to[row * stride + column] = to_half(row < inputs && column < outputs ? from[row * outputs + column] : 0.0f);
+        }
+    };
+    auto vector = [&](float* to, int padded, const float* from, int count) {
+        for (int i = threadIdx.x; i < padded; i += blockDim.x) to[i] = i < count ? from[i] : 0.0f;
+    };
+    constexpr int PADDED = 16 * WIDTH_BLOCKS;
+    matrix(&weights.first[0][0], 16 * ENCODED_BLOCKS, PADDED, STRIDE, layers, ENCODED, WIDTH);
+    vector(weights.biases[0], PADDED, layers + ENCODED * WIDTH, WIDTH);
+    for (int layer = 1; layer < HIDDEN; ++layer) {
+        matrix(&weights.hidden[layer - 1][0][0], PADDED, PADDED, STRIDE, layers + layer_start(layer), WIDTH, WIDTH);
+        vector(weights.biases[layer], PADDED, layers + layer_start(layer) + WIDTH * WIDTH, WIDTH);
+    }
+    matrix(&weights.head[0][0], PADDED, 8, HEAD_STRIDE, layers + layer_start(HIDDEN), WIDTH, 1);
+    vector(&weights.head_bias, 1, layers + layer_start(HIDDEN) + WIDTH, 1);
+    __syncthreads();
+}
+
+// Two neighbouring features of an entry; with one feature a level there is but one.
+struct Features {
+    const uint16_t* tables;
+
+    RW_FN float2 pair(uint32_t entry, int feature) const {
+        return unpack(__ldg(reinterpret_cast<const uint32_t*>(tables) + entry * uint32_t(FEATURES / 2) + uint32_t(feature / 2)));
+    }
+    RW_FN float single(uint32_t entry) const { return from_half(__ldg(tables + entry)); }
+};
+
+// Columns `column` and `column + 1` of an encoded point.
+RW_FN float2 encode(const Level* levels, const Features& features, const float (&point)[DIMS], int column) {
+    if (column >= ENCODED) return make_float2(0.0f, 0.0f);
+    float2 sum = make_float2(0.0f, 0.0f);
+#if RW_LEVELS == 0
+    const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
+    float position = point[0];
+    RW_UNROLL for (int k = 1; k < DIMS; ++k) position = axis == k ? point[k] : position;
+    position = 2.0f * min_(max_(position, 0.0f), 1.0f) - 1.0f;
+    // The sine of (pi / 2) 2^octave p: exact up to the last step, since powers of two and whole turns cost nothing.
+    sincospif(0.5f * position * float(1u << octave), &sum.x, &sum.y);
+#elif RW_FEATURES == 1
+    const Cell first = locate(levels[column], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) sum.x = fma_(first.weight[corner], features.single(first.index[corner]), sum.x);
+    if (column + 1 < ENCODED) {
+        const Cell second = locate(levels[column + 1], point);
+        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner)
+            sum.y = fma_(second.weight[corner], features.single(second.index[corner]), sum.y);
+    }
+#else
+    const Cell cell = locate(levels[column / FEATURES], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
+        const float2 pair = features.pair(cell.index[corner], column % FEATURES);
+        sum.x = fma_(cell.weight[corner], pair.x, sum.x);
+        sum.y = fma_(cell.weight[corner], pair.y, sum.y);
+    }
+#endif
+    return sum;
+}
+
+// The warp's 16 points, of which a lane holds those of its two rows.
+RW_FN void encode_rows(Rows<ENCODED_BLOCKS>& rows, const Level* levels, const Features& features, const float (&points)[2][DIMS]) {
+    RW_UNROLL for (int block = 0; block < ENCODED_BLOCKS; ++block) {
+        RW_UNROLL for (int part = 0; part < 4; ++part) {
+            const float2 pair = encode(levels, features, points[part & 1], 16 * block + 8 * (part >> 1) + 2 * int(lane() & 3u));
+            rows.block[block][part] = pack(pair.x, pair.y);
+        }
+    }
+}
+
+RW_FN void add(float* at, float x, float y) {
+#if __CUDA_ARCH__ >= 900
+    atomicAdd(reinterpret_cast<float2*>(at), make_float2(x, y));
+#else
+    atomicAdd(at, x);
+    atomicAdd(at + 1, y);
+#endif
+}
+
+// The gradient of columns `column` and `column + 1` goes to the entries that they came from.
+RW_FN void scatter(const Level* levels, const float (&point)[DIMS], int column, float x, float y, float* __restrict__ gradient) {
+    if (column >= ENCODED) return;
+#if RW_FEATURES == 1
+    const Cell first = locate(levels[column], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) atomicAdd(gradient + first.index[corner], first.weight[corner] * x);
+    if (column + 1 >= ENCODED) return;
+    const Cell second = locate(levels[column + 1], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) atomicAdd(gradient + second.index[corner], second.weight[corner] * y);
+#else
+    const Cell cell = locate(levels[column / FEATURES], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; corner += 2) {
+        const uint32_t index = cell.index[corner], next = cell.index[corner + 1];
+        const float a = cell.weight[corner], b = cell.weight[corner + 1];
+#if RW_FEATURES == 2 && __CUDA_ARCH__ >= 900
+        // Both ends of an edge along the first axis often lie side by side: one request instead of two.
+        if ((index ^ next) == 1u) {
+            const float low = index & 1u ? b : a, high = index & 1u ? a : b;
+            atomicAdd(reinterpret_cast<float4*>(gradient + 2 * size_t(index & ~1u)), make_float4(low * x, low * y, high * x, high * y));
+            continue;
+        }
+#endif
+        add(gradient + size_t(index) * FEATURES + column % FEATURES, a * x, a * y);
+        add(gradient + size_t(next) * FEATURES + column % FEATURES, b * x, b * y);
+    }
+#endif
+}
+
+// rows * matrix, with the biases where sums start; `matrix` has 16 * IN rows and 16 * WIDTH_BLOCKS columns.
+template <int IN>
+RW_FN void forward(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uint16_t (*matrix)[STRIDE], const float* biases) {
+    RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
+        RW_UNROLL for (int k = 0; k < 2; ++k) sums.block[n][k] = sums.block[n][k + 2] = biases[8 * n + 2 * (lane() & 3u) + k];
+    }
+    const uint32_t row = (lane() >> 3 & 1u) * 8u + (lane() & 7u), column = (lane() >> 4) * 8u;
+    RW_UNROLL for (int k = 0; k < IN; ++k) {
+        RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
+            uint32_t b[4];
+            read_turned(b, &matrix[16 * k + row][16 * n + column]);
+            multiply(sums.block[2 * n], rows.block[k], b[0], b[1]);
+            multiply(sums.block[2 * n + 1], rows.block[k], b[2], b[3]);
+        }
+    }
+}
+
+// rows * the transposed matrix, which has as many rows as there are sums.
+template <int OUT> RW_FN void backward(Sums<OUT>& sums, const Rows<WIDTH_BLOCKS>& rows, const uint16_t (*matrix)[STRIDE]) {
+    RW_UNROLL for (int n = 0; n < OUT; ++n) {
+        RW_UNROLL for (int k = 0; k < 4; ++k) sums.block[n][k] = 0.0f;
+    }
+    const uint32_t row = (lane() >> 4) * 8u + (lane() & 7u), column = (lane() >> 3 & 1u) * 8u;
+    RW_UNROLL for (int k = 0; k < WIDTH_BLOCKS; ++k) {
+        RW_UNROLL for (int n = 0; n < OUT / 2; ++n) {
+            uint32_t b[4];
+            read_blocks(b, &matrix[16 * n + row][16 * k + column]);
+            multiply(sums.block[2 * n], rows.block[k], b[0], b[1]);
+            multiply(sums.block[2 * n + 1], rows.block[k], b[2], b[3]);
+        }
+    }
+}
+
+RW_FN float rectify(float x) { return max_(x, 0.0f); }
+
+// The next layer's rows: positive sums, the others 0.
+RW_FN void activate(Rows<WIDTH_BLOCKS>& rows, const Sums<2 * WIDTH_BLOCKS>& sums) {
+    RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
+        RW_UNROLL for (int part = 0; part < 4; ++part) {
+            const float(&from)[4] = sums.block[2 * n + (part >> 1)];
+            rows.block[n][part] = pack(rectify(from[2 * (part & 1)]), rectify(from[2 * (part & 1) + 1]));
+        }
+    }
+}
+
+// Outputs of the warp's rows: lanes 4g hold those of samples g and g + 8.
+RW_FN void head(float (&outputs)[2], const Rows<WIDTH_BLOCKS>& rows, const Weights& weights) {
+    float sums[4] = {weights.head_bias, 0.0f, weights.head_bias, 0.0f};
+    RW_UNROLL for (int k = 0; k < WIDTH_BLOCKS; ++k) {
+        uint32_t b[2];
+        read_turned(b, &weights.head[16 * k + (lane() & 15u)][0]);
+        multiply(sums, rows.block[k], b[0], b[1]);
+    }
+    outputs[0] = sums[0];
+    outputs[1] = sums[2];
+}
+
+// All layers; `rows` keeps what each hidden layer gave.
+RW_FN void layers_forward(float (&outputs)[2], const Rows<ENCODED_BLOCKS>& encoded, Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Weights& weights) {
+    {
+        Sums<2 * WIDTH_BLOCKS> sums;
+        forward(sums, encoded, weights.first, weights.biases[0]);
+        activate(rows[0], sums);
+    }
+    RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) {
+        Sums<2 * WIDTH_BLOCKS> sums;
+        forward(sums, rows[layer - 1], weights.hidden[layer - 1], weights.biases[layer]);
+        activate(rows[layer], sums);
+    }
+    head(outputs, rows[HIDDEN - 1], weights);
+}
+
+#endif
+
+}  // namespace rw

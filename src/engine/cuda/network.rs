@@ -1,0 +1,288 @@
+//! The network on the device: its kernels, compiled for one architecture, and prediction.
+//!
+//! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads them.
+
+use super::layout::TableArgument;
+use super::network_layout::{GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
+use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
+use crate::field::Domain;
+use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Target};
+use cudarc::driver::sys::{CUdevice_attribute as Device, CUfunction_attribute as Function};
+use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg, result};
+use std::sync::Arc;
+
+/// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
+const THREADS: u32 = 256;
+const TILE: usize = 128;
+/// Entries that each level's place in the padded tables is a multiple of.
+const PADDING: usize = 64;
+/// Widest encoding and widest layer, and most hidden layers, that a warp's registers hold.
+const WIDEST: usize = 128;
+const DEEPEST: usize = 4;
+/// Oldest device with the matrix instruction.
+const OLDEST: (i32, i32) = (8, 0);
+
+/// The macros that `network.cu` is compiled with for an architecture; none where it is too wide or too deep, or has several outputs.
+pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
+    let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
+    if shape.target != Target::Ftle || hidden == 0 || hidden > DEEPEST || width > WIDEST || shape.encoded() > WIDEST {
+        return None;
+    }
+    let axes: Vec<String> = shape.axes.iter().map(usize::to_string).collect();
+    let (weights, workspace) = shared_bytes(shape);
+    Some(vec![
+        format!("RW_AXES={}", axes.join(",")),
+        format!("RW_DIMS={}", shape.dimensions()),
+        format!("RW_LEVELS={}", shape.levels.len()),
+        format!("RW_FEATURES={}", shape.features),
+        format!("RW_OCTAVES={}", shape.octaves),
+        format!("RW_WIDTH={width}"),
+        format!("RW_HIDDEN={hidden}"),
+        format!("RW_WEIGHTS_BYTES={weights}"),
+        format!("RW_WORKSPACE_BYTES={workspace}"),
+    ])
+}
+
+/// Sizes of `Weights` in `network.cuh` and `Workspace` in `network.cu`, which assert them.
+fn shared_bytes(shape: &Architecture) -> (usize, usize) {
+    let hidden = shape.layers.len() - 1;
+    let [encoded, width] = [shape.encoded(), shape.layers[0].outputs].map(|n| n.next_multiple_of(16));
+    let (row, head_row) = (width + 8, 16);
+    let halves = encoded * row + (hidden - 1).max(1) * width * row + width * head_row;
+    let weights = (2 * halves + 4 * (hidden * width + 1)).next_multiple_of(16);
+    (weights, weights + 2 * TILE * (encoded.max(width) + 8 + row))
+}
+
+/// A kernel that keeps its layers in shared memory, and the blocks that the device holds at once.
+#[derive(Debug)]
+pub(super) struct Resident {
+    pub(super) function: CudaFunction,
+    shared: u32,
+    blocks: u32,
+}
+
+impl Resident {
+    fn new(gpu: &Gpu, function: CudaFunction, shared: usize) -> Result<Self, DeviceError> {
+        let doing = DeviceError::driver("asking for shared memory");
+        gpu.context().bind_to_thread().map_err(&doing)?;
+        let most = gpu.context().attribute(Device::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN).map_err(&doing)?;
+        if shared > most as usize {
+            let what = format!("a network whose layers need {shared} bytes of shared memory; there are {most}");
+            return Err(DeviceError::Unsupported { what });
+        }
+        function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
+        let together = function.occupancy_max_active_blocks_per_multiprocessor(THREADS, shared, None).map_err(&doing)?;
+        Ok(Self { function, shared: shared as u32, blocks: together.max(1) * gpu.multiprocessors() })
+    }
+
+    /// As many blocks as stay, or as `count` samples keep busy.
+    pub(super) fn config(&self, count: usize) -> LaunchConfig {
+        let tiles = count.div_ceil(TILE).clamp(1, self.blocks as usize) as u32;
+        LaunchConfig { grid_dim: (tiles, 1, 1), block_dim: (THREADS, 1, 1), shared_mem_bytes: self.shared }
+    }
+}
+
+/// Everything that depends on an architecture alone.
+#[derive(Debug)]
+pub(super) struct NetworkKernels {
+    pub(super) gpu: Arc<Gpu>,
+    pub(super) shape: Architecture,
+    pub(super) grid: GridArgument,
+    /// Values of the padded tables.
+    pub(super) padded: usize,
+    pub(super) predict: Resident,
+    pub(super) gradient: Resident,
+    pub(super) adam_tables: CudaFunction,
+    pub(super) adam_layers: CudaFunction,
+    pub(super) average: CudaFunction,
+    halves: CudaFunction,
+    pub(super) samples: CudaFunction,
+    pub(super) points: CudaFunction,
+}
+
+impl NetworkKernels {
+    /// Compiles them, or takes them from the cache.
+    pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture) -> Result<Arc<Self>, DeviceError> {
+        let refuse = |what: String| Err(DeviceError::Unsupported { what });
+        if gpu.capability() < OLDEST {
+            let (major, minor) = gpu.capability();
+            return refuse(format!("a network on compute capability {major}.{minor}; it needs 8.0 or later"));
+        }
+        let Some(defines) = network_defines(shape) else {
+            return refuse(format!(
+                "a network of {} hidden layers of {} over {} encoded values for the target {:?}; the device takes the target ftle with up to \
+                 {DEEPEST} hidden layers of up to {WIDEST} over up to {WIDEST}",
+                shape.layers.len() - 1,
+                shape.layers[0].outputs,
+                shape.encoded(),
+                shape.target
+            ));
+        };
+        let (grid, padded) = grid(shape)?;
+        let kernel = |name| gpu.kernel("network.cu", &defines, name);
+        let (weights, workspace) = shared_bytes(shape);
+        Ok(Arc::new(Self {
+            predict: Resident::new(gpu, kernel("network_predict")?, weights)?,
+            gradient: Resident::new(gpu, kernel("network_gradient")?, workspace)?,
+            adam_tables: kernel("network_adam_tables")?,
+            adam_layers: kernel("network_adam_layers")?,
+            average: kernel("network_average")?,
+            halves: kernel("network_halves")?,
+            samples: kernel("network_samples")?,
+            points: kernel("network_points")?,
+            gpu: gpu.clone(),
+            shape: shape.clone(),
+            grid,
+            padded,
+        }))
+    }
+
+    /// Rounds burn's tables into padded ones.
+    pub(super) fn round(&self, tables: &Buffer<f32>, halves: &Buffer<u16>) -> Result<(), DeviceError> {
+        if self.padded == 0 {
+            return Ok(());
+        }
+        let (n, from, to) = (self.padded as u64, tables.address(), halves.address());
+        let stream = self.gpu.work();
+        let mut call = stream.launch_builder(&self.halves);
+        call.arg(&self.grid).arg(&n).arg(&from).arg(&to);
+        // SAFETY: the arguments of `network_halves`; `halves` holds `padded` values and `tables` all of burn's.
+        unsafe { launch(&mut call, threads(self.padded, 256)) }
+    }
+}
+
+/// Levels as the kernels read them, and the values of the padded tables.
+fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
+    let mut grid = GridArgument::default();
+    let mut offset = 0;
+    for (level, argument) in shape.levels.iter().zip(&mut grid.levels) {
+        let mut stride = 1_u32;
+        let factor = std::array::from_fn(|axis| {
+            let dense = stride;
+            stride = stride.wrapping_mul(level.cells[axis] + 1);
+            if level.hashed { HASH[axis] } else { dense }
+        });
+        *argument = LevelArgument {
+            cells: level.cells.map(|n| n as f32),
+            last_cell: level.cells.map(|n| n - 1),
+            factor,
+            mask: (level.entries - 1) as u32,
+            hashed: u32::from(level.hashed),
+            entries: level.entries as u32,
+            offset: offset as u32,
+            start: level.offset as u32,
+        };
+        offset += level.entries.next_multiple_of(PADDING);
+    }
+    if u32::try_from(offset).is_err() {
+        return Err(DeviceError::Unsupported { what: format!("tables of {offset} entries") });
+    }
+    Ok((grid, offset * shape.features))
+}
+
+/// How outputs become log-stretch, above `base` by `share` of them where there is one.
+pub(super) fn reading(objective: &Objective, base: Option<&DeviceTable>, share: f32) -> ReadingArgument {
+    let table = base.map_or(TableArgument { nodes: [0; 3], dimensions: 0, values: 0 }, |base| {
+        let nodes = base.nodes().map(|n| n as i32);
+        TableArgument { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: base.address() }
+    });
+    ReadingArgument {
+        mean: objective.scale.mean[0],
+        deviation: objective.scale.deviation[0],
+        tau: objective.tau,
+        published: i32::from(objective.loss == Loss::Published),
+        share,
+        pad: 0,
+        base: table,
+    }
+}
+
+/// Lower corner and edge lengths of a domain.
+pub(super) fn unit_box(domain: &Domain) -> UnitBoxArgument {
+    UnitBoxArgument { min: domain.min, extent: domain.extent() }
+}
+
+/// A network that predicts, alone or above a table.
+#[derive(Debug)]
+pub struct DeviceNetwork {
+    kernels: Arc<NetworkKernels>,
+    halves: Buffer<u16>,
+    layers: Buffer<f32>,
+    objective: Objective,
+    base: Option<(Arc<DeviceTable>, f32)>,
+}
+
+impl DeviceNetwork {
+    /// Whether the kernels take networks of this architecture on this device.
+    pub fn takes(gpu: &Gpu, shape: &Architecture) -> bool {
+        gpu.capability() >= OLDEST && network_defines(shape).is_some()
+    }
+
+    /// Brings parameters over, as burn's tensors hold them. `base`: a table below, and the share of the network that counts above it.
+    ///
+    /// # Errors
+    /// An architecture that the kernels do not take, or memory that is not there.
+    pub fn upload(
+        gpu: &Arc<Gpu>,
+        shape: &Architecture,
+        objective: &Objective,
+        tables: &[f32],
+        layers: &[f32],
+        base: Option<(Arc<DeviceTable>, f32)>,
+    ) -> Result<Self, DeviceError> {
+        let kernels = NetworkKernels::new(gpu, shape)?;
+        let tables = gpu.upload("a network's tables", tables)?;
+        let layers = gpu.upload("a network's layers", layers)?;
+        Self::of(&kernels, objective, &tables, layers, base)
+    }
+
+    /// Of parameters on the device.
+    pub(super) fn of(
+        kernels: &Arc<NetworkKernels>,
+        objective: &Objective,
+        tables: &Buffer<f32>,
+        layers: Buffer<f32>,
+        base: Option<(Arc<DeviceTable>, f32)>,
+    ) -> Result<Self, DeviceError> {
+        let halves = kernels.gpu.alloc("a network's rounded tables", kernels.padded)?;
+        kernels.round(tables, &halves)?;
+        Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone(), base })
+    }
+
+    /// Memory of what prediction reads, in bytes.
+    pub fn bytes(&self) -> usize {
+        2 * self.kernels.padded + 4 * self.layers.len()
+    }
+}
+
+impl DevicePredict for DeviceNetwork {
+    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+        if count == 0 {
+            return Ok(());
+        }
+        let base = self.base.as_ref().map(|(table, _)| &**table);
+        let reading = reading(&self.objective, base, self.base.as_ref().map_or(1.0, |(_, share)| *share));
+        let (halves, layers, n) = (self.halves.address(), self.layers.address(), count as u32);
+        let kernel = &self.kernels.predict;
+        let stream = self.kernels.gpu.work();
+        let mut call = stream.launch_builder(&kernel.function);
+        call.arg(&self.kernels.grid).arg(&halves).arg(&layers).arg(&reading).arg(&points).arg(&n).arg(&out);
+        // SAFETY: the caller's, and the arguments are those of `network_predict`.
+        unsafe { launch(&mut call, kernel.config(count)) }
+    }
+}
+
+/// A copy on the device, in the order of the work stream.
+pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer<f32>, DeviceError> {
+    let doing = DeviceError::driver("copying on the device");
+    let to = gpu.alloc(what, from.len())?;
+    gpu.context().bind_to_thread().map_err(&doing)?;
+    // SAFETY: both buffers hold as many values, and neither is freed before the work stream has passed this.
+    unsafe { result::memcpy_dtod_async(to.address(), from.address(), 4 * from.len(), gpu.work().cu_stream()) }.map_err(doing)?;
+    Ok(to)
+}
+
+/// Whether `encoding` has tables.
+pub(super) fn has_tables(shape: &Architecture) -> bool {
+    shape.encoding == Encoding::HashGrid
+}

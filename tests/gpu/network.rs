@@ -1,0 +1,507 @@
+//! The network on the device against the same network in f64, against finite differences, against burn's Adam and against the CPU's
+//! training.
+
+use super::network_support::reference::{Reference, labels, norm};
+use super::network_support::uniform_points;
+use super::scenes::*;
+use burn::backend::Flex;
+use burn::module::Param;
+use burn::optim::{AdamConfig, SimpleOptimizer};
+use burn::tensor::{Tensor, TensorData};
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::cuda::{DeviceError, DeviceNetwork, DevicePredict, DeviceStep, DeviceTable, DeviceTraining, GpuSettings};
+use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::field::Domain;
+use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
+use ridgewatch::surrogate::network::{
+    Architecture, Average, Encoding, Fused, Loss, Model, NetworkSettings, Objective, Pick, Step, Target, stock_step,
+};
+use ridgewatch::surrogate::{Predict, Samples, Table};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+struct Case {
+    name: &'static str,
+    settings: NetworkSettings,
+    axes: &'static [usize],
+}
+
+/// Every kind of encoding, every number of axes and features, widths and depths that fill blocks of 16 and that do not.
+fn cases() -> Vec<Case> {
+    let small = NetworkSettings {
+        levels: 3,
+        features: 2,
+        log2_table: 7,
+        base_resolution: 4,
+        growth: 2.0,
+        octaves: 4,
+        width: 16,
+        mean_penalty: 0.0,
+        ..NetworkSettings::default()
+    };
+    let with = |change: fn(&mut NetworkSettings)| {
+        let mut settings = small.clone();
+        change(&mut settings);
+        settings
+    };
+    let space = &[0, 1, 2][..];
+    vec![
+        Case { name: "2 axes", settings: small.clone(), axes: &[0, 1] },
+        Case { name: "3 axes, width 64", settings: with(|s| s.width = 64), axes: space },
+        Case { name: "8 levels, finer than 8 samples a node", settings: with(|s| (s.levels, s.log2_table) = (8, 12)), axes: space },
+        Case { name: "4 features, width 128", settings: with(|s| (s.features, s.width) = (4, 128)), axes: space },
+        Case { name: "8 features, x and z", settings: with(|s| s.features = 8), axes: &[0, 2] },
+        Case { name: "1 feature, 1 axis, odd width", settings: with(|s| (s.features, s.width) = (1, 21)), axes: &[1] },
+        Case { name: "one hidden layer", settings: with(|s| s.hidden_layers = 1), axes: &[0, 1] },
+        Case {
+            name: "frequency, 4 layers of 40",
+            settings: with(|s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 4, 40)),
+            axes: &[0, 1],
+        },
+        Case { name: "published loss", settings: with(|s| s.loss = Loss::Published), axes: &[0, 1] },
+    ]
+}
+
+const SAMPLES: usize = 1000;
+
+/// A network whose values are of order 1, and samples for it.
+fn prepare(case: &Case) -> (Model, Objective, Samples) {
+    let extent = [2.0, 1.0, 1.5];
+    let shape = Architecture::new(&case.settings, case.axes, extent).unwrap();
+    let mut objective = Objective::new(&case.settings, &shape, extent, 2.5);
+    let samples = labels(SAMPLES, 11);
+    objective.standardise(&shape, &samples, None);
+    let mut model = Model::new(shape, 3, false);
+    for _ in 0..20 {
+        stock_step(&mut model, &objective, &samples, SAMPLES, 1e-2);
+    }
+    (model, objective, samples)
+}
+
+/// Biases of either sign that decide alone which neurons pass, smaller weights: rounding then switches none, and gradients compare.
+fn settled(model: &Model) -> Model {
+    let mut values = model.layers();
+    let (_, hidden) = model.shape.layers.split_last().unwrap();
+    for layer in hidden {
+        values[layer.weights..layer.biases].iter_mut().for_each(|w| *w *= 0.25);
+        for (neuron, bias) in values[layer.biases..layer.biases + layer.outputs].iter_mut().enumerate() {
+            *bias = if neuron % 3 == 1 { -1.5 } else { 1.5 };
+        }
+    }
+    let mut model = Model { table_moments: None, layer_moments: None, ..model.clone() };
+    let count = values.len();
+    model.module.layers =
+        Param::initialized(model.module.layers.id, Tensor::<Flex, 1>::from_data(TensorData::new(values, [count]), &Default::default()));
+    model
+}
+
+fn step(count: usize, rate: f64) -> DeviceStep {
+    DeviceStep { count, drawn: None, hold_out: false, rate, average_share: 0.0, lazy: false }
+}
+
+fn training(model: &Model, objective: &Objective) -> DeviceTraining {
+    DeviceTraining::new(&gpu(), model, objective).unwrap()
+}
+
+fn stored(training: &DeviceTraining, like: &Model) -> Model {
+    let mut model = like.clone();
+    training.store(&mut model).unwrap();
+    model
+}
+
+fn predict(network: &DeviceNetwork, points: &[[f32; 3]]) -> Vec<f32> {
+    let gpu = gpu();
+    let flat = gpu.upload("points", points).unwrap();
+    let out = gpu.upload("values", &vec![f32::NAN; points.len()]).unwrap();
+    // SAFETY: both buffers hold as many entries as there are points.
+    unsafe { network.predict(flat.address(), points.len(), out.address()) }.unwrap();
+    let mut found = vec![f32::NAN; points.len()];
+    out.read(&mut found).unwrap();
+    found
+}
+
+/// Log-stretch from the reference's output.
+fn read(objective: &Objective, output: f64) -> f64 {
+    match objective.loss {
+        Loss::MeanSquare => output * f64::from(objective.scale.deviation[0]) + f64::from(objective.scale.mean[0]),
+        Loss::Published => f64::from(objective.tau) * (output.abs().exp() - 1.0).copysign(output),
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn predictions_are_the_references() {
+    for case in cases() {
+        let (model, objective, _) = prepare(&case);
+        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers(), None).unwrap();
+        // Not a multiple of any tile, with corners, and points outside, which are moved to the edge.
+        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 5003);
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0], [-0.5, 0.3, 2.0]]);
+        let found = predict(&network, &points);
+        let inside = |p: &[f32; 3]| p.map(|x| x.clamp(0.0, 1.0));
+        for (name, reference, tolerance) in [
+            // What is left is the order of sums in single precision, and halves that this rounds to the other side.
+            ("in halves", Reference::in_halves(&model), 4e-4),
+            // Halves carry 11 bits.
+            ("exact", Reference::new(&model), 2e-3),
+        ] {
+            let expected: Vec<f64> = points.iter().map(|p| read(&objective, reference.outputs(inside(p))[0][0])).collect();
+            let apart: Vec<f64> = found.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b).collect();
+            let worst = apart.iter().fold(0.0, |m: f64, e| if e.is_nan() { f64::INFINITY } else { m.max(e.abs()) });
+            let error = norm(&apart) / norm(&expected);
+            println!("{}: {name}: relative {error:.1e}, worst {worst:.1e}", case.name);
+            assert!(error < tolerance, "{}: {name}: {error}", case.name);
+            assert!(worst < 20.0 * tolerance * norm(&expected) / (expected.len() as f64).sqrt(), "{}: {name}: {worst}", case.name);
+        }
+    }
+}
+
+/// After one step from no moments the first one is a tenth of the gradient.
+fn gradients(model: &Model) -> Vec<f64> {
+    let moment = |values: TensorData| values.iter::<f64>().map(|m| m / 0.1).collect::<Vec<_>>();
+    let tables = model.table_moments.as_ref().map(|state| moment(state.momentum.moment_1.clone().into_data()));
+    let layers = moment(model.layer_moments.as_ref().unwrap().momentum.moment_1.clone().into_data());
+    tables.into_iter().flatten().chain(layers).collect()
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn gradients_equal_finite_differences_and_burns() {
+    for case in cases() {
+        let (model, objective, samples) = prepare(&case);
+        let model = settled(&model);
+        let mut device = training(&model, &objective);
+        let pool = device.upload(&samples, None).unwrap();
+        let loss = device.train_steps(&pool, &[step(SAMPLES, 1e-9)]).unwrap()[0];
+        let found = gradients(&stored(&device, &model));
+        let mut stock = model.clone();
+        let stock_loss = stock_step(&mut stock, &objective, &samples, SAMPLES, 1e-9);
+        assert!((loss / stock_loss - 1.0).abs() < 2e-3, "{}: loss {loss}, burn's {stock_loss}", case.name);
+        let burns = gradients(&stock);
+        let apart: Vec<f64> = found.iter().zip(&burns).map(|(a, b)| a - b).collect();
+        let from_burn = norm(&apart) / norm(&burns);
+
+        let mut reference = Reference::new(&model);
+        let tables = reference.tables.len();
+        let all = tables + reference.layers.len();
+        let (mut differences, mut apart) = (Vec::new(), Vec::new());
+        for parameter in (0..all).step_by((all / 100).max(1)) {
+            let mut at = |step: f64| {
+                let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
+                let kept = std::mem::replace(value, *value + step);
+                let loss = reference.loss(&objective, &samples);
+                let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
+                *value = kept;
+                loss
+            };
+            differences.push((at(1e-6) - at(-1e-6)) / 2e-6);
+            apart.push(found[parameter] - differences[differences.len() - 1]);
+        }
+        let from_differences = norm(&apart) / norm(&differences);
+        println!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
+        // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
+        assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn adam_is_burns() {
+    let (model, objective, samples) = prepare(&cases()[1]);
+    let model = Model { table_moments: None, layer_moments: None, ..model };
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&samples, None).unwrap();
+    let mut before = model.clone();
+    let adam = AdamConfig::new().with_beta_1(0.9).with_beta_2(0.999).with_epsilon(model.epsilon).build();
+    for number in 0..5 {
+        device.train_steps(&pool, &[step(SAMPLES, 1e-2)]).unwrap();
+        let after = stored(&device, &model);
+        assert_eq!(after.steps(), number + 1);
+        // The gradient that the moments speak of, given to burn's Adam.
+        let flat = |tensor: Tensor<Flex, 1>| tensor.into_data().to_vec::<f32>().unwrap();
+        let first = after.layer_moments.as_ref().unwrap().momentum.moment_1.clone();
+        let gradient = match &before.layer_moments {
+            Some(state) => (first - state.momentum.moment_1.clone() * 0.9) / 0.1,
+            None => first / 0.1,
+        };
+        let (value, state) = SimpleOptimizer::<Flex>::step(&adam, 1e-2, before.module.layers.val(), gradient, before.layer_moments.clone());
+        let state = state.unwrap().momentum;
+        let found = after.layer_moments.as_ref().unwrap().momentum.clone();
+        // The gradient got back by a difference is good to a few units in the last place of the moment.
+        for (name, a, b, tolerance) in [
+            ("parameters", flat(after.module.layers.val()), flat(value), 2e-5),
+            ("second moments", flat(found.moment_2), flat(state.moment_2), 0.0),
+        ] {
+            for (a, b) in a.iter().zip(&b) {
+                assert!((a - b).abs() <= tolerance + 2e-4 * b.abs(), "step {number}: {name} {a} and {b}");
+            }
+        }
+        before = after;
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn lines_without_a_gradient_wait() {
+    // Two samples reach a few entries of a large table.
+    let settings = NetworkSettings { levels: 2, features: 2, base_resolution: 40, ..NetworkSettings::default() };
+    let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
+    let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
+    let model = Model::new(shape, 5, false);
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&labels(2, 3), None).unwrap();
+    let lazy = DeviceStep { lazy: true, ..step(2, 1e-2) };
+    device.train_steps(&pool, &[lazy, lazy]).unwrap();
+    let others = device.upload(&labels(2, 4), None).unwrap();
+    device.train_steps(&others, &[lazy]).unwrap();
+    let (before, after) = (model.tables(), stored(&device, &model).tables());
+    let mut moved = 0;
+    for (level, lines) in model.shape.levels.iter().map(|l| (l, (l.entries * 2).div_ceil(16))) {
+        for line in 0..lines {
+            let range = level.offset * 2 + 16 * line..(level.offset * 2 + 16 * line + 16).min((level.offset + level.entries) * 2);
+            moved += usize::from(before[range.clone()] != after[range]);
+        }
+    }
+    // Four samples, two levels, eight corners, of which pairs often share a line.
+    assert!((16..=64).contains(&moved), "{moved} lines moved");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn training_learns_what_the_cpu_learns() {
+    let settings = NetworkSettings { levels: 8, features: 2, log2_table: 15, growth: 1.5, ..NetworkSettings::default() };
+    let extent = [1.0; 3];
+    let shape = Architecture::new(&settings, &[0, 1, 2], extent).unwrap();
+    let mut objective = Objective::new(&settings, &shape, extent, 1.0);
+    let samples = labels(1 << 15, 7);
+    objective.standardise(&shape, &samples, None);
+    let (mut model, count, all) = (Model::new(shape, 9, false), 4096, 150);
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&samples, None).unwrap();
+    let share = |number: u64| if number % 8 == 7 { 0.5 } else { 0.0 };
+    let steps: Vec<DeviceStep> = (0..all)
+        .map(|i| DeviceStep {
+            drawn: Some((21, i * count as u64)),
+            hold_out: true,
+            average_share: share(i),
+            lazy: true,
+            ..step(count, 1e-2)
+        })
+        .collect();
+    let found = device.train_steps(&pool, &steps).unwrap();
+    let mut average = Average { tables: model.tables(), layers: model.layers() };
+    let mut expected = Vec::new();
+    Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
+        expected.extend(loss);
+        let pick = Pick::Random { seed: 21, counter: done * count as u64, among: None, hold_out: true };
+        (done < all).then_some(Step { samples: &samples, pick, count, rate: 1e-2, average_share: share(done), lazy: true, base: None })
+    });
+    // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
+    assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "first losses {} and {}", found[0], expected[0]);
+    let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;
+    println!("losses: device {:.2e} ... {:.3e}, CPU ... {:.3e}", found[0], mean(&found), mean(&expected));
+    assert!((mean(&found) / mean(&expected) - 1.0).abs() < 0.15, "last losses {} and {}", mean(&found), mean(&expected));
+    assert!(mean(&found) < 0.02 * found[0], "it learns");
+    // What predicts is the mean, brought back or not.
+    let points = uniform_points(31, 3001);
+    let frozen = predict(&device.frozen(None).unwrap(), &points);
+    let back = device.average().unwrap();
+    let again = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &back.tables, &back.layers, None).unwrap();
+    assert_eq!(frozen, predict(&again, &points));
+    let cpu = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &average.tables, &average.layers, None).unwrap();
+    let cpu = predict(&cpu, &points);
+    let apart: Vec<f64> = frozen.iter().zip(&cpu).map(|(a, b)| f64::from(a - b)).collect();
+    let spread = f64::from(objective.scale.deviation[0]) * (points.len() as f64).sqrt();
+    assert!(norm(&apart) < 0.05 * spread, "{} of {spread}", norm(&apart));
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_table_below_adds_up() {
+    let (gpu, source) = (gpu(), turbulence([40, 24, 24], 4));
+    let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
+    let tracer = cpu_tracer(source.clone(), &map, 0.0).unwrap();
+    let table = Table::trace(&*tracer, [20, 12, 12]);
+    let base = std::sync::Arc::new(DeviceTable::upload(&gpu, &domain(&source), &table).unwrap());
+    let (model, objective, _) = prepare(&cases()[1]);
+    let points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 4001);
+    let of = |base| DeviceNetwork::upload(&gpu, &model.shape, &objective, &model.tables(), &model.layers(), base).unwrap();
+    let alone = predict(&of(None), &points);
+    let sum = predict(&of(Some((base.clone(), 0.7))), &points);
+    let mut below = vec![0.0; points.len()];
+    table.predict(&points, &mut below);
+    for ((sum, alone), below) in sum.iter().zip(&alone).zip(&below) {
+        assert!((sum - (below + 0.7 * alone)).abs() < 1e-5, "{sum} = {below} + 0.7 * {alone}");
+    }
+    // Trained on what the labels have beyond the table: where they are the table's own values, nothing is left to learn.
+    let zero = Model::new(model.shape.clone(), 2, true);
+    let mut device = training(&zero, &Objective { scale: Default::default(), ..objective.clone() });
+    let labels = Samples { log_stretch: below.clone(), points, ..Samples::default() };
+    let pool = device.upload(&labels, Some(&base)).unwrap();
+    let loss = device.train_steps(&pool, &[step(4000, 1e-3)]).unwrap()[0];
+    assert!(loss < 1e-10, "{loss}");
+    let pool = device.upload(&labels, None).unwrap();
+    let loss = device.train_steps(&pool, &[step(4000, 1e-3)]).unwrap()[0];
+    let expected = below[..4000].iter().map(|s| f64::from(s * s)).sum::<f64>() / 4000.0;
+    assert!((loss / expected - 1.0).abs() < 0.01, "{loss} {expected}");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn held_out_and_broken_samples_are_not_learned_from() {
+    let (model, objective, mut samples) = prepare(&cases()[0]);
+    for index in (0..SAMPLES).step_by(64) {
+        samples.log_stretch[index] = 1e6;
+    }
+    samples.log_stretch[5] = f32::NAN;
+    samples.log_stretch[6] = f32::INFINITY;
+    samples.points[7][1] = f32::NAN;
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&samples, None).unwrap();
+    let drawn = |hold_out| DeviceStep { drawn: Some((1, 0)), hold_out, ..step(5000, 1e-3) };
+    let losses = device.train_steps(&pool, &[drawn(true); 3]).unwrap();
+    assert!(losses.iter().all(|loss| *loss < 1.0), "{losses:?}");
+    assert!(stored(&device, &model).tables().iter().all(|x| x.is_finite()));
+    let losses = device.train_steps(&pool, &[drawn(false)]).unwrap();
+    assert!(losses[0] > 1e3, "the held-out ones are there: {losses:?}");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn what_the_kernels_do_not_take_is_refused() {
+    let refused = |settings: &NetworkSettings| {
+        let shape = Architecture::new(settings, &[0, 1, 2], [1.0; 3]).unwrap();
+        let objective = Objective::new(settings, &shape, [1.0; 3], 1.0);
+        DeviceTraining::new(&gpu(), &Model::new(shape, 1, false), &objective).unwrap_err()
+    };
+    let usual = NetworkSettings { log2_table: 10, ..NetworkSettings::default() };
+    for settings in [
+        NetworkSettings { width: 129, ..usual.clone() },
+        NetworkSettings { hidden_layers: 5, ..usual.clone() },
+        NetworkSettings { target: Target::FlowMap, ..usual.clone() },
+        NetworkSettings { loss: Loss::Published, mean_penalty: 1.0, ..usual },
+    ] {
+        assert!(matches!(refused(&settings), DeviceError::Unsupported { .. }), "{settings:?}");
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn a_ring_keeps_the_newest() {
+    let (model, objective, _) = prepare(&cases()[0]);
+    let device = training(&model, &objective);
+    let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+    let mut ring = device.ring(1000).unwrap();
+    let mut expected = vec![[f32::NAN; 4]; 1000];
+    let mut written = 0;
+    for (seed, count) in [(1, 300), (2, 500), (3, 300), (4, 1000), (5, 1)] {
+        let samples = labels(count, seed);
+        let (points, values) = (gpu().upload("points", &samples.points).unwrap(), gpu().upload("values", &samples.log_stretch).unwrap());
+        // SAFETY: both buffers hold `count` entries and are freed in the order of the work stream.
+        unsafe { device.append(&mut ring, &unit, points.address(), values.address(), count, None) }.unwrap();
+        for (p, s) in samples.points.iter().zip(&samples.log_stretch) {
+            expected[written % 1000] = [p[0], p[1], p[2], (s - objective.scale.mean[0]) / objective.scale.deviation[0]];
+            written += 1;
+        }
+        assert_eq!(ring.len(), written.min(1000));
+        for (found, expected) in ring.values().unwrap().iter().zip(&expected) {
+            assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?} {expected:?}");
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn drawn_points_fill_the_domain() {
+    let (model, objective, _) = prepare(&cases()[0]);
+    let device = training(&model, &objective);
+    let domain = Domain::cuboid([-1.0, 0.0, 10.0], [1.0, 0.5, 40.0]);
+    let mut buffer = gpu().upload("points", &[[f32::NAN; 3]; 1 << 16]).unwrap();
+    device.draw_points(&domain, 5, 1 << 40, &mut buffer).unwrap();
+    let mut points = vec![[0.0; 3]; 1 << 16];
+    buffer.read(&mut points).unwrap();
+    assert!(points.iter().all(|&p| domain.contains(p)));
+    for axis in 0..3 {
+        // Sixteen even parts; six standard deviations of their counts.
+        let mut counts = [0_i32; 16];
+        points.iter().for_each(|&p| counts[(domain.to_unit(p)[axis] * 16.0).min(15.0) as usize] += 1);
+        assert!(counts.iter().all(|c| (c - 4096).abs() < 6 * 64), "{counts:?}");
+    }
+}
+
+/// Film and record of the last frame of a small run that trains a fixed number of steps a frame.
+fn last_frame(device: &Device, seed: u64) -> Frame {
+    let text = "
+[source]
+kind = \"turbulence\"
+nodes = [48, 24, 24]
+[time]
+tau = 8
+slides = 1
+frames_per_slide = 3
+[flow]
+steps = 16
+[surrogate]
+kind = \"residual\"
+[network]
+levels = 4
+features = 2
+log2_table = 14
+base_resolution = 8
+width = 16
+batch = 4096
+[training]
+steps_per_frame = 60
+[render]
+method = \"gated\"
+width = 48
+height = 24
+samples = 8
+[transfer]
+low = 0.1
+high = 0.3
+";
+    let scene = SceneFile::parse(Path::new("a test"), text, &[format!("seed={seed}")]).unwrap();
+    let mut last = None;
+    let options = RunOptions { device: device.clone(), ..RunOptions::default() };
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            last = Some(frame);
+        }
+    };
+    run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).unwrap();
+    last.unwrap()
+}
+
+/// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
+/// networks, which are trained on other samples.
+#[test]
+#[ignore = "needs a GPU"]
+fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
+    const SEEDS: u64 = 16;
+    let pictures = |device: &Device, first: u64| -> Vec<Frame> { (first..first + SEEDS).map(|seed| last_frame(device, seed)).collect() };
+    let (found, expected) = (pictures(&device(GpuSettings::default()), 0), pictures(&Device::CPU, 100));
+    for frame in &found {
+        let record = &frame.record;
+        assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
+        // A GPU that walks answers points ahead of their flights; one that only traces does not.
+        assert!(record.traced_ahead > 0, "the device walks");
+    }
+    let moments = |frames: &[Frame], pixel: usize| {
+        let values: Vec<f64> = frames.iter().map(|f| f.film.rgba[pixel][..3].iter().map(|&c| f64::from(c)).sum()).collect();
+        let mean = values.iter().sum::<f64>() / SEEDS as f64;
+        (mean, values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (SEEDS - 1) as f64 / SEEDS as f64)
+    };
+    let (mut squares, mut count) = (0.0, 0);
+    for pixel in 0..found[0].film.rgba.len() {
+        let ((a, noise_a), (b, noise_b)) = (moments(&found, pixel), moments(&expected, pixel));
+        if noise_a + noise_b > 1e-12 {
+            squares += (a - b).powi(2) / (noise_a + noise_b);
+            count += 1;
+        }
+    }
+    let mean = squares / f64::from(count);
+    println!("difference of the means over its noise, squared: {mean:.3} on average over {count} pixels");
+    // A squared Student t of 30 degrees of freedom is 30 / 28 on average, with a standard deviation of 1.6.
+    assert!(count > 200 && (mean - 30.0 / 28.0).abs() < 6.0 * 1.6 / f64::from(count).sqrt(), "{mean} over {count}");
+}

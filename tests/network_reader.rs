@@ -1,0 +1,54 @@
+//! `examples/evaluate_network.py` gives what the program predicts, from the checkpoint alone. Needs Python with NumPy (`make test-data` has it).
+
+#![allow(clippy::unwrap_used)]
+
+mod network_support;
+
+use network_support::{DoubleGyre, traced, uniform_points};
+use ridgewatch::flow::Tracer;
+use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
+use ridgewatch::surrogate::{Kind, SurrogateSettings, build};
+use std::io::Write;
+use std::process::{Command, Stdio};
+
+/// The example's answers at unit points.
+fn evaluated(checkpoint: &std::path::Path, points: &[[f32; 3]]) -> Vec<f32> {
+    let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/evaluate_network.py");
+    let mut child = Command::new(python).args([script.as_ref(), checkpoint]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z}\n")).collect();
+    // The script reads everything before it writes anything.
+    child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", output.status);
+    String::from_utf8(output.stdout).unwrap().lines().map(|line| line.parse().unwrap()).collect()
+}
+
+#[test]
+#[ignore = "needs Python with NumPy (`make test-data` has it)"]
+fn numpy_reproduces_predictions_from_a_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let tracer = DoubleGyre::new(0.0, 3.0, 30);
+    let samples = traced(&tracer, uniform_points(3, 4000), false);
+    let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 3, width: 24, octaves: 4, batch: 1024, ..hash.clone() };
+    for (name, kind, network) in
+        [("hash", Kind::Network, &hash), ("frequency", Kind::Network, &frequency), ("residual", Kind::Residual, &hash)]
+    {
+        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
+        let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
+        surrogate.learn(&samples, f64::INFINITY, 200);
+        let path = folder.path().join(name);
+        surrogate.save(&path).unwrap();
+        let mut points = uniform_points(8, 500);
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]]);
+        let mut expected = vec![0.0; points.len()];
+        surrogate.predict(&points, &mut expected);
+        let found = evaluated(&path, &points);
+        assert_eq!(found.len(), expected.len());
+        for ((point, found), expected) in points.iter().zip(&found).zip(&expected) {
+            // f64 there, f32 here.
+            assert!((found - expected).abs() < 2e-4 * expected.abs().max(1.0), "{name}: {point:?}: {found} for {expected}");
+        }
+    }
+}
