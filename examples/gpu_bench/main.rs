@@ -393,10 +393,10 @@ mod bench {
             let grid = Arc::new(Grid { axes, geometry: Geometry::Sphere { radius: 1f64.to_degrees() }, slab: (0.0, 1.0) });
             let source = VelocitySource::Window(Arc::new(Turbulence::easy(shape, 0).window(&grid, SNAPSHOTS)?));
             let batch = Batch::new(&self.gpu, &scattered(&grid.domain(), 1 << 23, 1))?;
-            println!("| kernel | steps | M samples/s | registers |\n|---|---|---|---|");
-            for (kind, tuning) in &KERNELS[..3] {
+            println!("| order | steps | M samples/s | registers |\n|---|---|---|---|");
+            for (kind, sorted) in [("sorted", true), ("as they come", false)] {
                 for steps in [11, 22] {
-                    let tracer = self.tracer(&source, &turbulent(steps), *tuning)?;
+                    let tracer = self.tracer(&source, &turbulent(steps), Tuning { sorted, ..Tuning::default() })?;
                     let ms = batch.time(&tracer, batch.count)?;
                     println!("| {kind} | {steps} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
                 }

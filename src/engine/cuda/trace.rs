@@ -5,8 +5,8 @@ use super::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
 use super::sort::{MOST, SortCells, Sorter};
 use super::window::DeviceWindow;
 use super::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
-use crate::field::Domain;
 use crate::field::analytic::{Analytic, ClosedForm, Form};
+use crate::field::{Domain, Geometry};
 use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
 use crate::simd::Real;
 use cudarc::driver::{CudaFunction, PushKernelArg};
@@ -126,8 +126,10 @@ impl DeviceTracer {
                     Ok(address)
                 };
                 let spread = tuning.spread && tuning.sorted && map.integrator == Integrator::Differences;
-                // In double precision the kept cell takes registers that other warps need, and is slower (docs/performance.md).
-                let keep = tuning.keep && map.precision == Precision::F32;
+                // In double precision, and with levels on the sphere, the kept cell takes registers that other warps need, and is slower
+                // (docs/performance.md).
+                let layered = matches!(grid.geometry, Geometry::Sphere { .. }) && grid.dimensions() == 3;
+                let keep = tuning.keep && map.precision == Precision::F32 && !layered;
                 let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, keep)?;
                 let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
                 Ok(Self {
