@@ -8,13 +8,13 @@ mod error;
 pub use error::ConfigError;
 
 use crate::engine::{DeviceSettings, Settings, TimeSettings, TrainingSettings};
-use crate::flow::FlowSettings;
+use crate::flow::{FlowSettings, Integrator, StepsSetting};
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
-use crate::source::{DomainSettings, NetCdfSettings, SourceSettings};
-use crate::surrogate::{SurrogateSettings, network::NetworkSettings};
+use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
+use crate::surrogate::{Kind, SurrogateSettings, network::NetworkSettings};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
@@ -98,6 +98,18 @@ impl Origin {
     }
 }
 
+/// What stands for the scene file where there is none.
+const COMMAND_LINE: &str = "(command line)";
+
+/// Dotted keys of all values.
+fn keys_of(table: &toml::Table) -> Vec<String> {
+    let below = |(key, value): (&String, &toml::Value)| match value {
+        toml::Value::Table(inner) => keys_of(inner).into_iter().map(|rest| format!("{key}.{rest}")).collect(),
+        _ => vec![key.clone()],
+    };
+    table.iter().flat_map(below).collect()
+}
+
 impl SceneFile {
     /// Reads and checks a scene file; `overrides` are `table.key=value` with values in TOML (a bare word is a string).
     /// Paths in `archive.files`, `live.ring`, `live.connections` and `training.resume` are relative to the scene file's folder.
@@ -121,37 +133,64 @@ impl SceneFile {
     /// Checks the text of a scene file; `path` appears in errors only.
     pub fn parse(path: &Path, text: &str, overrides: &[String]) -> Result<Self, ConfigError> {
         let plain: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(path, text, &e))?;
-        let mut scene = if overrides.is_empty() { plain } else { Self::overridden(&plain, overrides)? };
-        scene.origin = Origin::new(path, text, overrides);
-        scene.check()?;
-        Ok(scene)
+        let table: toml::Table = text.parse().map_err(|e| ConfigError::from_toml(path, text, &e))?;
+        Self::complete(plain, Origin::new(path, text, overrides), &keys_of(&table), overrides)
     }
 
     /// A scene for files given by name alone: every default.
     pub fn for_archive(files: Vec<PathBuf>, overrides: &[String]) -> Result<Self, ConfigError> {
-        let origin = Path::new("(command line)");
-        let text = "[source]\nkind = \"archive\"\n";
-        let mut scene: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(origin, text, &e))?;
-        scene.archive.files = files;
-        if !overrides.is_empty() {
-            scene = Self::overridden(&scene, overrides)?;
-        }
-        scene.origin = Origin::new(origin, "", overrides);
-        scene.check()?;
-        Ok(scene)
+        let mut plain = Self::bare("archive")?;
+        plain.archive.files = files;
+        Self::complete(plain, Origin::new(Path::new(COMMAND_LINE), "", overrides), &[], overrides)
     }
 
     /// A scene for a simulation that runs now, of which only the place is known: every default.
     pub fn for_live(overrides: &[String]) -> Result<Self, ConfigError> {
-        let origin = Path::new("(command line)");
-        let text = "[source]\nkind = \"live\"\n";
-        let mut scene: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(origin, text, &e))?;
-        if !overrides.is_empty() {
-            scene = Self::overridden(&scene, overrides)?;
-        }
-        scene.origin = Origin::new(origin, "", overrides);
+        Self::complete(Self::bare("live")?, Origin::new(Path::new(COMMAND_LINE), "", overrides), &[], overrides)
+    }
+
+    fn bare(kind: &str) -> Result<Self, ConfigError> {
+        let text = format!("[source]\nkind = \"{kind}\"\n");
+        toml::from_str(&text).map_err(|e| ConfigError::from_toml(Path::new(COMMAND_LINE), &text, &e))
+    }
+
+    /// Applies the overrides and checks all. `keys` are those that the file of `plain` sets.
+    fn complete(mut plain: Self, origin: Origin, keys: &[String], overrides: &[String]) -> Result<Self, ConfigError> {
+        plain.origin = origin.clone();
+        let mut scene = if overrides.is_empty() { plain.clone() } else { Self::overridden(&plain, overrides)? };
+        scene.origin = origin;
         scene.check()?;
+        // What the file says is judged by the file alone: an option that makes a part of it idle is no fault of the file.
+        plain.refuse_idle(keys)?;
+        let set: Vec<String> = scene.origin.elsewhere.iter().map(|(key, _)| key.clone()).collect();
+        scene.refuse_idle(&set)?;
         Ok(scene)
+    }
+
+    /// Refuses keys that would be read and do nothing in this scene. (Keys of `[source]` are refused by their room, those of `[archive]` that
+    /// do not fit the files when these are open.)
+    fn refuse_idle(&self, keys: &[String]) -> Result<(), ConfigError> {
+        use SourceKind::{Archive, Live, Turbulence};
+        let (kind, flow) = (self.source.kind, &self.flow);
+        let gridded = matches!(kind, Archive | Live | Turbulence);
+        let adaptive = flow.integrator == Integrator::DormandPrince;
+        for (idle, works, accepted) in [
+            ("archive", kind == Archive, "only with source.kind = \"archive\""),
+            ("live", kind == Live, "only with source.kind = \"live\""),
+            ("time.start", !gridded, "only with closed forms; snapshots have times of their own"),
+            ("time.step", !gridded, "only with closed forms; time.stride says how far the window of snapshots moves"),
+            ("time.stride", gridded, "only with snapshots; time.step says how far the seed time of a closed form moves"),
+            ("flow.gap", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
+            ("flow.steps", !adaptive, "left out with flow.integrator = \"dormand_prince\", which chooses its own"),
+            ("flow.tolerance", !adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\""),
+            ("surrogate.table_nodes", self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\""),
+        ] {
+            let below = |key: &&String| key.strip_prefix(idle).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+            if let Some(key) = keys.iter().find(below).filter(|_| !works) {
+                return Err(self.locate(Refused::new(key.as_str(), "does nothing here", accepted)));
+            }
+        }
+        Ok(())
     }
 
     /// What the cycle is told.
@@ -245,7 +284,7 @@ impl SceneFile {
             }
             table.insert(last.to_owned(), value);
             // Deserialise after each, so that the error names the one at fault.
-            let _: Self = tree.clone().try_into().map_err(|e: toml::de::Error| fail(error::with_suggestion(e.message())))?;
+            let _: Self = tree.clone().try_into().map_err(|e: toml::de::Error| fail(error::in_plain_words(e.message())))?;
         }
         tree.try_into().map_err(|e: toml::de::Error| ConfigError::Override { given: overrides.join(" "), message: e.message().to_owned() })
     }

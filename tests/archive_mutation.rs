@@ -1,23 +1,20 @@
-//! Damaged NetCDF-4 and HDF5 files. Their bytes are read by libhdf5, whose C code may crash, hang or ask for any memory: each file goes to a
-//! child process with limits, which must end by itself with an answer or one message.
+//! Damaged NetCDF-4 and HDF5 files of every kind that is read. Their bytes are read by libhdf5, whose C code may crash, hang or ask for any
+//! memory: each file goes to a child process with limits, which must end by itself with an answer or one message.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 #![cfg(target_os = "linux")]
 
 mod netcdf_fixture;
 
+use hdf5_metno::File;
+use ndarray::{Array4, Array5};
+use netcdf_fixture::grids::{Ocean, Wrf, packed_levels};
+use netcdf_fixture::mutants::{mutant, random, used};
 use netcdf_fixture::*;
-use ridgewatch::source::{NetCdfArchive, NetCdfSettings, SyntheticSettings, SyntheticShape, synthesize};
-use std::path::Path;
+use ridgewatch::source::{SyntheticSettings, SyntheticShape, synthesize};
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
-
-/// SplitMix64.
-fn random(state: &mut u64) -> u64 {
-    *state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-    let z = (*state ^ (*state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-    let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-    z ^ (z >> 31)
-}
 
 /// Address space of a child, kB: the program and its libraries take half of it.
 const MEMORY: u64 = 2_000_000;
@@ -37,11 +34,14 @@ enum End {
     Hung,
 }
 
-fn read(files: &[&Path]) -> End {
+/// Looks at files or, `traced`, computes an FTLE from them, for which snapshots of all are read. Also returns the bytes that it had in
+/// memory at most.
+#[allow(clippy::zombie_processes)] // `ended` waits for it, and learns what it took.
+fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
     let files = files.iter().map(|f| f.display().to_string()).collect::<Vec<_>>().join(" ");
-    // Two are traced, so that snapshots of the second are read.
-    let (work, then) = if files.contains(' ') { ("ftle", "--grid 5x5 --set time.tau=7200") } else { ("inspect", "") };
-    let command = format!("ulimit -v {MEMORY}; exec {} {work} {files} {then}", env!("CARGO_BIN_EXE_ridgewatch"));
+    let work = if traced { "ftle" } else { "inspect" };
+    let options = if traced { options } else { options.split("--grid").next().unwrap_or_default() };
+    let command = format!("ulimit -v {MEMORY}; exec {} {work} {files} {options}", env!("CARGO_BIN_EXE_ridgewatch"));
     let mut child = Command::new("sh")
         .args(["-c", &command])
         .env("RIDGEWATCH_OPENING_LIMIT", "5")
@@ -50,99 +50,191 @@ fn read(files: &[&Path]) -> End {
         .spawn()
         .unwrap();
     let begin = Instant::now();
-    let status = loop {
-        if let Some(status) = child.try_wait().unwrap() {
-            break status;
+    let (status, peak) = loop {
+        if let Some(ended) = ended(child.id()) {
+            break ended;
         }
         if begin.elapsed() > LONGEST {
             child.kill().unwrap();
             child.wait().unwrap();
-            return End::Hung;
+            return (End::Hung, 0);
         }
         std::thread::sleep(Duration::from_millis(1));
     };
     let said = std::io::read_to_string(child.stderr.take().unwrap()).unwrap();
-    assert!(!said.contains("panicked"), "{said}");
-    match status.code() {
-        Some(0) => End::Answered,
-        Some(1) => {
-            if said.contains("was not opened within 5 s") {
-                return End::GivenUp;
+    assert!(!said.contains("panicked"), "{command}: {said}");
+    let end = match status {
+        0 => End::Answered,
+        // 2 where damage makes a file one that the options do not fit.
+        1 | 2 => {
+            assert!(said.contains("mutant") || said.contains("--set") || said.contains("--grid"), "names the file: {command}: {said}");
+            match () {
+                () if said.contains("not opened within 5 s") => End::GivenUp,
+                () if said.contains("crashed") => End::Crashed,
+                () => End::Refused,
             }
-            assert!(said.contains("mutant"), "names the file: {said}");
-            if said.contains("crashed") { End::Crashed } else { End::Refused }
         }
-        other => panic!("ended with {other:?} ({status:?}): {said}"),
+        other => panic!("{command}: ended with {other}: {said}"),
+    };
+    (end, peak)
+}
+
+/// Exit status (or minus the signal) and peak memory in bytes of a child, once it has ended.
+fn ended(child: u32) -> Option<(i32, u64)> {
+    let mut status = 0;
+    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
+    let usage = unsafe {
+        let mut usage: libc::rusage = std::mem::zeroed();
+        let found = libc::wait4(child as libc::pid_t, &raw mut status, libc::WNOHANG, &raw mut usage);
+        if found == 0 {
+            return None;
+        }
+        assert_eq!(found, child as libc::pid_t, "{}", std::io::Error::last_os_error());
+        usage
+    };
+    let code = if libc::WIFEXITED(status) { libc::WEXITSTATUS(status) } else { -libc::WTERMSIG(status) };
+    Some((code, usage.ru_maxrss as u64 * 1024))
+}
+
+/// A file to be damaged, and how it is read.
+struct Case {
+    name: &'static str,
+    whole: PathBuf,
+    /// A whole file of an earlier time: behind it a damaged one is not read in the same way.
+    before: Option<PathBuf>,
+    options: &'static str,
+}
+
+/// Two times of `Velocity_*` with coordinates, or of `u*` without.
+fn turbulence_database(path: &Path, current: bool) {
+    let file = File::create(path).unwrap();
+    for t in 1..3 {
+        let values = Array4::from_shape_fn((3, 4, 5, 3), |(z, y, x, c)| (x + 2 * y + 3 * z + c * t) as f32);
+        let name = if current { format!("Velocity_{t:04}") } else { format!("u{:05}", 10 * t) };
+        file.new_dataset_builder().with_data(&values).create(name.as_str()).unwrap();
     }
+    for (name, n) in [("xcoor", 5), ("ycoor", 4), ("zcoor", 3)].into_iter().filter(|_| current) {
+        let values: Vec<f32> = (0..n).map(|i| 0.5 * i as f32).collect();
+        file.new_dataset_builder().with_data(&values).create(name).unwrap();
+    }
+}
+
+/// All components and times in one compressed dataset of a group, and the rest beside it.
+fn grouped(path: &Path) {
+    let file = File::create(path).unwrap();
+    let group = file.create_group("fields").unwrap();
+    let values = Array5::from_shape_fn((3, 4, 5, 6, 3), |(t, z, y, x, c)| (x + 2 * y + 3 * z + c * t) as f32);
+    group.new_dataset_builder().deflate(4).chunk((1, 4, 5, 6, 3)).with_data(&values).create("velocity").unwrap();
+    group.new_dataset_builder().with_data(&[0.0f64, 1.0, 2.0]).create("time").unwrap();
+    for (name, n) in [("x", 6), ("y", 5), ("z", 4)] {
+        let values: Vec<f64> = (0..n).map(f64::from).collect();
+        group.new_dataset_builder().with_data(&values).create(name).unwrap();
+    }
+}
+
+/// NetCDF-4.
+fn netcdf4(folder: &Path) -> Vec<Case> {
+    let at = |name: &str| folder.join(name);
+    let hours = "hours since 2000-01-01";
+    let era = |hour: f64| packed_levels(NETCDF4, &[850.0, 500.0, 700.0], hour);
+    let ocean = |hour: f64| Ocean { n: 9, hour, ..Ocean::default() }.fixture();
+    vec![
+        Case {
+            name: "plane",
+            whole: plane(NETCDF4, &[2.0, 3.0, 4.0], hours).write(&at("plane.nc")),
+            before: Some(plane(NETCDF4, &[0.0], hours).write(&at("plane_before.nc"))),
+            options: "--set time.tau=3600 --grid 5x5",
+        },
+        Case {
+            name: "packed levels",
+            whole: era(2.0).write(&at("levels.nc")),
+            before: Some(era(0.0).write(&at("levels_before.nc"))),
+            options: "--set time.tau=3600 --grid 5x5x5",
+        },
+        Case {
+            name: "staggered",
+            whole: Wrf { hour: 18, ..Wrf::default() }.fixture().write(&at("staggered.nc")),
+            before: Some(Wrf::default().fixture().write(&at("staggered_before.nc"))),
+            options: "--set time.tau=3600 --grid 5x5x5",
+        },
+        Case {
+            name: "curvilinear",
+            whole: ocean(2.0).write(&at("curvilinear.nc")),
+            before: Some(ocean(0.0).write(&at("curvilinear_before.nc"))),
+            options: "--set time.tau=3600 --grid 5x5",
+        },
+    ]
+}
+
+/// HDF5.
+fn hdf5(folder: &Path) -> Vec<Case> {
+    let small = SyntheticSettings { nodes: [4, 4, 4], snapshots: 2, ..SyntheticSettings::new(SyntheticShape::Flame) };
+    let mut flame = synthesize(&small, folder).unwrap();
+    let [current, legacy, group] = ["current.h5", "legacy.h5", "grouped.h5"].map(|name| folder.join(name));
+    turbulence_database(&current, true);
+    turbulence_database(&legacy, false);
+    grouped(&group);
+    let traced = "--set time.tau=1 --grid 5x5x5";
+    vec![
+        Case { name: "flame", whole: flame.remove(1), before: Some(flame.remove(0)), options: traced },
+        Case { name: "JHTDB", whole: current, before: None, options: traced },
+        Case {
+            name: "JHTDB, older",
+            whole: legacy,
+            before: None,
+            options: "--set archive.spacing=[0.1,0.1,0.1] --set time.tau=1 --grid 5x5x5",
+        },
+        Case {
+            name: "grouped, deflated",
+            whole: group,
+            before: None,
+            options: "--set archive.velocity=fields/velocity --set archive.order=tzyxc --set time.tau=1 --grid 5x5x5",
+        },
+    ]
 }
 
 #[test]
 fn mutated_files_end_in_an_answer_or_a_message() {
     // RIDGEWATCH_MUTATIONS=10000 (of each format) for a long run.
-    let count: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(75);
+    let count: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(80);
     let dir = tempfile::tempdir().unwrap();
-    let netcdf = plane(NETCDF4, &[0.0, 1.0, 2.0], "hours since 2000-01-01").write(&dir.path().join("whole.nc"));
-    let small = SyntheticSettings { nodes: [4, 4, 4], snapshots: 2, ..SyntheticSettings::new(SyntheticShape::Flame) };
-    let hdf5 = synthesize(&small, dir.path()).unwrap().remove(0);
     let mut state = 7;
-    let mut largest = 0;
-    let later = plane(NETCDF4, &[7.0], "hours since 2000-01-01").write(&dir.path().join("later.nc"));
-    for (whole, mutant, other) in [(netcdf, "mutant.nc", vec![later.as_path()]), (hdf5, "mutant.h5", vec![])] {
-        assert!(NetCdfArchive::open(std::slice::from_ref(&whole), &NetCdfSettings::default()).is_ok());
-        let whole = std::fs::read(whole).unwrap();
-        largest = largest.max(whole.len() as u64);
-        let file = dir.path().join(mutant);
-        // Where the file holds structure: most of it is zeros and values.
-        let used: Vec<usize> = (0..whole.len()).filter(|&i| whole[i] != 0).collect();
-        let mut ends = std::collections::BTreeMap::new();
-        let mut longest = Duration::ZERO;
-        for _ in 0..count {
-            let mut bytes = whole.clone();
-            for _ in 0..1 + random(&mut state) % 4 {
-                let near = used[random(&mut state) as usize % used.len()] + random(&mut state) as usize % 4;
-                let at = near.min(bytes.len() - 1);
-                bytes[at] = match random(&mut state) % 4 {
-                    0 => 0,
-                    1 => 0xff,
-                    2 => bytes[at] ^ (1 << (random(&mut state) % 8)),
-                    _ => random(&mut state) as u8,
-                };
+    for (format, ending, cases) in [("NetCDF-4", "nc", netcdf4(dir.path())), ("HDF5", "h5", hdf5(dir.path()))] {
+        let mut of_format = BTreeMap::new();
+        let share = count.div_ceil(cases.len() as u64);
+        for Case { name, whole, before, options } in &cases {
+            let both: Vec<&Path> = before.iter().map(PathBuf::as_path).chain([whole.as_path()]).collect();
+            assert_eq!(read(&both, true, options).0, End::Answered, "{name}: {both:?}");
+            let whole = std::fs::read(whole).unwrap();
+            let file = dir.path().join("mutant").with_extension(ending);
+            let used = used(&whole);
+            let (mut ends, mut longest, mut largest) = (BTreeMap::new(), Duration::ZERO, 0);
+            for _ in 0..share {
+                let _ = std::fs::remove_file(&file);
+                std::fs::write(&file, mutant(&whole, &used, &mut state)).unwrap();
+                // Alone and behind a whole one, headers only and the field.
+                let (behind, traced) = (random(&mut state).is_multiple_of(2), random(&mut state).is_multiple_of(2));
+                let files: Vec<&Path> = before.iter().filter(|_| behind).map(PathBuf::as_path).chain([file.as_path()]).collect();
+                let begin = Instant::now();
+                let (end, peak) = read(&files, traced, options);
+                longest = longest.max(begin.elapsed());
+                largest = largest.max(peak);
+                *ends.entry(end).or_insert(0u64) += 1;
+                *of_format.entry(end).or_insert(0u64) += 1;
+                if matches!(end, End::Hung | End::Crashed | End::GivenUp)
+                    && let Some(keep) = std::env::var_os("RIDGEWATCH_KEEP_MUTANTS")
+                {
+                    std::fs::copy(&file, Path::new(&keep).join(format!("{end:?}_{name}_{}.{ending}", ends[&end]))).unwrap();
+                }
             }
-            if random(&mut state).is_multiple_of(8) {
-                bytes.truncate(random(&mut state) as usize % (bytes.len() + 1));
-            }
-            let _ = std::fs::remove_file(&file);
-            std::fs::write(&file, &bytes).unwrap();
-            let begin = Instant::now();
-            // Alone and behind a whole one, which is not read in the same way.
-            let before = if random(&mut state).is_multiple_of(2) { &other[..] } else { &[] };
-            let end = read(&[before, &[&file]].concat());
-            longest = longest.max(begin.elapsed());
-            *ends.entry(end).or_insert(0u64) += 1;
-            if matches!(end, End::Hung | End::Crashed | End::GivenUp)
-                && let Some(keep) = std::env::var_os("RIDGEWATCH_KEEP_MUTANTS")
-            {
-                std::fs::copy(&file, Path::new(&keep).join(format!("{end:?}_{}_{mutant}", ends[&end]))).unwrap();
-            }
+            println!("{format}, {name}, {} bytes: {share} mutants: {ends:?}, {longest:.1?} and {} MB at most", whole.len(), largest >> 20);
+            // 2^20 values may be read from any file, or of f32 1032 / 4 a byte of it (see `Container::read`): once by the library, once by us,
+            // both as f64, kept as three components in f32, and as nodes of 16 bytes. A whole file takes less than 30 MB.
+            let bound = (30 << 20) + (8 + 8 + 3 * 4 + 16) * (1 << 20).max(whole.len() as u64 * 1032 / 4);
+            assert!(largest < bound, "{name}: {largest} of {bound} bytes");
         }
-        println!("{mutant}: {count} mutants: {ends:?}, {longest:.1?} at most, {} MB at most so far", peak_of_children() >> 20);
-        assert!(ends[&End::Answered] > 0 && ends[&End::Refused] > 0, "mutations must reach both ends");
-        assert!(!ends.contains_key(&End::Hung), "no hang");
+        println!("{format}: {of_format:?}");
+        assert!(of_format[&End::Answered] > 0 && of_format[&End::Refused] > 0, "mutations must reach both ends");
+        assert!(!of_format.contains_key(&End::Hung), "no hang");
     }
-    // 2^20 values may be read from any file, or of f32 1032 / 4 a byte of it (see `Container::read`): once by the library, once by us, both as
-    // f64, kept as three components in f32, and as nodes of 16 bytes. A whole file takes less than 30 MB.
-    let bound = (30 << 20) + (8 + 8 + 3 * 4 + 16) * (1 << 20).max(largest * 1032 / 4);
-    println!("memory: {} of {} MB that are allowed", peak_of_children() >> 20, bound >> 20);
-    assert!(peak_of_children() < bound, "{}", peak_of_children());
-}
-
-/// Bytes that the largest child so far had in memory.
-fn peak_of_children() -> u64 {
-    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
-    let usage = unsafe {
-        let mut usage: libc::rusage = std::mem::zeroed();
-        assert_eq!(libc::getrusage(libc::RUSAGE_CHILDREN, &raw mut usage), 0);
-        usage
-    };
-    usage.ru_maxrss as u64 * 1024
 }

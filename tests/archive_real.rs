@@ -78,14 +78,17 @@ fn era5_on_a_projected_grid() {
 fn wrf_hurricane() {
     let file = data("wrf_katrina_uvw_4t.nc");
     let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
-    assert_eq!((archive.grid().shape(), archive.times().len()), ([95, 95, 28], 4));
+    assert_eq!((archive.grid().shape(), archive.times().len()), ([125, 119, 28], 4));
+    // 48 x 48 cells that follow the storm by 15 cells west and 12 north in nine hours.
     assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
     let snapshot = archive.read(0).unwrap();
-    assert!((snapshot.missing() as f64) < 0.05 * snapshot.nodes.len() as f64);
+    let known = snapshot.nodes.len() - snapshot.missing();
+    // But for some nodes at the ground.
+    assert!((0.99..=1.0).contains(&(known as f64 / (95.0 * 95.0 * 28.0))), "{known}");
     let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), None).unwrap();
     let resampling = inspection.resampling.unwrap();
     println!("WRF resampling: {resampling:?}");
-    assert!(resampling.error < 0.01 * resampling.velocity, "{resampling:?}");
+    assert!(resampling.error < 0.003 * resampling.velocity, "{resampling:?}");
     replay(&[file.to_str().unwrap(), "--set", "time.tau=3600"]);
 }
 
@@ -186,7 +189,7 @@ fn era5_agrees_with_an_independent_integration() {
     assert!(pairs.0.len() >= 45, "few of the 50 may graze a missing cell with a neighbour");
     let (relative, correlation) = report("ERA5", 7200.0, &pairs);
     // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
-    assert!(relative < 0.01 && correlation > 0.999, "{relative} {correlation}");
+    assert!(relative < 0.0026 && correlation > 0.99996, "{relative} {correlation}");
 }
 
 #[test]
@@ -197,5 +200,5 @@ fn wrf_agrees_with_an_independent_integration() {
     assert!(pairs.0.len() >= 45, "few of the 50 may graze the ground with a neighbour");
     let (relative, correlation) = report("WRF", 3600.0, &pairs);
     // Horizontally the same interpolant; vertically ours has fixed heights, theirs the levels of each column.
-    assert!(relative < 0.05 && correlation > 0.99, "{relative} {correlation}");
+    assert!(relative < 0.024 && correlation > 0.9992, "{relative} {correlation}");
 }

@@ -3,9 +3,10 @@
 
 mod netcdf_fixture;
 
+use netcdf_fixture::grids::{packed_levels, packed_wind};
 use netcdf_fixture::*;
 use ridgewatch::field::{EARTH_RADIUS, Geometry};
-use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, VelocityUnit, inspect, read_ahead};
+use ridgewatch::source::{FileOrder, Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, VelocityUnit, inspect, read_ahead};
 use std::path::PathBuf;
 use tempfile::tempdir;
 
@@ -396,11 +397,16 @@ fn inspection_says_what_and_why() {
     assert_eq!(inspection.missing.as_ref().unwrap().share, 1.0 / 48.0);
     let time = inspection.time.as_ref().unwrap();
     assert_eq!((time.window_snapshots, time.window_bytes), (Some(3), Some(3 * 12 * 16)));
-    assert!(inspection.axes[1].descending_in_file);
+    assert_eq!(inspection.axes[1].in_file.as_ref().unwrap().order, FileOrder::Descending);
     let text = inspection.to_string();
-    for piece in
-        ["u    u", "usual name `u`, unit `m/s`", "unit `K` is no velocity", "descending in the file", "every 3600 s", "missing 2.1 %"]
-    {
+    for piece in [
+        "u    u",
+        "usual name `u`, unit `m/s`",
+        "unit `K` is no velocity",
+        "; in the file 4 to 0 m, descending",
+        "every 3600 s",
+        "missing 2.1 %",
+    ] {
         assert!(text.contains(piece), "{piece} is missing in:\n{text}");
     }
     assert!(serde_json::to_string(&inspection).unwrap().contains("\"role\":\"time\""));
@@ -412,19 +418,46 @@ fn inspection_says_what_and_why() {
 }
 
 #[test]
+fn pressure_levels_come_in_any_order() {
+    let dir = tempdir().unwrap();
+    for (format, name) in [(CLASSIC, "classic"), (NETCDF4, "netcdf4")] {
+        for (n, levels) in [[1000.0, 500.0, 850.0, 200.0], [200.0, 500.0, 850.0, 1000.0], [1000.0, 850.0, 500.0, 200.0]].iter().enumerate()
+        {
+            let files = [0.0, 2.0].map(|hour| packed_levels(format, levels, hour).write(&dir.path().join(format!("{name}_{n}_{hour}.nc"))));
+            let mut archive = open(&files);
+            let grid = archive.grid().clone();
+            let [nx, ny, nz] = grid.shape();
+            assert_eq!((nx, ny, nz, archive.times().len()), (4, 5, 4, 4));
+            let snapshot = archive.read(2).unwrap();
+            for (i, node) in (0..snapshot.nodes.len()).map(|i| (i, east_north(&snapshot, i))) {
+                let pressure = 1000.0 * (-grid.axes[2].coordinates()[i / (nx * ny)] / 7000.0).exp();
+                let expected = packed_wind(pressure, i % nx, i / nx % ny);
+                // Packed in steps of 0.01 m/s; both components are the same.
+                assert!(node.iter().all(|v| (v - expected).abs() < 5.01e-3 + 1e-5), "{levels:?}, node {i}: {node:?}, {expected}");
+            }
+            let inspection = inspect(&files, &NetCdfSettings::default(), None).unwrap().to_string();
+            let order = ["1000 to 200 hPa, unsorted", "200 to 1000 hPa, ascending", "1000 to 200 hPa, descending"][n];
+            assert!(inspection.contains(order), "{inspection}");
+        }
+    }
+}
+
+#[test]
 fn two_hundred_files_start_at_once() {
     let dir = tempdir().unwrap();
     for (kind, options) in [("classic", OFFSET_64), ("netcdf4", NETCDF4)] {
         for hour in 0..200 {
             plane(options, &[f64::from(hour)], "hours since 2000-01-01").write(&dir.path().join(format!("{kind}_{hour:03}.nc")));
         }
-        let begin = std::time::Instant::now();
-        let archive = open(&[dir.path().join(format!("{kind}_*.nc"))]);
-        let took = begin.elapsed();
+        // The shortest of five tries: others are at work on the machine, and the files are in its cache.
+        let took = (0..5).map(|_| {
+            let begin = std::time::Instant::now();
+            assert_eq!(open(&[dir.path().join(format!("{kind}_*.nc"))]).times().len(), 200);
+            begin.elapsed()
+        });
+        let took = took.min().unwrap();
         println!("200 {kind} files opened in {took:?}");
-        assert_eq!(archive.times().len(), 200);
-        // Tens to hundreds of milliseconds on two shared cores; a busy machine may take longer, but reading all would not do.
-        assert!(took.as_secs() < 10, "{took:?}");
+        assert!(took.as_secs_f64() < 1.0, "{took:?}");
     }
 }
 

@@ -161,9 +161,9 @@ fn axes_that_are_none() {
             .variable("v", &["time", "y", "x"], Data::F32(vec![0.0; count]))
             .write(&dir.path().join("axis.nc"))
     };
-    says(&with_axes(&[0.0, 1.0, 0.5], &[0.0, 1.0]), &["`x` is not strictly ascending: node 2 is 0.5, the one before it is 1"]);
-    says(&with_axes(&[0.0, 1.0], &[3.0, 2.0, 2.0]), &["`y (descending, read backwards)` is not strictly ascending"]);
-    says(&with_axes(&[0.0, f64::NAN, 2.0], &[0.0, 1.0]), &["`x` is not strictly ascending"]);
+    says(&with_axes(&[0.0, 1.0, 0.5], &[0.0, 1.0]), &["`x`: it turns back between its entries 1 and 2 (0.5 and 1 m)"]);
+    says(&with_axes(&[0.0, 1.0], &[3.0, 2.0, 2.0]), &["`y`: its entries 1 and 2 are both 2"]);
+    says(&with_axes(&[0.0, f64::NAN, 2.0], &[0.0, 1.0]), &["`x`: its entry 1 is missing"]);
     says(&with_axes(&[0.0], &[0.0, 1.0]), &["axis `x` has 1 node(s); at least 2 are needed"]);
     // No coordinates; and coordinates of two dimensions.
     let bare = Fixture::new(CLASSIC, &[("time", 1), ("j", 2), ("i", 3)])

@@ -72,6 +72,12 @@ fn scene(common: &Common, options: &Options) -> Result<SceneFile> {
         let value = if tau.parse::<f64>().is_ok() { tau.clone() } else { format!("{tau:?}") };
         overrides.push(format!("time.tau={value}"));
     }
+    if let [one] = configs.as_slice()
+        && SceneFile::read(one, &overrides)?.source.kind != SourceKind::Live
+    {
+        // Before anything is said of a simulation that the scene does not follow.
+        bail!(Usage("the scene's source.kind is not \"live\"; archives and closed forms are for `ridgewatch replay`".into()));
+    }
     if options.once {
         overrides.push("live.at_end=\"stop\"".into());
     }
@@ -91,9 +97,6 @@ fn scene(common: &Common, options: &Options) -> Result<SceneFile> {
         [one] => SceneFile::read(one, &overrides)?,
         [_, second, ..] => bail!(Usage(format!("{} is a second scene file: give one", second.display()))),
     };
-    if scene.source.kind != SourceKind::Live {
-        bail!(Usage("the scene's source.kind is not \"live\"; archives and closed forms are for `ridgewatch replay`".into()));
-    }
     if let Some(seed) = common.seed {
         scene.seed = seed;
     }

@@ -1,6 +1,6 @@
 //! `ridgewatch ftle`: the field on a grid, and how right it is.
 
-use super::{Common, Usage, located, messages, on_threads, print_json, print_text, scene};
+use super::{Common, Usage, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::engine::{Device, EngineError, Plan, Setup, Slide};
 use ridgewatch::field::analytic::Analytic;
@@ -112,14 +112,13 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let slide = slide.context("the source gave no slide")?;
     let device = super::device(common, &scene)?;
-    let report =
-        on_threads(common, || compute(&plan, &slide, options, &device))?.map_err(|error| match error.downcast::<EngineError>() {
-            Ok(error) => located(&scene, error, EngineError::refused),
-            Err(error) => match error.downcast::<FlowError>() {
-                Ok(error) => located(&scene, error, FlowError::refused),
-                Err(error) => error,
-            },
-        })?;
+    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<EngineError>() {
+        Ok(error) => located(&scene, error, EngineError::refused),
+        Err(error) => match error.downcast::<FlowError>() {
+            Ok(error) => located(&scene, error, FlowError::refused),
+            Err(error) => error,
+        },
+    })?;
     if common.json {
         return print_json(&report);
     }

@@ -1,7 +1,7 @@
 //! `ridgewatch inspect`.
 
 use super::{Common, Usage, located, print_json, print_text};
-use anyhow::Result;
+use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::TimeSpan;
 use ridgewatch::setting::word;
@@ -14,12 +14,13 @@ pub struct Options {
     /// Data files or globs, or a scene file (.toml) of kind archive.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Integration time that the window's memory is stated for, in seconds or with a unit, e.g. "30 days"; default: half of the span.
+    /// Integration time that the window's memory is stated for, in seconds or with a unit, e.g. "30 days"; default: the scene's `time.tau`, else half of
+    /// the span.
     #[arg(long)]
     tau: Option<String>,
 }
 
-/// Inspects.
+/// Inspects. What cannot be read is a failure, after the report.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = match &options.files[..] {
         [one] if one.extension().is_some_and(|e| e == "toml") => SceneFile::read(one, &common.overrides)?,
@@ -29,7 +30,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         return Err(Usage(format!("the scene's source is {}; inspect looks at archives", word(scene.source.kind))).into());
     }
     let tau = match &options.tau {
-        None => None,
+        None => scene.time.tau.as_ref().and_then(TimeSpan::value),
         Some(text) => {
             let span = text.parse().map_or_else(|_| TimeSpan::Words(text.clone()), TimeSpan::Number);
             let value = span.value().filter(|v| v.is_finite() && *v > 0.0);
@@ -39,8 +40,14 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let inspection = ridgewatch::source::inspect(&scene.archive.files, &scene.archive, tau)
         .map_err(|error| located(&scene, error, SourceError::refused))?;
     if common.json {
-        return print_json(&inspection);
+        print_json(&inspection)?;
+    } else {
+        print_text(&inspection);
     }
-    print_text(inspection);
-    Ok(())
+    match (&inspection.refused, &inspection.problem) {
+        (Some(refused), _) => Err(scene.locate(refused.clone()).into()),
+        // What follows the first line is in the report.
+        (None, Some(problem)) => bail!("cannot be read as an archive: {}", problem.lines().next().unwrap_or_default()),
+        (None, None) => Ok(()),
+    }
 }

@@ -83,6 +83,8 @@ enum Command {
 /// Runs a command.
 pub fn run(arguments: Arguments) -> Result<()> {
     let common = arguments.common;
+    // The pool of everything that has none of its own: conversions, copies and what runs beside a cycle. 0 means one a core.
+    rayon::ThreadPoolBuilder::new().num_threads(common.threads).build_global()?;
     match arguments.command {
         Command::Replay(options) => replay::run(&common, options),
         Command::Attach(options) => attach::run(&common, options),
@@ -194,11 +196,6 @@ fn threads(word: &str) -> Result<usize, String> {
 /// A number of seconds above 0.
 fn seconds(word: &str) -> Result<f64, String> {
     word.parse().ok().filter(|s: &f64| s.is_finite() && *s > 0.0).ok_or_else(|| "accepted: a number above 0".to_owned())
-}
-
-/// Runs `work` on a pool of `--threads` threads.
-fn on_threads<T: Send>(common: &Common, work: impl FnOnce() -> T + Send) -> Result<T> {
-    Ok(rayon::ThreadPoolBuilder::new().num_threads(common.threads).build()?.install(work))
 }
 
 /// Prints the machine-readable result.

@@ -60,7 +60,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
     let spinner = messages::spinner(format!("writing {} snapshots", settings.snapshots));
-    let files = super::on_threads(common, || ridgewatch::source::synthesize(&settings, &options.out))??;
+    let files = ridgewatch::source::synthesize(&settings, &options.out)?;
     spinner.finish_and_clear();
     if common.json {
         return print_json(&files);

@@ -71,7 +71,7 @@ impl ConfigError {
     /// From a TOML error, with its line and, for an unknown key, the nearest known one.
     pub(super) fn from_toml(path: &Path, text: &str, error: &toml::de::Error) -> Self {
         let (line, excerpt) = line_at(text, error.span().map_or(0, |s| s.start));
-        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: with_suggestion(error.message()) }
+        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: in_plain_words(error.message()) }
     }
 }
 
@@ -96,8 +96,50 @@ fn line_at(text: &str, at: usize) -> (usize, String) {
     (number + 1, text.lines().nth(number).unwrap_or("").to_owned())
 }
 
+/// serde's message in the words of a scene file, with the nearest accepted name where one is unknown.
+pub(super) fn in_plain_words(message: &str) -> String {
+    let wrong = ["invalid type: ", "invalid value: ", "invalid length "].into_iter().find_map(|start| message.strip_prefix(start));
+    match wrong.and_then(|rest| rest.split_once(", expected ")) {
+        Some((found, expected)) => format!("is {}; accepted: {}", found_in_words(found), expected_in_words(expected)),
+        None => match message.strip_prefix("missing field ") {
+            Some(field) => format!("{field} is missing"),
+            None => with_suggestion(message),
+        },
+    }
+}
+
+/// ``integer `5` `` as `5`.
+fn found_in_words(found: &str) -> String {
+    let value = found.split_once('`').and_then(|(_, rest)| rest.rsplit_once('`')).map(|(value, _)| value);
+    match (found, value, found.strip_prefix("string ")) {
+        (_, Some(value), _) => value.to_owned(),
+        (_, _, Some(text)) => text.to_owned(),
+        ("sequence", ..) => "a list".to_owned(),
+        ("map", ..) => "a table".to_owned(),
+        _ if found.bytes().all(|b| b.is_ascii_digit()) => format!("a list of {found}"),
+        _ => found.to_owned(),
+    }
+}
+
+/// `usize` as `a whole number, 0 or above`.
+fn expected_in_words(expected: &str) -> String {
+    match expected {
+        "usize" | "u64" | "u32" | "u16" | "u8" => "a whole number, 0 or above".to_owned(),
+        "isize" | "i64" | "i32" => "a whole number".to_owned(),
+        "f64" | "f32" => "a number".to_owned(),
+        "a boolean" => "true or false".to_owned(),
+        "a string" | "path string" => "a text in quotation marks".to_owned(),
+        "a sequence" => "a list".to_owned(),
+        _ if expected.starts_with("struct ") => "a table".to_owned(),
+        _ => match expected.strip_prefix("an array of length ") {
+            Some(length) => format!("a list of {length}"),
+            None => expected.to_owned(),
+        },
+    }
+}
+
 /// Adds the nearest accepted name to serde's message on an unknown field or variant.
-pub(super) fn with_suggestion(message: &str) -> String {
+fn with_suggestion(message: &str) -> String {
     let mut quoted = message.split('`').skip(1).step_by(2);
     let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown")) else { return message.to_owned() };
     // A name that holds the other, as `tol` and `tolerance`, is nearer than its length says.

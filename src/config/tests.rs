@@ -65,7 +65,7 @@ fn a_fault_in_any_section_points_at_its_line() {
     let camera = "look_at = [1, 0.5, 0]\nup = [0, 1, 0]";
     for (section, fault, key, found, accepted) in [
         ("source", "epsilon = nan", "source.epsilon", "nan", "a finite number"),
-        ("time", "stride = 0", "time.stride", "0", "from 1 to"),
+        ("time", "frames_per_slide = 0", "time.frames_per_slide", "0", "from 1 to"),
         ("flow", "gap = 0.0", "flow.gap", "0", "above 0"),
         ("surrogate", "table_nodes = [1, 8, 8]", "surrogate.table_nodes", "[1, 8, 8]", "at least 2"),
         ("network", "features = 3", "network.features", "3", "1, 2, 4 or 8"),
@@ -92,7 +92,7 @@ fn a_fault_in_any_section_points_at_its_line() {
 
 #[test]
 fn a_fault_found_later_is_located_and_options_are_blamed_for_theirs() {
-    let text = format!("{GYRE}[flow]\ngap = 1e-12\n");
+    let text = format!("{GYRE}[flow]\ngap = 1e-12\nintegrator = \"differences\"\n");
     let mut scene = SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap();
     let late = crate::flow::FlowError::OutOfRange { key: "gap", found: 1e-12, accepted: "more" }.refused().unwrap();
     assert!(scene.locate(late.clone()).to_string().starts_with("scene.toml:9: `flow.gap` is 0.000000000001; accepted: more"));
@@ -134,6 +134,59 @@ fn values_are_shown_as_a_scene_file_writes_them() {
     assert!(error(GYRE, &["time.tau=-1"]).contains("`time.tau` is -1.0;"));
     assert!(error(GYRE, &["time.tau=soon"]).contains("`time.tau` is \"soon\";"));
     assert!(error(GYRE, &["render.majorant_cells=[0, 1, 1]"]).contains("is [0, 1, 1];"));
+}
+
+/// What a key of the wrong type is told.
+#[test]
+fn types_are_said_in_plain_words() {
+    for (set, words) in [
+        ("render.samples=many", "is \"many\"; accepted: a whole number, 0 or above"),
+        ("render.samples=1.5", "is 1.5; accepted: a whole number, 0 or above"),
+        ("render.samples=-1", "is -1; accepted: a whole number, 0 or above"),
+        ("trust.tolerance=low", "is \"low\"; accepted: a number"),
+        ("trust.cells=[8, 8]", "is a list of 2; accepted: a list of 3"),
+        ("trust.cells=8", "is 8; accepted: a list of 3"),
+        ("render=3", "is 3; accepted: a table"),
+        ("title=3", "is 3; accepted: a text in quotation marks"),
+        ("archive.steady=1", "is 1; accepted: true or false"),
+        ("time.tau=[1]", "a number, or words such as"),
+    ] {
+        let said = error(GYRE, &[set]);
+        assert!(said.starts_with(&format!("--set {set}: ")) && said.contains(words), "{set}: {said}");
+    }
+    let said = error(&format!("{GYRE}[render]\nwidth = \"wide\"\n"), &[]);
+    assert_eq!(said, "scene.toml:9: is \"wide\"; accepted: a whole number, 0 or above\n     9 | width = \"wide\"");
+    assert!(error("[source]\nomega = 1\n", &[]).contains("`kind` is missing"));
+}
+
+/// A key that is read and does nothing is a mistake that nobody would notice.
+#[test]
+fn keys_that_do_nothing_are_refused_where_they_stand() {
+    for (section, line, key) in [
+        ("archive", "w = \"none\"", "archive.w"),
+        ("archive.synthetic", "shape = \"flame\"", "archive.synthetic.shape"),
+        ("live", "at_end = \"stop\"", "live.at_end"),
+        ("time", "stride = 2", "time.stride"),
+        ("flow", "gap = 1e-3", "flow.gap"),
+        ("flow", "tolerance = 0.1\nsteps = 9", "flow.tolerance"),
+        ("flow", "steps = 9\nintegrator = \"dormand_prince\"\nprecision = \"f64\"", "flow.steps"),
+        ("surrogate", "table_nodes = [8, 8, 8]\nkind = \"network\"", "surrogate.table_nodes"),
+    ] {
+        let (text, at) = with_fault(section, line);
+        let said = error(&text, &[]);
+        assert!(said.starts_with(&format!("scene.toml:{at}: `{key}` does nothing here; accepted: ")), "{said}");
+    }
+    let archive = "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[time]\n";
+    for line in ["start = 1.0", "step = 2.0"] {
+        let said = error(&format!("{archive}{line}\n"), &[]);
+        assert!(said.starts_with("scene.toml:6: `time.st") && said.contains("only with closed forms"), "{said}");
+    }
+    assert!(error(GYRE, &["flow.gap=1e-3"]).starts_with("--set flow.gap=1e-3: `flow.gap` does nothing here"));
+    assert!(error(GYRE, &["time.step=0", "time.slides=2"]).starts_with("--set time.slides=2: `time.step` is 0"));
+    // An option that makes a part of the file idle is no fault of the file.
+    let text = format!("{GYRE}[surrogate]\ntable_nodes = [8, 8, 8]\n");
+    let set = ["surrogate.kind=network".to_owned()];
+    assert!(SceneFile::parse(Path::new("s"), &text, &set).is_ok());
 }
 
 #[test]

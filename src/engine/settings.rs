@@ -82,7 +82,7 @@ impl Settings {
 
 /// A number in the source's time unit, or words such as `"30 days"` where that unit is the second.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(untagged)]
+#[serde(untagged, expecting = "a number, or words such as \"30 days\"")]
 pub enum TimeSpan {
     /// In time units of the source.
     Number(f64),
@@ -162,6 +162,10 @@ impl TimeSettings {
         }
         require(time.start.is_finite(), "time.start", time.start, "a finite number")?;
         require(time.step.is_finite(), "time.step", time.step, "a finite number")?;
+        if time.step == 0.0 && time.slides.is_some_and(|slides| slides > 1) {
+            let refused = Refused::new("time.step", "is 0", "a number other than 0: all slides would be of one time");
+            return Err(refused.beside(&["time.slides"]));
+        }
         if let Some(slides) = time.slides {
             count("time.slides", slides, 1, 10_000_000)?;
         }

@@ -9,7 +9,7 @@ use super::files::expand;
 use super::hyperslab::{Orders, read_component};
 use super::layout::{ComponentPlan, Layout, Resampling, difference, plan};
 use super::poles::Poles;
-use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::settings::{Metric, NetCdfSettings, Staggering, VelocityUnit};
 use super::synthetic::synthesized;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
 use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -93,8 +93,10 @@ impl NetCdfArchive {
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
             entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
             files.push(ArchiveFile { path, frames: layout.frames.clone() });
-            match &first {
+            match &mut first {
                 Some((reference, _)) => {
+                    let path = &files[index].path;
+                    reference.widen(&layout).map_err(|fault| SourceError::Axis { path: path.clone(), fault })?;
                     if let Some(what) = difference(reference, &layout) {
                         return Err(SourceError::Mixed { first: files[0].path.clone(), second: files[index].path.clone(), what });
                     }
@@ -112,6 +114,7 @@ impl NetCdfArchive {
             Metric::Index => (0..seconds.len()).map(|i| i as f64).collect(),
             Metric::Sphere | Metric::Cartesian => seconds.clone(),
         };
+        check_fit(settings, &layout, format)?;
         let path = &files[0].path;
         let conversion = match (layout.metric, settings.velocity_unit) {
             (Metric::Index, VelocityUnit::Si) => Some(Conversion::to_cells(&layout.axes)),
@@ -369,6 +372,51 @@ fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
     }
     Ok(())
+}
+
+/// Settings that would do nothing for files of this kind.
+fn check_fit(settings: &NetCdfSettings, layout: &Layout, format: &str) -> Result<(), SourceError> {
+    let s = settings;
+    let hdf5 = format == Format::Hdf5.name();
+    let (staggered, curvilinear) = match layout.resampling.as_deref() {
+        Some(Resampling::Staggered(_)) => (true, false),
+        Some(Resampling::Curvilinear(_)) => (false, true),
+        None => (false, false),
+    };
+    let what = match () {
+        () if staggered => "WRF output",
+        () if curvilinear => "longitudes and latitudes of two dimensions",
+        () => format,
+    };
+    let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
+    for (key, given, fits, accepted) in [
+        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; `u`, `v` and `w` name variables of NetCDF"),
+        ("order", s.order.is_some(), hdf5, "with HDF5 only"),
+        ("spacing", s.spacing.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
+        ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
+        ("time_step", s.time_step.is_some(), hdf5, "with HDF5 only; the times of NetCDF are in the file"),
+        ("heights", s.heights.is_some(), staggered, "with WRF output only"),
+        ("staggering", s.staggering != Staggering::default(), staggered, "with WRF output only"),
+        ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("grid_relative", s.grid_relative.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("vertical_scale", s.vertical_scale.is_some(), heights, "with levels, in the sphere and cartesian metrics"),
+    ] {
+        if given && !fits {
+            return Err(SourceError::Setting { key, found: format!("given, but does nothing for {what}"), accepted: accepted.into() });
+        }
+    }
+    let repeats = |text: &str| if hdf5 { !text.is_empty() && text.bytes().all(|b| b"xyzXYZ".contains(&b)) } else { text == "none" };
+    match s.periodic.as_deref().filter(|text| !repeats(text)) {
+        None => Ok(()),
+        Some(text) => Err(SourceError::Setting {
+            key: "periodic",
+            found: format!("{text:?}"),
+            accepted: if hdf5 { "the letters of the axes that repeat, such as \"xy\"" } else { "\"none\", or left out" }.into(),
+        }),
+    }
 }
 
 fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {

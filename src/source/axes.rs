@@ -4,6 +4,7 @@ use super::SourceError;
 use super::cf::coordinate::Kind;
 use super::cf::units::{AXIS_UNITS, Unit};
 use crate::field::{Axis, AxisFault};
+use serde::Serialize;
 use std::ops::Range;
 use std::path::Path;
 
@@ -18,14 +19,56 @@ pub(super) struct AxisPlan {
     pub(super) notes: Vec<String>,
     /// Unit of velocities along it: `m/s` or `Pa/s`; none where the axis has no unit.
     pub(super) quantity: Quantity,
-    /// Whether the file's coordinates descend.
-    pub(super) descending: bool,
+    /// What the file has; none where the axis is not one of the file.
+    pub(super) in_file: Option<InFile>,
+}
+
+/// A coordinate as it stands in a file.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct InFile {
+    /// First coordinate.
+    pub first: f64,
+    /// Last coordinate.
+    pub last: f64,
+    /// Their unit.
+    pub units: String,
+    /// How they run.
+    pub order: FileOrder,
+}
+
+/// How coordinates run in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum FileOrder {
+    /// Upwards.
+    Ascending,
+    /// Downwards.
+    Descending,
+    /// To and fro (longitudes that jump by a turn run on).
+    Unsorted,
+}
+
+impl FileOrder {
+    /// Of the order in which coordinates would ascend.
+    fn of(order: &[usize]) -> Self {
+        let by = |step: isize| order.windows(2).all(|w| w[0].checked_add_signed(step) == Some(w[1]));
+        match () {
+            () if by(1) => Self::Ascending,
+            () if by(-1) => Self::Descending,
+            () => Self::Unsorted,
+        }
+    }
+
+    /// In words.
+    pub(super) fn name(self) -> &'static str {
+        ["ascending", "descending", "unsorted"][self as usize]
+    }
 }
 
 impl AxisPlan {
     /// An axis that is not one of the file.
     pub(super) fn made(kind: Kind, axis: Axis, quantity: Quantity) -> Self {
-        Self { kind, order: (0..axis.len()).collect(), axis, notes: Vec::new(), quantity, descending: false }
+        Self { kind, order: (0..axis.len()).collect(), axis, notes: Vec::new(), quantity, in_file: None }
     }
 }
 
@@ -53,9 +96,11 @@ impl Coordinates<'_> {
         SourceError::Axis { path: self.path.into(), fault }
     }
 
-    /// Makes the axis, cropped to `range` when there is one.
-    pub(super) fn plan(mut self, range: Option<[f64; 2]>) -> Result<AxisPlan, SourceError> {
+    /// Makes the axis, cropped to `range` when there is one. Longitudes that go round are periodic where `periodic` holds; without, they end
+    /// where their nodes do.
+    pub(super) fn plan(mut self, range: Option<[f64; 2]>, periodic: bool) -> Result<AxisPlan, SourceError> {
         let mut notes = Vec::new();
+        let ends = self.values.first().copied().zip(self.values.last().copied());
         let (quantity, units) = self.convert_units(&mut notes)?;
         if self.kind == Kind::Longitude {
             unwrap_longitudes(&mut self.values, &mut notes);
@@ -68,17 +113,30 @@ impl Coordinates<'_> {
             self.values.iter_mut().for_each(|v| *v = -*v);
             notes.push(format!("`{}` counts downwards: read as height = -{}", self.name, self.name));
         }
-        let descending = count > 1 && self.values[count - 1] < self.values[0];
-        if descending {
+        if self.kind == Kind::Level && self.values.iter().all(|v| v.is_finite()) {
+            // Levels may come in any order: theirs is no place in the horizontal plane that a jump would tear.
+            order.sort_by(|&a, &b| self.values[a].total_cmp(&self.values[b]));
+            self.values.sort_by(f64::total_cmp);
+        } else if count > 1 && self.values[count - 1] < self.values[0] {
             order.reverse();
             self.values.reverse();
         }
-        // The fault counts nodes in ascending order; say so where the file descends.
-        Axis::new(self.name, units, self.values.clone()).map_err(|f| self.fault(in_file_order(f, descending, count)))?;
+        self.check_ascent(units, &order)?;
+        let in_order = match FileOrder::of(&order) {
+            FileOrder::Ascending if downward => FileOrder::Descending,
+            FileOrder::Descending if downward => FileOrder::Ascending,
+            FileOrder::Unsorted => {
+                notes.push(format!("`{}` neither ascends nor descends in the file: sorted", self.name));
+                FileOrder::Unsorted
+            }
+            as_it_is => as_it_is,
+        };
+        let in_file = ends.map(|(first, last)| InFile { first, last, units: self.units.unwrap_or_default().into(), order: in_order });
         snap_to_uniform(&mut self.values);
         let mut period = None;
         if self.kind == Kind::Longitude {
-            period = self.close_circle(&mut order, &mut notes);
+            // A region may cross the seam, whether or not the axis repeats.
+            period = self.close_circle(&mut order, &mut notes, periodic || range.is_some());
         } else if self.kind == Kind::Latitude && self.values.iter().any(|v| v.abs() > 90.001) {
             let what = format!("latitudes run from {} to {} degrees; accepted are -90 to 90", self.values[0], self.values[count - 1]);
             return Err(SourceError::Layout { path: self.path.into(), variable: self.name.into(), what });
@@ -87,11 +145,38 @@ impl Coordinates<'_> {
             period = self.crop(range, &mut order, period)?;
         }
         let mut axis = Axis::new(self.name, units, std::mem::take(&mut self.values)).map_err(|f| self.fault(f))?;
-        if let Some(period) = period {
-            axis = axis.with_period(period);
-            notes.push(format!("`{}` goes round: periodic with {period}", self.name));
+        match period {
+            Some(period) if periodic => {
+                axis = axis.with_period(period);
+                notes.push(format!("`{}` goes round: periodic with {period}", self.name));
+            }
+            Some(_) => notes.push(format!("`{}` goes round, but ends where its nodes do, as set", self.name)),
+            None => {}
         }
-        Ok(AxisPlan { kind: self.kind, axis, order, notes, quantity, descending: descending != downward })
+        Ok(AxisPlan { kind: self.kind, axis, order, notes, quantity, in_file })
+    }
+
+    /// Refuses coordinates that turn back, repeat or are missing, and counts them as the file does; they have been brought into `order`.
+    fn check_ascent(&self, units: &str, order: &[usize]) -> Result<(), SourceError> {
+        let refuse = |what| Err(SourceError::Layout { path: self.path.into(), variable: self.name.into(), what });
+        if let Some(odd) = self.values.iter().position(|v| !v.is_finite()) {
+            return refuse(format!("its entry {} is missing or not a number; every node needs a coordinate", order[odd]));
+        }
+        let odd = match Axis::new(self.name, units, self.values.clone()) {
+            Ok(_) => return Ok(()),
+            Err(AxisFault::NotAscending { index, .. }) => index,
+            Err(other) => return Err(self.fault(other)),
+        };
+        let (here, before) = (order[odd].max(order[odd - 1]), order[odd].min(order[odd - 1]));
+        let (a, b) = (self.values[odd].max(self.values[odd - 1]), self.values[odd].min(self.values[odd - 1]));
+        refuse(if a == b {
+            format!("its entries {before} and {here} are both {a} {units}; accepted are coordinates that differ")
+        } else {
+            format!(
+                "it turns back between its entries {before} and {here} ({b} and {a} {units}); accepted are coordinates that ascend or descend \
+                 throughout, in any order for levels"
+            )
+        })
     }
 
     /// Converts to degrees, metres or pascal.
@@ -126,15 +211,17 @@ impl Coordinates<'_> {
         SourceError::UnknownUnit { path: self.path.into(), variable: self.name.into(), unit: unit.into(), accepted: AXIS_UNITS.into() }
     }
 
-    /// Finds whether longitudes go round the earth; drops a last node that repeats the first.
-    fn close_circle(&mut self, order: &mut Vec<usize>, notes: &mut Vec<String>) -> Option<f64> {
+    /// Finds whether longitudes go round the earth; `once`, drops a last node that repeats the first.
+    fn close_circle(&mut self, order: &mut Vec<usize>, notes: &mut Vec<String>, once: bool) -> Option<f64> {
         let count = self.values.len();
         let step = (self.values[count - 1] - self.values[0]) / (count - 1) as f64;
         let slack = step * 1e-3;
         if count > 3 && (self.values[count - 1] - self.values[0] - 360.0).abs() < slack {
-            self.values.pop();
-            order.pop();
-            notes.push(format!("the last node of `{}` repeats the first: dropped", self.name));
+            if once {
+                self.values.pop();
+                order.pop();
+                notes.push(format!("the last node of `{}` repeats the first: dropped", self.name));
+            }
             return Some(360.0);
         }
         let even = self.values.windows(2).all(|w| (w[1] - w[0] - step).abs() < slack);
@@ -170,16 +257,6 @@ impl Coordinates<'_> {
         self.values = kept.into_iter().map(|k| k.0).collect();
         snap_to_uniform(&mut self.values);
         Ok(period.filter(|_| whole))
-    }
-}
-
-/// Translates the node of a fault to the file's order.
-fn in_file_order(fault: AxisFault, descending: bool, count: usize) -> AxisFault {
-    match fault {
-        AxisFault::NotAscending { name, index, here, before } if descending => {
-            AxisFault::NotAscending { name: format!("{name} (descending, read backwards)"), index: count - 1 - index, here, before }
-        }
-        other => other,
     }
 }
 
@@ -259,14 +336,14 @@ mod tests {
 
     #[test]
     fn global_longitudes_are_periodic_and_regional_ones_are_not() {
-        let global = longitudes((0..360).map(f64::from).collect()).plan(None).unwrap();
+        let global = longitudes((0..360).map(f64::from).collect()).plan(None, true).unwrap();
         assert_eq!((global.axis.period(), global.axis.len()), (Some(360.0), 360));
-        let repeated = longitudes((0..=360).map(f64::from).collect()).plan(None).unwrap();
+        let repeated = longitudes((0..=360).map(f64::from).collect()).plan(None, true).unwrap();
         assert_eq!((repeated.axis.period(), repeated.axis.len()), (Some(360.0), 360));
         // A twelfth of a degree in f32.
-        let fine = longitudes((0..4320).map(|i| f64::from((f64::from(i) / 12.0 - 180.0) as f32)).collect()).plan(None).unwrap();
+        let fine = longitudes((0..4320).map(|i| f64::from((f64::from(i) / 12.0 - 180.0) as f32)).collect()).plan(None, true).unwrap();
         assert_eq!((fine.axis.period(), fine.axis.uniform_step().is_some()), (Some(360.0), true));
-        assert_eq!(longitudes((0..359).map(f64::from).collect()).plan(None).unwrap().axis.period(), None);
+        assert_eq!(longitudes((0..359).map(f64::from).collect()).plan(None, true).unwrap().axis.period(), None);
     }
 
     #[test]
@@ -276,26 +353,68 @@ mod tests {
             (vec![170.0, 175.0, -180.0, -175.0], 170.0, 185.0),
             (vec![5.0, 0.0, 355.0, 350.0], -10.0, 5.0),
         ] {
-            let plan = longitudes(values).plan(None).unwrap();
+            let plan = longitudes(values).plan(None, true).unwrap();
             assert_eq!((plan.axis.first(), plan.axis.last()), (first, last));
         }
     }
 
     #[test]
     fn regions_cross_the_seam() {
-        let plan = longitudes((0..36).map(|i| f64::from(i * 10)).collect()).plan(Some([-20.0, 15.0])).unwrap();
+        let plan = longitudes((0..36).map(|i| f64::from(i * 10)).collect()).plan(Some([-20.0, 15.0]), true).unwrap();
         assert_eq!(plan.axis.coordinates(), [-20.0, -10.0, 0.0, 10.0]);
         assert_eq!(plan.order, [34, 35, 0, 1]);
         assert_eq!(plan.axis.period(), None);
         let expected = [Run { nodes: 0..2, start: 34, reversed: false }, Run { nodes: 2..4, start: 0, reversed: false }];
         assert_eq!(runs(&plan.order), expected);
-        let turned = longitudes((0..36).map(|i| f64::from(i * 10)).collect()).plan(Some([-180.0, 180.0])).unwrap();
+        let turned = longitudes((0..36).map(|i| f64::from(i * 10)).collect()).plan(Some([-180.0, 180.0]), true).unwrap();
         assert_eq!((turned.axis.first(), turned.axis.period()), (-180.0, Some(360.0)));
         let regional = || longitudes(vec![340.0, 345.0, 350.0, 355.0]);
-        assert_eq!(regional().plan(Some([-16.0, -4.0])).unwrap().axis.coordinates(), [-15.0, -10.0, -5.0]);
-        let message = regional().plan(Some([10.0, 20.0])).unwrap_err().to_string();
+        assert_eq!(regional().plan(Some([-16.0, -4.0]), true).unwrap().axis.coordinates(), [-15.0, -10.0, -5.0]);
+        let message = regional().plan(Some([10.0, 20.0]), true).unwrap_err().to_string();
         assert!(message.contains("0 node(s)") && message.contains("from 340 to 355"), "{message}");
-        assert!(regional().plan(Some([352.0, 343.0])).is_err(), "both ends without the middle");
+        assert!(regional().plan(Some([352.0, 343.0]), true).is_err(), "both ends without the middle");
+    }
+
+    #[test]
+    fn longitudes_that_are_to_end_keep_their_last_node() {
+        let round = || longitudes((0..=36).map(|i| f64::from(i * 10)).collect());
+        let plan = round().plan(None, false).unwrap();
+        assert_eq!((plan.axis.period(), plan.axis.len(), plan.axis.last()), (None, 37, 360.0));
+        assert!(plan.notes.iter().any(|n| n.contains("ends where its nodes do")), "{:?}", plan.notes);
+        assert!(plan.notes.iter().all(|n| !n.contains("periodic") && !n.contains("dropped")), "{:?}", plan.notes);
+        // A region across the seam meets the first node once.
+        let plan = round().plan(Some([-20.0, 15.0]), false).unwrap();
+        assert_eq!((plan.axis.coordinates(), plan.axis.period()), (&[-20.0, -10.0, 0.0, 10.0][..], None));
+    }
+
+    #[test]
+    fn levels_come_in_any_order() {
+        let levels = |values: &[f64], down| Coordinates {
+            units: Some("hPa"),
+            positive_down: down,
+            kind: Kind::Level,
+            ..longitudes(values.to_vec())
+        };
+        for (values, order, in_order) in [
+            ([1000.0, 500.0, 850.0], [1, 2, 0], FileOrder::Unsorted),
+            ([500.0, 850.0, 1000.0], [0, 1, 2], FileOrder::Ascending),
+            ([1000.0, 850.0, 500.0], [2, 1, 0], FileOrder::Descending),
+        ] {
+            let plan = levels(&values, false).plan(None, true).unwrap();
+            assert_eq!((plan.axis.coordinates(), &plan.order[..]), (&[5e4, 8.5e4, 1e5][..], &order[..]));
+            let in_file = plan.in_file.unwrap();
+            assert_eq!((in_file.first, in_file.last, in_file.order), (values[0], values[2], in_order));
+            assert_eq!(plan.notes.iter().any(|n| n.contains("sorted")), in_order == FileOrder::Unsorted);
+        }
+        // A depth ascends although the height that is made of it descends.
+        let depth = Coordinates { units: Some("m"), ..levels(&[0.0, 10.0, 30.0], true) }.plan(None, true).unwrap();
+        assert_eq!((depth.axis.first(), depth.in_file.unwrap().order), (-30.0, FileOrder::Ascending));
+        for (values, piece) in
+            [([1000.0, 500.0, 1000.0], "entries 0 and 2 are both 100000"), ([1000.0, f64::NAN, 500.0], "entry 1 is missing")]
+        {
+            let message = levels(&values, false).plan(None, true).unwrap_err().to_string();
+            assert!(message.contains(piece), "{message}");
+        }
     }
 
     #[test]

@@ -7,8 +7,8 @@ use std::cell::Cell;
 use std::ffi::{CString, c_char, c_int};
 use std::path::Path;
 use std::ptr::null;
-use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Mutex, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 thread_local! {
@@ -20,6 +20,8 @@ thread_local! {
 static START: OnceLock<Instant> = OnceLock::new();
 /// When a file began to be opened, milliseconds since [`report_crashes`] and one more; 0 while none is.
 static OPENING: AtomicU64 = AtomicU64::new(0);
+/// Which file that was.
+static OPENED: Mutex<String> = Mutex::new(String::new());
 /// Seconds that a library may take to open a file: some damaged ones send it round for ever.
 const LONGEST_OPENING: u64 = 120;
 
@@ -41,6 +43,7 @@ impl Reading {
     pub(super) fn opening(path: &Path) -> Self {
         let mut reading = Self::of(path);
         if let Some(start) = START.get() {
+            *OPENED.lock().unwrap_or_else(PoisonError::into_inner) = path.display().to_string();
             OPENING.store(start.elapsed().as_millis() as u64 + 1, Ordering::Relaxed);
             reading.opening = true;
         }
@@ -78,7 +81,8 @@ pub fn report_crashes() {
             std::thread::sleep(Duration::from_millis(500));
             let since = OPENING.load(Ordering::Relaxed);
             if since > 0 && start.elapsed().as_millis() as u64 + 1 > since + 1000 * limit {
-                let text = format!("ridgewatch: a file was not opened within {limit} s: it is damaged, or its disk does not answer\n");
+                let name = OPENED.lock().unwrap_or_else(PoisonError::into_inner);
+                let text = format!("ridgewatch: {name}: not opened within {limit} s: it is damaged, or its disk does not answer\n");
                 // SAFETY: `write` gets a pointer to as many bytes as it is told; the library cannot be stopped, the process can.
                 unsafe {
                     let _ = libc::write(2, text.as_ptr().cast(), text.len());

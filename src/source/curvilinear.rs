@@ -1,8 +1,9 @@
 //! Longitudes and latitudes as arrays of two dimensions (ocean models, projections): resampled to a grid of even longitudes and latitudes.
 //!
 //! Each node of the new grid is found in a cell of the old one, in the plane that touches the sphere there, and gets the bilinear
-//! interpolation of the cell's four corners; it is missing where a corner is, or where no cell holds it. Each component is resampled from
-//! its own points.
+//! interpolation of the cell's four corners; it is missing where a corner is, or where no cell holds it. Each horizontal component is
+//! resampled from its own points as a vector in space, along the direction in which it runs there: east and north turn about a pole within
+//! a cell, vectors do not.
 
 use super::SourceError;
 use super::axes::{AxisPlan, Quantity};
@@ -25,8 +26,10 @@ pub(super) struct Curvilinear {
     /// The points themselves.
     meshes: Vec<Arc<Mesh>>,
     target: Target,
-    /// Sine and cosine, at each node of the grid, of the angle from east to the direction in which u runs; empty where that is east.
-    turns: Vec<[f32; 2]>,
+    /// Unit vectors in which u and v run, at each of their points.
+    directions: [Vec<[f32; 3]>; 2],
+    /// East and north, at each node of the grid.
+    bases: [Vec<[f32; 3]>; 2],
 }
 
 impl Curvilinear {
@@ -38,34 +41,53 @@ impl Curvilinear {
         entry: usize,
         levels: &[usize],
     ) -> Result<Vec<Vec<f32>>, SourceError> {
-        let mut out = Vec::with_capacity(frame.len());
-        for (plan, locator) in frame.iter().zip(&self.locators) {
-            let [x, y, _] = as_in_file(plan);
-            let values = read_component(file, plan, &[x, y, levels.to_vec()], entry)?;
-            let plane = locator.points();
-            out.push(values.chunks_exact(plane).flat_map(|level| locator.apply(level)).collect::<Vec<f32>>());
-        }
-        if !self.turns.is_empty() {
-            let (u, rest) = out.split_at_mut(1);
-            for (i, (u, v)) in u[0].iter_mut().zip(rest[0].iter_mut()).enumerate() {
-                let [sine, cosine] = self.turns[i % self.turns.len()];
-                (*u, *v) = (*u * cosine - *v * sine, *u * sine + *v * cosine);
-            }
+        let values = |which: usize| {
+            let [x, y, _] = as_in_file(&frame[which]);
+            read_component(file, &frame[which], &[x, y, levels.to_vec()], entry)
+        };
+        let mut out = self.horizontal(&values(0)?, &values(1)?);
+        if let Some(locator) = self.locators.get(2) {
+            out.push(values(2)?.chunks_exact(locator.points()).flat_map(|level| locator.apply(level)).collect());
         }
         Ok(out)
     }
 
-    /// What interpolation on the grid gives at the file's own points, held against what the file has there: m/s, root mean square over
-    /// the horizontal components.
+    /// Eastward and northward velocities at the nodes of all levels.
+    fn horizontal(&self, u: &[f32], v: &[f32]) -> Vec<Vec<f32>> {
+        let mut out = vec![Vec::new(), Vec::new()];
+        for levels in u.chunks_exact(self.locators[0].points()).zip(v.chunks_exact(self.locators[1].points())) {
+            let along: [Vec<f32>; 3] = std::array::from_fn(|k| {
+                let part = |which: usize, level: &[f32]| {
+                    let part: Vec<f32> = level.iter().zip(&self.directions[which]).map(|(value, d)| value * d[k]).collect();
+                    self.locators[which].apply(&part)
+                };
+                part(0, levels.0).iter().zip(part(1, levels.1)).map(|(a, b)| a + b).collect()
+            });
+            for (values, base) in out.iter_mut().zip(&self.bases) {
+                values.extend(base.iter().enumerate().map(|(node, e)| (0..3).map(|k| e[k] * along[k][node]).sum::<f32>()));
+            }
+        }
+        out
+    }
+
+    /// What interpolation on the grid (of vectors, as the flow is sampled) gives at the file's own points, held against what the file has
+    /// there: m/s, root mean square over the horizontal components.
     pub(super) fn error(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
         let (mut wrong, mut size, mut count) = (0.0, 0.0, 0usize);
-        for which in 0..2 {
-            let (plan, locator, mesh) = (&frame[which], &self.locators[which], &self.meshes[which]);
-            let values = read_component(file, plan, &as_in_file(plan), entry)?;
-            for level in values.chunks_exact(locator.points()) {
-                let on_grid = locator.apply(level);
-                for (point, &value) in level.iter().enumerate() {
-                    let found = self.target.interpolate(&on_grid, mesh.longitude[point], mesh.latitude[point]);
+        let mut own = Vec::with_capacity(2);
+        for plan in &frame[..2] {
+            own.push(read_component(file, plan, &as_in_file(plan), entry)?);
+        }
+        let on_grid = self.horizontal(&own[0], &own[1]);
+        let nodes = self.bases[0].len();
+        for (level, (east, north)) in on_grid[0].chunks_exact(nodes).zip(on_grid[1].chunks_exact(nodes)).enumerate() {
+            let along: [Vec<f32>; 3] =
+                std::array::from_fn(|k| (0..nodes).map(|n| east[n] * self.bases[0][n][k] + north[n] * self.bases[1][n][k]).collect());
+            for which in 0..2 {
+                let (mesh, points) = (&self.meshes[which], self.locators[which].points());
+                for (point, &value) in own[which][level * points..][..points].iter().enumerate() {
+                    let at = |k: usize| self.target.interpolate(&along[k], mesh.longitude[point], mesh.latitude[point]);
+                    let found: f64 = (0..3).map(|k| at(k) * f64::from(self.directions[which][point][k])).sum();
                     if found.is_finite() && value.is_finite() {
                         wrong += (found - f64::from(value)).powi(2);
                         size += f64::from(value).powi(2);
@@ -308,20 +330,14 @@ impl Planner<'_> {
             locators.push(known.map_or_else(|| Arc::new(Locator::new(mesh, &target)), |i| locators[i].clone()));
         }
         let (along, why) = self.runs_along_grid(u);
-        let turns = if along {
-            let (sine, cosine) = of_u.directions();
-            let (sine, cosine) = (locators[0].apply(&sine), locators[0].apply(&cosine));
-            sine.into_iter().zip(cosine).map(|(s, c)| [s / s.hypot(c), c / s.hypot(c)]).collect()
-        } else {
-            Vec::new()
-        };
+        let directions = std::array::from_fn(|k| meshes[k].1.directions(along).into_iter().map(|both| both[k]).collect());
         let names = pairs[0].map(|i| self.header().variables[i].name.clone());
         self.notes.push(format!(
             "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
             names[0], names[1], of_u.shape[0], of_u.shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
         ));
-        let directions = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
-        self.notes.push(format!("velocities run along {directions} ({why})"));
+        let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
+        self.notes.push(format!("velocities run along {which} ({why})"));
         let path = self.path().to_path_buf();
         let fault = |fault: AxisFault| SourceError::Axis { path: path.clone(), fault };
         let kinds = [(Kind::Longitude, "degrees_east"), (Kind::Latitude, "degrees_north")];
@@ -329,12 +345,12 @@ impl Planner<'_> {
         for (k, (kind, units)) in kinds.into_iter().enumerate() {
             let last = target.first[k] + target.step[k] * (target.nodes[k] - 1) as f64;
             let mut axis = Axis::uniform(names[k].as_str(), units, target.first[k], last, target.nodes[k]).map_err(fault)?;
-            if k == 0 && target.round {
+            if k == 0 && target.round && self.goes_round() {
                 axis = axis.with_period(360.0);
             }
             axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
         }
         let meshes = meshes.into_iter().map(|(_, m)| m).collect();
-        Ok((Arc::new(Resampling::Curvilinear(Curvilinear { locators, meshes, target, turns })), axes))
+        Ok((Arc::new(Resampling::Curvilinear(Curvilinear { locators, meshes, target, directions, bases: target.bases() })), axes))
     }
 }

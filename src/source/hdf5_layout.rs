@@ -274,7 +274,10 @@ impl Planner<'_> {
             }
         };
         let coordinates = Coordinates { path: self.path(), name, units, positive_down: false, kind, values };
-        let mut plan = coordinates.plan(None)?;
+        let mut plan = coordinates.plan(None, true)?;
+        if index.is_none() {
+            plan.in_file = None;
+        }
         if s.periodic.as_deref().is_some_and(|p| p.to_ascii_lowercase().contains(letter)) {
             let step = (plan.axis.last() - plan.axis.first()) / (nodes - 1) as f64;
             let period = step * nodes as f64;

@@ -1,11 +1,12 @@
 //! What would be read from an archive, and why.
 
 use super::archive::{Displacement, NetCdfArchive, files_of};
-use super::axes::Quantity;
+use super::axes::{InFile, Quantity};
 use super::cf::velocity;
 use super::container::{Container, Header};
 use super::settings::NetCdfSettings;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
+use crate::setting::Refused;
 use serde::Serialize;
 use std::fmt;
 use std::path::PathBuf;
@@ -26,6 +27,9 @@ pub struct Inspection {
     pub variables: Vec<VariableReport>,
     /// Why it cannot be read as an archive; what follows is empty then.
     pub problem: Option<String>,
+    /// The setting at fault, where the problem is one.
+    #[serde(skip)]
+    pub refused: Option<Refused>,
     /// What would be read.
     pub source: Option<SourceDescription>,
     /// Axes of the grid.
@@ -74,8 +78,8 @@ pub struct AxisReport {
     pub least_spacing: f64,
     /// Greatest distance between neighbours.
     pub greatest_spacing: f64,
-    /// Whether the file runs the other way.
-    pub descending_in_file: bool,
+    /// The coordinates as they stand in the file; none where the axis is made (resampled, or counted by settings).
+    pub in_file: Option<InFile>,
     /// Length after which it repeats.
     pub period: Option<f64>,
 }
@@ -152,6 +156,7 @@ pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -
         format: first.format.name().into(),
         variables: variables(&first.header),
         problem: None,
+        refused: None,
         source: None,
         axes: Vec::new(),
         time: None,
@@ -160,8 +165,8 @@ pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -
         resolution: None,
     };
     match NetCdfArchive::open_files(files, settings) {
-        Ok(archive) => inspection.fill(archive, tau)?,
-        Err(error) => inspection.problem = Some(error.to_string()),
+        Ok(archive) => inspection.fill(archive, settings.steady, tau)?,
+        Err(error) => (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused()),
     }
     Ok(inspection)
 }
@@ -185,7 +190,7 @@ fn variables(header: &Header) -> Vec<VariableReport> {
 }
 
 impl Inspection {
-    fn fill(&mut self, mut archive: NetCdfArchive, tau: Option<f64>) -> Result<(), SourceError> {
+    fn fill(&mut self, mut archive: NetCdfArchive, steady: bool, tau: Option<f64>) -> Result<(), SourceError> {
         let description = archive.describe();
         let mut give = |name: &str, role: &str, why: String| {
             if let Some(variable) = self.variables.iter_mut().find(|v| v.name == name) {
@@ -209,13 +214,13 @@ impl Inspection {
                 last: plan.axis.coordinates()[plan.axis.len() - 1],
                 least_spacing: steps.iter().copied().fold(f64::INFINITY, f64::min),
                 greatest_spacing: steps.iter().copied().fold(0.0, f64::max),
-                descending_in_file: plan.descending,
+                in_file: plan.in_file.clone(),
                 period: plan.axis.period(),
             });
         }
         let what = description.notes.iter().filter(|n| n.contains("resampled") || n.contains("components on faces")).cloned().collect();
         self.resampling = archive.resampling_error()?.map(|[error, velocity]| ResamplingReport { what, error, velocity });
-        self.time = Some(times(&archive, &description, tau));
+        self.time = Some(times(&archive, &description, steady, tau));
         let count = archive.times().len();
         let sampled = count.min(SAMPLED);
         let mut sum = Displacement::default();
@@ -241,15 +246,22 @@ impl Inspection {
     }
 }
 
-fn times(archive: &NetCdfArchive, description: &SourceDescription, tau: Option<f64>) -> TimeReport {
+fn times(archive: &NetCdfArchive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
     let interval = median_interval(times);
-    let tau = tau.map_or_else(|| archive.default_tau(), |t| archive.check_tau(t).map(|()| t));
+    let steady = steady && times.len() == 1;
+    let tau = match tau {
+        Some(tau) if steady => Ok(tau),
+        Some(tau) => archive.check_tau(tau).map(|()| tau),
+        None if steady => Err(SourceError::Setting { key: "tau", found: "missing".into(), accepted: "a steady flow gives none".into() }),
+        None => archive.default_tau(),
+    };
     // The window keeps what covers tau: the snapshots inside, and one to interpolate from.
     let held =
         |tau: f64| if interval > 0.0 { ((tau / interval - 1e-9).ceil() as usize).saturating_add(1).min(times.len()) } else { times.len() };
-    let snapshots = tau.as_ref().ok().map(|&t| held(t));
+    // A steady flow is there twice (see [`super::Steady`]).
+    let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { held(t) });
     TimeReport {
         snapshots: times.len(),
         first: show(times[0]),
@@ -291,7 +303,12 @@ impl fmt::Display for Inspection {
                 write!(f, ", spacing {} to {}", Short(axis.least_spacing), Short(axis.greatest_spacing))?;
             }
             let period = axis.period.map(|p| format!(", periodic with {p}")).unwrap_or_default();
-            writeln!(f, "{}{period}", if axis.descending_in_file { ", descending in the file" } else { "" })?;
+            match &axis.in_file {
+                Some(InFile { first, last, units, order }) => {
+                    writeln!(f, "{period}; in the file {} to {} {units}, {}", Short(*first), Short(*last), order.name())?;
+                }
+                None => writeln!(f, "{period}; made, ascending")?,
+            }
         }
         if let Some(t) = &self.time {
             if t.snapshots == 1 {

@@ -355,7 +355,7 @@ impl Planner<'_> {
             let fault = |fault| SourceError::Axis { path: self.path().into(), fault };
             let axis = Axis::uniform(name.as_str(), "", 0.0, (len - 1) as f64, len).map_err(fault)?;
             let notes = vec![format!("`{name}` has no coordinates: counted from 0")];
-            return Ok(AxisPlan { kind: extent.kind, axis, order: (0..len).collect(), notes, quantity: Quantity::None, descending: false });
+            return Ok(AxisPlan { kind: extent.kind, axis, order: (0..len).collect(), notes, quantity: Quantity::None, in_file: None });
         };
         let variable = &header.variables[coordinate];
         let coordinates = Coordinates {
@@ -367,14 +367,12 @@ impl Planner<'_> {
             kind: extent.kind,
             values: self.coordinate_values(coordinate)?,
         };
-        let mut plan = coordinates.plan(range)?;
-        if plan.axis.period().is_some() && self.settings.periodic.as_deref() == Some("none") {
-            let values = plan.axis.coordinates().to_vec();
-            plan.axis = Axis::new(plan.axis.name(), plan.axis.units(), values)
-                .map_err(|fault| SourceError::Axis { path: self.path().into(), fault })?;
-            plan.notes.push(format!("`{}` goes round, but ends where its nodes do, as set", plan.axis.name()));
-        }
-        Ok(plan)
+        coordinates.plan(range, self.goes_round())
+    }
+
+    /// Whether longitudes that go round are to be periodic.
+    pub(super) fn goes_round(&self) -> bool {
+        self.settings.periodic.as_deref() != Some("none")
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {
@@ -482,6 +480,9 @@ pub(super) fn difference(a: &Layout, b: &Layout) -> Option<String> {
             continue;
         }
         let (one, two) = (&x.axis, &y.axis);
+        if one == two {
+            return Some(format!("axis `{}` is in another order", one.name()));
+        }
         let show = |a: &Axis| format!("`{}` of {} nodes from {} to {} {}", a.name(), a.len(), a.first(), a.last(), a.units());
         let detail = match one.coordinates().iter().zip(two.coordinates()).position(|(p, q)| p != q) {
             Some(i) if one.len() == two.len() => format!(", first at node {i}: {} and {}", one.coordinates()[i], two.coordinates()[i]),

@@ -53,6 +53,11 @@ fn east_north(longitude: f64, latitude: f64) -> [Vector; 2] {
     [[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]]
 }
 
+/// Degrees between two points (longitude, latitude).
+pub(super) fn apart(p: [f64; 2], q: [f64; 2]) -> f64 {
+    dot(vector(p[0], p[1]), vector(q[0], q[1])).clamp(-1.0, 1.0).acos().to_degrees()
+}
+
 /// A difference of longitudes in [-180, 180).
 fn turn(degrees: f64) -> f64 {
     (degrees + 180.0).rem_euclid(360.0) - 180.0
@@ -84,32 +89,46 @@ impl Mesh {
     fn goes_round(&self, spacing: f64) -> bool {
         let [nx, ny] = self.shape;
         let closes = |j: &usize| match (self.point(nx - 1, *j), self.point(0, *j), self.point(nx / 2, *j)) {
-            (Some(a), Some(b), Some(m)) => {
-                let near = |p: [f64; 2], q: [f64; 2]| dot(vector(p[0], p[1]), vector(q[0], q[1])).clamp(-1.0, 1.0).acos().to_degrees();
-                near(a, b) < 2.0 * spacing && near(a, m) > 4.0 * spacing
-            }
+            (Some(a), Some(b), Some(m)) => apart(a, b) < 2.0 * spacing && apart(a, m) > 4.0 * spacing,
             _ => false,
         };
         nx > 8 && (0..ny).filter(closes).count() * 2 > ny
     }
 
-    /// Sine and cosine of the angle from east to the direction of x, a point each.
-    pub(super) fn directions(&self) -> (Vec<f32>, Vec<f32>) {
+    /// Unit vectors in which u and v run, a point each: east and north, or `along` the mesh: the direction of x, and a right angle to the left
+    /// of it. NaN where neighbours coincide.
+    pub(super) fn directions(&self, along: bool) -> Vec<[[f32; 3]; 2]> {
         let [nx, ny] = self.shape;
-        let mut out = (vec![f32::NAN; nx * ny], vec![f32::NAN; nx * ny]);
+        let round = along && self.goes_round(median(self.spacings(0)).unwrap_or(0.0));
+        let mut out = Vec::with_capacity(nx * ny);
         for j in 0..ny {
             for i in 0..nx {
-                let ends =
-                    (self.point(i.saturating_sub(1), j).or(self.point(i, j)), self.point((i + 1).min(nx - 1), j).or(self.point(i, j)));
-                let (Some(here), (Some(a), Some(b))) = (self.point(i, j), ends) else { continue };
-                let (a, b) = (vector(a[0], a[1]), vector(b[0], b[1]));
-                let along = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
+                let Some(here) = self.point(i, j) else {
+                    out.push([[f32::NAN; 3]; 2]);
+                    continue;
+                };
                 let [east, north] = east_north(here[0], here[1]);
-                let (x, y) = (dot(along, east), dot(along, north));
-                let length = x.hypot(y);
-                if length > 0.0 {
-                    (out.0[j * nx + i], out.1[j * nx + i]) = ((y / length) as f32, (x / length) as f32);
-                }
+                let [x, y] = if along {
+                    let own = vector(here[0], here[1]);
+                    let at = |i: usize| self.point(i, j).map_or(own, |p| vector(p[0], p[1]));
+                    let (first, last) = (i == 0, i + 1 == nx);
+                    let a = if first && round { at(nx - 1) } else { at(i.saturating_sub(1)) };
+                    let b = if last && round { at(0) } else { at((i + 1).min(nx - 1)) };
+                    let (before, after) = ([0, 1, 2].map(|k| own[k] - a[k]), [0, 1, 2].map(|k| b[k] - own[k]));
+                    // Where columns overlap at the seam, the one beyond lies behind.
+                    let step = match dot(before, after) > 0.0 {
+                        false if first => after,
+                        false if last => before,
+                        _ => [0, 1, 2].map(|k| before[k] + after[k]),
+                    };
+                    let (x, y) = (dot(step, east), dot(step, north));
+                    let length = x.hypot(y);
+                    if length > 0.0 { [x / length, y / length] } else { [f64::NAN; 2] }
+                } else {
+                    [1.0, 0.0]
+                };
+                let of = |a: f64, b: f64| std::array::from_fn(|k| (a * east[k] + b * north[k]) as f32);
+                out.push([of(x, y), of(-y, x)]);
             }
         }
         out
@@ -174,6 +193,19 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
 }
 
 impl Target {
+    /// Unit vectors to the east and to the north, a node each.
+    pub(super) fn bases(&self) -> [Vec<[f32; 3]>; 2] {
+        let [nx, ny] = self.nodes;
+        let at = |k: usize| -> Vec<[f32; 3]> {
+            let base = |n: usize| {
+                let place = [0, 1].map(|a| self.first[a] + self.step[a] * [n % nx, n / nx][a] as f64);
+                east_north(place[0], place[1])[k].map(|v| v as f32)
+            };
+            (0..nx * ny).map(base).collect()
+        };
+        [at(0), at(1)]
+    }
+
     /// Bilinear interpolation of values on the grid; NaN outside.
     pub(super) fn interpolate(&self, values: &[f32], longitude: f64, latitude: f64) -> f64 {
         let mut x = (longitude - self.first[0]).rem_euclid(360.0) / self.step[0];
@@ -358,10 +390,13 @@ mod tests {
         }
         // The turned square fills more than half of the box around it.
         assert!(found * 2 > on_grid.len() && found < on_grid.len(), "{found} of {}", on_grid.len());
-        let (sine, cosine) = mesh.directions();
         let middle = 20 * 41 + 20;
+        let [x, y] = mesh.directions(true)[middle].map(|d| d.map(f64::from));
+        let [east, north] = east_north(mesh.longitude[middle], mesh.latitude[middle]);
         // East is stretched by 0.7 / cos(50 degrees) here.
-        assert!((f64::from(sine[middle]).atan2(f64::from(cosine[middle])).to_degrees() - 25.0).abs() < 3.0);
+        assert!((dot(x, north).atan2(dot(x, east)).to_degrees() - 25.0).abs() < 3.0);
+        assert!(dot(x, y).abs() < 1e-6 && (dot(y, north) - dot(x, east)).abs() < 1e-6, "{x:?} {y:?}");
+        assert_eq!(mesh.directions(false)[middle], [east, north].map(|e| e.map(|v| v as f32)));
     }
 
     #[test]

@@ -26,6 +26,7 @@ mod libraries;
 pub mod live;
 mod locator;
 mod memory;
+mod nest;
 mod netcdf4;
 mod poles;
 mod reader;
@@ -37,6 +38,7 @@ mod times;
 mod vertical;
 
 pub use archive::NetCdfArchive;
+pub use axes::{FileOrder, InFile};
 pub use crash::report_crashes;
 pub use error::SourceError;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};

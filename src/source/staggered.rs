@@ -14,6 +14,7 @@ use super::container::{Container, NumberType};
 use super::dimensions::Extent;
 use super::hyperslab::{as_in_file, read_component};
 use super::layout::{ComponentPlan, Layout, Planner, Resampling, Role};
+use super::nest::{Nest, Shift};
 use super::settings::{Metric, Staggering, VelocityUnit};
 use crate::field::{Axis, AxisFault};
 use std::sync::Arc;
@@ -22,7 +23,7 @@ use std::sync::Arc;
 const GRAVITY: f64 = 9.81;
 
 /// What it takes to read a file.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Staggered {
     /// Perturbation and base-state geopotential on full levels.
     geopotential: [ComponentPlan; 2],
@@ -34,6 +35,26 @@ pub(super) struct Staggered {
     fineness: usize,
     /// Heights of the grid, metres.
     heights: Vec<f64>,
+    /// Distances between centres along x and y, metres of the projection.
+    step: [f64; 2],
+    /// Where the grid lies, where the file tells.
+    nest: Option<Nest>,
+    /// The places that the grid takes at the times of the archive.
+    reach: Reach,
+}
+
+/// The least and the greatest shift along x and y.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) struct Reach {
+    least: Shift,
+    greatest: Shift,
+}
+
+impl Reach {
+    fn with(self, other: Self) -> Self {
+        let both = |f: fn(isize, isize) -> isize, a: Shift, b: Shift| [f(a[0], b[0]), f(a[1], b[1])];
+        Self { least: both(isize::min, self.least, other.least), greatest: both(isize::max, self.greatest, other.greatest) }
+    }
 }
 
 /// Linear interpolation along one axis: two entries and the weight of the second.
@@ -90,7 +111,7 @@ fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: impl Fn
 }
 
 impl Staggered {
-    /// Places along x and y of the grid's nodes.
+    /// Places along x or y of the nodes on the file's cells.
     fn places(&self, axis: usize) -> Vec<f64> {
         (0..(self.cells[axis] - 1) * self.fineness + 1).map(|a| a as f64 / self.fineness as f64).collect()
     }
@@ -128,8 +149,34 @@ impl Staggered {
         [self.cells[0] + usize::from(which == 0), self.cells[1] + usize::from(which == 1)]
     }
 
-    /// One time, onto the grid: missing below the ground and above the highest half level (w: the highest full level).
+    /// One time, onto the grid: missing below the ground, above the highest full level, and where a nest that moves is not.
     pub(super) fn read(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<Vec<Vec<f32>>, SourceError> {
+        let own = self.on_own_cells(file, frame, entry)?;
+        if self.reach == Reach::default() {
+            return Ok(own);
+        }
+        let shift = self.nest.as_ref().map_or(Ok([0; 2]), |nest| nest.shift(file, entry))?;
+        let nodes = [0, 1].map(|k| self.places(k).len());
+        let all = [0, 1].map(|k| nodes[k] + (self.reach.greatest[k] - self.reach.least[k]) as usize * self.fineness);
+        // A file that changed since it was opened may lie anywhere.
+        if (0..2).any(|k| shift[k] < self.reach.least[k] || shift[k] > self.reach.greatest[k]) {
+            let what = "it changed since the archive was opened".into();
+            return Err(SourceError::Read { path: file.path.clone(), variable: frame[0].name.clone(), what });
+        }
+        let from = [0, 1].map(|k| (shift[k] - self.reach.least[k]) as usize * self.fineness);
+        let spread_out = |values: &Vec<f32>| {
+            let mut out = vec![f32::NAN; all[0] * all[1] * self.heights.len()];
+            for (row, line) in values.chunks_exact(nodes[0]).enumerate() {
+                let (level, y) = (row / nodes[1], row % nodes[1]);
+                out[(level * all[1] + from[1] + y) * all[0] + from[0]..][..nodes[0]].copy_from_slice(line);
+            }
+            out
+        };
+        Ok(own.iter().map(spread_out).collect())
+    }
+
+    /// One time, onto nodes on the file's own cells.
+    fn on_own_cells(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<Vec<Vec<f32>>, SourceError> {
         let places = [self.places(0), self.places(1)];
         let centres: [Vec<Tap>; 2] = [0, 1].map(|k| self.taps(k, &places[k], false));
         let plane = places[0].len() * places[1].len();
@@ -149,8 +196,9 @@ impl Staggered {
                     let z = z as f32;
                     let found = match which {
                         2 => in_column(z, half_levels + 1, at_full, value),
-                        // Between the ground and the lowest half level the wind is that of the latter.
+                        // Between the ground and the lowest half level the wind is that of the latter; above the highest alike.
                         _ if z >= at_full(0) && z < at_half(0) => Some(value(0)),
+                        _ if z > at_half(half_levels - 1) && z <= at_full(half_levels) => Some(value(half_levels - 1)),
                         _ => in_column(z, half_levels, at_half, value),
                     };
                     on_heights[level * plane + point] = found.unwrap_or(f32::NAN);
@@ -161,9 +209,21 @@ impl Staggered {
         Ok(out)
     }
 
+    /// The axes of x and y, in metres: the first centre of the first time is at half a cell.
+    fn horizontal(&self) -> Result<[AxisPlan; 2], AxisFault> {
+        let plan = |k: usize, name: &str, kind: Kind| {
+            let Reach { least, greatest } = self.reach;
+            let nodes = (self.cells[k] - 1 + (greatest[k] - least[k]) as usize) * self.fineness + 1;
+            let place = |a: usize| least[k] as f64 + a as f64 / self.fineness as f64;
+            let axis = Axis::new(name, "m", (0..nodes).map(|a| (place(a) + 0.5) * self.step[k]).collect())?;
+            Ok(AxisPlan::made(kind, axis, Quantity::Length))
+        };
+        Ok([plan(0, "west_east", Kind::X)?, plan(1, "south_north", Kind::Y)?])
+    }
+
     /// What interpolation on the grid gives at the file's own points, held against what the file has there: m/s, root mean square.
     pub(super) fn error(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
-        let grid = self.read(file, frame, entry)?;
+        let grid = self.on_own_cells(file, frame, entry)?;
         let full = self.full_levels(file, entry)?;
         let [nx, ny, nz] = self.cells;
         let nodes = [(nx - 1) * self.fineness + 1, (ny - 1) * self.fineness + 1];
@@ -194,6 +254,43 @@ impl Staggered {
         }
         let mean = |sum: f64| (sum / count.max(1) as f64).sqrt();
         Ok([mean(wrong), mean(size)])
+    }
+}
+
+impl Staggered {
+    /// What is to be said of a grid that moves.
+    fn moves(&self) -> Option<String> {
+        let cells = [0, 1].map(|k| self.reach.greatest[k] - self.reach.least[k]);
+        (self.reach != Reach::default()).then(|| {
+            format!(
+                "the grid moves, by up to {} and {} cells along x and y: each time lies in its place, in a domain that holds all places; \
+                 velocities are missing where the grid is not",
+                cells[0], cells[1]
+            )
+        })
+    }
+}
+
+impl Layout {
+    /// Widens the domain of a nest to that of a later file, which holds it.
+    pub(super) fn widen(&mut self, later: &Self) -> Result<(), AxisFault> {
+        let (Some(Resampling::Staggered(own)), Some(Resampling::Staggered(other))) =
+            (self.resampling.as_deref(), later.resampling.as_deref())
+        else {
+            return Ok(());
+        };
+        if own.reach == other.reach {
+            return Ok(());
+        }
+        let wide = Staggered { reach: other.reach, ..(**own).clone() };
+        let known = own.moves();
+        self.notes.retain(|note| Some(note) != known.as_ref());
+        self.notes.extend(wide.moves());
+        for (axis, wider) in self.axes.iter_mut().zip(wide.horizontal()?) {
+            *axis = wider;
+        }
+        self.resampling = Some(Arc::new(Resampling::Staggered(Box::new(wide))));
+        Ok(())
     }
 }
 
@@ -296,13 +393,28 @@ impl Planner<'_> {
             _ => self.time(&extents)?,
         };
         let fineness = if s.staggering == Staggering::Faces { 2 } else { 1 };
-        let mut staggered = Staggered { geopotential, scale, cells, fineness, heights: Vec::new() };
-        // All files of an archive share the heights of the first.
+        // All files of an archive share the domain and the heights of the first.
         let same = first.and_then(|l| match l.resampling.as_deref() {
-            Some(Resampling::Staggered(s)) => Some(s.heights.clone()),
+            Some(Resampling::Staggered(s)) => Some(s),
             _ => None,
         });
-        staggered.heights = match (same, &s.heights) {
+        let nest = match same {
+            Some(first) => first.nest.clone(),
+            None => Nest::of(self.file, [cells[0], cells[1]], dx.min(dy))?,
+        };
+        let mut own_reach = Reach::default();
+        match &nest {
+            Some(nest) => {
+                for entry in 0..time.seconds.len() {
+                    let shift = nest.shift(self.file, entry)?;
+                    own_reach = own_reach.with(Reach { least: shift, greatest: shift });
+                }
+            }
+            None => self.notes.push("no XLONG and XLAT of its centres: the grid is taken to stay where it is".into()),
+        }
+        let reach = same.map_or(own_reach, |s| s.reach.with(own_reach));
+        let mut staggered = Staggered { geopotential, scale, cells, fineness, heights: Vec::new(), step: [dx, dy], nest, reach };
+        staggered.heights = match (same.map(|s| s.heights.clone()), &s.heights) {
             (Some(heights), _) => heights,
             (None, Some(heights)) => heights.clone(),
             (None, None) => mean_heights(&staggered, &staggered.full_levels(self.file, 0)?),
@@ -320,15 +432,13 @@ impl Planner<'_> {
             [Some(_), Some(_)] => "metres are those of the map projection: u and v are multiplied by its scale factors MAPFAC".into(),
             _ => "no map scale factors (MAPFAC_U, MAPFAC_V): metres of the projection are taken for metres on the ground".into(),
         });
-        self.notes.push("below the lowest half level the wind is that of the latter; below the ground it is missing".into());
+        self.notes.push(
+            "below the lowest half level, and above the highest, the wind is that of the half level; below the ground it is missing".into(),
+        );
+        self.notes.extend(staggered.moves());
         let path = self.path().to_path_buf();
         let fault = |fault: AxisFault| SourceError::Axis { path: path.clone(), fault };
-        let mut axes = Vec::new();
-        for (k, (name, kind, step)) in [("west_east", Kind::X, dx), ("south_north", Kind::Y, dy)].into_iter().enumerate() {
-            let places = staggered.places(k);
-            let axis = Axis::new(name, "m", places.iter().map(|p| (p + 0.5) * step).collect()).map_err(fault)?;
-            axes.push(AxisPlan::made(kind, axis, Quantity::Length));
-        }
+        let mut axes = staggered.horizontal().map_err(fault)?.to_vec();
         let levels = Axis::new("height", "m", staggered.heights.clone()).map_err(fault)?;
         axes.push(AxisPlan::made(Kind::Level, levels, Quantity::Length));
         let (vertical, poles) = self.finish_axes(&mut axes, Metric::Cartesian)?;
@@ -355,7 +465,8 @@ impl Planner<'_> {
     }
 }
 
-/// Heights of full and half levels, averaged over the plane; the lowest is that of the lowest ground.
+/// Heights of full and half levels, averaged over the plane; the lowest is that of the lowest ground, the highest that of the highest half
+/// level where it is lowest: every column reaches up to it.
 fn mean_heights(staggered: &Staggered, full: &[f32]) -> Vec<f64> {
     let plane = staggered.cells[0] * staggered.cells[1];
     let means: Vec<f64> = full.chunks_exact(plane).map(|p| p.iter().map(|&z| f64::from(z)).sum::<f64>() / plane as f64).collect();
@@ -366,7 +477,10 @@ fn mean_heights(staggered: &Staggered, full: &[f32]) -> Vec<f64> {
         heights.push(pair[1]);
     }
     // Above the highest half level there is no u.
-    heights.pop();
+    let (below, top) = (&full[full.len() - 2 * plane..][..plane], &full[full.len() - plane..]);
+    let highest = below.iter().zip(top).map(|(a, b)| 0.5 * (f64::from(*a) + f64::from(*b))).fold(f64::INFINITY, f64::min);
+    heights.retain(|&z| z < highest);
+    heights.push(highest);
     heights
 }
 
@@ -382,6 +496,9 @@ mod tests {
             cells: [3, 2, 2],
             fineness: 2,
             heights: Vec::new(),
+            step: [1.0; 2],
+            nest: None,
+            reach: Reach::default(),
         };
         let places = staggered.places(0);
         assert_eq!(places, [0.0, 0.5, 1.0, 1.5, 2.0]);

@@ -24,7 +24,6 @@ pub(super) fn to_heights(plan: AxisPlan, scale: f64) -> Result<(AxisPlan, Vec<f6
                 counted(scale)
             ));
             plan.order.reverse();
-            plan.descending = !plan.descending;
             plan.axis = Axis::new(name, units("m"), heights)?;
             plan.quantity = Quantity::Length;
             Ok((plan, factors))

@@ -76,6 +76,18 @@ class Wrf:
         self.v = filled(d["V"][:]) * filled(d["MAPFAC_V"][:])[:, None]
         self.w = filled(d["W"][:])
         self.height = (filled(d["PH"][:]) + filled(d["PHB"][:])) / 9.81
+        # A nest that follows a storm: cells by which it lies elsewhere than at first.
+        lon, lat = np.radians(filled(d["XLONG"][:])), np.radians(filled(d["XLAT"][:]))
+        self.moved = [self.shift(lon[0], lat[0], lon[n], lat[n]) for n in range(len(self.time))]
+
+    @staticmethod
+    def shift(lon0, lat0, lon, lat):
+        """From the pair of centres, one of each time, that are nearest to one another."""
+        east = (lon0[:, :, None, None] - lon[None, None]) * np.cos(lat)[None, None]
+        apart = np.hypot(east, lat0[:, :, None, None] - lat[None, None])
+        j0, i0, j, i = np.unravel_index(np.argmin(apart), apart.shape)
+        assert apart[j0, i0, j, i] < 1e-5
+        return i0 - i, j0 - j
 
     @staticmethod
     def plane(values, i, j):
@@ -89,7 +101,8 @@ class Wrf:
         return (1 - t) * ((1 - s) * block[:, 0, 0] + s * block[:, 0, 1]) + t * ((1 - s) * block[:, 1, 0] + s * block[:, 1, 1])
 
     def at_time(self, n, place):
-        i, j = place[0] / self.dx, place[1] / self.dy  # faces count from 0, centres from a half
+        # Faces count from 0, centres from a half.
+        i, j = place[0] / self.dx - self.moved[n][0], place[1] / self.dy - self.moved[n][1]
         full = self.plane(self.height[n], i - 0.5, j - 0.5)
         if full is None:
             return np.full(3, np.nan)

@@ -1,6 +1,9 @@
 //! Small NetCDF files, written by libnetcdf where a test needs them.
 #![allow(dead_code, unused_imports)] // Each test file uses its part.
 
+pub mod grids;
+pub mod mutants;
+
 use netcdf::types::NcVariableType;
 use netcdf::{AttributeValue, NcTypeDescriptor, Options};
 use ridgewatch::field::Snapshot;
@@ -11,7 +14,7 @@ pub enum Data {
     F64(Vec<f64>),
     I16(Vec<i16>),
     /// Bytes of characters.
-    Text(&'static str),
+    Text(String),
 }
 
 /// A character as the library has it.
@@ -31,6 +34,7 @@ pub struct Variable {
     dimensions: Vec<String>,
     data: Data,
     attributes: Vec<(String, AttributeValue)>,
+    deflated: bool,
 }
 
 /// A file to be written.
@@ -64,13 +68,19 @@ impl Fixture {
 
     pub fn variable(mut self, name: &str, dimensions: &[&str], data: Data) -> Self {
         let dimensions = dimensions.iter().map(|d| d.to_string()).collect();
-        self.variables.push(Variable { name: name.into(), dimensions, data, attributes: vec![] });
+        self.variables.push(Variable { name: name.into(), dimensions, data, attributes: vec![], deflated: false });
         self
     }
 
     /// Adds an attribute to the last variable.
     pub fn with(mut self, name: &str, value: impl Into<AttributeValue>) -> Self {
         self.variables.last_mut().unwrap().attributes.push((name.into(), value.into()));
+        self
+    }
+
+    /// Compresses the last variable, where the format can.
+    pub fn deflated(mut self) -> Self {
+        self.variables.last_mut().unwrap().deflated = true;
         self
     }
 
@@ -105,6 +115,9 @@ impl Fixture {
                 Data::Text(_) => file.add_variable_with_type(&v.name, &dims, &NcVariableType::Char),
             }
             .unwrap();
+            if v.deflated && self.format == NETCDF4 {
+                variable.set_compression(4, true).unwrap();
+            }
             for (name, value) in &v.attributes {
                 variable.put_attribute(name, value.clone()).unwrap();
             }

@@ -262,7 +262,7 @@ impl Shared {
 
     /// The thread: brings what is expected, and gives back the memory of what is gone.
     fn bring_expected(&self) {
-        let copiers = std::thread::available_parallelism().map_or(1, |n| n.get() / 4).clamp(1, COPIERS);
+        let copiers = (rayon::current_num_threads() / 4).clamp(1, COPIERS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(copiers).thread_name(|i| format!("ridgewatch-copy-{i}")).build();
         let mut state = self.state();
         let Ok(pool) = pool else {

@@ -17,12 +17,12 @@ pub(super) struct Conversion {
 }
 
 impl Conversion {
-    /// For snapshots on `grid`. One core in four is taken, [`CONVERTERS`] at most: the others are the frames'.
+    /// For snapshots on `grid`. One of four threads that the process may have is taken, [`CONVERTERS`] at most: the others are the frames'.
     ///
     /// # Errors
     /// The threads could not be started.
     pub fn new(grid: Arc<Grid>) -> Result<Self, SourceError> {
-        let threads = std::thread::available_parallelism().map_or(1, |n| n.get() / 4).clamp(1, CONVERTERS);
+        let threads = (rayon::current_num_threads() / 4).clamp(1, CONVERTERS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("ridgewatch-convert-{i}")).build();
         let pool = pool.map_err(|e| SourceError::Inconsistent { what: format!("the converting threads could not start: {e}") })?;
         Ok(Self { grid, pool, made: Vec::new(), spare: None })
