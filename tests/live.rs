@@ -217,24 +217,36 @@ fn a_frame_goes_out_before_the_rest_of_its_training() {
     assert!(records.iter().skip(1).all(|r| r["training"]["steps"].as_u64().unwrap() > 0), "{records:?}");
 }
 
+/// Optimizer steps behind the weights of a checkpoint.
+fn trained_steps(checkpoint: &Path) -> u64 {
+    let bytes = std::fs::read(checkpoint).unwrap();
+    let length = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+    let header: serde_json::Value = serde_json::from_slice(&bytes[8..8 + length]).unwrap();
+    header["__metadata__"]["network.steps"].as_str().unwrap().parse().unwrap()
+}
+
 #[test]
 fn weights_outlive_the_sidecar() {
     let place = Place::new("weights");
     let (checkpoint, ring) = (place.files.join("weights"), text(&place.ring).to_owned());
     let (archive, live) = (place.archive(), place.live());
     let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "20", "--steps", "100000"]));
-    let attach = |name: &str| {
+    let attach = |name: &str, training: &str| {
         let run = place.files.join(name);
         let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", "2", "--checkpoint", text(&checkpoint)];
-        let more = ["--method", "gated", "--set", "training.seconds_per_frame=0.1", "--set", "surrogate.kind=network"];
+        let more = ["--method", "gated", "--set", training, "--set", "surrogate.kind=network"];
         ridgewatch(&arguments).args(more).output().unwrap()
     };
-    let first = attach("first");
+    let first = attach("first", "training.seconds_per_frame=0.1");
     good(&first);
     assert!(checkpoint.exists() && !String::from_utf8_lossy(&first.stderr).contains("going on from"));
-    let second = attach("second");
+    let before = trained_steps(&checkpoint);
+    let second = attach("second", "training.steps_per_frame=1");
     good(&second);
     assert!(String::from_utf8_lossy(&second.stderr).contains("going on from the weights in"));
+    // A step a frame, and one of a frame that the end may have cut off: without the first's weights it would have got no further.
+    let (steps, of_its_own) = (trained_steps(&checkpoint), records(&place.files.join("second")).len() as u64 + 1);
+    assert!(before > of_its_own && (before..=before + of_its_own).contains(&steps), "{before}, {of_its_own}, {steps}");
 }
 
 #[test]

@@ -188,6 +188,37 @@ fn another_grid_in_mid_run_is_refused_and_the_old_one_taken_again() {
 }
 
 #[test]
+fn other_blocks_of_the_same_grid_are_refused_and_the_old_ones_taken_again() {
+    let block = |index, count, offset, extent| Description { block: BlockExtent { index, count, offset, extent }, ..plane(8) };
+    let columns = |count: u32| -> Vec<_> {
+        let width = 8 / u64::from(count);
+        (0..count).map(|k| block(k, count, [width * u64::from(k), 0, 0], [width, 8, 1])).collect()
+    };
+    let rows = [block(0, 2, [0, 0, 0], [8, 4, 1]), block(1, 2, [0, 4, 0], [8, 4, 1])];
+    for (name, others, told) in [("rows", rows.to_vec(), "overlaps block"), ("count", columns(4), "number of blocks")] {
+        let folder = Folder::new(name);
+        let start = |blocks: Vec<Description>, first: u64| -> Vec<_> {
+            let solvers: Vec<_> = blocks.into_iter().map(|block| producer(&folder, block)).collect();
+            for n in first..first + 2 {
+                solvers.iter().for_each(|solver| publish(solver, n, n as f64, 1.0));
+            }
+            solvers
+        };
+        let solvers = start(columns(2), 0);
+        let window = follow(&settings(&folder), 1.0);
+        take(&window, |taken| newest(taken) == 1.0);
+        drop(solvers);
+        let others = start(others, 2);
+        std::thread::sleep(Duration::from_millis(300));
+        assert!(window.next_within(Duration::from_millis(50)).is_err(), "{name}");
+        drop(others);
+        let _solvers = start(columns(2), 4);
+        let (_, warnings) = take(&window, |taken| newest(taken) == 5.0);
+        assert!(has(&warnings, told) && has(&warnings, "needs a run of its own"), "{name}: {warnings:?}");
+    }
+}
+
+#[test]
 fn odd_times_and_missing_values_are_told() {
     let folder = Folder::new("odd");
     let solver = producer(&folder, plane(8));

@@ -40,21 +40,65 @@ fn compile(source: &Path, to: &Path, extra: &[&str]) {
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
 }
 
-/// Functions of a text by name, with the number of their parameters.
-fn functions(text: &str, begin: &str) -> BTreeMap<String, usize> {
+/// A function as C declares it: its return type and those of its parameters, without blanks at stars.
+type Signature = (String, Vec<String>);
+
+/// Splits `const float *u` into its type and its name.
+fn type_and_name(declared: &str) -> (String, String) {
+    let declared = declared.split_whitespace().collect::<Vec<_>>().join(" ");
+    let begin = declared.rfind(|c: char| !c.is_ascii_alphanumeric() && c != '_').map_or(0, |at| at + 1);
+    (declared[..begin].trim_end().replace(" *", "*"), declared[begin..].to_owned())
+}
+
+/// Functions that a header without comments declares.
+fn declared(header: &str) -> BTreeMap<String, Signature> {
+    let lines: Vec<_> = header.lines().filter(|line| !line.starts_with('#')).collect();
     let mut found = BTreeMap::new();
-    for (at, _) in text.match_indices(begin) {
-        let rest = &text[at + begin.len() - 3..];
-        let Some(open) = rest.find('(') else { continue };
-        let name = &rest[..open];
-        if !name.bytes().all(|b| b.is_ascii_lowercase() || b.is_ascii_digit() || b == b'_') {
-            continue;
-        }
-        let close = rest.find(')').unwrap();
-        let parameters = rest[open + 1..close].split(',').filter(|p| !p.trim().is_empty() && p.trim() != "void").count();
-        found.insert(name.to_owned(), parameters);
+    for statement in lines.join("\n").split(';') {
+        let Some((head, parameters)) = statement.split_once('(') else { continue };
+        let (returned, name) = type_and_name(head.rsplit_once('{').map_or(head, |(_, head)| head));
+        let parameters = parameters.trim_end().strip_suffix(')').unwrap();
+        let parameters = parameters.split(',').filter(|p| p.trim() != "void").map(|p| type_and_name(p).0).collect();
+        assert!(found.insert(name.clone(), (returned, parameters)).is_none(), "{name} twice");
     }
     found
+}
+
+/// A type of the library as C writes it.
+fn in_c(rust: &str) -> String {
+    if let Some(pointee) = rust.strip_prefix("*const ") {
+        assert!(!pointee.starts_with('*'), "{rust}");
+        return format!("const {}*", in_c(pointee));
+    }
+    if let Some(pointee) = rust.strip_prefix("*mut ") {
+        return format!("{}*", in_c(pointee));
+    }
+    let c = match rust {
+        "()" => "void",
+        "u32" => "uint32_t",
+        "u64" => "uint64_t",
+        "i64" => "int64_t",
+        "f32" => "float",
+        "f64" => "double",
+        "c_char" => "char",
+        "Status" => "rw_status",
+        "RwDescription" => "rw_description",
+        "RwField" => "rw_field",
+        other => panic!("{other}: a type without a counterpart in C"),
+    };
+    c.to_owned()
+}
+
+/// Functions that the library exports, as C would declare them.
+fn exported(library: &str) -> BTreeMap<String, Signature> {
+    let function = |text: &str| {
+        let (name, rest) = text.split_once('(').unwrap();
+        let (parameters, rest) = rest.split_once(')').unwrap();
+        let returned = rest.split_once('{').unwrap().0.trim().strip_prefix("->").unwrap_or("()");
+        let types = parameters.split(',').filter_map(|p| Some(in_c(p.split_once(':')?.1.trim()))).collect();
+        (name.to_owned(), (in_c(returned.trim()), types))
+    };
+    library.split("extern \"C\" fn ").skip(1).map(function).collect()
 }
 
 #[test]
@@ -70,9 +114,8 @@ fn the_header_and_the_library_agree() {
         rest = after.split_once("*/").unwrap().1;
     }
     plain.push_str(rest);
-    let declared: BTreeMap<_, _> = [" rw_", "*rw_"].iter().flat_map(|begin| functions(&plain, begin)).collect();
-    let exported = functions(&library, "extern \"C\" fn rw_");
-    assert_eq!(declared, exported);
+    let declared = declared(&plain);
+    assert_eq!(declared, exported(&library));
     assert!(declared.len() >= 17, "{declared:?}");
     // Status numbers.
     let number = |text: &str, name: &str| -> Option<u32> {

@@ -9,6 +9,9 @@
 mod assemble;
 mod bytes;
 mod copy;
+#[cfg(test)]
+#[path = "../tests/support/counting.rs"]
+mod counting;
 mod description;
 mod error;
 mod follow;

@@ -343,11 +343,14 @@ fn read_greeting(from: &mut impl Read) -> Result<[u8; 32], WireError> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::counting::{HELD, PEAK};
     use crate::{AxisDescription, Geometry};
     use std::io::Cursor;
 
-    /// A peer that has the key and lies: heads and descriptions are changed, then hashed and signed as if they were meant so.
+    /// A peer that has the key and lies: heads and descriptions are changed, then hashed and signed as if they were meant so. Memory: that of the
+    /// description as announced, which the limit on descriptions bounds, of a step, of the description's parts and of an error's words.
     #[test]
+    #[allow(clippy::print_stdout)]
     fn lies_under_a_good_signature_are_refused_too() {
         let cases: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(20_000);
         let axis = |name, n| AxisDescription::uniform(name, "m", 0.0, 1.0, n);
@@ -363,8 +366,8 @@ mod tests {
             ((z ^ (z >> 31)) % n as u64) as usize
         };
         let (mut taken, mut refused) = (0u64, [0u64; 4]);
-        let mut values = Vec::new();
-        for _ in 0..cases {
+        let mut most = 0;
+        for case in 0..cases {
             let (mut from, mut to) = (Session { key: Key([1; 32]), number: 7 }, Session { key: Key([1; 32]), number: 7 });
             let mut message = Vec::new();
             from.send(&mut message, &facts, Some(&description), &[0.5; 40]).unwrap();
@@ -383,7 +386,17 @@ mod tests {
             let signature = from.key.signature(&[&message[..HEAD]]);
             message[HEAD..begin].copy_from_slice(&signature);
             let mut known = |_, announced: Option<Description>| announced.map(|d| d.block_bytes());
-            match to.receive(&mut Cursor::new(&message), &limits, &mut known, &mut values) {
+            // Where the head says how long the description is.
+            let announced = u32::from_le_bytes(message[64..68].try_into().unwrap());
+            let announced = if announced > DESCRIPTION_BYTES { 0 } else { announced as isize };
+            let mut values = Vec::new();
+            let held = HELD.get();
+            PEAK.set(held);
+            let received = to.receive(&mut Cursor::new(&message), &limits, &mut known, &mut values);
+            let took = PEAK.get() - held;
+            most = most.max(took);
+            assert!(took <= announced + (1 << 16) + (1 << 15), "case {case} took {took} bytes, {announced} of them announced");
+            match received {
                 Ok(facts) => {
                     assert!(facts.time.is_finite() && values.len() <= 1 << 14);
                     taken += 1;
@@ -400,6 +413,7 @@ mod tests {
                 }
             }
         }
+        println!("{cases} lies: {taken} taken, {refused:?} refused, {most} bytes at most");
         assert!(taken > cases / 20 && refused.iter().all(|n| *n > cases / 1000), "{taken} {refused:?}: the corpus is lopsided");
     }
 }
