@@ -105,6 +105,9 @@ fn files_are_ordered_by_time_not_by_name() {
         let gaps = archive.gaps();
         assert_eq!(gaps.len(), 1);
         assert_eq!((gaps[0].missing, gaps[0].after), (1, archive.times()[1]));
+        let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
+        let indexed = NetCdfArchive::open(&[dir.path().join("*.nc")], &settings).unwrap();
+        assert_eq!(indexed.gaps(), gaps, "in snapshots every interval is one");
         let said = archive.describe().notes.join("\n");
         assert!(said.contains("between 2000-01-02T00:00:00Z and 2000-01-04T00:00:00Z"), "{said}");
     }

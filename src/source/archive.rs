@@ -168,9 +168,9 @@ impl NetCdfArchive {
         self.metric
     }
 
-    /// Intervals of more than one and a half times the median.
+    /// Intervals of more than one and a half times the median, in [`Self::seconds`].
     pub fn gaps(&self) -> Vec<TimeGap> {
-        time_gaps(&self.times)
+        time_gaps(&self.seconds)
     }
 
     /// Units of the axes in the files, before the index metric replaced them, with direction: for reports.

@@ -246,6 +246,13 @@ impl Inspection {
     }
 }
 
+/// Most snapshots that a window over `tau` holds: those inside, and one to interpolate from.
+fn fullest_window(times: &[f64], tau: f64) -> usize {
+    let slack = 1e-9 * tau;
+    let end = |i: usize| times.partition_point(|&t| t < times[i] + tau - slack);
+    (0..times.len()).map(|i| (i, end(i))).filter(|&(_, j)| j < times.len()).map(|(i, j)| j - i + 1).max().unwrap_or(times.len())
+}
+
 fn times(archive: &NetCdfArchive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
@@ -257,11 +264,8 @@ fn times(archive: &NetCdfArchive, description: &SourceDescription, steady: bool,
         None if steady => Err(SourceError::Setting { key: "tau", found: "missing".into(), accepted: "a steady flow gives none".into() }),
         None => archive.default_tau(),
     };
-    // The window keeps what covers tau: the snapshots inside, and one to interpolate from.
-    let held =
-        |tau: f64| if interval > 0.0 { ((tau / interval - 1e-9).ceil() as usize).saturating_add(1).min(times.len()) } else { times.len() };
     // A steady flow is there twice (see [`super::Steady`]).
-    let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { held(t) });
+    let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { fullest_window(times, t) });
     TimeReport {
         snapshots: times.len(),
         first: show(times[0]),
@@ -382,5 +386,17 @@ mod tests {
         {
             assert_eq!(Short(value).to_string(), text);
         }
+    }
+
+    #[test]
+    fn the_fullest_window_counts() {
+        let even: Vec<f64> = (0..60).map(f64::from).collect();
+        assert_eq!(
+            (super::fullest_window(&even, 29.5), super::fullest_window(&even, 30.0), super::fullest_window(&even, 59.0)),
+            (31, 31, 60)
+        );
+        // Hourly for two days, then daily.
+        let uneven: Vec<f64> = (0..48).map(f64::from).chain((2..10).map(|d| f64::from(24 * d))).collect();
+        assert_eq!(super::fullest_window(&uneven, 48.0), 49);
     }
 }
