@@ -287,7 +287,7 @@ impl Reader {
             }
             Err(error) => {
                 self.barred.insert(block);
-                let text = format!("the simulation was not taken in: {error}; what has another grid needs a run of its own");
+                let text = format!("the simulation was not taken in: {error}; another grid, or other blocks, need a run of their own");
                 self.shared.lock().warn(text);
                 return;
             }
