@@ -16,6 +16,8 @@ use super::times::TimePlan;
 
 /// Names of a scalar, attribute or dataset that holds the time.
 const TIME_NAMES: [&str; 5] = ["time", "Time", "t", "simulation_time", "physical_time"];
+/// Most nodes along an axis: single precision tells no more places apart, and a damaged shape must not take memory before it is refused.
+const MOST_ALONG: usize = 1 << 24;
 /// Names of coordinates, compared without their group and without regard to case; `x` stands for the axis.
 const COORDINATE_NAMES: [&str; 7] = ["x", "xcoor", "xc", "x_coordinate", "coords_x", "grid_x", "x_coor"];
 
@@ -76,14 +78,18 @@ impl Planner<'_> {
         };
         // What cannot be mended is told before what settings could add.
         for (letter, name) in [(b'x', "x"), (b'y', "y"), (b'z', "z")] {
-            if let Some(place) = order.iter().position(|&o| o == letter)
-                && shape[place] < 2
-            {
+            let Some(place) = order.iter().position(|&o| o == letter) else { continue };
+            let nodes = shape[place];
+            if nodes < 2 {
                 let what = format!(
-                    "it is {} node(s) thick along {name}: no flow map can be traced in a single slab; accepted are 2 nodes or more along every axis",
-                    shape[place]
+                    "it is {nodes} node(s) thick along {name}: no flow map can be traced in a single slab; accepted are 2 nodes or more along every axis"
                 );
                 return Err(self.misfit(first, what));
+            }
+            if nodes > MOST_ALONG {
+                return Err(
+                    self.misfit(first, format!("it claims {nodes} nodes along {name}; accepted are {MOST_ALONG} at most along an axis"))
+                );
             }
         }
         let mut axes = Vec::new();
