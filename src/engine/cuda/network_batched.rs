@@ -92,9 +92,7 @@ impl Batched {
         let product = |name| {
             let function = kernel(name)?;
             let doing = DeviceError::driver("asking for shared memory");
-            function
-                .set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, PRODUCT_BYTES as i32)
-                .map_err(doing)?;
+            function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, PRODUCT_BYTES as i32).map_err(doing)?;
             Ok::<_, DeviceError>(function)
         };
         let tables = match shape.levels.is_empty() {
