@@ -32,7 +32,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 #[cfg(feature = "cuda")]
 mod bench {
     use ridgewatch::engine::cuda::{
-        Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
+        Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
+        Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::Domain;
     use ridgewatch::field::turbulence::Turbulence;
