@@ -1,8 +1,8 @@
 //! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table, or a network that is trained
 //! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
 //! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
-//! traced share, with the device's memory over a thousand frames. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ SAMPLES [table.key=value]`, where
-//! keys are those of a scene and hold for the networks' rows.
+//! traced share, with the device's memory over a thousand frames. Prints; needs a GPU.
+//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [table.key=value]`, where keys are those of a scene.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -72,7 +72,8 @@ fn median_and_most(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64 
 }
 
 fn main() {
-    let told: Vec<String> = std::env::args().skip(1).filter(|a| a.contains('=')).collect();
+    let (told, words): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
+    let asked = |what: &str| words.iter().all(|w| w.parse::<usize>().is_ok()) || words.iter().any(|w| w == what);
     let given: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
@@ -111,10 +112,10 @@ fn main() {
     );
 
     println!(
-        "| answers | frames/s | frame, ms (longest) | walk | trace | predict | audit | train | steps | queries | traced | trusted volume | \
+        "| answers | frames/s | frame, ms (and longest) | walk | trace | predict | audit | train | on the device: picture | training | steps | queries | traced | trusted volume | \
          stated error | over tolerance | surrogate alone, dB | PSNR of {FRAMES} frames, dB |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|{}", "---|".repeat(18));
     let double = nodes.map(|n| 2 * n - 1);
     let rows = [
         ("RK4", None),
@@ -124,26 +125,32 @@ fn main() {
         ("network above the table of the data's nodes", Some((Kind::Residual, nodes))),
     ];
     for (name, surrogate) in rows {
+        let is_network = surrogate.is_some_and(|(kind, _)| kind != Kind::Table);
+        if !asked(if is_network { "networks" } else { "tables" }) {
+            continue;
+        }
         scene.render.method = if surrogate.is_some() { Method::Gated } else { Method::Reference };
         if let Some((kind, nodes)) = surrogate {
             (scene.surrogate.kind, scene.surrogate.table_nodes) = (kind, Some(nodes));
         }
-        let learns = surrogate.is_some_and(|(kind, _)| kind != Kind::Table);
-        scene.time.warmup_frames = if learns { LEARNING } else { WARM_UP };
+        scene.time.warmup_frames = if is_network { LEARNING } else { WARM_UP };
         let (sum, records) = pictures(&scene, &device);
         let psnr = compare_films(&sum, &reference, scene.render.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
         let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
         let over = records.iter().filter(|r| r.over_tolerance.is_some()).count();
-        let seconds = records[FRAMES - 1].seconds.elapsed - records[0].seconds.elapsed;
+        // Adding the pictures up is the measurement's time, not the loop's.
+        let seconds: f64 = records.iter().map(|r| r.seconds.total).sum();
         println!(
-            "| {name} | {:.1} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {:.1} | {psnr:.1} |",
-            (FRAMES - 1) as f64 / seconds,
+            "| {name} | {:.1} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {:.1} | {psnr:.1} |",
+            FRAMES as f64 / seconds,
             median_and_most(&records, |r| 1e3 * r.seconds.total),
             ms(|r| r.seconds.render),
             ms(|r| r.seconds.trace),
             ms(|r| r.seconds.predict),
             ms(|r| r.seconds.audit),
             ms(|r| r.seconds.train),
+            ms(|r| r.seconds.device),
+            ms(|r| r.training.as_ref().and_then(|learned| learned.device_seconds).unwrap_or(0.0)),
             median(&records, |r| r.training.as_ref().map_or(0.0, |learned| learned.steps as f64)),
             median(&records, |r| r.queries as f64),
             100.0 * median(&records, |r| r.traced_share),
@@ -153,13 +160,18 @@ fn main() {
         );
         for record in &records {
             assert!(record.device.starts_with("cuda") && record.traced_ahead > 0, "{:?}", record.warnings);
-            assert!(!learns || record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
+            assert!(!is_network || record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
         }
     }
     println!();
 
+    if !asked("slides") {
+        return;
+    }
     println!("<!-- block gated-slides -->");
-    println!("{SLIDES} slides of {FRAMES_A_SLIDE} frames after {LEARNING} at the first; the share that is traced by the frame of a slide, its length in ms beside it.\n");
+    println!(
+        "{SLIDES} slides of {FRAMES_A_SLIDE} frames after {LEARNING} at the first; the share that is traced by the frame of a slide, its length in ms beside it.\n"
+    );
     println!("| answers | slide | {} | slide itself, ms |", SHOWN.map(|n| (n + 1).to_string()).join(" | "));
     println!("|---|---|{}---|", "---|".repeat(SHOWN.len()));
     scene.time.frames_per_slide = FRAMES_A_SLIDE;

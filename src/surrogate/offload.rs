@@ -1,7 +1,7 @@
 //! The seam for engines that train networks on a device: what is asked of one.
 //!
 //! burn's module stays on the host. It goes over when training begins, comes back at the seams (a checkpoint, a slide that makes the network
-//! start anew, every ten seconds), and training goes on from what came back last when the device is lost.
+//! start anew, every ten seconds or so), and training goes on from what came back last when the device is lost.
 
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::{SampleRing, Table};

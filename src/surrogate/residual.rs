@@ -6,7 +6,9 @@
 use super::checkpoint::Checkpoint;
 use super::network::HELD_OUT;
 use super::trainer::{FrozenNetwork, Trainer};
-use super::{CheckpointError, Learned, NetworkSettings, NetworkState, Offload, Predict, SampleRing, Samples, Surrogate, SurrogateError, Table};
+use super::{
+    CheckpointError, Learned, NetworkSettings, NetworkState, Offload, Predict, SampleRing, Samples, Surrogate, SurrogateError, Table,
+};
 use crate::flow::Tracer;
 use std::path::Path;
 use std::sync::Arc;

@@ -6,9 +6,7 @@
 //! only when the loss has stopped falling.
 
 use super::checkpoint::{Checkpoint, Entry};
-use super::network::{
-    Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step,
-};
+use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step};
 use super::{
     CheckpointError, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples,
     SurrogateError, Table, fresh_stamp,
@@ -40,8 +38,10 @@ const STALL_FACTOR: f64 = 0.7;
 const LEAST_FACTOR: f64 = 0.1;
 /// Steps that a device is told at once at most, and before it is known how long one takes.
 const GROUP: [u64; 2] = [64, 8];
-/// Seconds of a run after which what a device has learned comes back: so much is lost with it.
+/// Seconds of a run after which what a device has learned comes back, at least: so much is lost with it.
 const FETCH_EVERY: f64 = 10.0;
+/// And so many times the seconds that it takes to come back, so that it costs one hundredth of the time.
+const FETCH_APART: f64 = 100.0;
 
 /// How far training has come; everything besides weights and moments that the next step depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -77,6 +77,8 @@ struct Away {
     /// How far it was when it last came back, and when that was.
     fetched: Progress,
     fetched_at: Instant,
+    /// Seconds that it took; 0 before the first time.
+    fetch_seconds: f64,
     /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
     step_seconds: f64,
     /// What it predicts since the latest step.
@@ -361,6 +363,7 @@ impl Trainer {
             steps: self.model.steps(),
             fetched: self.progress,
             fetched_at: Instant::now(),
+            fetch_seconds: 0.0,
             step_seconds: 0.0,
             frozen: OnceLock::new(),
         });
@@ -378,8 +381,9 @@ impl Trainer {
     /// Brings back what a device has learned; it goes on there.
     fn fetch(&mut self) -> Result<(), DeviceLost> {
         let Some(away) = &mut self.away else { return Ok(()) };
+        let begin = Instant::now();
         away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
-        (away.fetched, away.fetched_at) = (self.progress, Instant::now());
+        (away.fetched, away.fetched_at, away.fetch_seconds) = (self.progress, Instant::now(), begin.elapsed().as_secs_f64());
         self.pack();
         Ok(())
     }
@@ -442,7 +446,8 @@ impl Trainer {
             if restart {
                 away.training.restart_average()?;
             }
-            return if away.fetched_at.elapsed().as_secs_f64() >= FETCH_EVERY { self.fetch() } else { Ok(()) };
+            let due = away.fetched_at.elapsed().as_secs_f64() >= FETCH_EVERY.max(FETCH_APART * away.fetch_seconds);
+            return if due { self.fetch() } else { Ok(()) };
         }
         if restart {
             self.average = Arc::new(Average { tables: self.model.tables(), layers: self.model.layers() });

@@ -14,7 +14,7 @@ use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
     Architecture, Average, Fused, Loss, Model, NetworkSettings, Objective, Pick, PlannedStep, Step, Target, stock_step,
 };
-use ridgewatch::surrogate::{Offload, OffloadedTraining, Predict, SampleRing, Samples, Table};
+use ridgewatch::surrogate::{Offload, Predict, SampleRing, Samples, Table};
 
 /// Of the cases that the CPU trains, those that the kernels take.
 fn cases() -> Vec<Case> {

@@ -1,9 +1,9 @@
 //! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
 
 use super::layout::{Outputs, TableArgument, TableFrame};
+use super::predictor::predict_from_host;
 use super::sort::{MOST, Sorter};
 use super::trace::DeviceTracer;
-use super::predictor::predict_from_host;
 use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
 use crate::engine::accelerator::DeviceNodes;
 use crate::field::Domain;

@@ -1,12 +1,12 @@
 //! What comes before a slide's frames: sizes, tables, probes and the pilot.
 
 use super::{Cycle, KEEP_A_FRAME, RENDER_RESIDUALS};
-use crate::engine::{Device, EngineError};
 use crate::engine::answers::Answers;
 use crate::engine::audit;
 use crate::engine::feed::Slide;
 use crate::engine::setup::{Plan, assemble};
 use crate::engine::stop::{Halt, Interruptible, heed};
+use crate::engine::{Device, EngineError};
 use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Scene;
 use crate::surrogate::network::Target;
