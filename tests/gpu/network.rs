@@ -368,8 +368,6 @@ fn what_the_kernels_do_not_take_is_refused() {
     };
     let usual = NetworkSettings { log2_table: 10, ..NetworkSettings::default() };
     for settings in [
-        NetworkSettings { width: 129, ..usual.clone() },
-        NetworkSettings { hidden_layers: 5, ..usual.clone() },
         NetworkSettings { target: Target::FlowMap, ..usual.clone() },
         NetworkSettings { loss: Loss::Published, mean_penalty: 1.0, ..usual },
     ] {
