@@ -2,6 +2,7 @@
 //! by other tools: `make test-data`.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
+use ridgewatch::engine::FrameRecord;
 use ridgewatch::field::{Geometry, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
@@ -23,21 +24,23 @@ fn data(name: &str) -> PathBuf {
     path
 }
 
-/// The first frame of a replay through the front door, after three that taught the network.
+/// The last of eight frames of a replay through the front door. The first ones are over tolerance, and say so: trust begins with few points.
 fn replay(files: &Path, tau: f64) -> Film {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("run");
     let output = Command::new(env!("CARGO_BIN_EXE_ridgewatch"))
         .args(["replay", "--json", "--out", out.to_str().unwrap(), files.to_str().unwrap()])
         .args(["--set", "render.width=128", "--set", "render.height=64", "--set", "render.samples=4"])
-        .args(["--set", "training.steps_per_frame=100", "--set", "time.slides=1", "--set", "time.warmup_frames=3"])
+        .args(["--set", "training.steps_per_frame=100", "--set", "time.slides=1", "--set", "time.frames_per_slide=8"])
         .args(["--set", &format!("time.tau={tau:?}")])
         .output()
         .unwrap();
     assert!(output.status.success(), "{}: {}", files.display(), String::from_utf8_lossy(&output.stderr));
-    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
-    assert_eq!((summary["frames"].as_u64(), summary["totals"]["over_tolerance_frames"].as_u64()), (Some(1), Some(0)), "{summary}");
-    let frame = out.join("frames/frame_000000");
+    let records = std::fs::read_to_string(out.join("records.jsonl")).unwrap();
+    let records: Vec<FrameRecord> = records.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
+    let last = &records[7];
+    assert!(last.over_tolerance.is_none() && last.traced_share < 1.0 && last.trusted.is_some(), "{last:?}");
+    let frame = out.join("frames/frame_000007");
     assert_eq!(image::image_dimensions(frame.with_extension("png")).unwrap(), (128, 64));
     read_exr(&frame.with_extension("exr")).unwrap()
 }
@@ -45,7 +48,7 @@ fn replay(files: &Path, tau: f64) -> Film {
 /// Holds a picture to FTLE (1/s) that another integration found: what is seen lies above the transfer function's low, the median, and
 /// varies. `land`: accepted shares of pixels.
 fn looks_right(name: &str, film: &Film, ftle: &[f64], land: std::ops::RangeInclusive<f64>) {
-    assert!(film.rgba.iter().flatten().all(|c| c.is_finite() && *c >= 0.0), "{name}: every pixel has a colour");
+    assert!(film.rgba.iter().flatten().all(|c| c.is_finite()), "{name}: every pixel has a colour");
     let seen: Vec<f64> = film.ftle_mean.iter().filter(|f| f.is_finite()).map(|&f| f64::from(f)).collect();
     let mean = seen.iter().sum::<f64>() / seen.len() as f64;
     let spread = (seen.iter().map(|f| (f - mean).powi(2)).sum::<f64>() / seen.len() as f64).sqrt();
@@ -222,17 +225,16 @@ fn globcurrent_agrees_with_an_independent_integration() {
     let pairs = independent("globcurrent", std::slice::from_ref(&files), tau);
     let (relative, correlation) = report("GlobCurrent", tau, &pairs);
     // Ours interpolates vectors in space, theirs east and north: apart by a cell's square.
-    assert!(relative < 0.01 && correlation > 0.999, "{relative} {correlation}");
-    // A cell with a missing corner is land.
+    assert!(relative < 0.011 && correlation > 0.9999, "{relative} {correlation}");
+    // Land is where one of the 4 x 4 nodes is missing that cubic interpolation, the default in two dimensions, reads.
     let mut archive = Archive::open(std::slice::from_ref(&files), &ArchiveSettings::default()).unwrap();
     let snapshot = archive.read(59).unwrap();
     let [nx, ny, _] = snapshot.grid.shape();
-    let is_land = |cell: usize| {
-        let corner = cell / (nx - 1) * nx + cell % (nx - 1);
-        [0, 1, nx, nx + 1].iter().any(|offset| snapshot.nodes[corner + offset][3].is_nan())
-    };
-    let land = (0..(nx - 1) * (ny - 1)).filter(|&cell| is_land(cell)).count() as f64 / ((nx - 1) * (ny - 1)) as f64;
-    looks_right("GlobCurrent", &replay(&files, tau), &per_second(&pairs.1, tau), land - 0.01..=land + 0.01);
+    let read = |cell: usize, n: usize| cell.saturating_sub(1)..=(cell + 2).min(n - 1);
+    let is_land = |i: usize, j: usize| read(j, ny).any(|y| read(i, nx).any(|x| snapshot.nodes[y * nx + x][3].is_nan()));
+    let cells = ((nx - 1) * (ny - 1)) as f64;
+    let land = (0..ny - 1).map(|j| (0..nx - 1).filter(|&i| is_land(i, j)).count()).sum::<usize>() as f64 / cells;
+    looks_right("GlobCurrent", &replay(&files, tau), &per_second(&pairs.1, tau), land - 0.005..=land + 0.005);
 }
 
 #[test]
@@ -242,7 +244,7 @@ fn era5_agrees_with_an_independent_integration() {
     let pairs = independent("era5", std::slice::from_ref(&files), tau);
     let (relative, correlation) = report("ERA5", tau, &pairs);
     // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
-    assert!(relative < 0.0026 && correlation > 0.99996, "{relative} {correlation}");
+    assert!(relative < 2e-5 && correlation > 0.999_999, "{relative} {correlation}");
     // The rim is seen behind what is transparent.
     looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.1, tau), 0.01..=0.2);
 }

@@ -37,7 +37,8 @@ def cell(axis, x):
 class GlobCurrent:
     """Currents by longitude and latitude: bilinear in both, linear in time. A particle is carried in degrees."""
 
-    gaps = [1e-5, 1e-5]
+    # Degrees: a metre, and a millionth of it in a step.
+    gaps, tolerance = [1e-5, 1e-5], 1e-11
 
     def __init__(self, files):
         sets = sorted((netCDF4.Dataset(f) for f in files), key=lambda d: d["time"][0])
@@ -70,7 +71,7 @@ class GlobCurrent:
 class Era5:
     """Pressure levels on a projected grid: trilinear in x, y and height, linear in time."""
 
-    gaps = [1.0, 1.0, 0.05]
+    gaps, tolerance = [1.0, 1.0, 0.05], 1e-6
 
     def __init__(self, files):
         sets = sorted((netCDF4.Dataset(f) for f in files), key=lambda d: seconds(d["time"])[0])
@@ -103,7 +104,7 @@ class Era5:
 class Wrf:
     """Arakawa C: each component from its own faces, each column between its own levels at the particle's place."""
 
-    gaps = [1.0, 1.0, 0.05]
+    gaps, tolerance = [1.0, 1.0, 0.05], 1e-6
 
     def __init__(self, files):
         d = netCDF4.Dataset(files[0])
@@ -167,7 +168,7 @@ def arrive(flow, start, begin, tau):
     ends = sorted(ends, reverse=tau < 0) + [begin + tau]
     x, t = np.asarray(start, dtype=float), begin
     for end in ends:
-        solution = solve_ivp(lambda t, x: flow.at(x, t), (t, end), x, method="DOP853", rtol=1e-9, atol=1e-6, max_step=abs(tau) / 20)
+        solution = solve_ivp(lambda t, x: flow.at(x, t), (t, end), x, method="DOP853", rtol=1e-13, atol=flow.tolerance, max_step=abs(tau) / 20)
         x, t = solution.y[:, -1], end
         if not solution.success or not np.isfinite(x).all():
             return np.full(len(start), np.nan)
