@@ -8,10 +8,10 @@ use super::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSetting
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use crate::setting::{Refused, require};
 use crate::source::Listener;
+use crate::surrogate::Offload;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
-#[cfg(feature = "cuda")]
 use std::sync::Arc;
 use thiserror::Error;
 
@@ -62,13 +62,37 @@ impl fmt::Display for DeviceChoice {
 
 /// How node velocities are held on a GPU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
 pub enum Storage {
     /// 16 bytes a node.
     #[default]
     F32,
     /// 8 bytes a node: velocities are rounded to 11 bits.
     F16,
+    /// 16 bytes a node: rounded to 11 bits, with the change to the next snapshot beside it, so that a tracer asks once instead of twice.
+    F16Pairs,
+}
+
+impl Storage {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::F16Pairs];
+
+    /// Bytes of a node.
+    pub fn bytes(self) -> u64 {
+        match self {
+            Self::F32 | Self::F16Pairs => 16,
+            Self::F16 => 8,
+        }
+    }
+
+    /// As written in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+            Self::F16Pairs => "f16_pairs",
+        }
+    }
 }
 
 /// What happens when work on a GPU fails.
@@ -202,6 +226,15 @@ impl Device {
             #[cfg(feature = "cuda")]
             Self::Gpu { gpu, .. } => Ok(gpu.health().check()?),
             Self::Cpu { .. } => Ok(()),
+        }
+    }
+
+    /// What trains networks on it; none where the CPU does.
+    pub(super) fn offload(&self) -> Option<Arc<dyn Offload>> {
+        match self {
+            Self::Cpu { .. } => None,
+            #[cfg(feature = "cuda")]
+            Self::Gpu { gpu, .. } => gpu.offload().filter(|_| gpu.health().works()),
         }
     }
 
