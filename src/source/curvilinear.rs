@@ -359,6 +359,7 @@ impl Planner<'_> {
             axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
         }
         let meshes = meshes.into_iter().map(|(_, m)| m).collect();
-        Ok((Arc::new(Resampling::Curvilinear(Curvilinear { locators, meshes, target, directions, bases: target.bases(), what })), axes))
+        let resampled = Curvilinear { locators, meshes, target, directions, bases: target.bases(), what };
+        Ok((Arc::new(Resampling::Curvilinear(Box::new(resampled))), axes))
     }
 }

@@ -90,7 +90,7 @@ impl Layout {
 #[derive(Debug)]
 pub(super) enum Resampling {
     Staggered(Box<Staggered>),
-    Curvilinear(Curvilinear),
+    Curvilinear(Box<Curvilinear>),
 }
 
 impl Resampling {

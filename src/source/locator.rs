@@ -164,7 +164,7 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
     let (south, north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
     let mut middle = latitudes;
     middle.sort_by(f64::total_cmp);
-    if !(north - south > NARROWEST) {
+    if north - south <= NARROWEST {
         return Err(format!("its points lie on one parallel, at {south} degrees north: they make no cell"));
     }
     let cosine = middle[middle.len() / 2].to_radians().cos().max(0.1);
@@ -186,7 +186,7 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
         start -= 360.0;
     }
     let width = if round { 360.0 } else { 360.0 - hole };
-    if !(width > NARROWEST) {
+    if width <= NARROWEST {
         return Err(format!("its points lie on one meridian, at {start} degrees east: they make no cell"));
     }
     loop {
