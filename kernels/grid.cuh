@@ -8,7 +8,9 @@
 
 namespace rw {
 
-enum Storage { F32 = 0, F16 = 1 };
+// How nodes are held; in pairs, in half precision, each with its change to the next snapshot behind it: one request reads both, and the
+// second snapshot is never asked.
+enum Storage { F32 = 0, F16 = 1, F16_PAIRS = 2 };
 
 // One axis. A state coordinate is the distance from the first node in mean spacings.
 template <class R> struct AxisData {
@@ -91,33 +93,38 @@ template <class Config> struct Node {
     bool known;
 };
 
+template <class Config> RW_FN Node<Config> halves(uint32_t low, uint32_t high) {
+    return {{from_half(uint16_t(low & 0xffffu)), from_half(uint16_t(low >> 16)), from_half(uint16_t(high & 0xffffu)), from_half(uint16_t(high >> 16))},
+            !Config::MARKS || (high >> 16 & 0x7fffu) <= 0x7c00u};
+}
+
 template <class Config> RW_FN Node<Config> node_at(const void* nodes, size_t index) {
-    Node<Config> node;
-    if (Config::STORAGE == F32) {
-        Four f = load(static_cast<const Four*>(nodes) + index);
-        node.v[0] = f.x;
-        node.v[1] = f.y;
-        node.v[2] = f.z;
-        node.v[3] = f.w;
-        node.known = !Config::MARKS || !is_nan(f.w);
+    if constexpr (Config::STORAGE == F32) {
+        const Four f = load(static_cast<const Four*>(nodes) + index);
+        return {{f.x, f.y, f.z, f.w}, !Config::MARKS || !is_nan(f.w)};
     } else {
-        uint32_t low, high;
 #if RW_DEVICE
-        uint2 w = __ldg(static_cast<const uint2*>(nodes) + index);
-        low = w.x;
-        high = w.y;
+        const uint2 w = __ldg(static_cast<const uint2*>(nodes) + index);
+        return halves<Config>(w.x, w.y);
 #else
         const uint32_t* w = static_cast<const uint32_t*>(nodes) + 2 * index;
-        low = w[0];
-        high = w[1];
+        return halves<Config>(w[0], w[1]);
 #endif
-        node.v[0] = from_half(uint16_t(low & 0xffffu));
-        node.v[1] = from_half(uint16_t(low >> 16));
-        node.v[2] = from_half(uint16_t(high & 0xffffu));
-        node.v[3] = from_half(uint16_t(high >> 16));
-        node.known = !Config::MARKS || (high >> 16 & 0x7fffu) <= 0x7c00u;
     }
-    return node;
+}
+
+// One node at both snapshots; `second` is its velocity there or, of pairs, its change since the first.
+template <class Config> struct Both {
+    Node<Config> first, second;
+};
+
+template <class Config> RW_FN Both<Config> both_at(const void* first, const void* second, size_t index) {
+    if constexpr (Config::STORAGE == F16_PAIRS) {
+        const Words4 w = load(static_cast<const Words4*>(first) + index);
+        return {halves<Config>(w.x, w.y), halves<Config>(w.z, w.w)};
+    } else {
+        return {node_at<Config>(first, index), node_at<Config>(second, index)};
+    }
 }
 
 // Index of the node after `cell` along an axis.
@@ -171,7 +178,7 @@ template <class R, int N> struct Sample {
 template <class Config, class Real> struct Sampler {
     using R = Real;
     static constexpr int N = Config::N, NC = Config::COMPONENTS;
-    static constexpr bool DOUBLE = sizeof(R) == 8;
+    static constexpr bool DOUBLE = sizeof(R) == 8, IN_PAIRS = Config::STORAGE == F16_PAIRS;
     // Nodes that are kept: the cell's corners, or the stencil of a cubic in the plane.
     static constexpr int KEPT = Config::CUBIC ? (N == 2 ? 16 : 1) : (N == 2 ? 4 : 8);
     static constexpr bool SCALE_LATE = Config::SCALED && DOUBLE;
@@ -197,11 +204,13 @@ template <class Config, class Real> struct Sampler {
     }
 
     RW_FN void put(Memory& kept, int k, const void* first, const void* second, size_t index) const {
-        const Node<Config> a = node_at<Config>(first, index), b = node_at<Config>(second, index);
+        const Both<Config> node = both_at<Config>(first, second, index);
         RW_UNROLL for (int c = 0; c < NC; c++) {
-            float u = a.v[c], w = b.v[c];
-            if (!DOUBLE) {
-                w -= u;
+            float u = node.first.v[c], w = node.second.v[c];
+            if (DOUBLE) {
+                if (IN_PAIRS) w += u;
+            } else {
+                if (!IN_PAIRS) w -= u;
                 if (Config::SCALED) {
                     u *= float(data.rate[c]);
                     w *= float(data.rate[c]);
@@ -211,11 +220,12 @@ template <class Config, class Real> struct Sampler {
             kept.second[k][c] = w;
         }
         if (Config::MARKS) {
-            kept.known_first = kept.known_first && a.known;
-            kept.known_second = kept.known_second && b.known;
+            kept.known_first = kept.known_first && node.first.known;
+            kept.known_second = kept.known_second && node.second.known;
         }
     }
-    static constexpr size_t NODE = Config::STORAGE == F32 ? 16 : 8;
+    // Bytes of a node.
+    static constexpr size_t NODE = Config::STORAGE == F16 ? 8 : 16;
 
     // Reads the corners of a cell at both snapshots.
     RW_FN void read(Memory& kept, const void* first, const void* second, uint32_t cell, const Place<R> (&p)[N]) const {
@@ -409,11 +419,11 @@ template <class Config, class Real> struct Sampler {
                 R row[NC] = {}, row_slope[NC] = {};
                 RW_UNROLL for (int i = 0; i < 4; i++) {
                     const size_t index = uint32_t(sz.nodes[z]) * data.plane + uint32_t(sy.nodes[y]) * data.row + uint32_t(sx.nodes[i]);
-                    const Node<Config> a = node_at<Config>(first, index), b = node_at<Config>(second, index);
-                    known_first = known_first && a.known;
-                    known_second = known_second && b.known;
+                    const Both<Config> node = both_at<Config>(first, second, index);
+                    known_first = known_first && node.first.known;
+                    known_second = known_second && node.second.known;
                     RW_UNROLL for (int c = 0; c < NC; c++) {
-                        const R e = fma_(R(b.v[c]), weight, R(a.v[c]) * (R(1) - weight));
+                        const R u = node.first.v[c], e = fma_(R(node.second.v[c]), weight, IN_PAIRS ? u : u * (R(1) - weight));
                         row[c] = fma_(e, sx.weights[i], row[c]);
                         row_slope[c] = fma_(e, sx.slopes[i], row_slope[c]);
                     }

@@ -1,4 +1,4 @@
-// The gridded flow and the integrator that macros pick: RW_REAL, RW_AXES (2, 3), RW_SPHERE, RW_STORAGE (0: f32, 1: f16), RW_CUBIC,
+// The gridded flow and the integrator that macros pick: RW_REAL, RW_AXES (2, 3), RW_SPHERE, RW_STORAGE (see Storage), RW_CUBIC,
 // RW_MARKS, RW_KEEP, RW_SCALED, RW_EVEN, RW_WRAP, RW_SEAM (bit k: axis k), RW_DIFFERENCES.
 #pragma once
 #include "sphere.cuh"

@@ -1,15 +1,34 @@
-// Snapshots on their way into the window.
-#include "base.cuh"
+// Snapshots on their way into the window, in half precision. RW_STORAGE as in grid.cuh.
+#include "grid.cuh"
 
 using namespace rw;
 
-// Nodes in half precision: velocity / scale, and the mark (or the vertical velocity). 8 bytes a node.
+// Halves from one node to the next, in fours.
+constexpr int STRIDE = RW_STORAGE == F16_PAIRS ? 2 : 1;
+
+RW_FN uint32_t two(float low, float high) { return to_half(low) | uint32_t(to_half(high)) << 16; }
+// What is not a number stays so: the mark of a missing node.
+RW_FN uint2 encoded(float x, float y, float z, float w) { return make_uint2(two(x, y), two(z, w)); }
+RW_FN float4 decoded(uint2 w) {
+    return make_float4(from_half(uint16_t(w.x)), from_half(uint16_t(w.x >> 16)), from_half(uint16_t(w.y)), from_half(uint16_t(w.y >> 16)));
+}
+
+// Nodes as they are held: velocity * factor, and the mark (or the vertical velocity).
 extern "C" __global__ void __launch_bounds__(256)
-to_half_nodes(const float4* __restrict__ nodes, uint64_t n, float inverse_scale, uint2* __restrict__ out) {
+encode_nodes(const float4* __restrict__ nodes, uint64_t n, float factor, uint2* __restrict__ out) {
     const uint64_t i = blockIdx.x * uint64_t(256) + threadIdx.x;
     if (i >= n) return;
     const float4 v = nodes[i];
-    // What is not a number stays so: the mark of a missing node.
-    const uint32_t last = v.w != v.w ? 0x7e00u : to_half(v.w * inverse_scale);
-    out[i] = make_uint2(to_half(v.x * inverse_scale) | uint32_t(to_half(v.y * inverse_scale)) << 16, to_half(v.z * inverse_scale) | last << 16);
+    out[i * STRIDE] = encoded(v.x * factor, v.y * factor, v.z * factor, v.w * factor);
+}
+
+// Behind each node its change to the same node of the next snapshot; marked where that is missing. Both as they are held: at the next
+// snapshot's time, what is interpolated is what that snapshot holds.
+extern "C" __global__ void __launch_bounds__(256)
+pair_nodes(uint2* __restrict__ nodes, const uint2* __restrict__ next, uint64_t n) {
+    const uint64_t i = blockIdx.x * uint64_t(256) + threadIdx.x;
+    if (i >= n) return;
+    const float4 a = decoded(nodes[i * STRIDE]), b = decoded(next[i * STRIDE]);
+    // The mark of this node alone is no mark of the next one.
+    nodes[i * STRIDE + 1] = encoded(b.x - a.x, b.y - a.y, b.z - a.z, is_nan(a.w) && !is_nan(b.w) ? 0.0f : b.w - a.w);
 }

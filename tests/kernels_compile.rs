@@ -52,6 +52,8 @@ fn variants(source: &str) -> Vec<Vec<String>> {
         "trace_grid.cu" => vec![
             grid(&[]),
             grid(&[("STORAGE", "1"), ("MARKS", "1"), ("SCALED", "1"), ("EVEN", "5"), ("WRAP", "2"), ("SEAM", "2")]),
+            grid(&[("STORAGE", "2"), ("MARKS", "1")]),
+            grid(&[("STORAGE", "2"), ("REAL", "double"), ("KEEP", "0"), ("DIFFERENCES", "1")]),
             grid(&[("REAL", "double"), ("KEEP", "0")]),
             grid(&[("REAL", "double"), ("DIFFERENCES", "1")]),
             grid(&[("AXES", "2"), ("MARKS", "1"), ("DIFFERENCES", "1")]),
@@ -60,6 +62,7 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
+        "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
         "network.cu" => networks(),
         _ => vec![Vec::new()],
     }

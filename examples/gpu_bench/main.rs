@@ -189,10 +189,12 @@ mod bench {
             block(&format!("{name}-steps"));
             println!("| steps | storage | PSNR, dB |\n|---|---|---|");
             let held = Batch::new(&self.gpu, &points)?;
-            for (steps, storage) in [(6, Storage::F32), (11, Storage::F32), (22, Storage::F32), (22, Storage::F16), (110, Storage::F32)] {
+            let f16 =
+                [(6, Storage::F16Pairs), (11, Storage::F16Pairs), (22, Storage::F16), (22, Storage::F16Pairs), (110, Storage::F16Pairs)];
+            for (steps, storage) in STEPS.map(|steps| (steps, Storage::F32)).into_iter().chain(f16) {
                 let tracer = self.tracer(source, &turbulent(steps), Tuning { storage, ..Tuning::default() })?;
                 held.time(&tracer, points.len())?;
-                println!("| {steps} | {storage:?} | {:.1} |", psnr(&held.stretches()?));
+                println!("| {steps} | {} | {:.1} |", storage.name(), psnr(&held.stretches()?));
             }
             block(&format!("{name}-tables"));
             println!(
@@ -289,7 +291,7 @@ mod bench {
         /// the rate of a copy, whichever takes longer.
         fn floor(&self, steps: usize, storage: Storage, count: usize) -> f64 {
             let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue;
-            let node = if storage == Storage::F16 { 8.0 } else { 16.0 };
+            let node = storage.bytes() as f64;
             // Small batches do not touch it all: 16 nodes a seed and interval at most.
             let nodes = (SHAPE.iter().product::<usize>() * SNAPSHOTS).min(16 * (SNAPSHOTS - 1) * count) as f64;
             let bytes = (node * nodes + 20.0 * count as f64) / self.copy;
@@ -335,31 +337,44 @@ mod bench {
             );
 
             block(&format!("{name}-differences"));
-            println!("| integrator | precision | gap, cells | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|");
-            let count = 1 << 23;
-            let tangent = batch.time(&first, count)?;
-            println!("| tangent | f32 | - | {:.0} | 1 |", count as f64 / tangent / 1e3);
-            for (integrator, precision, gap, keep, spread) in [
+            println!(
+                "| integrator | precision | gap, cells | window | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|---|"
+            );
+            let (count, gap) = (1 << 23, 1e-4);
+            // Integrator, precision, gap, cell kept, a lane each.
+            let rivals = [
                 (Integrator::Tangent, Precision::F64, 0.0, false, false),
                 (Integrator::Differences, Precision::F32, 0.05, true, true),
                 (Integrator::Differences, Precision::F32, 0.05, false, true),
+                (Integrator::Differences, Precision::F64, gap, false, true),
                 (Integrator::Differences, Precision::F32, 0.05, true, false),
                 (Integrator::Differences, Precision::F32, 0.05, false, false),
-                (Integrator::Differences, Precision::F64, 1e-4, false, true),
-                (Integrator::Differences, Precision::F64, 1e-4, false, false),
-            ] {
-                let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
-                let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, spread, ..Tuning::default() })?, count)?;
-                let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
-                let how = match (integrator, spread) {
-                    (Integrator::Tangent, _) => "",
-                    (_, true) => ", a lane each",
-                    (_, false) => ", one thread",
-                };
-                let kept = if keep { ", cell kept" } else { "" };
-                let precision = if precision == Precision::F32 { "f32" } else { "f64" };
-                let gap = if gap > 0.0 { gap.to_string() } else { "-".into() };
-                println!("| {what}{how}{kept} | {precision} | {gap} | {:.0} | {:.2} |", count as f64 / ms / 1e3, ms / tangent);
+                (Integrator::Differences, Precision::F64, gap, false, false),
+            ];
+            for storage in [Storage::F32, Storage::F16Pairs] {
+                let held = Tuning { storage, ..Tuning::default() };
+                let tangent = batch.time(&self.tracer(&source, &turbulent(22), held)?, count)?;
+                println!("| tangent | f32 | - | {} | {:.0} | 1 |", storage.name(), count as f64 / tangent / 1e3);
+                // In pairs only the best of them.
+                for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
+                    let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
+                    let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, spread, ..held })?, count)?;
+                    let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
+                    let how = match (integrator, spread) {
+                        (Integrator::Tangent, _) => "",
+                        (_, true) => ", a lane each",
+                        (_, false) => ", one thread",
+                    };
+                    let kept = if keep { ", cell kept" } else { "" };
+                    let precision = if precision == Precision::F32 { "f32" } else { "f64" };
+                    let gap = if gap > 0.0 { gap.to_string() } else { "-".into() };
+                    println!(
+                        "| {what}{how}{kept} | {precision} | {gap} | {} | {:.0} | {:.2} |",
+                        storage.name(),
+                        count as f64 / ms / 1e3,
+                        ms / tangent
+                    );
+                }
             }
             let random = KERNELS[2].1;
             let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
@@ -369,7 +384,11 @@ mod bench {
                 "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, gap of 1e-6 cells) traces {:.2} M/s.",
                 1e-3 / slow
             );
-            for (what, tuning) in [("f32", Tuning::default()), ("f32 from a window in f16", KERNELS[3].1)] {
+            for (what, tuning) in [
+                ("f32", Tuning::default()),
+                ("f32 from a window in f16", KERNELS[3].1),
+                ("f32 from a window in f16 in pairs", KERNELS[4].1),
+            ] {
                 let times = [22, 11, 6].map(|steps| -> Outcome<String> {
                     let fast = batch.time(&self.tracer(&source, &turbulent(steps), tuning)?, 1 << 23)? / (1 << 23) as f64;
                     Ok(format!("{:.0} times with {steps} steps", slow / fast))
@@ -451,13 +470,14 @@ mod bench {
     /// tangent 27, stage points and sums 48.
     const STAGE_OPERATIONS: f64 = 183.0;
 
-    const KERNELS: [(&str, Tuning); 4] = {
+    const KERNELS: [(&str, Tuning); 5] = {
         let kept = Tuning { storage: Storage::F32, sorted: true, keep: true, spread: true };
         [
             ("cell kept, sorted", kept),
             ("plain, sorted", Tuning { keep: false, ..kept }),
             ("plain, as they come", Tuning { sorted: false, keep: false, spread: false, ..kept }),
             ("cell kept, sorted, f16", Tuning { storage: Storage::F16, ..kept }),
+            ("cell kept, sorted, f16 in pairs", Tuning { storage: Storage::F16Pairs, ..kept }),
         ]
     };
 

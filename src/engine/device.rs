@@ -62,13 +62,37 @@ impl fmt::Display for DeviceChoice {
 
 /// How node velocities are held on a GPU.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
+#[serde(rename_all = "snake_case")]
 pub enum Storage {
     /// 16 bytes a node.
     #[default]
     F32,
     /// 8 bytes a node: velocities are rounded to 11 bits.
     F16,
+    /// 16 bytes a node: rounded to 11 bits, with the change to the next snapshot beside it, so that a tracer asks once instead of twice.
+    F16Pairs,
+}
+
+impl Storage {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::F16Pairs];
+
+    /// Bytes of a node.
+    pub fn bytes(self) -> u64 {
+        match self {
+            Self::F32 | Self::F16Pairs => 16,
+            Self::F16 => 8,
+        }
+    }
+
+    /// As written in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::F32 => "f32",
+            Self::F16 => "f16",
+            Self::F16Pairs => "f16_pairs",
+        }
+    }
 }
 
 /// What happens when work on a GPU fails.

@@ -91,7 +91,7 @@ pub enum DeviceError {
         missing: usize,
         /// Nodes along x, y, z.
         nodes: [usize; 3],
-        /// `f32` or `f16`.
+        /// Its name.
         storage: &'static str,
         /// Bytes that the missing ones need.
         needed: u64,

@@ -129,7 +129,7 @@ impl GridArguments {
             format!("RW_REAL={}", R::NAME),
             format!("RW_AXES={}", grid.dimensions()),
             flag("RW_SPHERE", sphere),
-            format!("RW_STORAGE={}", u8::from(nodes.storage == Storage::F16)),
+            storage_define(nodes.storage),
             flag("RW_CUBIC", cubic),
             flag("RW_MARKS", nodes.missing),
             flag("RW_KEEP", keep),
@@ -141,6 +141,11 @@ impl GridArguments {
         ];
         Ok(Self { data: words(&data), steps, defines })
     }
+}
+
+/// `RW_STORAGE`, as `Storage` in `grid.cuh`.
+pub(super) fn storage_define(storage: Storage) -> String {
+    format!("RW_STORAGE={}", storage as u8)
 }
 
 /// The bytes of plain numbers.

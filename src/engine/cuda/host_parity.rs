@@ -62,12 +62,14 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, stora
         }
         VelocitySource::Window(window) => {
             let grid = window.grid().unwrap().clone();
-            let addresses =
-                window.snapshots().map(|s| if storage == Storage::F32 { s.nodes.as_ptr() as u64 } else { put(&halves(s)).unwrap() });
+            let snapshots: Vec<_> = window.snapshots().collect();
+            // Nothing follows the last one.
+            let held = (0..snapshots.len()).map(|i| encoded(snapshots[i], snapshots.get(i + 1).map(|s| s.as_ref()), storage));
+            let addresses = held.map(|bytes| put(&bytes).unwrap()).collect();
             let nodes = Nodes {
-                addresses: addresses.collect(),
+                addresses,
                 storage,
-                scale: if storage == Storage::F16 { HALF_SCALE } else { 1.0 },
+                scale: if storage != Storage::F32 { HALF_SCALE } else { 1.0 },
                 missing: window.snapshots().any(|s| s.missing() > 0),
             };
             let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
@@ -106,20 +108,34 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, stora
 /// Power of two by which half-precision velocities are multiplied here.
 const HALF_SCALE: f32 = 1.0 / 256.0;
 
-/// Nodes as `window.cu` encodes them, by rounding of our own.
-fn halves(snapshot: &Snapshot) -> Vec<u8> {
-    let half = |x: f32| -> u16 {
-        if x.is_nan() {
-            return 0x7e00;
-        }
-        let a = x.abs();
-        let exponent = if a < 2f32.powi(-14) { -14 } else { (a.to_bits() >> 23) as i32 - 127 };
-        let steps = (a / 2f32.powi(exponent - 10)).round_ties_even() as u16;
-        let magnitude = if a < 2f32.powi(-14) { steps } else { (((exponent + 15) as u16) << 10) + (steps - 1024) };
-        magnitude | if x < 0.0 { 0x8000 } else { 0 }
+/// A number in half precision, by rounding of our own.
+fn half(x: f32) -> u16 {
+    if x.is_nan() {
+        return 0x7e00;
+    }
+    let a = x.abs();
+    let exponent = if a < 2f32.powi(-14) { -14 } else { (a.to_bits() >> 23) as i32 - 127 };
+    let steps = (a / 2f32.powi(exponent - 10)).round_ties_even() as u16;
+    let magnitude = if a < 2f32.powi(-14) { steps } else { (((exponent + 15) as u16) << 10) + (steps - 1024) };
+    magnitude | if x < 0.0 { 0x8000 } else { 0 }
+}
+
+/// Nodes as `window.cu` writes them. Changes are those of the field as given: exact where halves hold both.
+fn encoded(snapshot: &Snapshot, next: Option<&Snapshot>, storage: Storage) -> Vec<u8> {
+    let mut bytes = Vec::new();
+    let mut put = |node: [f32; 4]| match storage {
+        Storage::F32 => node.iter().for_each(|x| bytes.extend(x.to_le_bytes())),
+        _ => node.iter().for_each(|x| bytes.extend(half(x / HALF_SCALE).to_le_bytes())),
     };
-    let node = |n: &[f32; 4]| [half(n[0] / HALF_SCALE), half(n[1] / HALF_SCALE), half(n[2] / HALF_SCALE), half(n[3] / HALF_SCALE)];
-    snapshot.nodes.iter().flat_map(node).flat_map(u16::to_le_bytes).collect()
+    for (i, node) in snapshot.nodes.iter().enumerate() {
+        put(*node);
+        if storage == Storage::F16Pairs {
+            let after = next.map_or([f32::NAN; 4], |next| next.nodes[i]);
+            let only_here = node[3].is_nan() && !after[3].is_nan();
+            put(std::array::from_fn(|c| if c == 3 && only_here { 0.0 } else { after[c] - node[c] }));
+        }
+    }
+    bytes
 }
 
 /// Other points in every run.
@@ -358,38 +374,49 @@ fn levels_on_the_sphere() {
         &FlowMap { integrator: Integrator::Differences, ..stop.clone() },
         3.4,
     );
-    check_halves("levels", &smooth(&region(&even), 0.5, true), &FlowMap { direction: Direction::Forward, ..stop });
+    check_storage("levels", &smooth(&region(&even), 0.5, true), &FlowMap { direction: Direction::Forward, ..stop });
 }
 
 #[test]
-fn half_precision_windows() {
+fn windows_in_half_precision_and_in_pairs() {
     let even = |n: usize| ["x", "y", "z"][..n].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
     let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
     let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
-    check_halves("linear, holes", &smooth(&cartesian(even(3)), 0.5, true), &stop);
-    check_halves("cubic in the plane, holes", &smooth(&cartesian(even(2)), 0.5, true), &cubic);
-    check_halves("cubic in space", &smooth(&cartesian(even(3)), 0.5, false), &cubic);
+    check_storage("linear, holes", &smooth(&cartesian(even(3)), 0.5, true), &stop);
+    check_storage("cubic in the plane, holes", &smooth(&cartesian(even(2)), 0.5, true), &cubic);
+    check_storage("cubic in space", &smooth(&cartesian(even(3)), 0.5, false), &cubic);
     let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
     let lat = Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap();
     let region = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
-    check_halves("sphere", &smooth(&region, 0.8, true), &stop);
-    check_halves("sphere, cubic", &smooth(&region, 0.8, false), &cubic);
+    check_storage("sphere", &smooth(&region, 0.8, true), &stop);
+    check_storage("sphere, cubic", &smooth(&region, 0.8, false), &cubic);
 }
 
-/// The kernel's code on a window in half precision against the CPU on the same field, rounded on the way: what is left is the arithmetic.
-fn check_halves(name: &str, source: &VelocitySource, map: &FlowMap) {
+/// The kernel's code on a window in half precision and in pairs against the CPU on the same field, rounded on the way: what is left is the
+/// arithmetic.
+fn check_storage(name: &str, source: &VelocitySource, map: &FlowMap) {
+    check_rounded(name, source, map, Storage::F16, |x| round_to_half(x / HALF_SCALE) * HALF_SCALE);
+    // Fixed point: halves hold changes exactly too.
+    check_rounded(name, source, map, Storage::F16Pairs, |x| {
+        let steps = (x * 128.0).round_ties_even();
+        assert!(steps.abs() <= 1024.0, "{name}: {x}");
+        steps / 128.0
+    });
+}
+
+fn check_rounded(name: &str, source: &VelocitySource, map: &FlowMap, storage: Storage, round: impl Fn(f32) -> f32) {
     let VelocitySource::Window(window) = source else { panic!("a window") };
     let mut rounded = Window::new(3.2);
     for snapshot in window.snapshots() {
-        let round = |x: f32| if x.is_nan() { x } else { round_to_half(x / HALF_SCALE) * HALF_SCALE };
+        let round = |x: f32| if x.is_nan() { x } else { round(x) };
         let nodes = snapshot.nodes.iter().map(|n| n.map(round)).collect();
         rounded.push(Arc::new(Snapshot::new(snapshot.time, snapshot.grid.clone(), nodes))).unwrap();
     }
     let seeds = fresh(&window.grid().unwrap().domain(), 500);
-    let exact = cpu(&VelocitySource::Window(Arc::new(rounded)), map, 0.1, &seeds);
-    let found = host(source, map, 0.1, Storage::F16, &seeds);
+    let rounded = VelocitySource::Window(Arc::new(rounded));
+    let (exact, found) = (cpu(&rounded, map, 0.1, &seeds), host(&rounded, map, 0.1, storage, &seeds));
     let odd = (0..seeds.len()).filter(|&i| (exact.log_stretch_f64[i] - found.log_stretch_f64[i]).abs() > 2e-9).count();
-    assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{name}: {odd} of {} differ", seeds.len());
+    assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{name}, {storage:?}: {odd} of {} differ", seeds.len());
 }
 
 /// Rounds to 11 bits (the test's velocities are neither subnormal nor too large in half precision).

@@ -1,11 +1,12 @@
 //! One snapshot from host to device: through page-locked pieces on the transfer stream, while kernels run on the work stream.
 
+use super::grid::storage_define;
 use super::window::DeviceSnapshot;
 use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::Snapshot;
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
 use rayon::prelude::*;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 
 /// Nodes of a page-locked piece: 8 MiB.
 const PIECE: usize = 1 << 19;
@@ -15,10 +16,10 @@ const PIECE: usize = 1 << 19;
 pub(super) struct Carrier {
     gpu: Arc<Gpu>,
     pieces: Option<Pieces>,
-    to_half: Option<CudaFunction>,
+    encode: Option<(Storage, CudaFunction)>,
 }
 
-/// Two page-locked pieces that take turns, and for half precision their images on the device.
+/// Two page-locked pieces that take turns, and for other storage than f32 their images on the device.
 #[derive(Debug)]
 struct Pieces {
     pinned: [PinnedHostSlice<u32>; 2],
@@ -30,10 +31,10 @@ struct Pieces {
 impl Carrier {
     /// Memory is taken when it is first needed.
     pub(super) fn new(gpu: &Arc<Gpu>) -> Self {
-        Self { gpu: gpu.clone(), pieces: None, to_half: None }
+        Self { gpu: gpu.clone(), pieces: None, encode: None }
     }
 
-    /// Enqueues the whole snapshot; [`DeviceSnapshot::ready`] tells when it is there. In half precision velocities are divided by `scale`.
+    /// Enqueues the whole snapshot; [`DeviceSnapshot::ready`] tells when it is there. Velocities are divided by `scale`.
     pub(super) fn carry(&mut self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<DeviceSnapshot, DeviceError> {
         let gpu = self.gpu.clone();
         let doing = DeviceError::driver("bringing a snapshot over");
@@ -44,14 +45,15 @@ impl Carrier {
             let pinned = || unsafe { gpu.context().alloc_pinned::<u32>(4 * PIECE) }.map_err(&doing);
             self.pieces = Some(Pieces { pinned: [pinned()?, pinned()?], free: [None, None], images: None });
         }
-        if storage == Storage::F16 && self.to_half.is_none() {
-            self.to_half = Some(gpu.kernel("window.cu", &[], "to_half_nodes")?);
+        let encoded = storage != Storage::F32;
+        if encoded && self.encode.as_ref().is_none_or(|(held, _)| *held != storage) {
+            self.encode = Some((storage, gpu.kernel("window.cu", &[storage_define(storage)], "encode_nodes")?));
         }
-        let Self { pieces: Some(pieces), to_half, .. } = self else {
+        let Self { pieces: Some(pieces), encode, .. } = self else {
             return Err(DeviceError::Unsupported { what: "a transfer without page-locked memory".into() });
         };
-        if storage == Storage::F16 && pieces.images.is_none() {
-            let image = || Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "half-precision encoding", 4 * PIECE);
+        if encoded && pieces.images.is_none() {
+            let image = || Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "the encoding of snapshots", 4 * PIECE);
             pieces.images = Some([image()?, image()?]);
         }
         for (turn, part) in snapshot.nodes.chunks(PIECE).enumerate() {
@@ -69,8 +71,8 @@ impl Carrier {
             });
             let piece = &*piece;
             let at = turn * PIECE * words;
-            match (&mut pieces.images, &*to_half) {
-                (Some(images), Some(kernel)) if storage == Storage::F16 => {
+            match (&mut pieces.images, &*encode) {
+                (Some(images), Some((_, kernel))) if encoded => {
                     let (from, to) = (images[side].address(), nodes.address_of(at));
                     let (count, inverse) = (part.len() as u64, 1.0 / scale);
                     // SAFETY: the piece is not written before its event; the image holds a piece, and `nodes` the part from `at` on.
@@ -86,13 +88,6 @@ impl Carrier {
             pieces.free[side] = Some(gpu.transfer().record_event(None).map_err(&doing)?);
         }
         let ready = gpu.transfer().record_event(None).map_err(&doing)?;
-        Ok(DeviceSnapshot {
-            host: snapshot.clone(),
-            nodes,
-            storage,
-            scale: if storage == Storage::F16 { scale } else { 1.0 },
-            missing: snapshot.missing() > 0,
-            ready,
-        })
+        Ok(DeviceSnapshot { host: snapshot.clone(), nodes, storage, scale, missing: snapshot.missing() > 0, next: OnceLock::new(), ready })
     }
 }

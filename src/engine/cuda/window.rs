@@ -2,38 +2,21 @@
 //! made. A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
 
 use super::ahead::Ahead;
-use super::grid::Nodes;
+use super::grid::{Nodes, storage_define};
 use super::transfer::Carrier;
-use super::{Buffer, DeviceError, Gpu, Storage};
+use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::{Snapshot, Window};
-use cudarc::driver::CudaEvent;
+use cudarc::driver::{CudaEvent, PushKernelArg};
 use rayon::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-impl Storage {
-    /// Bytes of a node.
-    pub fn bytes(self) -> u64 {
-        match self {
-            Self::F32 => 16,
-            Self::F16 => 8,
-        }
-    }
-    /// As written in settings.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-        }
-    }
-}
-
-/// Half-precision velocities of the first window are scaled to below this, which leaves later ones room to grow sixteenfold.
+/// Half-precision velocities of the first window are scaled to below this, which leaves later ones room to grow sevenfold.
 const HALF_PEAK: f32 = 4096.0;
-/// Largest half-precision number that is used; beyond it the window is encoded anew.
-const HALF_MOST: f32 = 60_000.0;
+/// Largest half-precision velocity that is used, so that changes fit too; beyond it the window is encoded anew.
+const HALF_MOST: f32 = 30_000.0;
 /// Snapshots that come over before a window wants them, at most.
 const AHEAD: usize = 2;
 /// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
@@ -49,7 +32,7 @@ const COPIERS: usize = 4;
 pub struct DeviceSnapshot {
     /// Holding it keeps its address from being given to another one.
     pub(super) host: Arc<Snapshot>,
-    /// `f32`: 4 words a node, `f16`: 2.
+    /// [`Storage::bytes`] a node.
     pub(super) nodes: Buffer<u32>,
     pub(super) storage: Storage,
     pub(super) scale: f32,
@@ -57,6 +40,8 @@ pub struct DeviceSnapshot {
     pub(super) missing: bool,
     /// When it is there.
     pub(super) ready: CudaEvent,
+    /// The one that its pairs lead to, once: earlier windows go on reading them.
+    pub(super) next: OnceLock<Weak<Snapshot>>,
 }
 
 /// The snapshots of one window, oldest first.
@@ -206,7 +191,17 @@ impl Shared {
         state.held.extend(taken);
         let (held, gone) = std::mem::take(&mut state.held).into_iter().partition(|s| wanted.iter().any(|w| Arc::ptr_eq(w, &s.host)));
         state.held = held;
-        let gone: Vec<Arc<DeviceSnapshot>> = gone;
+        let mut gone: Vec<Arc<DeviceSnapshot>> = gone;
+        if storage == Storage::F16Pairs {
+            // One that leads elsewhere comes over again.
+            let leads_here = |s: &Arc<DeviceSnapshot>| {
+                let after = wanted.iter().skip_while(|w| !Arc::ptr_eq(w, &s.host)).nth(1);
+                s.next.get().zip(after).is_none_or(|(next, after)| std::ptr::eq(next.as_ptr(), Arc::as_ptr(after)))
+            };
+            let (held, elsewhere): (Vec<_>, Vec<_>) = std::mem::take(&mut state.held).into_iter().partition(leads_here);
+            state.held = held;
+            gone.extend(elsewhere);
+        }
         if state.helped {
             state.gone.extend(gone.iter().map(|s| (s.host.clone(), Instant::now())));
         }
@@ -216,7 +211,7 @@ impl Shared {
         };
         let mut missing = fresh(&state);
         let mut scale = state.held.first().map_or(1.0, |s| s.scale);
-        if storage == Storage::F16 {
+        if storage != Storage::F32 {
             let peak = missing.iter().map(|s| peak(s)).fold(0.0, f32::max);
             if state.held.is_empty() || peak / scale > HALF_MOST {
                 // A power of two, so that nothing but range is changed.
@@ -257,7 +252,28 @@ impl Shared {
             self.gpu.work().wait(&there.ready).map_err(&doing)?;
             snapshots.push(there.clone());
         }
+        if storage == Storage::F16Pairs {
+            self.pair(&snapshots, storage)?;
+        }
         Ok(DeviceWindow { snapshots })
+    }
+
+    /// Writes changes behind the nodes of those that have none yet, on the work stream. Only tracers of windows that go on past a snapshot
+    /// read its changes, so that those of earlier windows, queued or to come, are not disturbed.
+    fn pair(&self, snapshots: &[Arc<DeviceSnapshot>], storage: Storage) -> Result<(), DeviceError> {
+        for (this, next) in snapshots.iter().zip(snapshots.iter().skip(1)) {
+            if this.next.get().is_some() {
+                continue;
+            }
+            let kernel = self.gpu.kernel("window.cu", &[storage_define(storage)], "pair_nodes")?;
+            let count = this.host.nodes.len();
+            let (nodes, after, n) = (this.nodes.address(), next.nodes.address(), count as u64);
+            // SAFETY: both hold as many nodes, in pairs, and were waited for; this one's changes are read behind this launch alone.
+            unsafe { launch(self.gpu.work().launch_builder(&kernel).arg(&nodes).arg(&after).arg(&n), threads(count, 256))? };
+            // Told apart by the snapshot that it is; nobody else sets it, under the lock.
+            let _ = this.next.set(Arc::downgrade(&next.host));
+        }
+        Ok(())
     }
 
     /// The thread: brings what is expected, and gives back the memory of what is gone.
@@ -299,7 +315,7 @@ impl Shared {
 
     /// One expected snapshot; none where it cannot come over now. The window that wants it then brings it, and says what is wrong.
     fn bring_one(&self, snapshot: &Arc<Snapshot>, (storage, scale): (Storage, f32)) -> Option<Arc<DeviceSnapshot>> {
-        if storage == Storage::F16 && peak(snapshot) / scale > HALF_MOST {
+        if storage != Storage::F32 && peak(snapshot) / scale > HALF_MOST {
             return None;
         }
         match self.carry(snapshot, storage, scale) {
