@@ -1,23 +1,34 @@
-//! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table answers where it is
-//! trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated; and what 64 accumulated frames are
-//! worth against 4,096 samples of another seed, beside 64 reference frames. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ SAMPLES`.
+//! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table, or a network that is trained
+//! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
+//! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
+//! traced share, with the device's memory over a thousand frames. Prints; needs a GPU.
+//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [table.key=value]`, where keys are those of a scene.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{
-    Device, DeviceChoice, DeviceSettings, Event, FrameRecord, RunOptions, Settings, Setup, run, stratified_points, trace,
-};
+use ridgewatch::engine::cuda::{CudaAccelerator, Gpu, GpuSettings};
+use ridgewatch::engine::{Device, Event, FrameRecord, RunOptions, Settings, Setup, Storage, run, stratified_points, trace};
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
 use ridgewatch::surrogate::Kind;
 use ridgewatch::trust::Strata;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
 const FRAMES: usize = 64;
 const WARM_UP: usize = 8;
+/// In which a network is trained up.
+const LEARNING: usize = 240;
+const SLIDES: usize = 4;
+const FRAMES_A_SLIDE: usize = 250;
+/// Frames of a slide whose traced share is shown, from 0.
+const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 249];
+/// A network of 72 MB, and batches that keep the device busy.
+const NETWORK: [&str; 5] =
+    ["network.levels=6", "network.features=4", "network.growth=2.2", "network.log2_table=22", "network.batch=262144"];
 
 /// `frames` pictures of a scene after its warm-up, added up, and their records.
 fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
@@ -55,16 +66,27 @@ fn median(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64) -> f64 {
     values[values.len() / 2]
 }
 
+/// Median and, in brackets, the largest.
+fn median_and_most(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64 + Copy) -> String {
+    format!("{:.1} ({:.1})", median(records, value), records.iter().map(value).fold(f64::NEG_INFINITY, f64::max))
+}
+
 fn main() {
+    let (told, words): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
+    let asked = |what: &str| words.iter().all(|w| w.parse::<usize>().is_ok()) || words.iter().any(|w| w == what);
     let given: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
-    let device = Device::open(DeviceChoice::Auto, &DeviceSettings::default()).unwrap();
-    if let Device::Cpu { why } = &device {
-        return println!("no GPU: nothing is measured ({why:?})");
-    }
+    let gpu = match Gpu::open(0, &GpuSettings::default()) {
+        Ok(gpu) => gpu,
+        Err(why) => return println!("no GPU: nothing is measured ({why})"),
+    };
+    let device = Device::Gpu { gpu: Arc::new(CudaAccelerator::new(gpu.clone(), Storage::F32)), may_fall_back: false };
     let text = include_str!("../configs/turbulence_easy.toml");
-    let mut scene = SceneFile::parse(Path::new("turbulence_easy.toml"), text, &["flow.steps=22".into()]).unwrap().settings();
+    let mut keys = vec!["flow.steps=22".to_owned()];
+    keys.extend(NETWORK.map(str::to_owned));
+    keys.extend(told);
+    let mut scene = SceneFile::parse(Path::new("turbulence_easy.toml"), text, &keys).unwrap().settings();
     scene.source.nodes = Some(nodes);
     (scene.render.width, scene.render.height, scene.render.samples) = (value(0, 1920), value(1, 1080), 1);
     scene.transfer = Some(colours(&scene, &device));
@@ -90,34 +112,100 @@ fn main() {
     );
 
     println!(
-        "| answers | frames/s | frame, ms | walk | trace | predict | audit | queries | traced | trusted volume | stated error | \
-         over tolerance | PSNR of {FRAMES} frames, dB |"
+        "| answers | frames/s | frame, ms (and longest) | walk | trace | predict | audit | train | on the device: picture | training | steps | queries | traced | trusted volume | \
+         stated error | over tolerance | surrogate alone, dB | PSNR of {FRAMES} frames, dB |"
     );
-    println!("|---|---|---|---|---|---|---|---|---|---|---|---|---|");
+    println!("|{}", "---|".repeat(18));
     let double = nodes.map(|n| 2 * n - 1);
-    for (name, table) in [("RK4", None), ("table of the data's nodes", Some(nodes)), ("table of twice as many an edge", Some(double))] {
-        scene.render.method = if table.is_some() { Method::Gated } else { Method::Reference };
-        scene.surrogate.kind = Kind::Table;
-        scene.surrogate.table_nodes = table;
+    let rows = [
+        ("RK4", None),
+        ("table of the data's nodes", Some((Kind::Table, nodes))),
+        ("table of twice as many an edge", Some((Kind::Table, double))),
+        ("network", Some((Kind::Network, nodes))),
+        ("network above the table of the data's nodes", Some((Kind::Residual, nodes))),
+    ];
+    for (name, surrogate) in rows {
+        let is_network = surrogate.is_some_and(|(kind, _)| kind != Kind::Table);
+        if !asked(if is_network { "networks" } else { "tables" }) {
+            continue;
+        }
+        scene.render.method = if surrogate.is_some() { Method::Gated } else { Method::Reference };
+        if let Some((kind, nodes)) = surrogate {
+            (scene.surrogate.kind, scene.surrogate.table_nodes) = (kind, Some(nodes));
+        }
+        scene.time.warmup_frames = if is_network { LEARNING } else { WARM_UP };
         let (sum, records) = pictures(&scene, &device);
         let psnr = compare_films(&sum, &reference, scene.render.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
         let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
-        let total = ms(|r| r.seconds.total);
         let over = records.iter().filter(|r| r.over_tolerance.is_some()).count();
+        // Adding the pictures up is the measurement's time, not the loop's.
+        let seconds: f64 = records.iter().map(|r| r.seconds.total).sum();
         println!(
-            "| {name} | {:.1} | {total:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {psnr:.1} |",
-            1e3 / total,
+            "| {name} | {:.1} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {:.1} | {psnr:.1} |",
+            FRAMES as f64 / seconds,
+            median_and_most(&records, |r| 1e3 * r.seconds.total),
             ms(|r| r.seconds.render),
             ms(|r| r.seconds.trace),
             ms(|r| r.seconds.predict),
             ms(|r| r.seconds.audit),
+            ms(|r| r.seconds.train),
+            ms(|r| r.seconds.device),
+            ms(|r| r.training.as_ref().and_then(|learned| learned.device_seconds).unwrap_or(0.0)),
+            median(&records, |r| r.training.as_ref().map_or(0.0, |learned| learned.steps as f64)),
             median(&records, |r| r.queries as f64),
             100.0 * median(&records, |r| r.traced_share),
             100.0 * median(&records, |r| r.trusted_share),
-            median(&records, |r| r.trusted.map_or(0.0, |e| e.optical_rms))
+            median(&records, |r| r.trusted.map_or(0.0, |e| e.optical_rms)),
+            median(&records, |r| r.surrogate_psnr.unwrap_or(f64::INFINITY))
         );
         for record in &records {
             assert!(record.device.starts_with("cuda") && record.traced_ahead > 0, "{:?}", record.warnings);
+            assert!(!is_network || record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
         }
     }
+    println!();
+
+    if !asked("slides") {
+        return;
+    }
+    println!("<!-- block gated-slides -->");
+    println!(
+        "{SLIDES} slides of {FRAMES_A_SLIDE} frames after {LEARNING} at the first; the share that is traced by the frame of a slide, its length in ms beside it.\n"
+    );
+    println!("| answers | slide | {} | slide itself, ms |", SHOWN.map(|n| (n + 1).to_string()).join(" | "));
+    println!("|---|---|{}---|", "---|".repeat(SHOWN.len()));
+    scene.time.frames_per_slide = FRAMES_A_SLIDE;
+    scene.time.slides = Some(SLIDES);
+    scene.source.snapshots = Some(12 + SLIDES - 1);
+    let mut memory = Vec::new();
+    for (name, surrogate) in &rows[3..] {
+        let Some((kind, nodes)) = *surrogate else { continue };
+        (scene.surrogate.kind, scene.surrogate.table_nodes) = (kind, Some(nodes));
+        let mut seen: Vec<(FrameRecord, u64, usize)> = Vec::new();
+        let mut sink = |event: Event| {
+            if let Event::Frame(frame) = event {
+                seen.push(((*frame.record).clone(), gpu.memory().0, gpu.context().mem_get_info().unwrap().0));
+            }
+        };
+        let options = RunOptions { device: device.clone(), ..RunOptions::default() };
+        run(Setup::new(scene.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
+        let seen = seen.split_off(LEARNING);
+        for (slide, frames) in seen.chunks(FRAMES_A_SLIDE).enumerate() {
+            let shown = SHOWN.map(|n| format!("{:.1} %, {:.0}", 100.0 * frames[n].0.traced_share, 1e3 * frames[n].0.seconds.total));
+            println!("| {name} | {} | {} | {:.0} |", slide + 1, shown.join(" | "), 1e3 * frames[0].0.seconds.slide);
+        }
+        // From the second slide on, everything that is ever taken has been.
+        let settled = &seen[FRAMES_A_SLIDE..];
+        let (least, most) = (settled.iter().map(|s| s.1).min().unwrap_or(0), settled.iter().map(|s| s.1).max().unwrap_or(0));
+        let (begin, end) = (settled[0].2, settled[settled.len() - 1].2);
+        memory.push(format!(
+            "{name}: {} frames, {} to {} MiB taken from the second slide on; free at its begin {} MiB, at the end {} MiB.",
+            seen.len() + LEARNING,
+            least >> 20,
+            most >> 20,
+            begin >> 20,
+            end >> 20
+        ));
+    }
+    println!("\n{}", memory.join("\n"));
 }

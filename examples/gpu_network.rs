@@ -32,15 +32,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 #[cfg(feature = "cuda")]
 mod bench {
     use ridgewatch::engine::cuda::{
-        Buffer, CudaTracer, DeviceError, DeviceNetwork, DevicePredict, DeviceSamples, DeviceStep, DeviceTable, DeviceTracer,
-        DeviceTraining, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
+        Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
+        Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::Domain;
     use ridgewatch::field::turbulence::Turbulence;
     use ridgewatch::flow::{
         Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
     };
-    use ridgewatch::surrogate::network::{Architecture, Encoding, Model, NetworkSettings, Objective, Scale};
+    use ridgewatch::surrogate::network::{Architecture, Encoding, Model, NetworkSettings, Objective, PlannedStep, Scale};
     use std::error::Error;
     use std::sync::Arc;
     use std::time::Instant;
@@ -69,8 +69,8 @@ mod bench {
         NetworkSettings { levels, features, growth, log2_table, width, ..NetworkSettings::default() }
     }
 
-    fn step(count: usize, drawn: u64, rate: f64) -> DeviceStep {
-        DeviceStep { count, drawn: Some((1, drawn)), hold_out: false, rate, average_share: 0.0, lazy: true }
+    fn step(count: usize, drawn: u64, rate: f64) -> PlannedStep {
+        PlannedStep { count, drawn: Some((1, drawn)), hold_out: false, rate, average_share: 0.0, lazy: true }
     }
 
     pub fn speed() -> Outcome<()> {
@@ -102,7 +102,7 @@ mod bench {
                 // SAFETY: both buffers hold 2^24 entries and outlive the work below.
                 unsafe { training.append(&mut pool, &cube, points.address(), values.address(), 1 << 24, None)? };
             }
-            let network = training.frozen(None)?;
+            let network = training.frozen()?;
             // SAFETY: as above.
             let predicted = time(&gpu, || unsafe { network.predict(points.address(), 1 << 24, values.address()) })?;
             let mut row = format!("| {name} | {parameters:.2} | {:.2} ", (1 << 24) as f64 / predicted * 1e-6);
@@ -110,7 +110,7 @@ mod bench {
                 const STEPS: u64 = 16;
                 let mut drawn = 0;
                 let milliseconds = time(&gpu, || {
-                    let steps: Vec<DeviceStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-2)).collect();
+                    let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-2)).collect();
                     drawn += STEPS * batch as u64;
                     training.train_steps(&pool, &steps).map(|_| ())
                 })?;
@@ -237,7 +237,6 @@ mod bench {
             row(&finer, f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3)?;
         }
         println!();
-        let table = Arc::new(table);
 
         println!("| | network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
         println!("|---|---|---|---|---|---|---|---|---|");
@@ -263,14 +262,13 @@ mod bench {
         gpu: &Arc<Gpu>,
         domain: &Domain,
         tracer: &DeviceTracer,
-        base: Option<&Arc<DeviceTable>>,
+        base: Option<&DeviceTable>,
         before: f64,
         settings: &NetworkSettings,
         seconds: f64,
-        measure: impl Fn(&DeviceNetwork) -> Outcome<f64>,
+        measure: impl Fn(&dyn DevicePredict) -> Outcome<f64>,
     ) -> Outcome<String> {
         const RATE: f64 = 1e-2;
-        let below = base.map(|table| &**table);
         let shape = Architecture::new(settings, &[0, 1, 2], domain.extent())?;
         let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
         let model = Model::new(shape, 1, base.is_some());
@@ -281,7 +279,7 @@ mod bench {
         chunk.trace(tracer)?;
         let mut pool = scout.ring(CHUNK)?;
         // SAFETY: both buffers hold `CHUNK` entries.
-        unsafe { scout.append(&mut pool, domain, chunk.points.address(), chunk.values.address(), CHUNK, below)? };
+        unsafe { scout.append(&mut pool, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
         objective.scale = scale(&pool, base.is_some())?;
         drop((scout, pool));
         let mut training = DeviceTraining::new(gpu, &model, &objective)?;
@@ -296,15 +294,15 @@ mod bench {
             training.draw_points(domain, 7, labels, &mut chunk.points)?;
             chunk.trace(tracer)?;
             // SAFETY: as above.
-            unsafe { training.append(&mut ring, domain, chunk.points.address(), chunk.values.address(), CHUNK, below)? };
+            unsafe { training.append(&mut ring, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
             labels += CHUNK as u64;
             let done = training.steps();
-            let steps: Vec<DeviceStep> = (0..STEPS)
+            let steps: Vec<PlannedStep> = (0..STEPS)
                 .map(|i| {
                     // The mean runs over the last tenth of the steps.
                     let number = done + i + 1;
                     let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
-                    DeviceStep { average_share, ..step(BATCH, trained + (i * BATCH) as u64, RATE) }
+                    PlannedStep { average_share, ..step(BATCH, trained + (i * BATCH) as u64, RATE) }
                 })
                 .collect();
             training.train_steps(&ring, &steps)?;
@@ -312,11 +310,11 @@ mod bench {
             clock += start.elapsed().as_secs_f64();
             if clock >= marks[0] {
                 marks.remove(0);
-                let network = training.frozen(base.map(|table| (table.clone(), 1.0)))?;
-                row += &format!("| {:.1} ", measure(&network)?);
+                let network = training.frozen()?;
+                row += &format!("| {:.1} ", measure(&network.above(base.map(|table| (table, 1.0))))?);
             }
         }
-        let bytes = training.frozen(None)?.bytes() as f64 * 1e-6;
+        let bytes = training.frozen()?.bytes() as f64 * 1e-6;
         Ok(format!("| {bytes:.0} {row}| {:.0} | {:.0} |", labels as f64 * 1e-6, trained as f64 * 1e-6))
     }
 

@@ -355,3 +355,11 @@ network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ 
     if (!isfinite(point[0] + point[1] + point[2])) target = not_a_number();
     samples[i] = {unit[0], unit[1], unit[2], target};
 }
+
+// Adds the number of samples that have a target to `count`.
+extern "C" __global__ void __launch_bounds__(256)
+network_usable(const Four* __restrict__ samples, uint32_t n, uint32_t* __restrict__ count) {
+    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
+    const uint32_t usable = __ballot_sync(0xffffffffu, i < n && isfinite(samples[i < n ? i : 0u].w));
+    if ((threadIdx.x & 31u) == 0u && usable) atomicAdd(count, uint32_t(__popc(usable)));
+}

@@ -15,6 +15,8 @@ mod device;
 mod lost;
 #[path = "gpu/network.rs"]
 mod network;
+#[path = "gpu/network_loop.rs"]
+mod network_loop;
 mod network_support;
 #[path = "gpu/render.rs"]
 mod render;

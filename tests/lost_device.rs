@@ -4,6 +4,9 @@
 #![cfg(feature = "cuda")]
 #![allow(clippy::unwrap_used)]
 
+use burn::backend::Flex;
+use burn::module::{Param, ParamId};
+use burn::tensor::{Tensor, TensorData};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaTracerError, DeviceError};
 use ridgewatch::engine::{
@@ -13,7 +16,10 @@ use ridgewatch::engine::{
 use ridgewatch::field::{Domain, Snapshot};
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
-use ridgewatch::surrogate::{Predict, Samples, Table};
+use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
+use ridgewatch::surrogate::{
+    DeviceLost, Learned, Offload, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
+};
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -86,6 +92,9 @@ impl Accelerator for Breaking {
         self.line.call("making a renderer")?;
         Ok(Box::new(Render { line: self.line.clone() }))
     }
+    fn offload(&self) -> Option<Arc<dyn Offload>> {
+        Some(Arc::new(Training { line: self.line.clone(), health: self.health.clone() }))
+    }
     fn expect(&self, _: &Arc<Snapshot>) {
         if let Err(error) = self.line.call("bringing a snapshot over") {
             self.health.fail(error);
@@ -143,6 +152,134 @@ impl DeviceNodes for Nodes {
     }
 }
 
+/// Trains with the CPU's kernels, on its own copy of network and samples.
+struct Training {
+    line: Arc<Line>,
+    health: Arc<Health>,
+}
+
+impl Training {
+    fn call(&self, what: &'static str) -> Result<(), DeviceLost> {
+        self.health.ask(|| self.line.call(what)).ok_or(DeviceLost)
+    }
+}
+
+impl Offload for Training {
+    fn takes(&self, _: &Architecture, _: &Objective) -> bool {
+        true
+    }
+    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>> {
+        self.call("taking a network over").ok()?;
+        Some(Box::new(Network {
+            there: Training { line: self.line.clone(), health: self.health.clone() },
+            fused: Fused::new(model, objective, BATCH),
+            model: model.clone(),
+            objective: objective.clone(),
+            average: average.clone(),
+            samples: Samples::default(),
+            mark: None,
+            base: None,
+            kept: None,
+        }))
+    }
+}
+
+/// Of the scene below.
+const BATCH: usize = 512;
+const STEPS: u64 = 20;
+
+struct Network {
+    there: Training,
+    fused: Fused,
+    model: Model,
+    objective: Objective,
+    average: Average,
+    samples: Samples,
+    mark: Option<RingMark>,
+    base: Option<Table>,
+    kept: Option<(Model, Average)>,
+}
+
+impl OffloadedTraining for Network {
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceLost> {
+        self.there.call("bringing samples over")?;
+        self.samples.points.resize(ring.len(), [f32::NAN; 3]);
+        self.samples.log_stretch.resize(ring.len(), f32::NAN);
+        for range in ring.written_since(self.mark) {
+            self.samples.points[range.clone()].copy_from_slice(&ring.samples().points[range.clone()]);
+            self.samples.log_stretch[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
+        }
+        (self.mark, self.base) = (Some(ring.mark()), base.cloned());
+        Ok(self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len()))
+    }
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
+        self.there.call("taking steps")?;
+        let Self { fused, model, objective, average, samples, base, .. } = self;
+        let (among, base) = (objective.sieve(samples), base.as_ref().map(|base| base as &dyn Field));
+        let mut losses = Vec::new();
+        fused.steps(model, objective, average, |done, loss| {
+            losses.extend(loss);
+            steps.get(done as usize).map(|step| Step::of(step, samples, among.as_deref(), base))
+        });
+        Ok(losses)
+    }
+    fn keep(&mut self) -> Result<(), DeviceLost> {
+        self.there.call("keeping a network")?;
+        self.kept = Some((self.model.clone(), self.average.clone()));
+        Ok(())
+    }
+    fn roll_back(&mut self) -> Result<(), DeviceLost> {
+        (self.model, self.average) = self.kept.clone().unwrap();
+        Ok(())
+    }
+    fn restart_average(&mut self) -> Result<(), DeviceLost> {
+        self.average = Average { tables: self.model.tables(), layers: self.model.layers() };
+        Ok(())
+    }
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {
+        self.there.call("freezing a network")?;
+        let (mut model, average) = (self.model.clone(), &self.average);
+        let tensor = |values: &Vec<f32>, shape: Vec<usize>| TensorData::new(values.clone(), shape);
+        let tables = vec![model.shape.table_entries(), model.shape.features];
+        model.module.tables =
+            Some(Param::initialized(ParamId::new(), Tensor::from_data(tensor(&average.tables, tables), &Default::default())));
+        let layers = tensor(&average.layers, vec![average.layers.len()]);
+        model.module.layers = Param::initialized(ParamId::new(), Tensor::from_data(layers, &Default::default()));
+        let there = Training { line: self.there.line.clone(), health: self.there.health.clone() };
+        Ok(Arc::new(Frozen { there, model, objective: self.objective.clone() }))
+    }
+    fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
+        self.there.call("fetching a network")?;
+        (*model, *average) = (self.model.clone(), self.average.clone());
+        Ok(())
+    }
+    fn device_seconds(&mut self) -> f64 {
+        0.0
+    }
+}
+
+struct Frozen {
+    there: Training,
+    model: Model,
+    objective: Objective,
+}
+
+impl OffloadedNetwork for Frozen {
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost> {
+        out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
+        self.there.call("asking a network")?;
+        let (shape, scale) = (Arc::new(self.model.shape.clone()), &self.objective.scale);
+        let flat: Vec<f32> = points.iter().flatten().copied().collect();
+        let points = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [points.len(), 3]), &Default::default());
+        let outputs = self.model.module.forward_fused(&shape, points).into_data().to_vec::<f32>().unwrap();
+        out.iter_mut().zip(outputs).for_each(|(out, output)| *out = output * scale.deviation[0] + scale.mean[0]);
+        Ok(())
+    }
+    fn as_any(&self) -> &dyn std::any::Any {
+        self
+    }
+}
+
 struct Render {
     line: Arc<Line>,
 }
@@ -167,7 +304,7 @@ impl DeviceRenderer for Render {
     ) -> Result<Option<AuditFindings>, DeviceError> {
         self.line.call("an audit")?;
         let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
-        let table = surrogate.as_any().unwrap().downcast_ref::<Table>().unwrap();
+        let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref::<Table>()) else { return Ok(None) };
         let nodes = table.on_device().unwrap().as_any().downcast_ref::<Nodes>().unwrap();
         Ok(Some(audit(request.clone(), &*traces.on_device().host, Some(&nodes.table))))
     }
@@ -217,7 +354,10 @@ struct Made {
 }
 
 fn made(scene: &SceneFile, device: Device) -> Made {
-    let options = RunOptions { device, threads: 2, ..RunOptions::default() };
+    made_with(scene, RunOptions { device, threads: 2, ..RunOptions::default() })
+}
+
+fn made_with(scene: &SceneFile, options: RunOptions) -> Made {
     let mut made = Made::default();
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
@@ -238,7 +378,8 @@ fn on(device: &Arc<Breaking>, scene: &SceneFile) -> Made {
 
 /// What a record says of the work, whoever did it.
 fn figures(record: &FrameRecord) -> FrameRecord {
-    FrameRecord { device: String::new(), warnings: Vec::new(), seconds: StageSeconds::default(), ..record.clone() }
+    let training = record.training.clone().map(|learned| Learned { seconds: 0.0, device_seconds: None, ..learned });
+    FrameRecord { device: String::new(), warnings: Vec::new(), seconds: StageSeconds::default(), training, ..record.clone() }
 }
 
 fn has_ended(record: &FrameRecord) -> usize {
@@ -398,4 +539,97 @@ samples = 2
             "bringing a snapshot over",
         ],
     );
+}
+
+/// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
+#[test]
+fn training_of_a_residual_over_a_sliding_window() {
+    let scene = SceneFile::parse(
+        Path::new("scene.toml"),
+        &format!(
+            "
+[source]
+kind = \"turbulence\"
+nodes = [16, 8, 8]
+snapshots = 9
+[time]
+tau = 4
+[flow]
+steps = 8
+[surrogate]
+kind = \"residual\"
+[network]
+levels = 4
+log2_table = 8
+width = 16
+batch = {BATCH}
+[training]
+steps_per_frame = {STEPS}
+[trust]
+cells = [2, 2, 2]
+[render]
+width = 16
+height = 8
+samples = 2
+"
+        ),
+        &[],
+    )
+    .unwrap();
+    let expected = made(&scene, Device::CPU);
+    let folder = tempfile::tempdir().unwrap();
+    let run = |device: &Arc<Breaking>| {
+        let device = Device::Gpu { gpu: device.clone(), may_fall_back: false };
+        let options = RunOptions { device, threads: 2, checkpoint: Some(folder.path().join("checkpoint")), ..RunOptions::default() };
+        made_with(&scene, options)
+    };
+    let whole = Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
+    let unbroken = run(&whole);
+    assert!(unbroken.error.is_none() && unbroken.films == expected.films && expected.films.len() >= 4);
+    for (found, expected) in unbroken.records.iter().zip(&expected.records) {
+        assert_eq!(figures(found), figures(expected));
+        assert!(found.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
+        assert!(expected.training.as_ref().is_some_and(|learned| learned.device_seconds.is_none() && learned.steps == STEPS));
+    }
+    let asked = whole.line.calls.lock().unwrap().clone();
+    for kind in [
+        "taking a network over",
+        "bringing samples over",
+        "taking steps",
+        "keeping a network",
+        "freezing a network",
+        "asking a network",
+        "fetching a network",
+    ] {
+        let places = some(&asked, kind);
+        assert!(!places.is_empty(), "{kind}");
+        for breaks_at in places {
+            for when_lost in [WhenLost::Cpu, WhenLost::Stop] {
+                let device = Breaking::new(breaks_at, How::Fault, when_lost);
+                let found = run(&device);
+                // How often a trace is cut up depends on the machine's speed.
+                let what = device.line.broke_in.get();
+                let case = format!("{when_lost:?} at call {breaks_at}, {what:?}");
+                let told: Vec<usize> = (0..found.records.len()).filter(|&i| has_ended(&found.records[i]) > 0).collect();
+                let lost = told.first().copied().unwrap_or(found.records.len());
+                assert!(expected.films[..lost] == found.films[..lost], "{case}: as on the CPU up to frame {lost}");
+                if when_lost == WhenLost::Stop {
+                    assert!(told.is_empty() && (found.error.is_some() || found.films.len() == expected.films.len()), "{case}");
+                    continue;
+                }
+                assert!(found.error.is_none() && found.films.len() == expected.films.len(), "{case}: {:?}", found.error);
+                assert!(told.len() <= 1, "{case}: told once");
+                for (i, record) in found.records.iter().enumerate() {
+                    let learned = record.training.as_ref().unwrap();
+                    // The frame in which it is lost may end with fewer steps, and says how many were lost.
+                    assert!(learned.steps == STEPS || i == lost || i == lost + 1, "{case}, frame {i}: {learned:?}");
+                    assert!(learned.loss.is_none_or(f64::is_finite) && learned.rollbacks == 0, "{case}, frame {i}: {learned:?}");
+                    assert!(i >= lost || learned.lost_steps == 0, "{case}, frame {i}: {learned:?}");
+                }
+                // Where no path met anything some layers hold no number.
+                let values = found.films.iter().flatten().map(|bits| f32::from_bits(*bits));
+                assert!(values.filter(|value| !value.is_nan()).all(|value| value.abs() < 1e6), "{case}: nothing of a broken answer");
+            }
+        }
+    }
 }

@@ -5,58 +5,11 @@
 mod network_support;
 
 use network_support::reference::{Reference, labels, norm};
-use network_support::uniform_points;
+use network_support::{Case, cases, uniform_points};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Encoding, Fused, Loss, Model, NetworkSettings, Objective, Pick, Step, Target, autodiff_gradient, operation_step,
-    stock_step,
+    Architecture, Average, Fused, Model, Objective, Pick, Step, autodiff_gradient, operation_step, stock_step,
 };
-
-struct Case {
-    name: &'static str,
-    settings: NetworkSettings,
-    axes: &'static [usize],
-}
-
-fn cases() -> Vec<Case> {
-    let small = NetworkSettings {
-        levels: 3,
-        features: 2,
-        log2_table: 7,
-        base_resolution: 4,
-        growth: 2.0,
-        octaves: 4,
-        width: 16,
-        batch: 300,
-        learning_rate: Some(1e-2),
-        ..NetworkSettings::default()
-    };
-    let flow_map = NetworkSettings { target: Target::FlowMap, jacobian_weight: 0.3, ..small.clone() };
-    vec![
-        Case { name: "hash grid, 2 axes", settings: small.clone(), axes: &[0, 1] },
-        Case { name: "hash grid, 3 axes, 4 features", settings: NetworkSettings { features: 4, ..small.clone() }, axes: &[0, 1, 2] },
-        Case { name: "hash grid, x and z", settings: small.clone(), axes: &[0, 2] },
-        Case { name: "hash grid, 1 axis, odd width", settings: NetworkSettings { width: 21, features: 1, ..small.clone() }, axes: &[1] },
-        Case {
-            name: "frequency, 4 layers of 40",
-            settings: NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, width: 40, ..small.clone() },
-            axes: &[0, 1],
-        },
-        Case { name: "one hidden layer", settings: NetworkSettings { hidden_layers: 1, ..small.clone() }, axes: &[0, 1] },
-        Case {
-            name: "published loss",
-            settings: NetworkSettings { loss: Loss::Published, mean_penalty: 0.7, ..small.clone() },
-            axes: &[0, 1],
-        },
-        Case { name: "flow map, 2 axes", settings: flow_map.clone(), axes: &[0, 1] },
-        Case { name: "flow map, 3 axes", settings: flow_map.clone(), axes: &[0, 1, 2] },
-        Case {
-            name: "flow map, frequency",
-            settings: NetworkSettings { encoding: Encoding::Frequency, octaves: 2, ..flow_map },
-            axes: &[0, 1],
-        },
-    ]
-}
 
 fn prepare(case: &Case) -> (Model, Objective, Samples) {
     let extent = [2.0, 1.0, 1.5];

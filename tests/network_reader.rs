@@ -7,7 +7,7 @@ mod network_support;
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
-use ridgewatch::surrogate::{Kind, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, SampleRing, SurrogateSettings, build};
 use std::io::Write;
 use std::process::{Command, Stdio};
 
@@ -37,7 +37,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        surrogate.learn(&samples, f64::INFINITY, 200);
+        surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 200);
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);

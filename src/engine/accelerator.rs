@@ -10,7 +10,7 @@ use super::device::WhenLost;
 use crate::field::{Domain, Snapshot};
 use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, VelocitySource};
 use crate::render::{Film, RenderStats, Renderer};
-use crate::surrogate::{Predict, Table};
+use crate::surrogate::{Offload, Predict, Table};
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
@@ -33,6 +33,11 @@ pub trait Accelerator: fmt::Debug + Send + Sync {
     /// # Errors
     /// What the device says.
     fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError>;
+
+    /// What trains networks on it; none where nothing does.
+    fn offload(&self) -> Option<Arc<dyn Offload>> {
+        None
+    }
 
     /// A snapshot that a window will want soon: it may come over while other work goes on.
     fn expect(&self, snapshot: &Arc<Snapshot>);
@@ -96,6 +101,15 @@ impl Health {
     /// Whether nothing has failed.
     pub fn works(&self) -> bool {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).is_none()
+    }
+
+    /// What the device says; none, and nothing is asked of it, once it has failed. The cycle looks for failures after each frame and records
+    /// them.
+    pub fn ask<T>(&self, call: impl FnOnce() -> Result<T, DeviceError>) -> Option<T> {
+        if !self.works() {
+            return None;
+        }
+        call().map_err(|error| self.fail(error)).ok()
     }
 
     /// Whether the run is to go on without the device.
@@ -166,17 +180,6 @@ impl fmt::Debug for BackedNodes {
     }
 }
 
-impl BackedNodes {
-    /// What the device says; none once it has failed.
-    fn ask<T>(&self, call: impl FnOnce(&dyn DeviceNodes) -> Result<T, DeviceError>) -> Option<T> {
-        if !self.health.works() {
-            return None;
-        }
-        // The cycle asks for the failure after each frame and records it.
-        call(&*self.device).map_err(|error| self.health.fail(error)).ok()
-    }
-}
-
 impl TracedNodes for BackedNodes {
     fn not_finite(&self) -> usize {
         self.device.not_finite()
@@ -186,7 +189,7 @@ impl TracedNodes for BackedNodes {
             let host = self.host.upgrade().filter(|_| self.health.check().is_ok());
             host.map(|host| Table::trace(&*host, self.nodes).values().to_vec())
         };
-        let values = self.ask(|device| device.values()).or_else(anew);
+        let values = self.health.ask(|| self.device.values()).or_else(anew);
         values.unwrap_or_else(|| {
             // The run is about to end: by the failure, or behind its last frame, where a checkpoint alone asks, and no run goes on from the
             // values of a table.
@@ -195,7 +198,7 @@ impl TracedNodes for BackedNodes {
         })
     }
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool {
-        self.ask(|device| device.interpolate(points, out)).is_some()
+        self.health.ask(|| self.device.interpolate(points, out)).is_some()
     }
     fn as_any(&self) -> &dyn std::any::Any {
         self.device.as_any()

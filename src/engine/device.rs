@@ -8,10 +8,10 @@ use super::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSetting
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use crate::setting::{Refused, require};
 use crate::source::Listener;
+use crate::surrogate::Offload;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
-#[cfg(feature = "cuda")]
 use std::sync::Arc;
 use thiserror::Error;
 
@@ -226,6 +226,15 @@ impl Device {
             #[cfg(feature = "cuda")]
             Self::Gpu { gpu, .. } => Ok(gpu.health().check()?),
             Self::Cpu { .. } => Ok(()),
+        }
+    }
+
+    /// What trains networks on it; none where the CPU does.
+    pub(super) fn offload(&self) -> Option<Arc<dyn Offload>> {
+        match self {
+            Self::Cpu { .. } => None,
+            #[cfg(feature = "cuda")]
+            Self::Gpu { gpu, .. } => gpu.offload().filter(|_| gpu.health().works()),
         }
     }
 

@@ -97,6 +97,10 @@ pub struct StageSeconds {
     pub audit: f64,
     /// Training.
     pub train: f64,
+    /// Of rendering, tracing and predicting, by a GPU's own clock; 0 where the CPU rendered. Its time for training is
+    /// [`crate::surrogate::Learned::device_seconds`].
+    #[serde(default)]
+    pub device: f64,
     /// The frame, without `waiting` and `slide`.
     pub total: f64,
     /// Since the run began, reading and preparing included.

@@ -179,10 +179,12 @@ impl TimeSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainingSettings {
-    /// Share of the threads that train while the others render (at least one thread each; with a single thread they take turns).
+    /// Share of the threads that train while the others render (at least one thread each; with a single thread they take turns). Where a GPU
+    /// trains: of the device's time, in turns with the picture.
     pub share: f64,
-    /// Wall-clock seconds of training that every frame gets at least: the next frame waits for them.
-    pub seconds_per_frame: f64,
+    /// Wall-clock seconds of training that every frame gets at least: the next frame waits for them. None: 1 where the CPU trains; where a
+    /// GPU does, what `share` gives.
+    pub seconds_per_frame: Option<f64>,
     /// Exactly so many optimizer steps a frame instead: slower, but the same on every run.
     pub steps_per_frame: Option<u64>,
     /// Samples that the ring holds.
@@ -193,22 +195,29 @@ pub struct TrainingSettings {
 
 impl Default for TrainingSettings {
     fn default() -> Self {
-        Self { share: 0.5, seconds_per_frame: 1.0, steps_per_frame: None, ring: 1 << 22, resume: None }
+        Self { share: 0.5, seconds_per_frame: None, steps_per_frame: None, ring: 1 << 22, resume: None }
     }
 }
 
 impl TrainingSettings {
+    /// Seconds of training that a frame gets at least where the CPU trains.
+    pub fn seconds(&self) -> f64 {
+        self.seconds_per_frame.unwrap_or(1.0)
+    }
+
+    /// Seconds of training that follow `picture` seconds of rendering where a device does both in turns, so that `share` of its time is
+    /// training's.
+    pub fn turn(&self, picture: f64) -> f64 {
+        (self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
+    }
+
     /// Checks ranges.
     pub fn check(&self) -> Result<(), Refused> {
         let t = self;
         require((0.0..1.0).contains(&t.share), "training.share", t.share, "a number from 0 up to, not including, 1")?;
-        require(
-            t.seconds_per_frame.is_finite() && t.seconds_per_frame >= 0.0,
-            "training.seconds_per_frame",
-            t.seconds_per_frame,
-            "0 or a number above",
-        )?;
-        require(t.seconds_per_frame <= 86_400.0, "training.seconds_per_frame", t.seconds_per_frame, "at most 86400 (a day)")?;
+        if let Some(seconds) = t.seconds_per_frame {
+            require((0.0..=86_400.0).contains(&seconds), "training.seconds_per_frame", seconds, "0 to 86400 (a day)")?;
+        }
         if let Some(steps) = t.steps_per_frame {
             require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
         }
@@ -219,6 +228,17 @@ impl TrainingSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_turn_of_training_is_its_share_of_the_device_s_time() {
+        let with = |share, seconds_per_frame| TrainingSettings { share, seconds_per_frame, ..TrainingSettings::default() };
+        for share in [0.0, 0.25, 0.5, 0.9] {
+            let turn = with(share, None).turn(0.03);
+            assert!((turn / (turn + 0.03) - share).abs() < 1e-12, "{share}: {turn}");
+        }
+        assert_eq!((with(0.5, Some(2.0)).turn(0.03), with(0.5, Some(0.0)).turn(0.03)), (2.0, 0.03), "seconds are the least");
+        assert_eq!((with(0.5, None).seconds(), with(0.5, Some(0.2)).seconds()), (1.0, 0.2));
+    }
 
     #[test]
     fn spans_have_units() {

@@ -1,16 +1,18 @@
-//! Which threads train while the others render, and for how long.
+//! Which threads train while the others render, and for how long; where a device trains, for how long after the picture.
 
 use super::{EngineError, Settings, TrainingSettings};
 use crate::render::Method;
-use crate::surrogate::{Kind, Learned, Samples, Surrogate};
+use crate::surrogate::{Kind, Learned, SampleRing, Surrogate};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// The pools of a run.
 pub(super) struct Threads {
-    pub(super) render: rayon::ThreadPool,
+    render: rayon::ThreadPool,
     /// Trains while the frame is rendered, and the pool of all threads that goes on when it is.
-    pub(super) train: Option<[rayon::ThreadPool; 2]>,
+    train: Option<[rayon::ThreadPool; 2]>,
+    /// Whether a device trains, so that all threads render.
+    pub(super) device_trains: bool,
 }
 
 impl Threads {
@@ -23,11 +25,29 @@ impl Threads {
             rayon::ThreadPoolBuilder::new().num_threads(n).thread_name(move |i| format!("{name}-{i}")).build()
         };
         if !learns || all == 1 || share == 0.0 {
-            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None });
+            return Ok(Self { render: pool(all, "ridgewatch-render")?, train: None, device_trains: false });
         }
         let train = ((all as f64 * share).round() as usize).clamp(1, all - 1);
         let pools = [pool(train, "ridgewatch-train")?, pool(all, "ridgewatch-all")?];
-        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools) })
+        Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools), device_trains: false })
+    }
+
+    /// Who renders.
+    pub(super) fn render(&self) -> &rayon::ThreadPool {
+        match &self.train {
+            Some([_, all]) if self.device_trains => all,
+            _ => &self.render,
+        }
+    }
+
+    /// Who trains while the frame is rendered, and who goes on when it is; none: training waits for its turn.
+    pub(super) fn beside(&self) -> Option<[&rayon::ThreadPool; 2]> {
+        self.train.as_ref().filter(|_| !self.device_trains).map(|[beside, all]| [beside, all])
+    }
+
+    /// All of them.
+    pub(super) fn all(&self) -> &rayon::ThreadPool {
+        self.train.as_ref().map_or(&self.render, |[_, all]| all)
     }
 }
 
@@ -43,7 +63,7 @@ pub(super) enum Until<'a> {
 /// Trains in slices until the end is reached or the run is to stop.
 pub(super) fn train(
     live: &mut dyn Surrogate,
-    samples: &Samples,
+    ring: &SampleRing,
     settings: &TrainingSettings,
     until: Until<'_>,
     stop: &AtomicBool,
@@ -70,10 +90,11 @@ pub(super) fn train(
                 (left.min(SLICE), u64::MAX)
             }
         };
-        let slice = live.learn(samples, seconds, steps);
+        let slice = live.learn(ring, seconds, steps);
         sum.dropped += slice.dropped;
         sum.rollbacks += slice.rollbacks;
         sum.lost_steps += slice.lost_steps;
+        sum.device_seconds = slice.device_seconds.map(|seconds| seconds + sum.device_seconds.unwrap_or(0.0)).or(sum.device_seconds);
         if slice.steps == 0 {
             break;
         }

@@ -41,6 +41,8 @@ pub struct RenderStats {
     pub walk_seconds: f64,
     /// Wall-clock seconds inside [`LogStretch::evaluate`].
     pub evaluate_seconds: f64,
+    /// Both by a device's own clock, where it did them; 0 otherwise.
+    pub device_seconds: f64,
     /// Whether `stop` ended the frame early: pixels that were not finished have 0 samples.
     pub stopped: bool,
 }

@@ -8,20 +8,29 @@ use crate::setting::Refused;
 use network::NetworkSettings;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use trainer::Trainer;
 
 mod checkpoint;
 pub mod network;
+mod offload;
 mod residual;
 mod ring;
 mod sizing;
 mod table;
 mod trainer;
 
+pub use offload::{DeviceLost, Offload, OffloadedNetwork, OffloadedTraining};
 pub use residual::Residual;
-pub use ring::{KEEP_STALE, SampleRing};
+pub use ring::{KEEP_STALE, RingMark, SampleRing};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;
+
+/// A number that was not given before.
+fn fresh_stamp() -> u64 {
+    static NEXT: AtomicU64 = AtomicU64::new(0);
+    NEXT.fetch_add(1, Ordering::Relaxed)
+}
 
 /// Traced samples to learn from. Positions are unit coordinates ([`crate::field::Domain::to_unit`]).
 #[derive(Debug, Clone, Default)]
@@ -53,7 +62,7 @@ impl Samples {
 pub struct Learned {
     /// Optimizer steps taken, without those lost by roll-backs.
     pub steps: u64,
-    /// Optimizer steps taken and lost by roll-backs.
+    /// Optimizer steps taken and lost by roll-backs, or with a device: those of earlier calls too that had not come back from it.
     #[serde(default)]
     pub lost_steps: u64,
     /// Samples used, with repetition.
@@ -66,6 +75,9 @@ pub struct Learned {
     pub rollbacks: u64,
     /// Wall-clock seconds.
     pub seconds: f64,
+    /// Of them, seconds of a device that took the steps; none where the CPU took them.
+    #[serde(default)]
+    pub device_seconds: Option<f64>,
 }
 
 impl Learned {
@@ -82,6 +94,7 @@ impl Learned {
             dropped: self.dropped + other.dropped,
             rollbacks: self.rollbacks + other.rollbacks,
             seconds: self.seconds + other.seconds,
+            device_seconds: self.device_seconds.map(|mine| mine + other.device_seconds.unwrap_or(0.0)).or(other.device_seconds),
         }
     }
 }
@@ -117,6 +130,8 @@ pub struct NetworkState<'a> {
     pub tables: &'a [f32],
     /// Weights and biases of all layers.
     pub layers: &'a [f32],
+    /// The same network where a device trains it; the numbers here are then those that came back last.
+    pub on_device: Option<&'a dyn OffloadedNetwork>,
     /// A table below, and the factor on the network above it.
     pub base: Option<(&'a Table, f32)>,
 }
@@ -127,8 +142,14 @@ pub trait Surrogate: Predict {
     fn freeze(&self) -> Arc<dyn Predict>;
     /// Whether `learn` does anything.
     fn learns(&self) -> bool;
-    /// Trains on `samples` for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
-    fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned;
+    /// Trains on the ring's samples for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
+    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned;
+    /// Trains on a device from now on, where that takes it.
+    fn offload(&mut self, _to: &Arc<dyn Offload>) {}
+    /// Whether the latest steps were taken on a device.
+    fn is_offloaded(&self) -> bool {
+        false
+    }
     /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over.
     fn window_slid(&mut self, tracer: &dyn Tracer);
     /// Writes everything needed to go on (weights, optimizer state, base table) into the file.
@@ -311,8 +332,16 @@ impl Surrogate for Network {
         true
     }
 
-    fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
-        self.trainer.learn(samples, None, seconds, max_steps)
+    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned {
+        self.trainer.learn(ring, None, seconds, max_steps)
+    }
+
+    fn offload(&mut self, to: &Arc<dyn Offload>) {
+        self.trainer.offload(to);
+    }
+
+    fn is_offloaded(&self) -> bool {
+        self.trainer.is_offloaded()
     }
 
     fn window_slid(&mut self, _: &dyn Tracer) {

@@ -6,7 +6,9 @@
 use super::checkpoint::Checkpoint;
 use super::network::HELD_OUT;
 use super::trainer::{FrozenNetwork, Trainer};
-use super::{CheckpointError, Learned, NetworkSettings, NetworkState, Predict, Samples, Surrogate, SurrogateError, Table};
+use super::{
+    CheckpointError, Learned, NetworkSettings, NetworkState, Offload, Predict, SampleRing, Samples, Surrogate, SurrogateError, Table,
+};
 use crate::flow::Tracer;
 use std::path::Path;
 use std::sync::Arc;
@@ -134,19 +136,26 @@ impl Surrogate for Residual {
         true
     }
 
-    fn learn(&mut self, samples: &Samples, seconds: f64, max_steps: u64) -> Learned {
+    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned {
         let start = std::time::Instant::now();
-        // Training reads the table in pieces by many threads: it had better be here before they start.
-        self.table.values();
+        let samples = ring.samples();
         if !samples.is_empty() && std::mem::take(&mut self.slid) && self.fitted_shrinkage(samples) < USELESS {
             self.trainer.forget_output();
         }
         let left = seconds - start.elapsed().as_secs_f64();
-        let learned = self.trainer.learn(samples, Some(&self.table), left, max_steps);
+        let learned = self.trainer.learn(ring, Some(&self.table), left, max_steps);
         if learned.steps > 0 {
             self.shrinkage = self.fitted_shrinkage(samples);
         }
         Learned { seconds: start.elapsed().as_secs_f64(), ..learned }
+    }
+
+    fn offload(&mut self, to: &Arc<dyn Offload>) {
+        self.trainer.offload(to);
+    }
+
+    fn is_offloaded(&self) -> bool {
+        self.trainer.is_offloaded()
     }
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {

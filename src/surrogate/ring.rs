@@ -1,15 +1,23 @@
 //! The bounded memory of traced samples: newest wins, and labels of a window that has slid on are set aside until a re-test says that
 //! they still hold.
 
-use super::Samples;
 use super::network::mix;
+use super::{Samples, fresh_stamp};
+use std::ops::Range;
 
 /// Share of re-traced labels that must still hold for the stale ones to be used again. A label error in one sample of twenty, at the
 /// tolerance of the test, adds less to the loss than the tolerance itself.
 pub const KEEP_STALE: f64 = 0.95;
 
+/// Where a ring stood when somebody took a copy of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RingMark {
+    epoch: u64,
+    pushed: u64,
+}
+
 /// Newest samples, at most `capacity`, those set aside included.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct SampleRing {
     capacity: usize,
     /// Labels of the present window. Circular once full.
@@ -20,13 +28,39 @@ pub struct SampleRing {
     stale: Samples,
     pushed: u64,
     dropped_stale: u64,
+    /// Another number whenever samples were moved, which no other ring has.
+    epoch: u64,
 }
 
 impl SampleRing {
     /// An empty ring of at least one sample.
     pub fn new(capacity: usize) -> Self {
         let empty = Samples::default();
-        Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, dropped_stale: 0 }
+        Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, dropped_stale: 0, epoch: fresh_stamp() }
+    }
+
+    /// A full ring of these samples.
+    pub fn holding(samples: &Samples) -> Self {
+        let mut ring = Self::new(samples.len());
+        ring.push(samples);
+        ring
+    }
+
+    /// Where the ring stands now.
+    pub fn mark(&self) -> RingMark {
+        RingMark { epoch: self.epoch, pushed: self.pushed }
+    }
+
+    /// Places in [`SampleRing::samples`] that have been written since `mark`: all of them where samples have been moved since, or without a mark.
+    pub fn written_since(&self, mark: Option<RingMark>) -> [Range<usize>; 2] {
+        let len = self.len();
+        let fresh = match mark {
+            Some(mark) if mark.epoch == self.epoch => usize::try_from(self.pushed - mark.pushed).map_or(len, |fresh| fresh.min(len)),
+            _ => len,
+        };
+        // The newest sample lies before `end`, and after the last place comes the first one again.
+        let end = if len < self.capacity { len } else { self.next };
+        if fresh <= end { [end - fresh..end, 0..0] } else { [len - (fresh - end)..len, 0..end] }
     }
 
     /// Most samples held.
@@ -73,6 +107,7 @@ impl SampleRing {
         if !self.fresh.is_empty() && shape(&self.fresh) != shape(samples) {
             self.fresh = Samples::default();
             self.next = 0;
+            self.epoch = fresh_stamp();
         }
         self.pushed += samples.len() as u64;
         let first = samples.len().saturating_sub(self.capacity);
@@ -96,6 +131,7 @@ impl SampleRing {
         self.dropped_stale += self.stale.len() as u64;
         self.stale = std::mem::take(&mut self.fresh);
         self.next = 0;
+        self.epoch = fresh_stamp();
     }
 
     /// Numbers of up to `count` stale samples to trace anew, drawn with repetition by seed and counter.
@@ -120,6 +156,7 @@ impl SampleRing {
         for index in 0..room {
             append(&mut self.fresh, &stale, index);
         }
+        self.epoch = fresh_stamp();
         self.dropped_stale += (stale.len() - room) as u64;
         true
     }
@@ -195,16 +232,19 @@ mod tests {
 
     #[test]
     fn stale_labels_are_not_drawn_until_they_are_shown_to_hold() {
-        let mut ring = SampleRing::new(10);
-        ring.push(&numbered(0..8));
-        ring.mark_stale();
-        assert!(ring.is_empty() && ring.batch(4, 1, 0).is_empty());
-        ring.push(&numbered(50..55));
+        let half_stale = || {
+            let mut ring = SampleRing::new(10);
+            ring.push(&numbered(0..8));
+            ring.mark_stale();
+            assert!(ring.is_empty() && ring.batch(4, 1, 0).is_empty());
+            ring.push(&numbered(50..55));
+            ring
+        };
         // Room for ten: five fresh ones push three of the eight stale ones out.
+        let (mut ring, mut dropped) = (half_stale(), half_stale());
         assert_eq!((ring.len(), ring.stale().len()), (5, 5));
         assert!(labels(&ring.batch(64, 1, 0)).iter().all(|&l| l >= 50));
         assert_eq!(ring.probe(100, 1, 0).len(), 5);
-        let mut dropped = ring.clone();
         assert!(!dropped.revalidate(0.94));
         assert_eq!((dropped.len(), dropped.dropped_stale()), (5, 5));
         assert!(ring.revalidate(0.96));
@@ -222,6 +262,29 @@ mod tests {
         let mean = ring.batch(100_000, 7, 0).log_stretch.iter().sum::<f32>() / 1e5;
         // The mean of 1e5 uniform draws from 0..999 has a deviation of 0.91; five of them.
         assert!((mean - 499.5).abs() < 4.6, "{mean}");
+    }
+
+    #[test]
+    fn a_copy_that_takes_what_was_written_stays_a_copy() {
+        let mut ring = SampleRing::new(10);
+        let (mut copy, mut mark, mut next) = (Vec::new(), None, 0);
+        for count in [0, 3, 4, 5, 10, 1, 9, 25, 7] {
+            ring.push(&numbered(next..next + count));
+            next += count;
+            copy.resize(ring.len(), f32::NAN);
+            let ranges = ring.written_since(mark);
+            assert!(ranges.iter().map(ExactSizeIterator::len).sum::<usize>() <= count as usize, "nothing is taken twice");
+            for range in ranges {
+                copy[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
+            }
+            assert_eq!(copy, ring.samples().log_stretch, "after {next}");
+            mark = Some(ring.mark());
+        }
+        ring.mark_stale();
+        ring.push(&numbered(90..92));
+        ring.revalidate(1.0);
+        assert_eq!((ring.len(), ring.written_since(mark)), (10, [0..10, 0..0]), "all were moved");
+        assert_ne!(SampleRing::new(10).mark(), SampleRing::new(10).mark(), "two rings are never the same");
     }
 
     #[test]

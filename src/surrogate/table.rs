@@ -2,11 +2,10 @@
 
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
-use super::{CheckpointError, Learned, Predict, Samples, Surrogate};
+use super::{CheckpointError, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
 use crate::flow::{Extras, Traced, TracedNodes, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, OnceLock};
 use wide::{f32x8, i32x8};
 
@@ -31,12 +30,6 @@ enum Values {
     Here(Arc<Vec<f32>>),
     /// With the device that traced them, and on the host once somebody there asked for them.
     There(Arc<dyn TracedNodes>, Arc<OnceLock<Vec<f32>>>),
-}
-
-/// A number that was not given before.
-pub(super) fn fresh_stamp() -> u64 {
-    static NEXT: AtomicU64 = AtomicU64::new(0);
-    NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
 impl Table {
@@ -216,7 +209,7 @@ impl Surrogate for Table {
         false
     }
 
-    fn learn(&mut self, _: &Samples, _: f64, _: u64) -> Learned {
+    fn learn(&mut self, _: &SampleRing, _: f64, _: u64) -> Learned {
         Learned::default()
     }
 

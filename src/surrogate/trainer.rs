@@ -6,10 +6,14 @@
 //! only when the loss has stopped falling.
 
 use super::checkpoint::{Checkpoint, Entry};
-use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, Pick, Predictor, Step};
-use super::table::fresh_stamp;
-use super::{CheckpointError, Learned, NetworkState, Predict, Samples, SurrogateError};
+use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step};
+use super::{
+    CheckpointError, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples,
+    SurrogateError, Table, fresh_stamp,
+};
 use crate::field::Domain;
+use std::borrow::Cow;
+use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
 /// Steps between two moves of the average: it changes slowly, and every move reads and writes all parameters.
@@ -32,6 +36,12 @@ const STALLED: f64 = 0.02;
 const STALL_FACTOR: f64 = 0.7;
 /// See [`STALL_FACTOR`].
 const LEAST_FACTOR: f64 = 0.1;
+/// Steps that a device is told at once at most, and before it is known how long one takes.
+const GROUP: [u64; 2] = [64, 8];
+/// Seconds of a run after which what a device has learned comes back, at least: so much is lost with it.
+const FETCH_EVERY: f64 = 10.0;
+/// And so many times the seconds that it takes to come back, so that it costs one hundredth of the time.
+const FETCH_APART: f64 = 100.0;
 
 /// How far training has come; everything besides weights and moments that the next step depends on.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -51,20 +61,55 @@ struct Progress {
     looked: f64,
 }
 
-/// Weights and moments to come back to.
+/// What to come back to.
 struct Kept {
-    state: [[Vec<f32>; 3]; 2],
     steps: usize,
-    average: Average,
     progress: Progress,
+    /// Weights, moments and mean; none where a device keeps them.
+    here: Option<([[Vec<f32>; 3]; 2], Average)>,
+}
+
+/// A network that a device trains.
+struct Away {
+    training: Box<dyn OffloadedTraining>,
+    /// Optimizer steps taken so far, those before it went there included.
+    steps: usize,
+    /// How far it was when it last came back, and when that was.
+    fetched: Progress,
+    fetched_at: Instant,
+    /// Seconds that it took; 0 before the first time.
+    fetch_seconds: f64,
+    /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
+    step_seconds: f64,
+    /// What it predicts since the latest step.
+    frozen: OnceLock<Arc<dyn OffloadedNetwork>>,
+}
+
+impl Away {
+    fn frozen(&self) -> Option<Arc<dyn OffloadedNetwork>> {
+        if let Some(frozen) = self.frozen.get() {
+            return Some(frozen.clone());
+        }
+        let frozen = self.training.frozen().ok()?;
+        Some(self.frozen.get_or_init(|| frozen).clone())
+    }
+}
+
+/// What is trained on, here.
+#[derive(Clone, Copy)]
+struct Labels<'a> {
+    samples: &'a Samples,
+    among: Option<&'a [u32]>,
+    base: Option<&'a dyn Field>,
 }
 
 /// A network, its optimizer and its schedule.
 pub(super) struct Trainer {
+    /// burn's module. While a device trains the network: as it last came back, and mean and predictor likewise.
     model: Model,
     objective: Objective,
-    average: Average,
-    predictor: Predictor,
+    average: Arc<Average>,
+    predictor: Arc<Predictor>,
     progress: Progress,
     settings: NetworkSettings,
     rate: f64,
@@ -72,16 +117,31 @@ pub(super) struct Trainer {
     standardised: bool,
     fused: Option<Fused>,
     kept: Option<Kept>,
+    /// Who trains it on a device, and there it is once it has begun.
+    offload: Option<Arc<dyn Offload>>,
+    away: Option<Away>,
 }
 
 /// A network as it was.
 pub(super) struct FrozenNetwork {
     shape: Architecture,
     objective: Objective,
-    tables: Vec<f32>,
-    layers: Vec<f32>,
-    predictor: Predictor,
+    average: Arc<Average>,
+    predictor: Arc<Predictor>,
+    on_device: Option<Arc<dyn OffloadedNetwork>>,
     stamp: u64,
+}
+
+/// By the device where it is there, otherwise here.
+fn predict(
+    on_device: Option<&dyn OffloadedNetwork>,
+    (shape, objective, average, predictor): (&Architecture, &Objective, &Average, &Predictor),
+    points: &[[f32; 3]],
+    out: &mut [f32],
+) {
+    if on_device.is_none_or(|network| network.predict(points, out).is_err()) {
+        predictor.log_stretch(shape, objective, &average.tables, points, out);
+    }
 }
 
 impl Predict for FrozenNetwork {
@@ -90,7 +150,7 @@ impl Predict for FrozenNetwork {
     }
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.predictor.log_stretch(&self.shape, &self.objective, &self.tables, points, out);
+        predict(self.on_device.as_deref(), (&self.shape, &self.objective, &self.average, &self.predictor), points, out);
     }
 
     fn bytes(&self) -> usize {
@@ -98,8 +158,9 @@ impl Predict for FrozenNetwork {
     }
 
     fn network(&self) -> Option<NetworkState<'_>> {
-        let Self { shape, objective, tables, layers, stamp, .. } = self;
-        Some(NetworkState { stamp: *stamp, shape, objective, tables, layers, base: None })
+        let Self { shape, objective, average, stamp, .. } = self;
+        let on_device = self.on_device.as_deref();
+        Some(NetworkState { stamp: *stamp, shape, objective, tables: &average.tables, layers: &average.layers, on_device, base: None })
     }
 }
 
@@ -109,8 +170,8 @@ impl Trainer {
         let shape = Architecture::new(settings, &axes, domain.extent())?;
         let objective = Objective::new(settings, &shape, domain.extent(), tau);
         let model = Model::new(shape, seed, centred);
-        let average = Average { tables: model.tables(), layers: model.layers() };
-        let predictor = Predictor::new(&model.shape, &average.layers);
+        let average = Arc::new(Average { tables: model.tables(), layers: model.layers() });
+        let predictor = Arc::new(Predictor::new(&model.shape, &average.layers));
         // The published rate of 1e-4 is meant for a day of training; within minutes ten times as much reaches further.
         let default = match settings.encoding {
             Encoding::HashGrid => 1e-2,
@@ -130,12 +191,30 @@ impl Trainer {
             standardised: false,
             fused: None,
             kept: None,
+            offload: None,
+            away: None,
         })
+    }
+
+    /// Trains on a device from the next step on, where that takes this network.
+    pub(super) fn offload(&mut self, to: &Arc<dyn Offload>) {
+        self.offload = to.takes(&self.model.shape, &self.objective).then(|| to.clone());
+    }
+
+    /// Whether a device trains it.
+    pub(super) fn is_offloaded(&self) -> bool {
+        self.offload.is_some()
+    }
+
+    /// Optimizer steps taken so far.
+    fn steps(&self) -> usize {
+        self.away.as_ref().map_or_else(|| self.model.steps(), |away| away.steps)
     }
 
     /// Writes the log-stretch (or the residual's part of it) at each point.
     pub(super) fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.predictor.log_stretch(&self.model.shape, &self.objective, &self.average.tables, points, out);
+        let frozen = self.away.as_ref().and_then(Away::frozen);
+        predict(frozen.as_deref(), (&self.model.shape, &self.objective, &self.average, &self.predictor), points, out);
     }
 
     /// What predicts now, for good.
@@ -143,9 +222,9 @@ impl Trainer {
         FrozenNetwork {
             shape: self.model.shape.clone(),
             objective: self.objective.clone(),
-            tables: self.average.tables.clone(),
-            layers: self.average.layers.clone(),
-            predictor: Predictor::new(&self.model.shape, &self.average.layers),
+            average: self.average.clone(),
+            predictor: self.predictor.clone(),
+            on_device: self.away.as_ref().and_then(Away::frozen),
             stamp: fresh_stamp(),
         }
     }
@@ -166,137 +245,277 @@ impl Trainer {
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
-        self.kept = None;
+        // It goes over again with the next step.
+        if self.fetch().is_err() {
+            self.lose_device();
+        }
+        (self.away, self.kept) = (None, None);
         self.model.zero_output();
         let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
-        self.average.layers[head.weights..head.biases + head.outputs].fill(0.0);
-        self.predictor = Predictor::new(&self.model.shape, &self.average.layers);
+        Arc::make_mut(&mut self.average).layers[head.weights..head.biases + head.outputs].fill(0.0);
+        self.pack();
     }
 
-    /// Trains on the samples, or on what they have beyond `base`.
-    pub(super) fn learn(&mut self, samples: &Samples, base: Option<&dyn Field>, seconds: f64, max_steps: u64) -> Learned {
+    /// Trains on the ring's samples, or on what they have beyond `base`.
+    pub(super) fn learn(&mut self, ring: &SampleRing, base: Option<&Table>, seconds: f64, max_steps: u64) -> Learned {
         let start = Instant::now();
+        let began = self.steps();
         let mut learned = Learned::default();
-        let sieved = self.objective.sieve(samples);
-        let among = sieved.as_deref();
-        let usable = among.map_or(samples.len(), <[u32]>::len);
-        learned.dropped = (samples.len() - usable) as u64;
-        if usable == 0 {
-            learned.seconds = start.elapsed().as_secs_f64();
-            return learned;
+        if self.train(ring, base, start, seconds, max_steps, &mut learned).is_err() {
+            let reached = self.steps();
+            self.lose_device();
+            learned.steps = self.steps().saturating_sub(began) as u64;
+            learned.lost_steps += (reached - self.steps()) as u64;
         }
-        if !self.standardised {
-            self.objective.standardise(&self.model.shape, samples, base);
-            self.standardised = true;
-        }
-        // Few samples need no large batch; they would only be drawn many times over.
-        let count = self.settings.batch.min(usable.max(256));
-        let mut fused = self.fused.take().unwrap_or_else(|| Fused::new(&self.model, &self.objective, self.settings.batch));
-        let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
-        let began = self.model.steps() as u64;
-        while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
-            let steps = self.model.steps() as u64;
-            // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
-            let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
-            if self.kept.as_ref().is_none_or(|kept| steps >= kept.steps as u64 + apart) {
-                self.keep();
-            }
-            let most = (KEEP_EVERY - steps % KEEP_EVERY).min(max_steps - learned.steps);
-            let (mut taken, mut sum, mut diverged) = (0, 0.0, false);
-            let Self { model, objective, average, progress, settings, rate, seed, .. } = self;
-            fused.steps(model, objective, average, |done, loss| {
-                if let Some(loss) = loss {
-                    taken = done;
-                    let first = *first_of_call.get_or_insert(loss);
-                    if progress.first_loss == 0.0 && loss.is_finite() {
-                        progress.first_loss = loss;
-                    }
-                    let hardest = first.min(HARDEST * progress.first_loss);
-                    let limit = DIVERGED * progress.first_loss.max(hardest).max(NEGLIGIBLE);
-                    diverged = !loss.is_finite() || loss > limit;
-                    if diverged {
-                        return None;
-                    }
-                    sum += loss;
-                    progress.observe(loss);
-                }
-                if done == most || start.elapsed().as_secs_f64() >= seconds {
-                    return None;
-                }
-                let counter = progress.drawn;
-                progress.drawn += count as u64;
-                progress.averaged += 1;
-                let share = if settings.averaging > 0.0 && progress.averaged.is_multiple_of(AVERAGE_EVERY) {
-                    (AVERAGE_EVERY as f32 / (settings.averaging * progress.averaged as f32)).min(1.0)
-                } else {
-                    0.0
-                };
-                let pick = Pick::Random { seed: *seed, counter, among, hold_out: base.is_some() };
-                let rate = *rate * progress.stall * progress.caution;
-                Some(Step { samples, pick, count, rate, average_share: share, lazy: true, base })
-            });
-            if diverged {
-                learned.rollbacks += 1;
-                // The moments are part of what diverged; so the steps since the last copy are lost.
-                let reached = steps + taken;
-                self.roll_back();
-                let kept = self.model.steps() as u64;
-                learned.lost_steps += reached.saturating_sub(kept);
-                learned.steps = kept.saturating_sub(began);
-                (losses, counted) = (losses + sum, counted + taken);
-                if self.progress.caution < LEAST_CAUTION {
-                    break;
-                }
-                continue;
-            }
-            learned.steps += taken;
-            (losses, counted) = (losses + sum, counted + taken);
-        }
-        self.fused = Some(fused);
-        if self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY {
-            self.average = Average { tables: self.model.tables(), layers: self.model.layers() };
-        }
-        self.predictor = Predictor::new(&self.model.shape, &self.average.layers);
-        learned.samples = counted * count as u64;
-        learned.loss = (counted > 0).then(|| losses / counted as f64);
+        learned.device_seconds = self.away.as_mut().map(|away| away.training.device_seconds());
         learned.seconds = start.elapsed().as_secs_f64();
         learned
     }
 
-    /// Copies the present weights as what to come back to.
-    fn keep(&mut self) {
-        let (steps, average, progress) = (self.model.steps(), &self.average, self.progress);
-        match &mut self.kept {
-            Some(kept) => {
-                self.model.copy_state(&mut kept.state);
-                kept.average.tables.copy_from_slice(&average.tables);
-                kept.average.layers.copy_from_slice(&average.layers);
-                (kept.steps, kept.progress) = (steps, progress);
+    fn train(
+        &mut self,
+        ring: &SampleRing,
+        base: Option<&Table>,
+        start: Instant,
+        seconds: f64,
+        max_steps: u64,
+        learned: &mut Learned,
+    ) -> Result<(), DeviceLost> {
+        let samples = ring.samples();
+        let mut labels = Labels { samples, among: None, base: base.map(|base| base as &dyn Field) };
+        if !self.standardised && (0..samples.len()).any(|index| self.objective.usable(samples, index)) {
+            self.objective.standardise(&self.model.shape, samples, labels.base);
+            self.standardised = true;
+        }
+        self.go_away();
+        let sieved;
+        let usable = if let Some(away) = &mut self.away {
+            away.training.bring(ring, base)?
+        } else {
+            // Training reads the table in pieces by many threads: it had better be here before they start.
+            base.map(Table::values);
+            sieved = self.objective.sieve(samples);
+            labels.among = sieved.as_deref();
+            labels.among.map_or(samples.len(), <[u32]>::len)
+        };
+        learned.dropped = (samples.len() - usable) as u64;
+        if usable == 0 {
+            return Ok(());
+        }
+        // Few samples need no large batch; they would only be drawn many times over.
+        let count = self.settings.batch.min(usable.max(256));
+        let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
+        let began = self.steps();
+        while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
+            let steps = self.steps();
+            // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
+            let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
+            let may_keep = learned.steps == 0 || (steps as u64).is_multiple_of(KEEP_EVERY);
+            if may_keep && self.kept.as_ref().is_none_or(|kept| steps as u64 >= kept.steps as u64 + apart) {
+                self.keep()?;
             }
-            None => self.kept = Some(Kept { state: self.model.state(), steps, average: average.clone(), progress }),
+            let most = (KEEP_EVERY - steps as u64 % KEEP_EVERY).min(max_steps - learned.steps);
+            let group = most.min(self.group(seconds - start.elapsed().as_secs_f64()));
+            let planned: Vec<(PlannedStep, u64)> = (0..group).map(|_| self.plan(count, base.is_some())).collect();
+            let found = self.take(&planned, labels)?;
+            learned.samples += (found.len() * count) as u64;
+            let mut diverged = false;
+            for (loss, (_, averaged)) in found.into_iter().zip(&planned) {
+                counted += 1;
+                diverged = self.progress.diverges(loss, *first_of_call.get_or_insert(loss));
+                if diverged {
+                    break;
+                }
+                losses += loss;
+                self.progress.observe(loss, *averaged);
+            }
+            if diverged {
+                learned.rollbacks += 1;
+                // The moments are part of what diverged; so the steps since the last copy are lost.
+                let reached = self.steps();
+                self.roll_back()?;
+                let kept = self.steps();
+                learned.lost_steps += reached.saturating_sub(kept) as u64;
+                if self.progress.caution < LEAST_CAUTION {
+                    learned.steps = kept.saturating_sub(began) as u64;
+                    break;
+                }
+            }
+            learned.steps = self.steps().saturating_sub(began) as u64;
+        }
+        learned.loss = (counted > 0).then(|| losses / counted as f64);
+        self.settle()
+    }
+
+    /// Brings the network to the device that is to train it, once.
+    fn go_away(&mut self) {
+        if self.away.is_some() {
+            return;
+        }
+        let Some(offload) = &self.offload else { return };
+        let Some(training) = offload.training(&self.model, &self.objective, &self.average) else {
+            self.offload = None;
+            return;
+        };
+        self.kept = None;
+        self.away = Some(Away {
+            training,
+            steps: self.model.steps(),
+            fetched: self.progress,
+            fetched_at: Instant::now(),
+            fetch_seconds: 0.0,
+            step_seconds: 0.0,
+            frozen: OnceLock::new(),
+        });
+    }
+
+    /// Goes on here, from what came back last. The generator moves on, so that the same batches are not drawn again.
+    fn lose_device(&mut self) {
+        self.offload = None;
+        self.kept = None;
+        if let Some(away) = self.away.take() {
+            self.progress = Progress { drawn: self.progress.drawn, ..away.fetched };
         }
     }
 
+    /// Brings back what a device has learned; it goes on there.
+    fn fetch(&mut self) -> Result<(), DeviceLost> {
+        let Some(away) = &mut self.away else { return Ok(()) };
+        let begin = Instant::now();
+        away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
+        (away.fetched, away.fetched_at, away.fetch_seconds) = (self.progress, Instant::now(), begin.elapsed().as_secs_f64());
+        self.pack();
+        Ok(())
+    }
+
+    /// Packs the layers of the mean for prediction here.
+    fn pack(&mut self) {
+        self.predictor = Arc::new(Predictor::new(&self.model.shape, &self.average.layers));
+    }
+
+    /// Steps to take before the clock is looked at again, with so many seconds left.
+    fn group(&self, left: f64) -> u64 {
+        let [most, first] = GROUP;
+        match &self.away {
+            None => 1,
+            Some(away) if away.step_seconds == 0.0 => first,
+            Some(away) => ((left / away.step_seconds) as u64).clamp(1, most),
+        }
+    }
+
+    /// The next step, and the number of steps that the average is then a share of.
+    fn plan(&mut self, count: usize, hold_out: bool) -> (PlannedStep, u64) {
+        let progress = &mut self.progress;
+        let drawn = Some((self.seed, progress.drawn));
+        progress.drawn += count as u64;
+        progress.averaged += 1;
+        let average_share = if self.settings.averaging > 0.0 && progress.averaged.is_multiple_of(AVERAGE_EVERY) {
+            (AVERAGE_EVERY as f32 / (self.settings.averaging * progress.averaged as f32)).min(1.0)
+        } else {
+            0.0
+        };
+        let rate = self.rate * progress.stall * progress.caution;
+        (PlannedStep { count, drawn, hold_out, rate, average_share, lazy: true }, progress.averaged)
+    }
+
+    /// Takes the steps, wherever the network is; the loss of each, before it.
+    fn take(&mut self, planned: &[(PlannedStep, u64)], labels: Labels<'_>) -> Result<Vec<f64>, DeviceLost> {
+        if let Some(away) = &mut self.away {
+            let begin = Instant::now();
+            let steps: Vec<PlannedStep> = planned.iter().map(|(step, _)| *step).collect();
+            away.frozen = OnceLock::new();
+            let losses = away.training.steps(&steps)?;
+            away.steps += steps.len();
+            away.step_seconds = begin.elapsed().as_secs_f64() / steps.len() as f64;
+            return Ok(losses);
+        }
+        let Self { model, objective, average, fused, settings, .. } = self;
+        let fused = fused.get_or_insert_with(|| Fused::new(model, objective, settings.batch));
+        let mut losses = Vec::with_capacity(planned.len());
+        fused.steps(model, objective, Arc::make_mut(average), |done, loss| {
+            losses.extend(loss);
+            planned.get(done as usize).map(|(step, _)| Step::of(step, labels.samples, labels.among, labels.base))
+        });
+        Ok(losses)
+    }
+
+    /// After the last step of a call: what predicts is up to date, and every few seconds it comes back from where it is trained.
+    fn settle(&mut self) -> Result<(), DeviceLost> {
+        let restart = self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY;
+        if let Some(away) = &mut self.away {
+            if restart {
+                away.training.restart_average()?;
+            }
+            let due = away.fetched_at.elapsed().as_secs_f64() >= FETCH_EVERY.max(FETCH_APART * away.fetch_seconds);
+            return if due { self.fetch() } else { Ok(()) };
+        }
+        if restart {
+            self.average = Arc::new(Average { tables: self.model.tables(), layers: self.model.layers() });
+        }
+        self.pack();
+        Ok(())
+    }
+
+    /// Copies the present weights as what to come back to.
+    fn keep(&mut self) -> Result<(), DeviceLost> {
+        let (steps, progress) = (self.steps(), self.progress);
+        if let Some(away) = &mut self.away {
+            away.training.keep()?;
+            self.kept = Some(Kept { steps, progress, here: None });
+            return Ok(());
+        }
+        match &mut self.kept {
+            Some(Kept { here: Some((state, average)), steps: kept_steps, progress: kept_progress }) => {
+                self.model.copy_state(state);
+                average.tables.copy_from_slice(&self.average.tables);
+                average.layers.copy_from_slice(&self.average.layers);
+                (*kept_steps, *kept_progress) = (steps, progress);
+            }
+            kept => *kept = Some(Kept { steps, progress, here: Some((self.model.state(), Average::clone(&self.average))) }),
+        }
+        Ok(())
+    }
+
     /// Back to the last good weights, at half the rate. The generator moves on, so that the same batches are not drawn again.
-    fn roll_back(&mut self) {
+    fn roll_back(&mut self) -> Result<(), DeviceLost> {
         let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
-        if let Some(kept) = &self.kept {
-            self.model.set_state(kept.state.clone(), kept.steps);
-            self.average = kept.average.clone();
-            self.progress = Progress { drawn, caution, ..kept.progress };
+        let Some(kept) = &self.kept else { return Ok(()) };
+        match (&mut self.away, &kept.here) {
+            (Some(away), _) => {
+                away.training.roll_back()?;
+                (away.steps, away.frozen) = (kept.steps, OnceLock::new());
+            }
+            (None, Some((state, average))) => {
+                self.model.set_state(state.clone(), kept.steps);
+                self.average = Arc::new(average.clone());
+            }
+            (None, None) => {}
+        }
+        self.progress = Progress { drawn, caution, ..kept.progress };
+        Ok(())
+    }
+
+    /// The network as it is now, wherever it is; as it last came back, where the device is lost.
+    fn present(&self) -> (Cow<'_, Model>, Cow<'_, Average>, Progress) {
+        let Some(away) = &self.away else { return (Cow::Borrowed(&self.model), Cow::Borrowed(&self.average), self.progress) };
+        let (mut model, mut average) = (self.model.clone(), Average::clone(&self.average));
+        match away.training.fetch(&mut model, &mut average) {
+            Ok(()) => (Cow::Owned(model), Cow::Owned(average), self.progress),
+            Err(DeviceLost) => (Cow::Borrowed(&self.model), Cow::Borrowed(&self.average), away.fetched),
         }
     }
 
     pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
         checkpoint.note("network.shape", self.shape_text());
-        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = self.progress;
+        let (model, average, progress) = self.present();
+        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
         let scale = &self.objective.scale;
         let numbers = [("stall", stall), ("caution", caution), ("first_loss", first_loss), ("smooth", smooth), ("looked", looked)];
         for (key, value) in numbers {
             checkpoint.note(&format!("network.{key}"), value.to_string());
         }
         checkpoint.note("network.learning_rate", (self.rate * stall * caution).to_string());
-        checkpoint.note("network.steps", self.model.steps().to_string());
+        checkpoint.note("network.steps", model.steps().to_string());
         checkpoint.note("network.drawn", drawn.to_string());
         checkpoint.note("network.averaged", averaged.to_string());
         checkpoint.note("network.standardised", self.standardised.to_string());
@@ -304,9 +523,9 @@ impl Trainer {
             checkpoint.note(&format!("network.mean.{output}"), scale.mean[output].to_string());
             checkpoint.note(&format!("network.deviation.{output}"), scale.deviation[output].to_string());
         }
-        let (entries, features) = (self.model.shape.table_entries(), self.model.shape.features);
-        let [tables, layers] = self.model.state();
-        let shapes = [vec![entries, features], vec![self.model.shape.layer_parameters()]];
+        let (entries, features) = (model.shape.table_entries(), model.shape.features);
+        let [tables, layers] = model.state();
+        let shapes = [vec![entries, features], vec![model.shape.layer_parameters()]];
         for (name, shape, values) in [("tables", &shapes[0], tables), ("layers", &shapes[1], layers)] {
             if values[0].is_empty() {
                 continue;
@@ -315,10 +534,11 @@ impl Trainer {
                 checkpoint.push(Entry::new(&format!("network.{name}{part}"), shape, values));
             }
         }
-        if !self.average.tables.is_empty() {
-            checkpoint.push(Entry::new("network.tables.average", &shapes[0], &self.average.tables));
+        let Average { tables, layers } = average.into_owned();
+        if !tables.is_empty() {
+            checkpoint.push(Entry::new("network.tables.average", &shapes[0], tables));
         }
-        checkpoint.push(Entry::new("network.layers.average", &shapes[1], &self.average.layers));
+        checkpoint.push(Entry::new("network.layers.average", &shapes[1], layers));
     }
 
     /// What must agree for a checkpoint to fit.
@@ -360,18 +580,29 @@ impl Trainer {
         let layers = checkpoint.values("network.layers.average", layer_values)?;
         self.model.set_state(state, steps);
         self.objective.scale = scale;
-        (self.progress, self.standardised, self.kept) = (progress, standardised, None);
-        self.predictor = Predictor::new(&self.model.shape, &layers);
-        self.average = Average { tables, layers };
+        // Where a device trains it, it goes over again with the next step.
+        (self.progress, self.standardised, self.kept, self.away) = (progress, standardised, None, None);
+        self.average = Arc::new(Average { tables, layers });
+        self.pack();
         Ok(())
     }
 }
 
 impl Progress {
-    /// Takes a step's loss in, and lowers the rate when the loss has stopped falling.
-    fn observe(&mut self, loss: f64) {
+    /// Whether a step's loss says that training has diverged, `first` being that of the call's first step.
+    fn diverges(&mut self, loss: f64, first: f64) -> bool {
+        if self.first_loss == 0.0 && loss.is_finite() {
+            self.first_loss = loss;
+        }
+        let hardest = first.min(HARDEST * self.first_loss);
+        let limit = DIVERGED * self.first_loss.max(hardest).max(NEGLIGIBLE);
+        !loss.is_finite() || loss > limit
+    }
+
+    /// Takes a step's loss in, the last of `averaged`, and lowers the rate when the loss has stopped falling.
+    fn observe(&mut self, loss: f64, averaged: u64) {
         self.smooth = if self.smooth == 0.0 { loss } else { 0.99 * self.smooth + 0.01 * loss };
-        if self.averaged.is_multiple_of(LOOK_EVERY) {
+        if averaged.is_multiple_of(LOOK_EVERY) {
             if self.looked > 0.0 && self.smooth > (1.0 - STALLED) * self.looked {
                 self.stall = (self.stall * STALL_FACTOR).max(LEAST_FACTOR);
             }

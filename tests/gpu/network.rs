@@ -2,64 +2,25 @@
 //! training.
 
 use super::network_support::reference::{Reference, labels, norm};
-use super::network_support::uniform_points;
+use super::network_support::{self, Case, uniform_points};
 use super::scenes::*;
 use burn::backend::Flex;
 use burn::module::Param;
 use burn::optim::{AdamConfig, SimpleOptimizer};
 use burn::tensor::{Tensor, TensorData};
-use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{DeviceError, DeviceNetwork, DevicePredict, DeviceStep, DeviceTable, DeviceTraining, GpuSettings};
-use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Encoding, Fused, Loss, Model, NetworkSettings, Objective, Pick, Step, Target, stock_step,
+    Architecture, Average, Fused, Loss, Model, NetworkSettings, Objective, Pick, PlannedStep, Step, Target, stock_step,
 };
-use ridgewatch::surrogate::{Predict, Samples, Table};
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use ridgewatch::surrogate::{Offload, Predict, SampleRing, Samples, Table};
 
-struct Case {
-    name: &'static str,
-    settings: NetworkSettings,
-    axes: &'static [usize],
-}
-
-/// Every kind of encoding, every number of axes and features, widths and depths that fill blocks of 16 and that do not.
+/// Of the cases that the CPU trains, those that the kernels take.
 fn cases() -> Vec<Case> {
-    let small = NetworkSettings {
-        levels: 3,
-        features: 2,
-        log2_table: 7,
-        base_resolution: 4,
-        growth: 2.0,
-        octaves: 4,
-        width: 16,
-        mean_penalty: 0.0,
-        ..NetworkSettings::default()
-    };
-    let with = |change: fn(&mut NetworkSettings)| {
-        let mut settings = small.clone();
-        change(&mut settings);
-        settings
-    };
-    let space = &[0, 1, 2][..];
-    vec![
-        Case { name: "2 axes", settings: small.clone(), axes: &[0, 1] },
-        Case { name: "3 axes, width 64", settings: with(|s| s.width = 64), axes: space },
-        Case { name: "8 levels, finer than 8 samples a node", settings: with(|s| (s.levels, s.log2_table) = (8, 12)), axes: space },
-        Case { name: "4 features, width 128", settings: with(|s| (s.features, s.width) = (4, 128)), axes: space },
-        Case { name: "8 features, x and z", settings: with(|s| s.features = 8), axes: &[0, 2] },
-        Case { name: "1 feature, 1 axis, odd width", settings: with(|s| (s.features, s.width) = (1, 21)), axes: &[1] },
-        Case { name: "one hidden layer", settings: with(|s| s.hidden_layers = 1), axes: &[0, 1] },
-        Case {
-            name: "frequency, 4 layers of 40",
-            settings: with(|s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 4, 40)),
-            axes: &[0, 1],
-        },
-        Case { name: "published loss", settings: with(|s| s.loss = Loss::Published), axes: &[0, 1] },
-    ]
+    let taken = |case: &Case| case.settings.target == Target::Ftle;
+    let without_penalty = |case: Case| Case { settings: NetworkSettings { mean_penalty: 0.0, ..case.settings }, ..case };
+    network_support::cases().into_iter().filter(taken).map(without_penalty).collect()
 }
 
 const SAMPLES: usize = 1000;
@@ -95,8 +56,8 @@ fn settled(model: &Model) -> Model {
     model
 }
 
-fn step(count: usize, rate: f64) -> DeviceStep {
-    DeviceStep { count, drawn: None, hold_out: false, rate, average_share: 0.0, lazy: false }
+fn step(count: usize, rate: f64) -> PlannedStep {
+    PlannedStep { count, drawn: None, hold_out: false, rate, average_share: 0.0, lazy: false }
 }
 
 fn training(model: &Model, objective: &Objective) -> DeviceTraining {
@@ -109,7 +70,7 @@ fn stored(training: &DeviceTraining, like: &Model) -> Model {
     model
 }
 
-fn predict(network: &DeviceNetwork, points: &[[f32; 3]]) -> Vec<f32> {
+fn predict(network: &dyn DevicePredict, points: &[[f32; 3]]) -> Vec<f32> {
     let gpu = gpu();
     let flat = gpu.upload("points", points).unwrap();
     let out = gpu.upload("values", &vec![f32::NAN; points.len()]).unwrap();
@@ -133,7 +94,7 @@ fn read(objective: &Objective, output: f64) -> f64 {
 fn predictions_are_the_references() {
     for case in cases() {
         let (model, objective, _) = prepare(&case);
-        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers(), None).unwrap();
+        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         // Not a multiple of any tile, with corners, and points outside, which are moved to the edge.
         let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 5003);
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0], [-0.5, 0.3, 2.0]]);
@@ -250,7 +211,7 @@ fn lines_without_a_gradient_wait() {
     let model = Model::new(shape, 5, false);
     let mut device = training(&model, &objective);
     let pool = device.upload(&labels(2, 3), None).unwrap();
-    let lazy = DeviceStep { lazy: true, ..step(2, 1e-2) };
+    let lazy = PlannedStep { lazy: true, ..step(2, 1e-2) };
     device.train_steps(&pool, &[lazy, lazy]).unwrap();
     let others = device.upload(&labels(2, 4), None).unwrap();
     device.train_steps(&others, &[lazy]).unwrap();
@@ -279,8 +240,8 @@ fn training_learns_what_the_cpu_learns() {
     let mut device = training(&model, &objective);
     let pool = device.upload(&samples, None).unwrap();
     let share = |number: u64| if number % 8 == 7 { 0.5 } else { 0.0 };
-    let steps: Vec<DeviceStep> = (0..all)
-        .map(|i| DeviceStep {
+    let steps: Vec<PlannedStep> = (0..all)
+        .map(|i| PlannedStep {
             drawn: Some((21, i * count as u64)),
             hold_out: true,
             average_share: share(i),
@@ -304,11 +265,11 @@ fn training_learns_what_the_cpu_learns() {
     assert!(mean(&found) < 0.02 * found[0], "it learns");
     // What predicts is the mean, brought back or not.
     let points = uniform_points(31, 3001);
-    let frozen = predict(&device.frozen(None).unwrap(), &points);
+    let frozen = predict(&device.frozen().unwrap(), &points);
     let back = device.average().unwrap();
-    let again = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &back.tables, &back.layers, None).unwrap();
+    let again = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &back.tables, &back.layers).unwrap();
     assert_eq!(frozen, predict(&again, &points));
-    let cpu = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &average.tables, &average.layers, None).unwrap();
+    let cpu = DeviceNetwork::upload(&gpu(), device.shape(), &objective, &average.tables, &average.layers).unwrap();
     let cpu = predict(&cpu, &points);
     let apart: Vec<f64> = frozen.iter().zip(&cpu).map(|(a, b)| f64::from(a - b)).collect();
     let spread = f64::from(objective.scale.deviation[0]) * (points.len() as f64).sqrt();
@@ -322,12 +283,12 @@ fn a_table_below_adds_up() {
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let tracer = cpu_tracer(source.clone(), &map, 0.0).unwrap();
     let table = Table::trace(&*tracer, [20, 12, 12]);
-    let base = std::sync::Arc::new(DeviceTable::upload(&gpu, &domain(&source), &table).unwrap());
+    let base = DeviceTable::upload(&gpu, &domain(&source), &table).unwrap();
     let (model, objective, _) = prepare(&cases()[1]);
     let points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 4001);
-    let of = |base| DeviceNetwork::upload(&gpu, &model.shape, &objective, &model.tables(), &model.layers(), base).unwrap();
-    let alone = predict(&of(None), &points);
-    let sum = predict(&of(Some((base.clone(), 0.7))), &points);
+    let network = DeviceNetwork::upload(&gpu, &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
+    let alone = predict(&network, &points);
+    let sum = predict(&network.above(Some((&base, 0.7))), &points);
     let mut below = vec![0.0; points.len()];
     table.predict(&points, &mut below);
     for ((sum, alone), below) in sum.iter().zip(&alone).zip(&below) {
@@ -358,7 +319,7 @@ fn held_out_and_broken_samples_are_not_learned_from() {
     samples.points[7][1] = f32::NAN;
     let mut device = training(&model, &objective);
     let pool = device.upload(&samples, None).unwrap();
-    let drawn = |hold_out| DeviceStep { drawn: Some((1, 0)), hold_out, ..step(5000, 1e-3) };
+    let drawn = |hold_out| PlannedStep { drawn: Some((1, 0)), hold_out, ..step(5000, 1e-3) };
     let losses = device.train_steps(&pool, &[drawn(true); 3]).unwrap();
     assert!(losses.iter().all(|loss| *loss < 1.0), "{losses:?}");
     assert!(stored(&device, &model).tables().iter().all(|x| x.is_finite()));
@@ -412,6 +373,75 @@ fn a_ring_keeps_the_newest() {
 
 #[test]
 #[ignore = "needs a GPU"]
+fn what_is_kept_comes_back() {
+    let (model, objective, samples) = prepare(&cases()[1]);
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&samples, None).unwrap();
+    let steps = |count| vec![PlannedStep { average_share: 0.3, ..step(SAMPLES, 1e-2) }; count];
+    let all = |device: &DeviceTraining| {
+        let model = stored(device, &model);
+        let moments = model.layer_moments.map(|state| state.momentum.moment_2.into_data().to_vec::<f32>().unwrap());
+        (model.module.layers.val().into_data().to_vec::<f32>().unwrap(), moments, device.average().unwrap(), device.steps())
+    };
+    device.train_steps(&pool, &steps(3)).unwrap();
+    device.keep().unwrap();
+    let (kept, points) = (all(&device), uniform_points(3, 100));
+    let predicted = predict(&device.frozen().unwrap(), &points);
+    let losses = device.train_steps(&pool, &steps(4)).unwrap();
+    assert!(all(&device) != kept && predict(&device.frozen().unwrap(), &points) != predicted);
+    device.roll_back().unwrap();
+    assert!(all(&device) == kept && predict(&device.frozen().unwrap(), &points) == predicted);
+    // The rounded tables come back too: the first loss is the same up to the order of sums.
+    let again = device.train_steps(&pool, &steps(1)).unwrap();
+    assert!((again[0] / losses[0] - 1.0).abs() < 1e-5, "{} and {}", again[0], losses[0]);
+    device.restart_average().unwrap();
+    let (now, ..) = all(&device);
+    assert_eq!(device.average().unwrap().layers, now);
+    device.set_average(&kept.2).unwrap();
+    assert_eq!(device.average().unwrap(), kept.2);
+}
+
+/// Samples come over from a ring that fills up, goes round, and is moved: a step on all of them has the loss that the CPU has on the ring's.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_ring_is_followed_wherever_it_writes() {
+    let (model, objective, _) = prepare(&cases()[1]);
+    let average = Average { tables: model.tables(), layers: model.layers() };
+    let offload = CudaOffload::new(&gpu());
+    assert!(offload.takes(&model.shape, &objective));
+    let mut device = offload.training(&model, &objective, &average).unwrap();
+    let mut ring = SampleRing::new(1000);
+    let mut follow = |ring: &SampleRing, broken: usize| {
+        assert_eq!(device.bring(ring, None).unwrap(), ring.len() - broken);
+        let found = device.steps(&[step(ring.len(), 1e-12)]).unwrap()[0];
+        let finite: Vec<usize> = (0..ring.len()).filter(|&i| ring.samples().log_stretch[i].is_finite()).collect();
+        let samples = Samples {
+            points: finite.iter().map(|&i| ring.samples().points[i]).collect(),
+            log_stretch: finite.iter().map(|&i| ring.samples().log_stretch[i]).collect(),
+            ..Samples::default()
+        };
+        let expected = stock_step(&mut model.clone(), &objective, &samples, samples.len(), 1e-12);
+        assert!((found / expected - 1.0).abs() < 2e-3, "{} samples: {found} and {expected}", ring.len());
+    };
+    for (seed, count) in [(1, 300), (2, 500), (3, 300), (4, 1), (5, 1000), (6, 999), (7, 2500)] {
+        let mut samples = labels(count, seed);
+        // What is left of other pushes shows in the loss.
+        samples.log_stretch.iter_mut().for_each(|s| *s += seed as f32);
+        ring.push(&samples);
+        follow(&ring, 0);
+    }
+    ring.mark_stale();
+    let mut samples = labels(10, 9);
+    samples.log_stretch[4] = f32::NAN;
+    ring.push(&samples);
+    ring.revalidate(1.0);
+    follow(&ring, 1);
+    follow(&SampleRing::holding(&labels(700, 10)), 0);
+    assert!(device.device_seconds() > 0.0 && device.device_seconds() == 0.0, "asked for once");
+}
+
+#[test]
+#[ignore = "needs a GPU"]
 fn drawn_points_fill_the_domain() {
     let (model, objective, _) = prepare(&cases()[0]);
     let device = training(&model, &objective);
@@ -427,81 +457,4 @@ fn drawn_points_fill_the_domain() {
         points.iter().for_each(|&p| counts[(domain.to_unit(p)[axis] * 16.0).min(15.0) as usize] += 1);
         assert!(counts.iter().all(|c| (c - 4096).abs() < 6 * 64), "{counts:?}");
     }
-}
-
-/// Film and record of the last frame of a small run that trains a fixed number of steps a frame.
-fn last_frame(device: &Device, seed: u64) -> Frame {
-    let text = "
-[source]
-kind = \"turbulence\"
-nodes = [48, 24, 24]
-[time]
-tau = 8
-slides = 1
-frames_per_slide = 3
-[flow]
-steps = 16
-[surrogate]
-kind = \"residual\"
-[network]
-levels = 4
-features = 2
-log2_table = 14
-base_resolution = 8
-width = 16
-batch = 4096
-[training]
-steps_per_frame = 60
-[render]
-method = \"gated\"
-width = 48
-height = 24
-samples = 8
-[transfer]
-low = 0.1
-high = 0.3
-";
-    let scene = SceneFile::parse(Path::new("a test"), text, &[format!("seed={seed}")]).unwrap();
-    let mut last = None;
-    let options = RunOptions { device: device.clone(), ..RunOptions::default() };
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            last = Some(frame);
-        }
-    };
-    run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).unwrap();
-    last.unwrap()
-}
-
-/// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
-/// networks, which are trained on other samples.
-#[test]
-#[ignore = "needs a GPU"]
-fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
-    const SEEDS: u64 = 16;
-    let pictures = |device: &Device, first: u64| -> Vec<Frame> { (first..first + SEEDS).map(|seed| last_frame(device, seed)).collect() };
-    let (found, expected) = (pictures(&device(GpuSettings::default()), 0), pictures(&Device::CPU, 100));
-    for frame in &found {
-        let record = &frame.record;
-        assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
-        // A GPU that walks answers points ahead of their flights; one that only traces does not.
-        assert!(record.traced_ahead > 0, "the device walks");
-    }
-    let moments = |frames: &[Frame], pixel: usize| {
-        let values: Vec<f64> = frames.iter().map(|f| f.film.rgba[pixel][..3].iter().map(|&c| f64::from(c)).sum()).collect();
-        let mean = values.iter().sum::<f64>() / SEEDS as f64;
-        (mean, values.iter().map(|v| (v - mean).powi(2)).sum::<f64>() / (SEEDS - 1) as f64 / SEEDS as f64)
-    };
-    let (mut squares, mut count) = (0.0, 0);
-    for pixel in 0..found[0].film.rgba.len() {
-        let ((a, noise_a), (b, noise_b)) = (moments(&found, pixel), moments(&expected, pixel));
-        if noise_a + noise_b > 1e-12 {
-            squares += (a - b).powi(2) / (noise_a + noise_b);
-            count += 1;
-        }
-    }
-    let mean = squares / f64::from(count);
-    println!("difference of the means over its noise, squared: {mean:.3} on average over {count} pixels");
-    // A squared Student t of 30 degrees of freedom is 30 / 28 on average, with a standard deviation of 1.6.
-    assert!(count > 200 && (mean - 30.0 / 28.0).abs() < 6.0 * 1.6 / f64::from(count).sqrt(), "{mean} over {count}");
 }

@@ -6,6 +6,7 @@ pub mod reference;
 use rayon::prelude::*;
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Extras, Traced, Tracer};
+use ridgewatch::surrogate::network::{Encoding, Loss, NetworkSettings, Target};
 use std::f64::consts::PI;
 
 /// A = 0.1, eps = 0.25, omega = 2 pi / 10, forward from `start` over `tau`.
@@ -105,4 +106,50 @@ pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> rid
         arrival: out.arrival.iter().map(unit).collect(),
         jacobian: out.jacobian.iter().map(scaled).collect(),
     }
+}
+
+/// A network that gradients are checked of.
+pub struct Case {
+    pub name: &'static str,
+    pub settings: NetworkSettings,
+    pub axes: &'static [usize],
+}
+
+/// Every kind of encoding, loss and target, every number of axes and features; widths and depths that fill blocks of 16 and that do not.
+pub fn cases() -> Vec<Case> {
+    let small = NetworkSettings {
+        levels: 3,
+        features: 2,
+        log2_table: 7,
+        base_resolution: 4,
+        growth: 2.0,
+        octaves: 4,
+        width: 16,
+        batch: 300,
+        learning_rate: Some(1e-2),
+        ..NetworkSettings::default()
+    };
+    let case = |name, axes, change: fn(&mut NetworkSettings)| {
+        let mut settings = small.clone();
+        change(&mut settings);
+        Case { name, settings, axes }
+    };
+    let (plane, space) = (&[0, 1][..], &[0, 1, 2][..]);
+    let flow_map: fn(&mut NetworkSettings) = |s| (s.target, s.jacobian_weight) = (Target::FlowMap, 0.3);
+    vec![
+        case("2 axes", plane, |_| ()),
+        case("3 axes, width 64", space, |s| s.width = 64),
+        case("8 levels, finer than 8 samples a node", space, |s| (s.levels, s.log2_table) = (8, 12)),
+        case("4 features, width 128", space, |s| (s.features, s.width) = (4, 128)),
+        case("8 features, x and z", &[0, 2], |s| s.features = 8),
+        case("1 feature, 1 axis, odd width", &[1], |s| (s.features, s.width) = (1, 21)),
+        case("one hidden layer", plane, |s| s.hidden_layers = 1),
+        case("frequency, 4 layers of 40", plane, |s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 4, 40)),
+        case("published loss", plane, |s| (s.loss, s.mean_penalty) = (Loss::Published, 0.7)),
+        case("flow map, 2 axes", plane, flow_map),
+        case("flow map, 3 axes", space, flow_map),
+        case("flow map, frequency", plane, |s| {
+            (s.target, s.jacobian_weight, s.encoding, s.octaves) = (Target::FlowMap, 0.3, Encoding::Frequency, 2);
+        }),
+    ]
 }

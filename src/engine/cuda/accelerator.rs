@@ -1,10 +1,11 @@
 //! CUDA as the engine's accelerator.
 
 use super::frames::CudaFrames;
-use super::{CudaTracer, CudaTracerError, DeviceError, Gpu, SnapshotStore, Storage, Tuning};
+use super::{CudaOffload, CudaTracer, CudaTracerError, DeviceError, Gpu, SnapshotStore, Storage, Tuning};
 use crate::engine::accelerator::{Accelerator, DeviceRenderer, Health};
 use crate::field::Snapshot;
 use crate::flow::{FlowMap, Tracer, VelocitySource};
+use crate::surrogate::Offload;
 use std::sync::Arc;
 
 /// A GPU and what is on it of the velocity.
@@ -43,6 +44,10 @@ impl Accelerator for CudaAccelerator {
 
     fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError> {
         Ok(Box::new(CudaFrames::new(&self.gpu)?))
+    }
+
+    fn offload(&self) -> Option<Arc<dyn Offload>> {
+        Some(Arc::new(CudaOffload::new(&self.gpu)))
     }
 
     fn expect(&self, snapshot: &Arc<Snapshot>) {

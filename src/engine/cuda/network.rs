@@ -97,6 +97,7 @@ pub(super) struct NetworkKernels {
     pub(super) average: CudaFunction,
     halves: CudaFunction,
     pub(super) samples: CudaFunction,
+    pub(super) usable: CudaFunction,
     pub(super) points: CudaFunction,
 }
 
@@ -129,6 +130,7 @@ impl NetworkKernels {
             average: kernel("network_average")?,
             halves: kernel("network_halves")?,
             samples: kernel("network_samples")?,
+            usable: kernel("network_usable")?,
             points: kernel("network_points")?,
             gpu: gpu.clone(),
             shape: shape.clone(),
@@ -202,14 +204,20 @@ pub(super) fn unit_box(domain: &Domain) -> UnitBoxArgument {
     UnitBoxArgument { min: domain.min, extent: domain.extent() }
 }
 
-/// A network that predicts, alone or above a table.
+/// A network that predicts.
 #[derive(Debug)]
 pub struct DeviceNetwork {
     kernels: Arc<NetworkKernels>,
     halves: Buffer<u16>,
     layers: Buffer<f32>,
     objective: Objective,
-    base: Option<(Arc<DeviceTable>, f32)>,
+}
+
+/// A network above a table: table + share * network.
+#[derive(Debug, Clone, Copy)]
+pub struct NetworkAbove<'a> {
+    network: &'a DeviceNetwork,
+    base: Option<(&'a DeviceTable, f32)>,
 }
 
 impl DeviceNetwork {
@@ -218,7 +226,7 @@ impl DeviceNetwork {
         gpu.capability() >= OLDEST && network_defines(shape).is_some()
     }
 
-    /// Brings parameters over, as burn's tensors hold them. `base`: a table below, and the share of the network that counts above it.
+    /// Brings parameters over, as burn's tensors hold them.
     ///
     /// # Errors
     /// An architecture that the kernels do not take, or memory that is not there.
@@ -228,12 +236,11 @@ impl DeviceNetwork {
         objective: &Objective,
         tables: &[f32],
         layers: &[f32],
-        base: Option<(Arc<DeviceTable>, f32)>,
     ) -> Result<Self, DeviceError> {
         let kernels = NetworkKernels::new(gpu, shape)?;
         let tables = gpu.upload("a network's tables", tables)?;
         let layers = gpu.upload("a network's layers", layers)?;
-        Self::of(&kernels, objective, &tables, layers, base)
+        Self::of(&kernels, objective, &tables, layers)
     }
 
     /// Of parameters on the device.
@@ -242,43 +249,60 @@ impl DeviceNetwork {
         objective: &Objective,
         tables: &Buffer<f32>,
         layers: Buffer<f32>,
-        base: Option<(Arc<DeviceTable>, f32)>,
     ) -> Result<Self, DeviceError> {
         let halves = kernels.gpu.alloc("a network's rounded tables", kernels.padded)?;
         kernels.round(tables, &halves)?;
-        Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone(), base })
+        Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone() })
     }
 
     /// Memory of what prediction reads, in bytes.
     pub fn bytes(&self) -> usize {
         2 * self.kernels.padded + 4 * self.layers.len()
     }
+
+    /// Above a table, by a share of the network.
+    pub fn above<'a>(&'a self, base: Option<(&'a DeviceTable, f32)>) -> NetworkAbove<'a> {
+        NetworkAbove { network: self, base }
+    }
 }
 
 impl DevicePredict for DeviceNetwork {
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+        // SAFETY: the caller's.
+        unsafe { self.above(None).predict(points, count, out) }
+    }
+}
+
+impl DevicePredict for NetworkAbove<'_> {
+    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
         if count == 0 {
             return Ok(());
         }
-        let base = self.base.as_ref().map(|(table, _)| &**table);
-        let reading = reading(&self.objective, base, self.base.as_ref().map_or(1.0, |(_, share)| *share));
-        let (halves, layers, n) = (self.halves.address(), self.layers.address(), count as u32);
-        let kernel = &self.kernels.predict;
-        let stream = self.kernels.gpu.work();
+        let DeviceNetwork { kernels, halves, layers, objective } = self.network;
+        let reading = reading(objective, self.base.map(|(table, _)| table), self.base.map_or(1.0, |(_, share)| share));
+        let (halves, layers, n) = (halves.address(), layers.address(), count as u32);
+        let kernel = &kernels.predict;
+        let stream = kernels.gpu.work();
         let mut call = stream.launch_builder(&kernel.function);
-        call.arg(&self.kernels.grid).arg(&halves).arg(&layers).arg(&reading).arg(&points).arg(&n).arg(&out);
+        call.arg(&kernels.grid).arg(&halves).arg(&layers).arg(&reading).arg(&points).arg(&n).arg(&out);
         // SAFETY: the caller's, and the arguments are those of `network_predict`.
         unsafe { launch(&mut call, kernel.config(count)) }
     }
 }
 
-/// A copy on the device, in the order of the work stream.
-pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer<f32>, DeviceError> {
+/// Copies all of `from` to the front of `to`, in the order of the work stream.
+pub(super) fn copy(gpu: &Gpu, from: &Buffer<f32>, to: &Buffer<f32>) -> Result<(), DeviceError> {
+    assert!(from.len() <= to.len(), "room for a copy");
     let doing = DeviceError::driver("copying on the device");
-    let to = gpu.alloc(what, from.len())?;
     gpu.context().bind_to_thread().map_err(&doing)?;
     // SAFETY: both buffers hold as many values, and neither is freed before the work stream has passed this.
-    unsafe { result::memcpy_dtod_async(to.address(), from.address(), 4 * from.len(), gpu.work().cu_stream()) }.map_err(doing)?;
+    unsafe { result::memcpy_dtod_async(to.address(), from.address(), 4 * from.len(), gpu.work().cu_stream()) }.map_err(doing)
+}
+
+/// A copy on the device, in the order of the work stream.
+pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer<f32>, DeviceError> {
+    let to = gpu.alloc(what, from.len())?;
+    copy(gpu, from, &to)?;
     Ok(to)
 }
 

@@ -3,35 +3,20 @@
 //! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
-use super::network::{DeviceNetwork, NetworkKernels, copied, has_tables, reading, unit_box};
+use super::network::{DeviceNetwork, NetworkKernels, copied, copy, has_tables, reading, unit_box};
 use super::network_layout::{AdamArgument, DrawArgument};
 use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
-use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Loss, Model, Objective};
+use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Loss, Model, Objective, PlannedStep};
 use cudarc::driver::PushKernelArg;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Steps whose losses are waited for together.
 const STEPS: usize = 256;
-
-/// One optimizer step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct DeviceStep {
-    /// Samples of the batch.
-    pub count: usize,
-    /// Drawn with repetition by this seed, after so many samples drawn before; none: the first ones, in order.
-    pub drawn: Option<(u64, u64)>,
-    /// Whether samples whose number is a multiple of [`HELD_OUT`] are left for validation.
-    pub hold_out: bool,
-    /// Adam's rate.
-    pub rate: f64,
-    /// Share by which the mean of the parameters moves towards them; 0 leaves it.
-    pub average_share: f32,
-    /// Whether lines of 16 values of the tables that got no gradient wait, as on the CPU. Otherwise every entry takes part in every step, as
-    /// with burn's Adam.
-    pub lazy: bool,
-}
+/// Samples that come over at once: bounds the memory beside the ring.
+const WRITTEN: usize = 1 << 20;
 
 /// Samples to learn from: unit point and target. A ring: the newest take the place of the oldest.
 #[derive(Debug)]
@@ -50,6 +35,11 @@ impl DeviceSamples {
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.len == 0
+    }
+
+    /// The same without samples.
+    pub(super) fn emptied(self) -> Self {
+        Self { samples: self.samples, len: 0, next: 0 }
     }
 
     /// Unit point and target of each.
@@ -74,6 +64,9 @@ struct Moments {
     len: usize,
 }
 
+/// What steps change of [`Moments`].
+type Kept = [Buffer<f32>; 4];
+
 impl Moments {
     fn upload(gpu: &Gpu, what: &str, [parameters, first, second]: &[Vec<f32>; 3], gradient: usize) -> Result<Self, DeviceError> {
         let mut zeros = gpu.alloc(what, gradient)?;
@@ -86,6 +79,27 @@ impl Moments {
             gradient: zeros,
             len: parameters.len(),
         })
+    }
+
+    fn all(&self) -> [&Buffer<f32>; 4] {
+        [&self.parameters, &self.first, &self.second, &self.average]
+    }
+
+    /// Copies everything that steps change to what was kept before, or to new memory.
+    fn keep(&self, gpu: &Gpu, kept: Option<Kept>) -> Result<Kept, DeviceError> {
+        let kept = match kept {
+            Some(kept) => kept,
+            None => {
+                let room = || gpu.alloc("a network to come back to", self.len);
+                [room()?, room()?, room()?, room()?]
+            }
+        };
+        self.all().into_iter().zip(&kept).try_for_each(|(from, to)| copy(gpu, from, to))?;
+        Ok(kept)
+    }
+
+    fn roll_back(&self, gpu: &Gpu, kept: &Kept) -> Result<(), DeviceError> {
+        kept.iter().zip(self.all()).try_for_each(|(from, to)| copy(gpu, from, to))
     }
 
     fn read(&self) -> Result<[Vec<f32>; 3], DeviceError> {
@@ -113,15 +127,27 @@ pub struct DeviceTraining {
     /// The tables, rounded and padded.
     halves: Buffer<u16>,
     losses: Buffer<f64>,
+    /// Tables and layers as they were after so many steps.
+    kept: Option<(usize, [Kept; 2])>,
+}
+
+/// Whether a loss needs the mean over the whole batch before any gradient.
+fn has_penalty(objective: &Objective) -> bool {
+    objective.loss == Loss::Published && objective.mean_penalty != 0.0
 }
 
 impl DeviceTraining {
+    /// Whether the kernels train networks of this architecture on this device.
+    pub fn takes(gpu: &Gpu, shape: &Architecture, objective: &Objective) -> bool {
+        DeviceNetwork::takes(gpu, shape) && !has_penalty(objective)
+    }
+
     /// Brings a model over; the mean of the parameters starts at them.
     ///
     /// # Errors
     /// What the kernels do not take: several outputs, widths beyond 128, the published penalty on means. Memory that is not there.
     pub fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective) -> Result<Self, DeviceError> {
-        if objective.loss == Loss::Published && objective.mean_penalty != 0.0 {
+        if has_penalty(objective) {
             let what = "training with the published penalty on the difference of the batch means (network.mean_penalty)".into();
             return Err(DeviceError::Unsupported { what });
         }
@@ -136,6 +162,7 @@ impl DeviceTraining {
             layers: Moments::upload(gpu, "a network's layers", &layers, layers[0].len())?,
             halves: gpu.alloc("a network's rounded tables", kernels.padded)?,
             losses: gpu.alloc("losses", STEPS)?,
+            kept: None,
             kernels,
         };
         training.kernels.round(&training.tables.parameters, &training.halves)?;
@@ -173,13 +200,56 @@ impl DeviceTraining {
         Ok(Average { tables: read(&self.tables.average, self.tables.len)?, layers: read(&self.layers.average, self.layers.len)? })
     }
 
+    /// Brings a running mean over.
+    ///
+    /// # Errors
+    /// What the device says.
+    ///
+    /// # Panics
+    /// When it is that of another shape.
+    pub fn set_average(&mut self, average: &Average) -> Result<(), DeviceError> {
+        assert!((average.tables.len(), average.layers.len()) == (self.tables.len, self.layers.len), "a mean of this shape");
+        self.tables.average.write(&average.tables)?;
+        self.layers.average.write(&average.layers)
+    }
+
+    /// Sets the running mean to the present parameters.
+    ///
+    /// # Errors
+    /// What the device says.
+    pub fn restart_average(&mut self) -> Result<(), DeviceError> {
+        [&self.tables, &self.layers].into_iter().try_for_each(|moments| copy(&self.gpu, &moments.parameters, &moments.average))
+    }
+
+    /// Remembers everything that steps change as what to come back to.
+    ///
+    /// # Errors
+    /// Memory that is not there.
+    pub fn keep(&mut self) -> Result<(), DeviceError> {
+        let [tables, layers] = self.kept.take().map_or([None, None], |(_, kept)| kept.map(Some));
+        self.kept = Some((self.time, [self.tables.keep(&self.gpu, tables)?, self.layers.keep(&self.gpu, layers)?]));
+        Ok(())
+    }
+
+    /// Comes back to what was kept last; nothing changes where nothing was.
+    ///
+    /// # Errors
+    /// What the device says.
+    pub fn roll_back(&mut self) -> Result<(), DeviceError> {
+        let Some((time, [tables, layers])) = &self.kept else { return Ok(()) };
+        self.tables.roll_back(&self.gpu, tables)?;
+        self.layers.roll_back(&self.gpu, layers)?;
+        self.time = *time;
+        self.kernels.round(&self.tables.parameters, &self.halves)
+    }
+
     /// What predicts now, for good: the running mean.
     ///
     /// # Errors
     /// Memory that is not there.
-    pub fn frozen(&self, base: Option<(Arc<DeviceTable>, f32)>) -> Result<DeviceNetwork, DeviceError> {
+    pub fn frozen(&self) -> Result<DeviceNetwork, DeviceError> {
         let layers = copied(&self.gpu, "a network's layers", &self.layers.average)?;
-        DeviceNetwork::of(&self.kernels, &self.objective, &self.tables.average, layers, base)
+        DeviceNetwork::of(&self.kernels, &self.objective, &self.tables.average, layers)
     }
 
     /// Room for `capacity` samples.
@@ -195,13 +265,78 @@ impl DeviceTraining {
     /// # Errors
     /// Memory that is not there.
     pub fn upload(&self, samples: &Samples, base: Option<&DeviceTable>) -> Result<DeviceSamples, DeviceError> {
-        let points = self.gpu.upload("samples", &samples.points)?;
-        let log_stretch = self.gpu.upload("samples", &samples.log_stretch)?;
         let mut ring = self.ring(samples.len())?;
-        let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
-        // SAFETY: both buffers hold `samples.len()` entries and are freed in the order of the work stream.
-        unsafe { self.append(&mut ring, &unit, points.address(), log_stretch.address(), samples.len(), base) }?;
+        self.write(&mut ring, 0..samples.len(), samples, base)?;
         Ok(ring)
+    }
+
+    /// Brings a range of samples over, each to the place that it has among `samples`. Those before must be there already.
+    ///
+    /// # Errors
+    /// Memory that is not there.
+    ///
+    /// # Panics
+    /// When the range goes beyond the ring or the samples.
+    pub fn write(
+        &self,
+        ring: &mut DeviceSamples,
+        range: Range<usize>,
+        samples: &Samples,
+        base: Option<&DeviceTable>,
+    ) -> Result<(), DeviceError> {
+        let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+        for from in range.clone().step_by(WRITTEN) {
+            let part = from..(from + WRITTEN).min(range.end);
+            let points = self.gpu.upload("samples", &samples.points[part.clone()])?;
+            let log_stretch = self.gpu.upload("samples", &samples.log_stretch[part.clone()])?;
+            // SAFETY: both buffers hold as many entries and are freed in the order of the work stream.
+            unsafe { self.place(ring, part, &unit, points.address(), log_stretch.address(), base) }?;
+        }
+        ring.len = ring.len.max(range.end);
+        Ok(())
+    }
+
+    /// Number of samples that can be learned from: those that are finite.
+    ///
+    /// # Errors
+    /// What the device says.
+    pub fn usable(&self, ring: &DeviceSamples) -> Result<usize, DeviceError> {
+        let count = self.gpu.upload("a counter", &[0_u32])?;
+        let (samples, n, to) = (ring.samples.address(), ring.len as u32, count.address());
+        let stream = self.gpu.work();
+        let mut call = stream.launch_builder(&self.kernels.usable);
+        call.arg(&samples).arg(&n).arg(&to);
+        // SAFETY: the arguments of `network_usable`; the ring holds as many samples.
+        unsafe { launch(&mut call, threads(ring.len, 256)) }?;
+        let mut found = [0];
+        count.read(&mut found)?;
+        Ok(found[0] as usize)
+    }
+
+    /// Traced points on the device go to the places of `to`.
+    ///
+    /// # Safety
+    /// As for [`Self::append`].
+    unsafe fn place(
+        &self,
+        ring: &DeviceSamples,
+        to: Range<usize>,
+        domain: &Domain,
+        points: u64,
+        log_stretch: u64,
+        base: Option<&DeviceTable>,
+    ) -> Result<(), DeviceError> {
+        if to.is_empty() {
+            return Ok(());
+        }
+        assert!(to.end <= ring.samples.len(), "a ring of {} for samples {to:?}", ring.samples.len());
+        let (domain, reading) = (unit_box(domain), reading(&self.objective, base, 1.0));
+        let (n, at) = (to.len() as u32, ring.samples.address_of(to.start));
+        let stream = self.gpu.work();
+        let mut call = stream.launch_builder(&self.kernels.samples);
+        call.arg(&domain).arg(&reading).arg(&points).arg(&log_stretch).arg(&n).arg(&at);
+        // SAFETY: the arguments of `network_samples`; the caller's addresses, and as many samples fit behind `at`.
+        unsafe { launch(&mut call, threads(to.len(), 256)) }
     }
 
     /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`) and their log-stretch (f32 each).
@@ -226,19 +361,11 @@ impl DeviceTraining {
     ) -> Result<(), DeviceError> {
         let capacity = ring.samples.len();
         assert!(count <= capacity, "a ring of {capacity} for {count} samples");
-        let (domain, reading) = (unit_box(domain), reading(&self.objective, base, 1.0));
         let before_the_end = count.min(capacity - ring.next);
         for (from, part) in [(0, before_the_end), (before_the_end, count - before_the_end)] {
-            if part == 0 {
-                continue;
-            }
-            let (points, log_stretch) = (points + 12 * from as u64, log_stretch + 4 * from as u64);
-            let (n, to) = (part as u32, ring.samples.address_of(ring.next));
-            let stream = self.gpu.work();
-            let mut call = stream.launch_builder(&self.kernels.samples);
-            call.arg(&domain).arg(&reading).arg(&points).arg(&log_stretch).arg(&n).arg(&to);
-            // SAFETY: the arguments of `network_samples`; the caller's addresses, and `part` samples fit behind `to`.
-            unsafe { launch(&mut call, threads(part, 256)) }?;
+            let to = ring.next..ring.next + part;
+            // SAFETY: the caller's.
+            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base) }?;
             ring.next = (ring.next + part) % capacity;
         }
         ring.len = (ring.len + count).min(capacity);
@@ -265,7 +392,7 @@ impl DeviceTraining {
     ///
     /// # Panics
     /// When a step takes more samples in order than there are, or there are none.
-    pub fn train_steps(&mut self, samples: &DeviceSamples, steps: &[DeviceStep]) -> Result<Vec<f64>, DeviceError> {
+    pub fn train_steps(&mut self, samples: &DeviceSamples, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceError> {
         let mut losses = Vec::with_capacity(steps.len());
         for part in steps.chunks(STEPS) {
             self.losses.zero_front(part.len())?;
@@ -279,7 +406,7 @@ impl DeviceTraining {
         Ok(losses)
     }
 
-    fn enqueue(&mut self, samples: &DeviceSamples, step: &DeviceStep, number: usize) -> Result<(), DeviceError> {
+    fn enqueue(&mut self, samples: &DeviceSamples, step: &PlannedStep, number: usize) -> Result<(), DeviceError> {
         assert!(!samples.is_empty() && step.count > 0 && (step.drawn.is_some() || step.count <= samples.len()), "samples for a batch");
         let Self { gpu, kernels, tables, layers, .. } = self;
         let stream = gpu.work();

@@ -244,6 +244,7 @@ impl GpuRenderer {
         stats.waves = timeline.waves;
         stats.walk_seconds = timeline.start + timeline.advance + timeline.film;
         stats.evaluate_seconds = timeline.answer;
+        stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
         Ok((film, stats))
     }
 

@@ -1,6 +1,7 @@
 //! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
 
 use super::layout::{Outputs, TableArgument, TableFrame};
+use super::predictor::predict_from_host;
 use super::sort::{MOST, Sorter};
 use super::trace::DeviceTracer;
 use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
@@ -26,8 +27,6 @@ pub struct DeviceTable {
 
 /// Nodes of a brick's edge in `table_bricks`.
 const EDGE: usize = 8;
-/// Points from the host that are looked up at once: bounds the memory of a call.
-const BATCH: usize = 1 << 22;
 
 impl DeviceTable {
     /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
@@ -155,14 +154,7 @@ impl DeviceNodes for DeviceTable {
     }
 
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
-        for (points, out) in points.chunks(BATCH).zip(out.chunks_mut(BATCH)) {
-            let unit = self.gpu.upload("points to look up", points)?;
-            let values = self.gpu.alloc::<f32>("points to look up", points.len())?;
-            // SAFETY: both buffers hold as many entries as there are points, and reading waits for the stream.
-            unsafe { self.predict(unit.address(), points.len(), values.address()) }?;
-            values.read(out)?;
-        }
-        Ok(())
+        predict_from_host(&self.gpu, self, points, out)
     }
 
     fn as_any(&self) -> &dyn std::any::Any {

@@ -31,7 +31,7 @@ impl Cycle<'_> {
         }
         let some = every(&work.samples, work.samples.len().div_ceil(RENDER_RESIDUALS).max(1));
         let transfer = self.renderer.transfer();
-        let rendered = self.threads.render.install(|| audit::residuals(front, &some, transfer, tracer.tau()));
+        let rendered = self.threads.render().install(|| audit::residuals(front, &some, transfer, tracer.tau()));
         self.trust.decay();
         self.trust.observe(Some(audited), &rendered);
         if let Some(sizing) = &mut self.sizing {
@@ -56,7 +56,7 @@ impl Cycle<'_> {
         let strata = Strata::even(cells, per_cell as u32);
         let unit = audit::stratified_points(&strata, self.plan.scene.seed, 2 * self.frame + 1);
         let interruptible = Interruptible::new(tracer, self.stop);
-        let verified = self.threads.render.install(|| {
+        let verified = self.threads.render().install(|| {
             let fresh = audit::trace(&interruptible, &unit, false);
             let residuals = audit::residuals(front, &fresh.samples, self.renderer.transfer(), tracer.tau());
             audit::trusted_error(&Audited::of(&residuals, strata), gate)

@@ -32,6 +32,14 @@ pub(super) struct Rendered {
     pub(super) audit_seconds: f64,
 }
 
+impl Rendered {
+    /// Seconds that the picture and its audit had the device: by its own clock where it rendered, otherwise by the wall's.
+    fn turn(&self) -> f64 {
+        let picture = if self.stats.device_seconds > 0.0 { self.stats.device_seconds } else { self.render_seconds };
+        picture + self.audit_seconds
+    }
+}
+
 enum Trainer<'scope, 'b> {
     Beside(std::thread::ScopedJoinHandle<'scope, Learned>),
     After(&'b mut Box<dyn Surrogate>, &'b SampleRing),
@@ -97,6 +105,7 @@ impl Cycle<'_> {
             predict: work.tally.predict_seconds,
             audit: audit_seconds,
             train: train_seconds,
+            device: work.stats.device_seconds,
             total,
             elapsed: self.began.elapsed().as_secs_f64(),
         };
@@ -132,6 +141,7 @@ impl Cycle<'_> {
         // the warm-up was.
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
+        self.threads.device_trains = self.live.as_ref().is_some_and(|live| live.is_offloaded());
         let (flow_map, keep) = (self.wants_flow_map(), self.keep_a_frame());
         let samples = self.learns().then_some(Extras { arrival: flow_map, jacobian: flow_map });
         let (mut learned, mut work) = (None, None);
@@ -142,15 +152,15 @@ impl Cycle<'_> {
             std::thread::scope(|scope| {
                 let training = live.as_mut().filter(|l| l.learns() && !ring.is_empty()).map(|live| {
                     let (ring, rendered, settings) = (&*ring, &rendered, &scene.training);
-                    match &threads.train {
+                    match threads.beside() {
                         Some([beside, all]) => Trainer::Beside(scope.spawn(move || {
-                            let learned = beside.install(|| train(&mut **live, ring.samples(), settings, Until::Rendered(rendered), stop));
-                            let left = settings.seconds_per_frame - learned.seconds;
+                            let learned = beside.install(|| train(&mut **live, ring, settings, Until::Rendered(rendered), stop));
+                            let left = settings.seconds() - learned.seconds;
                             if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
                                 return learned;
                             }
                             // The picture is done: its threads are free.
-                            learned.and(all.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(left), stop)))
+                            learned.and(all.install(|| train(&mut **live, ring, settings, Until::Seconds(left), stop)))
                         })),
                         None => Trainer::After(live, ring),
                     }
@@ -196,13 +206,16 @@ impl Cycle<'_> {
                         audit_seconds: auditing.elapsed().as_secs_f64(),
                     })
                 };
-                work = Some(threads.render.install(&mut render));
+                work = Some(threads.render().install(&mut render));
                 rendered.store(true, Ordering::Release);
                 learned = match training {
                     Some(Trainer::Beside(handle)) => Some(handle.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic))),
-                    Some(Trainer::After(live, ring)) if waits => Some(threads.render.install(|| {
-                        train(&mut **live, ring.samples(), &scene.training, Until::Seconds(scene.training.seconds_per_frame), stop)
-                    })),
+                    Some(Trainer::After(live, ring)) if waits => {
+                        let settings = &scene.training;
+                        let picture = work.as_ref().and_then(|work| work.as_ref().ok()).map_or(0.0, Rendered::turn);
+                        let seconds = if threads.device_trains { settings.turn(picture) } else { settings.seconds() };
+                        Some(threads.render().install(|| train(&mut **live, ring, settings, Until::Seconds(seconds), stop)))
+                    }
                     Some(Trainer::After(..)) | None => None,
                 };
             });
@@ -219,16 +232,16 @@ impl Cycle<'_> {
         if settings.steps_per_frame.is_some() {
             return;
         }
-        let pool = self.threads.train.as_ref().map_or(&self.threads.render, |[_, all]| all);
+        let pool = self.threads.all();
         let (ring, stop, begin) = (&self.ring, self.stop, Instant::now());
         loop {
             let gone = begin.elapsed().as_secs_f64();
             let least = settings.share * seconds;
-            if gone >= settings.seconds_per_frame || stop.load(Ordering::Relaxed) || (gone >= least && !window.is_waited_for()) {
+            if gone >= settings.seconds() || stop.load(Ordering::Relaxed) || (gone >= least && !window.is_waited_for()) {
                 return;
             }
-            let slice = (settings.seconds_per_frame - gone).min(MEANWHILE);
-            let learned = pool.install(|| train(&mut **live, ring.samples(), settings, Until::Seconds(slice), stop));
+            let slice = (settings.seconds() - gone).min(MEANWHILE);
+            let learned = pool.install(|| train(&mut **live, ring, settings, Until::Seconds(slice), stop));
             self.learned_meanwhile = Some(self.learned_meanwhile.take().unwrap_or_default().and(learned));
         }
     }

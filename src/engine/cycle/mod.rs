@@ -1,7 +1,7 @@
 //! The cycle: slide, render with the weights of the cycle before, test, then train.
 //!
 //! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames
-//! before. Samples traced for frame n are held against the frozen weights, which have not seen them, before they go to the ring.
+//! before. Where a GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are held against the frozen weights, which have not seen them, before they go to the ring.
 
 mod assess;
 mod frame;
@@ -171,7 +171,7 @@ fn drive(
     heed(stop)?;
     let mut slide = first.ok_or(EngineError::EndedEarly)?;
     let begun = Instant::now();
-    let (tracer, told) = threads.render.install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
+    let (tracer, told) = threads.render().install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
     slide.warnings.extend(told);
     heed(stop)?;
     // The number of steps is settled once, on the first slide, so that frames compare.
@@ -204,7 +204,7 @@ impl<'a> Cycle<'a> {
         report: &'a mut RunReport,
     ) -> Result<Self, Halt> {
         let scene = &plan.scene;
-        let settled = threads.render.install(|| prepare::settled_scene(plan, tracer, first));
+        let settled = threads.render().install(|| prepare::settled_scene(plan, tracer, first));
         heed(stop)?;
         let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
         let surrogate = match &first.velocity {
@@ -223,7 +223,7 @@ impl<'a> Cycle<'a> {
             if scene.network.size == Size::Auto {
                 sizing = Some(Sizing::new(&surrogate, &scene.network, &plan.domain)?);
             }
-            Some(threads.render.install(|| prepare::build(plan, &surrogate, sizing.as_ref(), tracer))?)
+            Some(threads.render().install(|| prepare::build(plan, &surrogate, sizing.as_ref(), tracer, &options.device))?)
         };
         heed(stop)?;
         if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
@@ -231,7 +231,7 @@ impl<'a> Cycle<'a> {
         {
             surrogate.load(path)?;
             // Its table is that of another window, for all that is known.
-            threads.render.install(|| surrogate.window_slid(tracer));
+            threads.render().install(|| surrogate.window_slid(tracer));
             heed(stop)?;
         }
         report.integration_steps = fixed_steps(tracer);
@@ -277,7 +277,7 @@ impl<'a> Cycle<'a> {
             ));
         }
         if let VelocitySource::Window(window) = &slide.velocity {
-            let resolution = self.threads.render.install(|| time_resolution(window, map, slide.time))?;
+            let resolution = self.threads.render().install(|| time_resolution(window, map, slide.time))?;
             if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
                 slide.warnings.push(format!(
                     "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",

@@ -1,12 +1,12 @@
 //! What comes before a slide's frames: sizes, tables, probes and the pilot.
 
 use super::{Cycle, KEEP_A_FRAME, RENDER_RESIDUALS};
-use crate::engine::EngineError;
 use crate::engine::answers::Answers;
 use crate::engine::audit;
 use crate::engine::feed::Slide;
 use crate::engine::setup::{Plan, assemble};
 use crate::engine::stop::{Halt, Interruptible, heed};
+use crate::engine::{Device, EngineError};
 use crate::flow::{Extras, Traced, Tracer};
 use crate::render::Scene;
 use crate::surrogate::network::Target;
@@ -23,7 +23,7 @@ impl Cycle<'_> {
     /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
     pub(super) fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
         let Some(resize) = self.resize.take() else { return Ok(false) };
-        let built = self.threads.render.install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer));
+        let built = self.threads.render().install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer, &self.options.device));
         heed(self.stop)?;
         let live = built?;
         let text = format!("frame {}: {} ({:.2} MB)", self.frame, resize.why, live.bytes() as f64 / 1e6);
@@ -41,17 +41,17 @@ impl Cycle<'_> {
         let resized = self.resized(&tracer)?;
         if let Some(live) = &mut self.live {
             if !resized {
-                self.threads.render.install(|| live.window_slid(&tracer));
+                self.threads.render().install(|| live.window_slid(&tracer));
                 heed(self.stop)?;
             }
             self.trust.window_slid();
             self.ring.mark_stale();
-            let holding = self.threads.render.install(|| self.share_of_labels_that_hold(&tracer));
+            let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
             heed(self.stop)?;
             self.ring.revalidate(holding);
         }
         let renderer = &mut self.renderer;
-        self.threads.render.install(|| renderer.window_slid());
+        self.threads.render().install(|| renderer.window_slid());
         Ok(())
     }
 
@@ -64,10 +64,10 @@ impl Cycle<'_> {
         let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
         let flow_map = self.wants_flow_map();
         let interruptible = Interruptible::new(tracer, self.stop);
-        let probe = self.threads.render.install(|| audit::trace(&interruptible, &unit, flow_map));
+        let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, flow_map));
         heed(self.stop)?;
         let domain = tracer.domain();
-        self.threads.render.install(|| {
+        self.threads.render().install(|| {
             let points: Vec<[f32; 3]> = probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
             self.renderer.observe(&points, &probe.samples.log_stretch);
         });
@@ -83,7 +83,7 @@ impl Cycle<'_> {
         let interruptible = Interruptible::new(tracer, self.stop);
         let mut answers = Answers::new(&interruptible, None, &gate, None, self.keep_a_frame()).with_flow_map(self.wants_flow_map());
         let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
-        self.threads.render.install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
+        self.threads.render().install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
         heed(stop)?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
         self.probed += traced;
@@ -102,7 +102,7 @@ impl Cycle<'_> {
         let Some(live) = &self.live else { return };
         let front = live.freeze();
         let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
-        let residuals = self.threads.render.install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
+        let residuals = self.threads.render().install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
         match strata {
             Some(strata) => self.trust.observe(Some(&Audited::of(&residuals, strata.clone())), &[]),
             None => self.trust.observe(None, &residuals),
@@ -136,17 +136,22 @@ impl Cycle<'_> {
     }
 }
 
-/// The surrogate at its size.
+/// The surrogate at its size, trained on the device where that trains it.
 pub(super) fn build(
     plan: &Plan,
     settings: &SurrogateSettings,
     sizing: Option<&Sizing>,
     tracer: &dyn Tracer,
+    device: &Device,
 ) -> Result<Box<dyn Surrogate>, SurrogateError> {
     let scene = &plan.scene;
     let plain = || (settings.clone(), scene.network.clone());
     let (settings, network) = sizing.map_or_else(plain, |sizing| sizing.settings(settings, &scene.network));
-    crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)
+    let mut surrogate = crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)?;
+    if let Some(offload) = device.offload() {
+        surrogate.offload(&offload);
+    }
+    Ok(surrogate)
 }
 
 pub(super) fn every(samples: &Samples, stride: usize) -> Samples {

@@ -34,7 +34,7 @@ pub(crate) use module::uniform;
 pub use objective::{Objective, Scale, signed_exp, signed_log};
 pub use operation::FusedNetwork;
 pub(crate) use predictor::Predictor;
-pub use train::{Average, Field, Fused, HELD_OUT, Pick, Step, autodiff_gradient, operation_step, stock_step};
+pub use train::{Average, Field, Fused, HELD_OUT, Pick, PlannedStep, Step, autodiff_gradient, operation_step, stock_step};
 
 /// How a position is shown to the MLP.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]

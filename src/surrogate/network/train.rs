@@ -98,6 +98,33 @@ pub struct Step<'a> {
     pub base: Option<&'a dyn Field>,
 }
 
+/// One optimizer step, told to whoever has the samples.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlannedStep {
+    /// Samples of the batch.
+    pub count: usize,
+    /// Drawn with repetition by this seed, after so many samples drawn before; none: the first ones, in order.
+    pub drawn: Option<(u64, u64)>,
+    /// Whether samples whose number is a multiple of [`HELD_OUT`] are left for validation.
+    pub hold_out: bool,
+    /// Adam's rate.
+    pub rate: f64,
+    /// Share by which the mean of the parameters moves towards them; 0 leaves it.
+    pub average_share: f32,
+    /// Whether lines of 16 values of the tables that got no gradient wait. Otherwise every entry takes part in every step, as with burn's
+    /// Adam.
+    pub lazy: bool,
+}
+
+impl<'a> Step<'a> {
+    /// The planned step on these samples, of which those numbered `among` may be drawn (all, where none).
+    pub fn of(planned: &PlannedStep, samples: &'a Samples, among: Option<&'a [u32]>, base: Option<&'a dyn Field>) -> Self {
+        let &PlannedStep { count, drawn, hold_out, rate, average_share, lazy } = planned;
+        let pick = drawn.map_or(Pick::InOrder, |(seed, counter)| Pick::Random { seed, counter, among, hold_out });
+        Self { samples, pick, count, rate, average_share, lazy, base }
+    }
+}
+
 /// Something with a value at every unit point.
 pub trait Field: Sync {
     /// Writes the value at each point.

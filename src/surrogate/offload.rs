@@ -1,0 +1,64 @@
+//! The seam for engines that train networks on a device: what is asked of one.
+//!
+//! burn's module stays on the host. It goes over when training begins, comes back at the seams (a checkpoint, a slide that makes the network
+//! start anew, every ten seconds or so), and training goes on from what came back last when the device is lost.
+
+use super::network::{Architecture, Average, Model, Objective, PlannedStep};
+use super::{SampleRing, Table};
+use std::any::Any;
+use std::sync::Arc;
+
+/// Trains networks on a device.
+pub trait Offload: Send + Sync {
+    /// Whether networks of this shape can be trained there.
+    fn takes(&self, shape: &Architecture, objective: &Objective) -> bool;
+
+    /// Takes a network over: parameters, moments and their running mean. None where the device is lost.
+    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>>;
+}
+
+/// The device is lost, for a reason that was told where it happened.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("the device is lost")]
+pub struct DeviceLost;
+
+/// A network in training on a device, where any call may be the last: every one of them may fail with [`DeviceLost`].
+#[allow(clippy::missing_errors_doc)] // said above
+pub trait OffloadedTraining: Send + Sync {
+    /// Brings over what `ring` has got since the last call, with what the labels have beyond `base` as targets. Gives the number of samples that can
+    /// be trained on: those that are finite.
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceLost>;
+
+    /// Takes steps on the samples that were brought over; the loss of each, before it.
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost>;
+
+    /// Remembers parameters, moments and mean as what to come back to.
+    fn keep(&mut self) -> Result<(), DeviceLost>;
+
+    /// Comes back to what was kept last.
+    fn roll_back(&mut self) -> Result<(), DeviceLost>;
+
+    /// Sets the running mean to the present parameters.
+    fn restart_average(&mut self) -> Result<(), DeviceLost>;
+
+    /// What the running mean predicts, for good.
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost>;
+
+    /// Brings parameters, moments and mean back.
+    fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost>;
+
+    /// Seconds of device time that steps have taken since this was last asked.
+    fn device_seconds(&mut self) -> f64;
+}
+
+/// A network on a device that does not change.
+pub trait OffloadedNetwork: Send + Sync {
+    /// Writes the log-stretch (or the residual's part of it) at each unit point.
+    ///
+    /// # Errors
+    /// When the device is lost; `out` then holds anything.
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost>;
+
+    /// Itself, for the engine whose device it is on.
+    fn as_any(&self) -> &dyn Any;
+}

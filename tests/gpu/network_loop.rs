@@ -1,0 +1,149 @@
+//! Runs whose network is trained on the device, against the same runs on the CPU.
+
+use super::network_support::uniform_points;
+use super::scenes::*;
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::cuda::GpuSettings;
+use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// A small run that trains a fixed number of steps a frame.
+const SCENE: &str = "
+[source]
+kind = \"turbulence\"
+nodes = [48, 24, 24]
+[time]
+tau = 8
+slides = 1
+frames_per_slide = 3
+[flow]
+steps = 16
+[surrogate]
+kind = \"residual\"
+[network]
+levels = 4
+features = 2
+log2_table = 14
+base_resolution = 8
+width = 16
+batch = 4096
+[training]
+steps_per_frame = 60
+[render]
+method = \"gated\"
+width = 48
+height = 24
+samples = 8
+[transfer]
+low = 0.1
+high = 0.3
+";
+
+fn frames(keys: &[String], options: &RunOptions) -> Vec<Frame> {
+    let scene = SceneFile::parse(Path::new("a test"), SCENE, keys).unwrap();
+    let mut frames = Vec::new();
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            frames.push(frame);
+        }
+    };
+    run(Setup::new(scene.settings()).unwrap(), options, &mut sink, &AtomicBool::new(false)).unwrap();
+    frames
+}
+
+fn last_frame(device: &Device, seed: u64) -> Frame {
+    frames(&[format!("seed={seed}")], &RunOptions { device: device.clone(), ..RunOptions::default() }).pop().unwrap()
+}
+
+/// What the device learned is worth as much as what the CPU learned, goes into a checkpoint, and either goes on from the other's.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_run_trains_on_the_device_and_goes_on_on_either() {
+    let folder = tempfile::tempdir().unwrap();
+    let gpu = device(GpuSettings::default());
+    let file = |name: &str| folder.path().join(name);
+    let learned = |device: &Device, from: Option<&str>, to: &str| {
+        let options = RunOptions { device: device.clone(), checkpoint: Some(file(to)), ..RunOptions::default() };
+        let mut keys = vec!["surrogate.kind=\"network\"".to_owned(), "time.frames_per_slide=6".to_owned()];
+        keys.extend(from.map(|from| format!("training.resume=\"{}\"", file(from).display())));
+        let frames = frames(&keys, &options);
+        for frame in &frames {
+            let learned = frame.record.training.clone().unwrap();
+            assert_eq!((learned.steps, learned.rollbacks), (60, 0));
+            assert_eq!(learned.device_seconds.is_some(), matches!(device, Device::Gpu { .. }));
+            assert!(frame.record.warnings.is_empty(), "{:?}", frame.record.warnings);
+        }
+        let psnr = |frame: &Frame| frame.record.surrogate_psnr.unwrap();
+        // The first frame is answered by what the run began with.
+        (psnr(&frames[0]), psnr(&frames[5]))
+    };
+    let (gpu_first, gpu_last) = learned(&gpu, None, "gpu");
+    let (cpu_first, cpu_last) = learned(&Device::CPU, None, "cpu");
+    let (on_cpu, on_cpu_last) = learned(&Device::CPU, Some("gpu"), "gpu, then cpu");
+    let (on_gpu, on_gpu_last) = learned(&gpu, Some("cpu"), "cpu, then gpu");
+    println!(
+        "dB: GPU {gpu_first:.2} to {gpu_last:.2}, then CPU {on_cpu:.2} to {on_cpu_last:.2}; CPU {cpu_first:.2} to {cpu_last:.2}, then GPU {on_gpu:.2} to {on_gpu_last:.2}"
+    );
+    assert!(gpu_last > gpu_first + 5.0 && cpu_last > cpu_first + 5.0, "both learn");
+    assert!((gpu_last - cpu_last).abs() < 1.0, "as much");
+    // A checkpoint is of the end of a run, whose last frame was answered by the network before its last 60 steps.
+    assert!(on_cpu > gpu_last - 0.5 && on_gpu > cpu_last - 0.5 && on_cpu_last > on_cpu - 0.5 && on_gpu_last > on_gpu - 0.5, "and go on");
+}
+
+/// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
+/// networks, which are trained on other samples.
+#[test]
+#[ignore = "needs a GPU"]
+fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
+    const SEEDS: u64 = 16;
+    let pictures = |device: &Device, first: u64| -> Vec<Frame> { (first..first + SEEDS).map(|seed| last_frame(device, seed)).collect() };
+    let (found, expected) = (pictures(&device(GpuSettings::default()), 0), pictures(&Device::CPU, 100));
+    for frame in &found {
+        let record = &frame.record;
+        assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
+        // A GPU that walks answers points ahead of their flights; one that only traces does not.
+        assert!(record.traced_ahead > 0, "the device walks");
+    }
+    // Where both come from one distribution, who made a frame does not matter: then the difference found is not larger than those of the same
+    // frames dealt out at random. That holds whatever the pixels have in common, as those of a frame do through its network.
+    let frames: Vec<Vec<f64>> = found.iter().chain(&expected).map(brightness).collect();
+    let mut dealt: Vec<usize> = (0..frames.len()).collect();
+    let (difference, pixels) = difference_over_noise(&frames, &dealt);
+    const DEALS: u64 = 9999;
+    let larger = (0..DEALS).filter(|deal| {
+        let random = uniform_points(*deal, dealt.len());
+        (1..dealt.len()).for_each(|last| dealt.swap(last, ((random[last][0] * (last + 1) as f32) as usize).min(last)));
+        difference_over_noise(&frames, &dealt).0 >= difference
+    });
+    let larger = larger.count();
+    println!(
+        "squared difference of the means over its variance: {difference:.3} on average over {pixels} pixels; {larger} of {DEALS} deals are as large"
+    );
+    assert!(pixels > 200 && larger > 0, "{difference} over {pixels} pixels: in no deal of {DEALS} as large");
+}
+
+/// Red, green and blue together of each pixel.
+fn brightness(frame: &Frame) -> Vec<f64> {
+    frame.film.rgba.iter().map(|pixel| pixel[..3].iter().map(|&c| f64::from(c)).sum()).collect()
+}
+
+/// Squared difference of the mean pictures of the first and the second half of `dealt` over its variance, on average over pixels that are not
+/// the same in all frames; and the number of these.
+fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
+    let half = dealt.len() / 2;
+    let moments = |half: &[usize], pixel: usize| {
+        let count = half.len() as f64;
+        let mean = half.iter().map(|&i| frames[i][pixel]).sum::<f64>() / count;
+        (mean, half.iter().map(|&i| (frames[i][pixel] - mean).powi(2)).sum::<f64>() / (count - 1.0) / count)
+    };
+    let (mut sum, mut count) = (0.0, 0);
+    for pixel in 0..frames[0].len() {
+        let ((a, noise_a), (b, noise_b)) = (moments(&dealt[..half], pixel), moments(&dealt[half..], pixel));
+        if noise_a + noise_b > 1e-12 {
+            sum += (a - b).powi(2) / (noise_a + noise_b);
+            count += 1;
+        }
+    }
+    (sum / count as f64, count)
+}
