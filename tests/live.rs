@@ -298,10 +298,11 @@ fn a_frame_goes_out_before_the_rest_of_its_training() {
     let place = Place::new("training");
     let (run, ring) = (place.files.join("run"), text(&place.ring));
     let (archive, live) = (place.archive(), place.live());
-    // Half a minute a frame, were it waited for: there are four.
-    let scene = ["live.follow=every", "training.seconds_per_frame=30", "surrogate.kind=network"];
+    // Half a minute a frame, were it waited for: there are four. Small steps, of which one is done in any case.
+    let scene = ["live.follow=every", "training.seconds_per_frame=30", "training.batch=1024", "surrogate.kind=network"];
     let overrides = scene.iter().flat_map(|one| ["--set", one]);
-    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run)];
+    // What is trained until the next step is there hangs on the cores it gets.
+    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run), "--nice", "0"];
     let attach = start(ridgewatch(&attach).args(overrides));
     until("the ring's folder", || place.ring.join("followers.lock").exists());
     good(&ridgewatch(&["publish", text(&archive), "--ring", ring, "--wait", "60000"]).output().unwrap());
@@ -325,17 +326,18 @@ fn weights_outlive_the_sidecar() {
     let (checkpoint, ring) = (place.files.join("weights"), text(&place.ring).to_owned());
     let (archive, live) = (place.archive(), place.live());
     let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "20", "--steps", "100000"]));
-    let attach = |name: &str, training: &str| {
+    let attach = |name: &str, seconds: &str, training: &str| {
         let run = place.files.join(name);
-        let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", "2", "--checkpoint", text(&checkpoint)];
-        let more = ["--method", "gated", "--set", training, "--set", "surrogate.kind=network"];
+        let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", seconds, "--checkpoint", text(&checkpoint)];
+        let more =
+            ["--method", "gated", "--set", training, "--set", "training.batch=1024", "--set", "surrogate.kind=network", "--nice", "0"];
         ridgewatch(&arguments).args(more).output().unwrap()
     };
-    let first = attach("first", "training.seconds_per_frame=0.1");
+    let first = attach("first", "4", "training.seconds_per_frame=0.2");
     good(&first);
     assert!(checkpoint.exists() && !String::from_utf8_lossy(&first.stderr).contains("going on from"));
     let before = trained_steps(&checkpoint);
-    let second = attach("second", "training.steps_per_frame=1");
+    let second = attach("second", "1", "training.steps_per_frame=1");
     good(&second);
     assert!(String::from_utf8_lossy(&second.stderr).contains("going on from the weights in"));
     // A step a frame, and one of a frame that the end may have cut off: without the first's weights it would have got no further.
