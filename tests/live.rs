@@ -299,7 +299,7 @@ fn a_frame_goes_out_before_the_rest_of_its_training() {
     let (run, ring) = (place.files.join("run"), text(&place.ring));
     let (archive, live) = (place.archive(), place.live());
     // Half a minute a frame, were it waited for: there are four. Small steps, of which one is done in any case.
-    let scene = ["live.follow=every", "training.seconds_per_frame=30", "training.batch=1024", "surrogate.kind=network"];
+    let scene = ["live.follow=every", "training.seconds_per_frame=30", "network.batch=1024", "surrogate.kind=network"];
     let overrides = scene.iter().flat_map(|one| ["--set", one]);
     // What is trained until the next step is there hangs on the cores it gets.
     let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run), "--nice", "0"];
@@ -330,7 +330,7 @@ fn weights_outlive_the_sidecar() {
         let run = place.files.join(name);
         let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", seconds, "--checkpoint", text(&checkpoint)];
         let more =
-            ["--method", "gated", "--set", training, "--set", "training.batch=1024", "--set", "surrogate.kind=network", "--nice", "0"];
+            ["--method", "gated", "--set", training, "--set", "network.batch=1024", "--set", "surrogate.kind=network", "--nice", "0"];
         ridgewatch(&arguments).args(more).output().unwrap()
     };
     let first = attach("first", "4", "training.seconds_per_frame=0.2");

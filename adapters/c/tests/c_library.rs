@@ -239,6 +239,7 @@ int main(int argc, char **argv) {
     WANT(rw_describe_uniform(d, 2, 0, 1, 8, 0) == RW_ARGUMENT);
     WANT(rw_describe_rectilinear(d, 0, NULL, 8, 0) == RW_ARGUMENT);
     WANT(rw_describe_time_unit(d, NULL) == RW_ARGUMENT);
+    WANT(rw_describe_start(NULL, 1) == RW_ARGUMENT && rw_describe_start(d, UINT64_MAX) == RW_OK);
     WANT(rw_describe_block(d, 0, 1, NULL, NULL) == RW_ARGUMENT);
     WANT(rw_open(argv[1], d, &field) == RW_ARGUMENT && strstr(rw_error(), "axis is missing") && !field);
     WANT(rw_open(argv[1], NULL, &field) == RW_ARGUMENT);
