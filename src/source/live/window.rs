@@ -104,9 +104,8 @@ impl State {
         let begun = *self.begun_at.get_or_insert_with(Instant::now);
         // The hair's breadth by which a sum of steps may miss tau is the window's own.
         let tenths = if self.window.is_full() { 10 } else { (10.0 * self.filled()) as usize };
-        while self.live.filling.len() < tenths {
-            self.live.filling.push(begun.elapsed().as_secs_f64());
-        }
+        let known = self.live.filling.len().max(tenths);
+        self.live.filling.resize(known, begun.elapsed().as_secs_f64());
     }
 
     /// Whether a slide is due.
