@@ -79,6 +79,27 @@ fn an_archive_with_land_goes_through_the_whole_loop() {
 }
 
 #[test]
+fn the_shipped_archive_scenes_run_over_what_they_promise() {
+    for (name, nodes, tau) in [("ecmwf", "[24, 12, 6]", 11.0), ("flame", "[24, 12, 12]", 6.0), ("globe", "[24, 13, 5]", 11.0 * 86_400.0)] {
+        let folder = tempfile::tempdir().unwrap();
+        let (run, files) = (folder.path().join("run"), folder.path().join("archive"));
+        let scene = format!("{}/configs/{name}.toml", env!("CARGO_MANIFEST_DIR"));
+        let (out, nodes) = (run.display().to_string(), format!("archive.synthetic.nodes={nodes}"));
+        let files = format!("archive.synthetic.folder={:?}", files.display().to_string());
+        let output = succeeds(&[&["replay", &scene, "--out", &out, "--set", &nodes, "--set", &files][..], &SMALL].concat());
+        let said = String::from_utf8_lossy(&output.stderr);
+        let records = records(&run);
+        assert_eq!(records.len(), 3, "{name}: of 14 or 9 snapshots, windows of 12 or 7");
+        for record in &records {
+            assert_eq!((record.direction.as_str(), record.tau, record.missing), ("backward", tau, 0), "{name}");
+            // Two steps an interval at the least: a path that stays within one would have two in all.
+            assert!(record.integration_steps.unwrap() >= if name == "flame" { 12 } else { 22 }, "{name}: {:?}", record.integration_steps);
+        }
+        assert_eq!(said.contains("goes round: periodic with 360"), name == "globe", "{name}: {said}");
+    }
+}
+
+#[test]
 fn a_variable_that_the_file_lacks_points_at_its_line() {
     let folder = tempfile::tempdir().unwrap();
     let file = eddy(folder.path());
