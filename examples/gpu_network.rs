@@ -112,7 +112,7 @@ mod bench {
                 let milliseconds = time(&gpu, || {
                     let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-2)).collect();
                     drawn += STEPS * batch as u64;
-                    training.train_steps(&pool, &steps).map(|_| ())
+                    training.train_steps(&pool, None, &steps).map(|_| ())
                 })?;
                 row += &format!("| {:.0} ", STEPS as f64 * batch as f64 / milliseconds * 1e-3);
             }
@@ -305,7 +305,7 @@ mod bench {
                     PlannedStep { average_share, ..step(BATCH, trained + (i * BATCH) as u64, RATE) }
                 })
                 .collect();
-            training.train_steps(&ring, &steps)?;
+            training.train_steps(&ring, None, &steps)?;
             trained += (STEPS * BATCH) as u64;
             clock += start.elapsed().as_secs_f64();
             if clock >= marks[0] {

@@ -69,13 +69,15 @@ network_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ 
 
 // Which samples make up a batch (Pick in train.rs).
 struct Draw {
-    const Four* samples;  // unit point, target
+    const Four* samples;  // unit point, target: the first `first` of `count`
+    const Four* more;     // those behind them
     uint64_t seed, counter;
-    uint32_t count, batch;
+    uint32_t count, first, batch;
     uint32_t random;    // 0: the first ones, in order
     uint32_t hold_out;  // samples whose number is a multiple of this are left out, where one is drawn; 0: none
+    uint32_t pad;
 };
-static_assert(sizeof(Draw) == 40, "layout");
+static_assert(sizeof(Draw) == 56, "layout");
 
 // 64 random bits (module.rs).
 RW_FN uint64_t mix(uint64_t seed, uint64_t counter) {
@@ -186,7 +188,10 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         RW_UNROLL for (int row = 0; row < 2; ++row) {
             const uint32_t position = tile * ROWS + 16u * (threadIdx.x / 32u) + g + 8u * row;
             Four sample = {0.0f, 0.0f, 0.0f, not_a_number()};
-            if (position < draw.batch) sample = load(draw.samples + drawn(draw, position));
+            if (position < draw.batch) {
+                const uint32_t number = drawn(draw, position);
+                sample = load(number < draw.first ? draw.samples + number : draw.more + (number - draw.first));
+            }
             const float unit[3] = {sample.x, sample.y, sample.z};
             inputs(points[row], unit);
             targets[row] = sample.w;
@@ -335,10 +340,11 @@ network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t f
     }
 }
 
-// Traced points (domain coordinates) as samples: the target is what the log-stretch has beyond `base`, scaled (Objective::targets).
+// Traced points (domain coordinates) as samples: the target is what the log-stretch has beyond `base`, scaled (Objective::targets). Of every
+// 2^held_back points one gets none, the one that the host may keep as a label; with 0 all get one.
 extern "C" __global__ void __launch_bounds__(256)
 network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ Reading reading, const float* __restrict__ points,
-                const float* __restrict__ log_stretch, uint32_t n, Four* __restrict__ samples) {
+                const float* __restrict__ log_stretch, uint32_t n, uint32_t held_back, Four* __restrict__ samples) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
     if (i >= n) return;
     const float point[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
@@ -352,7 +358,7 @@ network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ 
         target = (log_stretch[i] - below - reading.mean) / reading.deviation;
     }
     // No place, no target.
-    if (!isfinite(point[0] + point[1] + point[2])) target = not_a_number();
+    if (!isfinite(point[0] + point[1] + point[2]) || (held_back && keeps_label(point, held_back))) target = not_a_number();
     samples[i] = {unit[0], unit[1], unit[2], target};
 }
 
