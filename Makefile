@@ -5,7 +5,8 @@
 # make vendored    builds with HDF5 and NetCDF inside, where their libraries cannot be had or the program is to run elsewhere
 # make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
-# make test-adapters   their tests against compilers: gfortran, mpicc, Python; what is missing is installed where apt is, or named as NOT RUN
+# make test-adapters   their tests against compilers: gfortran, mpicc, Python. What is missing is installed where apt is (gfortran, openmpi-bin,
+#    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy and pytest go into out/adapters/venv alone
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes docs/performance.md
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
@@ -132,7 +133,7 @@ adapter-packages:
 	if [ -n "$$missing" ] && command -v apt-get >/dev/null; then \
 	  $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null || echo "could not install$$missing"; fi
 
-test-adapters: adapter-packages adapters
+test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-c -- --nocapture
 	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire --test ring -- --ignored; else \
 	  echo "NOT RUN: a ring on a full file system, since mounting a small one needs root"; fi

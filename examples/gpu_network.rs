@@ -1,5 +1,5 @@
 //! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
-//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [seconds]`
+//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [published] [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
 //! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled) and stands still
@@ -25,6 +25,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         if asked(word) {
             bench::quality(word, field, seconds)?;
         }
+    }
+    if asked("published") {
+        bench::published(seconds)?;
     }
     Ok(())
 }
@@ -188,35 +191,115 @@ mod bench {
         20.0 * (peak / square.sqrt()).log10()
     }
 
-    pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
-        let gpu = Gpu::open(0, &GpuSettings::default())?;
-        let turbulence = match field {
-            Field::Easy => Turbulence::easy(SHAPE, 0),
-            Field::Hard => Turbulence::hard(SHAPE, 0),
-        };
-        let window = Arc::new(turbulence.window(&Turbulence::grid(SHAPE)?, SNAPSHOTS)?);
-        let source = VelocitySource::Window(window);
-        let store = SnapshotStore::new(&gpu);
-        let steps = match field {
-            Field::Easy => 22,
-            Field::Hard => 44,
-        };
-        let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
-        let exact = CudaTracer::new(&store, &gpu, source, &map(220, Precision::F64), 0.0, Tuning::default())?;
-        let domain = tracer.domain().clone();
-        println!("<!-- block network-{name} -->");
+    /// A field with its tracer, and points where it is known.
+    struct Known {
+        gpu: Arc<Gpu>,
+        tracer: CudaTracer,
+        domain: Domain,
+        steps: usize,
+        /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
+        seeds: Batch,
+        tested: Batch,
+        truth: Vec<f32>,
+    }
 
-        // The test's points, twice: for the tracer, and in unit coordinates.
-        let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+    impl Known {
+        fn new(field: Field) -> Outcome<Self> {
+            let gpu = Gpu::open(0, &GpuSettings::default())?;
+            let turbulence = match field {
+                Field::Easy => Turbulence::easy(SHAPE, 0),
+                Field::Hard => Turbulence::hard(SHAPE, 0),
+            };
+            let window = Arc::new(turbulence.window(&Turbulence::grid(SHAPE)?, SNAPSHOTS)?);
+            let source = VelocitySource::Window(window);
+            let store = SnapshotStore::new(&gpu);
+            let steps = match field {
+                Field::Easy => 22,
+                Field::Hard => 44,
+            };
+            let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
+            let exact = CudaTracer::new(&store, &gpu, source, &map(220, Precision::F64), 0.0, Tuning::default())?;
+            let domain = tracer.domain().clone();
+            let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+            let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
+            let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
+            let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
+            let drawer = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
+            let (mut seeds, mut tested) = (Batch::new(&gpu, TESTED)?, Batch::new(&gpu, TESTED)?);
+            drawer.draw_points(&domain, 99, 0, &mut seeds.points)?;
+            drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
+            seeds.trace(exact.device())?;
+            let truth = seeds.found()?;
+            seeds.trace(tracer.device())?;
+            Ok(Self { gpu, tracer, domain, steps, seeds, tested, truth })
+        }
+    }
+
+    /// What training takes.
+    #[derive(Clone, Copy)]
+    struct Pace {
+        batch: usize,
+        rate: f64,
+    }
+
+    /// The published networks: what they do in a second and know after some, beside tracing the same number of samples.
+    pub fn published(seconds: f64) -> Outcome<()> {
+        const COUNT: usize = 1 << 18;
+        const PACE: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
+        let Known { gpu, tracer, domain, tested, truth, .. } = Known::new(Field::Easy)?;
+        let mut batch = Batch::new(&gpu, COUNT)?;
         let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
         let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
-        let drawer = DeviceTraining::new(&gpu, &Model::new(shape.clone(), 1, false), &Objective::new(&any, &shape, domain.extent(), 1.0))?;
-        let (mut seeds, mut tested) = (Batch::new(&gpu, TESTED)?, Batch::new(&gpu, TESTED)?);
-        drawer.draw_points(&domain, 99, 0, &mut seeds.points)?;
-        drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
-        seeds.trace(exact.device())?;
-        let truth = seeds.found()?;
-        seeds.trace(tracer.device())?;
+        let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
+        let drawer = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
+        drawer.draw_points(&domain, 3, 0, &mut batch.points)?;
+        println!("<!-- block network-published -->");
+        let ours = time(&gpu, || batch.trace(tracer.device()))?;
+        let megabytes = 12e-6 * (SHAPE.iter().product::<usize>() * SNAPSHOTS) as f64;
+        println!("Velocities: {megabytes:.0} MB. 2^18 samples traced, 22 steps: {ours:.2} ms.\n");
+        println!("| network | MB | 2^18 predicted, ms | G/s, 2^22 | trained, M/s | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|---|---|---|");
+        for (hidden_layers, width) in [(8, 256), (8, 512), (16, 256), (16, 512)] {
+            let settings = NetworkSettings { encoding: Encoding::Frequency, hidden_layers, width, ..NetworkSettings::default() };
+            let shape = Architecture::new(&settings, &[0, 1, 2], domain.extent())?;
+            let objective = Objective::new(&settings, &shape, domain.extent(), 1.0);
+            let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
+            let mut points = gpu.alloc("points", 1 << 22)?;
+            training.draw_points(&Domain::cuboid([0.0; 3], [1.0; 3]), 3, 0, &mut points)?;
+            let values = gpu.upload("values", &vec![0.5f32; 1 << 22])?;
+            let network = training.frozen()?;
+            let predicted = [COUNT, 1 << 22].map(|count| {
+                // SAFETY: both buffers hold 2^22 entries.
+                time(&gpu, || unsafe { network.predict(points.address(), count, values.address()) })
+            });
+            let [few, many] = predicted;
+            let mut pool = training.ring(1 << 22)?;
+            // SAFETY: as above.
+            unsafe { training.append(&mut pool, &domain, points.address(), values.address(), 1 << 22, None)? };
+            let mut drawn = 0;
+            let trained = time(&gpu, || {
+                drawn += 1;
+                training.train_steps(&pool, None, &[step(COUNT, drawn * COUNT as u64, PACE.rate)]).map(|_| ())
+            })?;
+            let row = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, PACE, seconds, |network| {
+                Ok(psnr(&tested.predict(network)?, &truth))
+            })?;
+            let (megabytes, row) = row.trim_start_matches("| ").split_once(' ').unwrap_or_default();
+            println!(
+                "| {hidden_layers}x{width} | {megabytes} | {:.2} | {:.3} | {:.1} {row}",
+                few?,
+                (1 << 22) as f64 / many? * 1e-6,
+                COUNT as f64 / trained * 1e-3
+            );
+        }
+        println!();
+        Ok(())
+    }
+
+    pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
+        const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
+        let Known { gpu, tracer, domain, steps, seeds, tested, truth } = Known::new(field)?;
+        println!("<!-- block network-{name} -->");
         println!("Labels, traced with {steps} steps: {:.1} dB. Tables, by their nodes:\n", psnr(&seeds.found()?, &truth));
 
         let mut table = DeviceTable::trace(tracer.device(), &domain, SHAPE)?;
@@ -247,7 +330,7 @@ mod bench {
                 ("8x4, growth 1.8, T = 2^24", hash(8, 4, 1.8, 24, 64)),
                 ("4x4, growth 1.6, base 128, T = 2^24", NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }),
             ] {
-                let row = learn(&gpu, &domain, tracer.device(), base, traced, &settings, seconds, |network| {
+                let row = learn(&gpu, &domain, tracer.device(), base, traced, &settings, PACE, seconds, |network| {
                     Ok(psnr(&tested.predict(network)?, &truth))
                 })?;
                 println!("| {kind} | {name} {row}");
@@ -265,10 +348,10 @@ mod bench {
         base: Option<&DeviceTable>,
         before: f64,
         settings: &NetworkSettings,
+        pace: Pace,
         seconds: f64,
         measure: impl Fn(&dyn DevicePredict) -> Outcome<f64>,
     ) -> Outcome<String> {
-        const RATE: f64 = 1e-2;
         let shape = Architecture::new(settings, &[0, 1, 2], domain.extent())?;
         let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
         let model = Model::new(shape, 1, base.is_some());
@@ -302,11 +385,11 @@ mod bench {
                     // The mean runs over the last tenth of the steps.
                     let number = done + i + 1;
                     let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
-                    PlannedStep { average_share, ..step(BATCH, trained + (i * BATCH) as u64, RATE) }
+                    PlannedStep { average_share, ..step(pace.batch, trained + (i * pace.batch) as u64, pace.rate) }
                 })
                 .collect();
             training.train_steps(&ring, None, &steps)?;
-            trained += (STEPS * BATCH) as u64;
+            trained += (STEPS * pace.batch) as u64;
             clock += start.elapsed().as_secs_f64();
             if clock >= marks[0] {
                 marks.remove(0);

@@ -213,8 +213,8 @@ template <class Flow> RW_FN void give(const Flow& flow, const Path<typename Flow
                                       const float (&seed)[3], size_t at, const Outputs& out) {
     using R = typename Flow::R;
     constexpr int C = Flow::C;
-    // The share is rounded as on the CPU: steps times the rounded inverse.
-    double lived = double(R(path.steps) * R(1.0 / verdict.steps)), s = double(path.log_stretch);
+    // A quotient, as on the CPU: exactly 1 where all steps were lived.
+    double lived = double(R(path.steps) / R(verdict.steps)), s = double(path.log_stretch);
     if (verdict.zero_where_left && path.left) s = 0;
     else if (verdict.by_lived) s = lived > 0 ? s / lived : 0;
     out.log_stretch[at] = float(s);

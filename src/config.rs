@@ -13,7 +13,7 @@ use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
-use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
+use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};
 use crate::surrogate::{Kind, SurrogateSettings, network::NetworkSettings};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
@@ -33,7 +33,7 @@ pub struct SceneFile {
     pub source: SourceSettings,
     /// Which files, variables and metric, for `source.kind = "archive"`.
     #[serde(default)]
-    pub archive: NetCdfSettings,
+    pub archive: ArchiveSettings,
     /// Which simulation, for `source.kind = "live"`.
     #[serde(default)]
     pub live: LiveSettings,

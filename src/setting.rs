@@ -23,6 +23,12 @@ impl Refused {
         Self { key: key.into(), found: found.to_string(), accepted: accepted.into(), beside: Vec::new() }
     }
 
+    /// Names the data over which the value, perhaps a default, is not accepted.
+    pub fn over(mut self, data: &str) -> Self {
+        self.found = format!("{} over {data}", self.found);
+        self
+    }
+
     /// Names further keys that have their part in the fault.
     pub fn beside(mut self, keys: &[&str]) -> Self {
         self.beside.extend(keys.iter().map(|&key| key.to_owned()));

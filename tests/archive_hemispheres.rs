@@ -8,7 +8,7 @@ use ridgewatch::field::{EARTH_RADIUS, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
-use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource};
+use ridgewatch::source::{Archive, ArchiveSettings, Metric, SnapshotSource};
 use std::sync::Arc;
 use tempfile::tempdir;
 
@@ -39,7 +39,7 @@ fn file(path: &std::path::Path, latitudes: &[f64]) -> std::path::PathBuf {
         .write(path)
 }
 
-fn trace(archive: &mut NetCdfArchive, seeds: &[[f32; 3]]) -> Traced {
+fn trace(archive: &mut Archive, seeds: &[[f32; 3]]) -> Traced {
     let mut window = Window::new(HOURS * 3600.0);
     for index in 0..archive.times().len() {
         window.push(Arc::new(archive.read(index).unwrap())).unwrap();
@@ -63,7 +63,7 @@ fn trace(archive: &mut NetCdfArchive, seeds: &[[f32; 3]]) -> Traced {
 /// `pole` is the latitude of the pole inside; a file ends at it, or a cell beside it.
 fn around(pole: f64, latitudes: &[f64]) {
     let dir = tempdir().unwrap();
-    let mut archive = NetCdfArchive::open(&[file(&dir.path().join("winds.nc"), latitudes)], &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(&[file(&dir.path().join("winds.nc"), latitudes)], &ArchiveSettings::default()).unwrap();
     let grid = archive.grid().clone();
     assert_eq!((archive.metric(), grid.axes[0].period()), (Metric::Sphere, Some(360.0)));
     let end = if pole > 0.0 { grid.axes[1].last() } else { grid.axes[1].first() };

@@ -6,7 +6,7 @@ mod netcdf_fixture;
 use netcdf_fixture::grids::{Ocean, Wrf, eastward, ground, wind};
 use netcdf_fixture::*;
 use ridgewatch::field::{Geometry, Snapshot};
-use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, Staggering, inspect};
+use ridgewatch::source::{Archive, ArchiveSettings, Metric, SnapshotSource, Staggering, inspect};
 use std::path::Path;
 use tempfile::tempdir;
 
@@ -32,7 +32,7 @@ fn error(snapshot: &Snapshot, time: f64) -> (f64, usize) {
 fn components_come_from_their_own_faces() {
     let dir = tempdir().unwrap();
     let file = Wrf::default().fixture().write(&dir.path().join("wrfout_d01"));
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()).unwrap();
     assert_eq!(archive.metric(), Metric::Cartesian);
     let grid = archive.grid().clone();
     // Faces and centres, from the first centre to the last; full and half levels.
@@ -47,27 +47,27 @@ fn components_come_from_their_own_faces() {
         // The lowest corner of the grid lies in the ground where that has risen.
         assert!(snapshot.nodes[0][3] == 0.0 && snapshot.nodes[10][3].is_nan());
     }
-    let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), None).unwrap();
+    let inspection = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None).unwrap();
     let resampling = inspection.resampling.as_ref().unwrap();
     // Linear fields survive but for the lowest half cells, where winds are held: 0.004 / s over up to 250 m there, in few points.
     assert!(resampling.error > 0.0 && resampling.error < 1e-2 * resampling.velocity, "{resampling:?}");
     assert!(inspection.to_string().contains("resampling\n  error"));
     // The same times as minutes, and where there are no characters.
     let minutes = Wrf { characters: false, ..Wrf::default() }.fixture().write(&dir.path().join("minutes.nc"));
-    let other = NetCdfArchive::open(&[minutes], &NetCdfSettings::default()).unwrap();
+    let other = Archive::open(&[minutes], &ArchiveSettings::default()).unwrap();
     assert_eq!(other.times(), archive.times());
-    let settings = NetCdfSettings { time: Some("XTIME".into()), ..NetCdfSettings::default() };
-    assert_eq!(NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap().times(), archive.times());
+    let settings = ArchiveSettings { time: Some("XTIME".into()), ..ArchiveSettings::default() };
+    assert_eq!(Archive::open(std::slice::from_ref(&file), &settings).unwrap().times(), archive.times());
     // Centres only; and heights of one's own.
     let settings =
-        NetCdfSettings { staggering: Staggering::Centres, heights: Some(vec![600.0, 900.0, 1200.0]), ..NetCdfSettings::default() };
-    let mut coarse = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+        ArchiveSettings { staggering: Staggering::Centres, heights: Some(vec![600.0, 900.0, 1200.0]), ..ArchiveSettings::default() };
+    let mut coarse = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
     assert_eq!(coarse.grid().shape(), [6, 5, 3]);
     let (worst, known) = error(&coarse.read(1).unwrap(), 1.0);
     assert!(worst < 5e-5 && known == 90, "{worst} {known}");
     for (toml, piece) in [("metric = \"sphere\"", "cartesian"), ("level = 3.0", "heights"), ("heights = [2.0, 1.0]", "strictly ascending")]
     {
-        let message = NetCdfArchive::open(std::slice::from_ref(&file), &toml::from_str(toml).unwrap()).err().unwrap().to_string();
+        let message = Archive::open(std::slice::from_ref(&file), &toml::from_str(toml).unwrap()).err().unwrap().to_string();
         assert!(message.contains(piece), "{toml}: {message}");
     }
 }
@@ -77,7 +77,7 @@ fn files_of_one_wrf_domain_are_one_archive() {
     let dir = tempdir().unwrap();
     let first = Wrf::default().fixture().write(&dir.path().join("wrfout_d01_12"));
     let second = Wrf { hour: 18, ..Wrf::default() }.fixture().write(&dir.path().join("wrfout_d01_18"));
-    let mut archive = NetCdfArchive::open(&[second, first], &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(&[second, first], &ArchiveSettings::default()).unwrap();
     assert_eq!(archive.times().len(), 4);
     assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
     for time in 0..4 {
@@ -92,7 +92,7 @@ fn a_wrf_nest_that_moves_is_read_in_its_places() {
     let dir = tempdir().unwrap();
     let at = |name: &str, wrf: Wrf| wrf.fixture().write(&dir.path().join(name));
     let open = |files: &[&std::path::PathBuf]| {
-        NetCdfArchive::open(&files.iter().map(|f| f.to_path_buf()).collect::<Vec<_>>(), &NetCdfSettings::default())
+        Archive::open(&files.iter().map(|f| f.to_path_buf()).collect::<Vec<_>>(), &ArchiveSettings::default())
     };
     let first = at("first.nc", Wrf { east: [0.0, 2.0], ..Wrf::default() });
     let later = at("later.nc", Wrf { hour: 18, east: [3.0, -1.0], ..Wrf::default() });
@@ -131,7 +131,7 @@ fn a_wrf_nest_that_moves_is_read_in_its_places() {
 fn curvilinear_grids_are_resampled_and_say_how_well() {
     let dir = tempdir().unwrap();
     let file = Ocean::default().fixture().write(&dir.path().join("ocean.nc"));
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()).unwrap();
     let grid = archive.grid().clone();
     assert!(matches!(grid.geometry, Geometry::Sphere { .. }) && grid.dimensions() == 2);
     let snapshot = archive.read(0).unwrap();
@@ -151,11 +151,11 @@ fn curvilinear_grids_are_resampled_and_say_how_well() {
     assert!(snapshot.missing() > 0, "corners outside of the turned square, and the island");
     let notes = archive.describe().notes.join("\n");
     assert!(notes.contains("resampled bilinearly from 49 x 49 points") && notes.contains("resampling error"), "{notes}");
-    let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), None).unwrap();
+    let inspection = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None).unwrap();
     let resampling = inspection.resampling.unwrap();
     assert!(resampling.error > 0.0 && resampling.error < 1e-3 * resampling.velocity, "{resampling:?}");
-    let settings = NetCdfSettings { resolution: Some([1.0, 1.0]), ..NetCdfSettings::default() };
-    let coarse = NetCdfArchive::open(&[file], &settings).unwrap();
+    let settings = ArchiveSettings { resolution: Some([1.0, 1.0]), ..ArchiveSettings::default() };
+    let coarse = Archive::open(&[file], &settings).unwrap();
     assert!(coarse.grid().nodes() < grid.nodes() / 4);
 }
 
@@ -165,7 +165,7 @@ fn a_later_file_on_other_points_is_refused() {
     let first = Ocean::default().fixture().write(&dir.path().join("first.nc"));
     let later = Ocean { hour: 2.0, ..Ocean::default() }.fixture().write(&dir.path().join("later.nc"));
     let moved = Ocean { east: 30.0, hour: 2.0, ..Ocean::default() }.fixture().write(&dir.path().join("moved.nc"));
-    let open = |second: &Path| NetCdfArchive::open(&[first.clone(), second.to_owned()], &NetCdfSettings::default());
+    let open = |second: &Path| Archive::open(&[first.clone(), second.to_owned()], &ArchiveSettings::default());
     assert_eq!(open(&later).unwrap().times().len(), 4);
     let said = open(&moved).err().unwrap().to_string();
     assert!(said.contains("moved.nc") && said.contains("nav_lon") && said.contains("lie on one grid"), "{said}");
@@ -175,7 +175,7 @@ fn a_later_file_on_other_points_is_refused() {
 fn velocities_along_a_turned_grid_are_turned_back() {
     let dir = tempdir().unwrap();
     let file = Ocean { along_grid: true, ..Ocean::default() }.fixture().write(&dir.path().join("turned.nc"));
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()).unwrap();
     let snapshot = archive.read(1).unwrap();
     let grid = snapshot.grid.clone();
     let nx = grid.shape()[0];
@@ -189,8 +189,8 @@ fn velocities_along_a_turned_grid_are_turned_back() {
         known += 1;
     }
     assert!(known > 500);
-    let settings = NetCdfSettings { grid_relative: Some(false), ..NetCdfSettings::default() };
-    let mut plain = NetCdfArchive::open(&[file], &settings).unwrap();
+    let settings = ArchiveSettings { grid_relative: Some(false), ..ArchiveSettings::default() };
+    let mut plain = Archive::open(&[file], &settings).unwrap();
     let snapshot = plain.read(1).unwrap();
     let node = (0..grid.nodes()).find(|&i| !snapshot.nodes[i][3].is_nan()).unwrap();
     assert!(east_north(&snapshot, node)[1].abs() < 1e-6, "as set");

@@ -6,19 +6,19 @@ use ridgewatch::field::{EARTH_RADIUS, Geometry, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
-use ridgewatch::source::{GlobeTurbulence, Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, SyntheticSettings, SyntheticShape};
+use ridgewatch::source::{Archive, ArchiveSettings, GlobeTurbulence, Metric, SnapshotSource, SyntheticSettings, SyntheticShape};
 use std::path::Path;
 use std::sync::Arc;
 use tempfile::tempdir;
 
-fn settings(shape: SyntheticShape, nodes: [usize; 3], k_max: f64, folder: &Path) -> NetCdfSettings {
+fn settings(shape: SyntheticShape, nodes: [usize; 3], k_max: f64, folder: &Path) -> ArchiveSettings {
     let synthetic =
         SyntheticSettings { nodes, snapshots: 5, k_max, amplitude: 6.0, folder: folder.to_path_buf(), ..SyntheticSettings::new(shape) };
-    NetCdfSettings { synthetic: Some(synthetic), ..NetCdfSettings::default() }
+    ArchiveSettings { synthetic: Some(synthetic), ..ArchiveSettings::default() }
 }
 
 /// The whole archive as a window.
-fn window(archive: &mut NetCdfArchive) -> Arc<Window> {
+fn window(archive: &mut Archive) -> Arc<Window> {
     let times = archive.times().to_vec();
     let mut window = Window::new(times[times.len() - 1] - times[0]);
     for index in 0..times.len() {
@@ -108,7 +108,7 @@ fn cells_of_flame_and_ecmwf_give_the_analytic_ftle() {
         let mut settings = settings(shape, nodes, 5.0, dir.path());
         settings.metric = Some(metric);
         settings.periodic = (metric == Metric::Index).then(|| "none".into());
-        let mut archive = NetCdfArchive::open(&[], &settings).unwrap();
+        let mut archive = Archive::open(&[], &settings).unwrap();
         assert_eq!((archive.grid().shape(), archive.times().len(), archive.grid().axes[0].period()), (nodes, 5, None));
         assert_eq!(archive.times(), [0.0, 1.0, 2.0, 3.0, 4.0]);
         found.push(trace(&window(&mut archive), &seeds).log_stretch_f64);
@@ -173,7 +173,7 @@ fn metres_over_a_globe_give_the_analytic_ftle() {
     let nodes = [180, 91, 37];
     let mut settings = settings(SyntheticShape::Globe, nodes, 4.0, dir.path());
     settings.metric = Some(Metric::Sphere);
-    let mut archive = NetCdfArchive::open(&[], &settings).unwrap();
+    let mut archive = Archive::open(&[], &settings).unwrap();
     let grid = archive.grid().clone();
     assert!(matches!(grid.geometry, Geometry::Sphere { .. }) && grid.axes[0].period() == Some(360.0));
     // 1000 hPa to 1 hPa at H = 7 km.
@@ -199,13 +199,13 @@ fn metres_over_a_globe_give_the_analytic_ftle() {
 fn an_archive_is_written_once() {
     let dir = tempdir().unwrap();
     let settings = settings(SyntheticShape::Flame, [8, 8, 8], 4.0, dir.path());
-    let first = NetCdfArchive::open(&[], &settings).unwrap().files().map(Path::to_path_buf).collect::<Vec<_>>();
+    let first = Archive::open(&[], &settings).unwrap().files().map(Path::to_path_buf).collect::<Vec<_>>();
     assert_eq!(first.len(), 5);
     let written = std::fs::metadata(&first[0]).unwrap().modified().unwrap();
-    NetCdfArchive::open(&[], &settings).unwrap();
+    Archive::open(&[], &settings).unwrap();
     assert_eq!(std::fs::metadata(&first[0]).unwrap().modified().unwrap(), written);
     assert_eq!(std::fs::read_dir(dir.path()).unwrap().count(), 1, "nothing unfinished is left");
     let mut wrong = settings;
     wrong.synthetic.as_mut().unwrap().nodes = [2, 8, 8];
-    assert!(NetCdfArchive::open(&[], &wrong).err().unwrap().to_string().contains("synthetic.nodes"));
+    assert!(Archive::open(&[], &wrong).err().unwrap().to_string().contains("synthetic.nodes"));
 }

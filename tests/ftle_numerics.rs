@@ -84,6 +84,19 @@ fn shear_stretch(rate: f64, tau: f64) -> f64 {
 }
 
 #[test]
+fn who_lives_all_steps_lives_the_whole_of_tau() {
+    // In f32 41 * (1 / 41) is 0.99999994, as with one number of steps in eight.
+    let (source, domain) = double_gyre();
+    let seeds = lattice(&domain, [4, 4, 1]);
+    for steps in [11, 41, 47, 55, 194] {
+        for precision in [Precision::F32, Precision::F64] {
+            let out = run(&source, &map(1.0, steps, precision), 0.0, &seeds);
+            assert!(out.lived.iter().all(|&lived| lived == 1.0), "{steps} steps, {precision:?}: {:?}", out.lived);
+        }
+    }
+}
+
+#[test]
 fn linear_flows_equal_their_closed_forms() {
     let seeds = lattice(&square(), [9, 7, 1]);
     for direction in [Direction::Forward, Direction::Backward] {

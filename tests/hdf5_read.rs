@@ -3,7 +3,7 @@
 
 use hdf5_metno::File;
 use ndarray::{Array, ArrayD, IxDyn};
-use ridgewatch::source::{Metric, NetCdfArchive, NetCdfSettings, SnapshotSource};
+use ridgewatch::source::{Archive, ArchiveSettings, Metric, SnapshotSource};
 use std::path::{Path, PathBuf};
 use tempfile::tempdir;
 
@@ -43,9 +43,9 @@ fn coordinates(file: &File, names: [&str; 3]) {
     }
 }
 
-fn check(paths: &[PathBuf], settings: &str, times: &[f64]) -> NetCdfArchive {
-    let settings: NetCdfSettings = toml::from_str(settings).unwrap();
-    let mut archive = NetCdfArchive::open(paths, &settings).unwrap();
+fn check(paths: &[PathBuf], settings: &str, times: &[f64]) -> Archive {
+    let settings: ArchiveSettings = toml::from_str(settings).unwrap();
+    let mut archive = Archive::open(paths, &settings).unwrap();
     assert_eq!((archive.grid().shape(), archive.times()), (N, times), "{settings:?}");
     for t in 0..times.len() {
         let snapshot = archive.read(t).unwrap();
@@ -58,8 +58,8 @@ fn check(paths: &[PathBuf], settings: &str, times: &[f64]) -> NetCdfArchive {
 }
 
 fn refused(path: &Path, settings: &str, pieces: &[&str]) {
-    let settings: NetCdfSettings = toml::from_str(settings).unwrap();
-    let message = NetCdfArchive::open(&[path.to_path_buf()], &settings).err().unwrap().to_string();
+    let settings: ArchiveSettings = toml::from_str(settings).unwrap();
+    let message = Archive::open(&[path.to_path_buf()], &settings).err().unwrap().to_string();
     for piece in pieces {
         assert!(message.contains(piece), "`{piece}` is missing in: {message}");
     }

@@ -5,7 +5,7 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
-use ridgewatch::engine::cuda::network_defines;
+use ridgewatch::engine::cuda::{is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, NetworkSettings};
 
 /// Macros in which the gridded kernel is compiled here.
@@ -29,16 +29,19 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
 }
 
 /// Encodings, widths and depths: what fills the registers, and what has no second feature or no tables.
-fn networks() -> Vec<Vec<String>> {
+fn networks(which: impl Fn(&Architecture) -> bool) -> Vec<Vec<String>> {
     let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
     let settings = [
         (usual.clone(), &[0, 1, 2][..]),
         (NetworkSettings { width: 128, features: 4, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { levels: 5, features: 1, width: 21, hidden_layers: 1, ..usual.clone() }, &[1]),
         (NetworkSettings { levels: 16, features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
-        (NetworkSettings { encoding: Encoding::Frequency, ..usual }, &[0, 1, 2]),
+        (NetworkSettings { encoding: Encoding::Frequency, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { encoding: Encoding::Frequency, width: 512, hidden_layers: 16, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { width: 200, hidden_layers: 5, ..usual }, &[0, 1]),
     ];
-    settings.iter().map(|(settings, axes)| network_defines(&Architecture::new(settings, axes, [1.0; 3]).unwrap()).unwrap()).collect()
+    let shapes = settings.iter().map(|(settings, axes)| Architecture::new(settings, axes, [1.0; 3]).unwrap());
+    shapes.filter(which).map(|shape| network_defines(&shape).unwrap()).collect()
 }
 
 fn variants(source: &str) -> Vec<Vec<String>> {
@@ -63,7 +66,9 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
-        "network.cu" => networks(),
+        "network.cu" => networks(|_| true),
+        "network_fused.cu" => networks(is_fused),
+        "network_batched.cu" => networks(|shape| !is_fused(shape)),
         _ => vec![Vec::new()],
     }
 }

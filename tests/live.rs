@@ -4,18 +4,25 @@
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output, Stdio};
+use std::sync::{Mutex, MutexGuard};
 use std::time::{Duration, Instant};
+
+/// Each test starts several processes with threads of their own: one test at a time, so that they keep to their times on few cores.
+static ALONE: Mutex<()> = Mutex::new(());
 
 /// Folders of one test: one for files, one for the ring.
 struct Place {
     files: PathBuf,
     ring: PathBuf,
+    _alone: MutexGuard<'static, ()>,
 }
 
 impl Place {
     fn new(name: &str) -> Self {
         let name = format!("rw-attach-{name}-{}", std::process::id());
-        let place = Self { files: std::env::temp_dir().join(&name), ring: PathBuf::from("/dev/shm").join(&name) };
+        // A test that failed has left nothing behind that would hurt the next.
+        let alone = ALONE.lock().unwrap_or_else(|broken| broken.into_inner());
+        let place = Self { files: std::env::temp_dir().join(&name), ring: PathBuf::from("/dev/shm").join(&name), _alone: alone };
         let _ = std::fs::remove_dir_all(&place.files);
         let _ = std::fs::remove_dir_all(&place.ring);
         std::fs::create_dir_all(&place.files).unwrap();
@@ -176,6 +183,93 @@ fn a_killed_simulation_and_a_killed_sidecar_are_survived() {
     assert!(!place.ring.exists(), "{:?}", std::fs::read_dir(&place.ring).map(|d| d.flatten().map(|e| e.path()).collect::<Vec<_>>()));
 }
 
+/// Through a relay or not: the simulation is killed, and comes back in fewer blocks.
+#[test]
+fn frames_resume_when_the_simulation_comes_back_in_other_blocks() {
+    for relayed in [false, true] {
+        let place = Place::new(if relayed { "blocks-relay" } else { "blocks-ring" });
+        let (run, connection, ring) = (place.files.join("run"), place.files.join("connection"), text(&place.ring).to_owned());
+        let (archive, live) = (place.archive(), place.live());
+        let _relay = relayed.then(|| start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)])));
+        let way = if relayed { text(&connection) } else { ring.as_str() };
+        if relayed {
+            until("the connection file", || connection.exists());
+        }
+        let incomplete = ["--set", "live.incomplete_seconds=0.5"];
+        let _sidecar = start(ridgewatch(&["attach", text(&live), way, "--out", text(&run)]).args(incomplete));
+        for (restarts, blocks) in ["2x2x1", "1x2x1", "1x1x1"].into_iter().enumerate() {
+            let publish = ["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000", "--blocks", blocks];
+            let solver = start(&mut ridgewatch(&publish));
+            let before = records(&run).len();
+            let resumed = |r: &serde_json::Value| r["live"]["restarts"] == restarts;
+            until("frames of this start", || records(&run).iter().skip(before).filter(|r| resumed(r)).count() >= 3);
+            // Dropping kills: SIGKILL.
+            drop(solver);
+        }
+    }
+}
+
+/// The nice values of a process's threads.
+fn niceness(process: u32) -> Vec<i32> {
+    let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
+    let stat = |task: std::io::Result<std::fs::DirEntry>| std::fs::read_to_string(task.ok()?.path().join("stat")).ok();
+    // Behind the name, which is in parentheses, from the third field on: nice is the 19th.
+    let nice = |stat: String| stat.rsplit_once(") ")?.1.split(' ').nth(16)?.parse().ok();
+    tasks.filter_map(stat).filter_map(nice).collect()
+}
+
+#[test]
+fn all_threads_step_back_for_the_simulation() {
+    let place = Place::new("nice");
+    let (archive, live, ring) = (place.archive(), place.live(), text(&place.ring).to_owned());
+    let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
+    // SAFETY: asks for this process's own.
+    let own = unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) };
+    for (name, arguments, expected) in [("default", &[][..], 10), ("asked", &["--nice", "17"], 17), ("none", &["--nice", "0"], own)] {
+        let run = place.files.join(name);
+        let sidecar = start(ridgewatch(&["attach", text(&live), &ring, "--out", text(&run)]).args(arguments));
+        until("the first frame", || !records(&run).is_empty());
+        let found = niceness(sidecar.0.id());
+        // Those that read, convert, write and make frames.
+        assert!(found.len() > 4 && found.iter().all(|nice| *nice == expected.max(own)), "{name}: {found:?}");
+    }
+}
+
+#[test]
+fn every_step_is_taken_through_a_relay() {
+    let place = Place::new("every");
+    let (run, connection, ring) = (place.files.join("run"), place.files.join("connection"), text(&place.ring).to_owned());
+    let (archive, live) = (place.archive(), place.live());
+    let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)]));
+    until("the connection file", || connection.exists());
+    let every = ["--once", "--set", "live.follow=every"];
+    let attach = start(ridgewatch(&["attach", text(&live), text(&connection), "--out", text(&run)]).args(every));
+    good(&ridgewatch(&["publish", text(&archive), "--ring", &ring, "--wait", "60000", "--blocks", "2x1x1"]).output().unwrap());
+    good(&wait(attach, Duration::from_secs(60)));
+    let records = records(&run);
+    assert_eq!(records.len(), 4);
+    for (n, record) in (4..).zip(&records) {
+        assert_eq!((&record["live"]["step"], &record["live"]["missed"]), (&n.into(), &0.into()), "{record}");
+    }
+    drop(relay);
+}
+
+#[test]
+fn a_run_that_ends_with_its_simulation_ends_with_its_relay_too() {
+    let place = Place::new("once");
+    let (run, connection, ring) = (place.files.join("run"), place.files.join("connection"), text(&place.ring).to_owned());
+    let (archive, live) = (place.archive(), place.live());
+    let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)]));
+    until("the connection file", || connection.exists());
+    let once = ["--once", "--set", "live.relay_seconds=1"];
+    let attach = start(ridgewatch(&["attach", text(&live), text(&connection), "--out", text(&run)]).args(once));
+    let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
+    until("the first frame", || !records(&run).is_empty());
+    // Dropping kills: SIGKILL. The simulation goes on, and nobody can tell.
+    drop(relay);
+    good(&wait(attach, Duration::from_secs(20)));
+}
+
 #[test]
 fn a_relay_ships_the_ring_to_another_node() {
     let place = Place::new("relay");
@@ -204,10 +298,11 @@ fn a_frame_goes_out_before_the_rest_of_its_training() {
     let place = Place::new("training");
     let (run, ring) = (place.files.join("run"), text(&place.ring));
     let (archive, live) = (place.archive(), place.live());
-    // Half a minute a frame, were it waited for: there are four.
-    let scene = ["live.follow=every", "training.seconds_per_frame=30", "surrogate.kind=network"];
+    // Half a minute a frame, were it waited for: there are four. Small steps, of which one is done in any case.
+    let scene = ["live.follow=every", "training.seconds_per_frame=30", "network.batch=1024", "surrogate.kind=network"];
     let overrides = scene.iter().flat_map(|one| ["--set", one]);
-    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run)];
+    // What is trained until the next step is there hangs on the cores it gets.
+    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run), "--nice", "0"];
     let attach = start(ridgewatch(&attach).args(overrides));
     until("the ring's folder", || place.ring.join("followers.lock").exists());
     good(&ridgewatch(&["publish", text(&archive), "--ring", ring, "--wait", "60000"]).output().unwrap());
@@ -231,17 +326,18 @@ fn weights_outlive_the_sidecar() {
     let (checkpoint, ring) = (place.files.join("weights"), text(&place.ring).to_owned());
     let (archive, live) = (place.archive(), place.live());
     let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "20", "--steps", "100000"]));
-    let attach = |name: &str, training: &str| {
+    let attach = |name: &str, seconds: &str, training: &str| {
         let run = place.files.join(name);
-        let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", "2", "--checkpoint", text(&checkpoint)];
-        let more = ["--method", "gated", "--set", training, "--set", "surrogate.kind=network"];
+        let arguments = ["attach", text(&live), &ring, "--out", text(&run), "--seconds", seconds, "--checkpoint", text(&checkpoint)];
+        let more =
+            ["--method", "gated", "--set", training, "--set", "network.batch=1024", "--set", "surrogate.kind=network", "--nice", "0"];
         ridgewatch(&arguments).args(more).output().unwrap()
     };
-    let first = attach("first", "training.seconds_per_frame=0.1");
+    let first = attach("first", "4", "training.seconds_per_frame=0.2");
     good(&first);
     assert!(checkpoint.exists() && !String::from_utf8_lossy(&first.stderr).contains("going on from"));
     let before = trained_steps(&checkpoint);
-    let second = attach("second", "training.steps_per_frame=1");
+    let second = attach("second", "1", "training.steps_per_frame=1");
     good(&second);
     assert!(String::from_utf8_lossy(&second.stderr).contains("going on from the weights in"));
     // A step a frame, and one of a frame that the end may have cut off: without the first's weights it would have got no further.

@@ -89,6 +89,10 @@ fn the_window_fills_and_moves_with_the_simulation() {
     publish(&solver, 4, 2.0, 1.0);
     let (taken, warnings) = take(&window, |_| true);
     assert_eq!((taken.live.step, newest(&taken), taken.live.snapshots, taken.live.steps, taken.live.missed), (4, 2.0, 5, 5, 0));
+    // A quarter of tau a step.
+    let filling = &taken.live.filling;
+    assert!(filling.len() == 10 && filling.is_sorted() && filling[0] == filling[1] && filling[5] == filling[6], "{filling:?}");
+    assert!(filling[9] - filling[6] >= 0.05, "{filling:?}: the last quarter was late");
     assert!(taken.live.delay <= taken.live.age && taken.live.age < 5.0 && warnings.is_empty(), "{warnings:?}");
     assert!(window.next_within(Duration::from_millis(20)).is_err(), "nothing new");
     publish(&solver, 5, 2.5, 3.0);
@@ -164,7 +168,7 @@ fn a_simulation_that_ends_and_starts_anew_is_gone_on_with() {
     (0..3).for_each(|n| publish(&solver, n, n as f64, 2.0));
     let (taken, warnings) = take(&window, |taken| newest(taken) == 2.0);
     assert!(has(&warnings, "went back from time 3.5 to 0"), "{warnings:?}");
-    assert_eq!((taken.window.oldest(), taken.live.restarts), (Some(0.0), 2));
+    assert_eq!((taken.window.oldest(), taken.live.restarts, taken.live.filling.len()), (Some(0.0), 2, 10));
     assert!(taken.window.snapshots().all(|s| s.nodes[0][0] == 2.0), "nothing of the run before");
 }
 
@@ -184,37 +188,47 @@ fn another_grid_in_mid_run_is_refused_and_the_old_one_taken_again() {
     let solver = producer(&folder, plane(8));
     publish(&solver, 5, 5.0, 1.0);
     let (_, warnings) = take(&window, |taken| newest(taken) == 5.0);
-    assert!(has(&warnings, "another grid, or other blocks, need a run of their own"), "{warnings:?}");
+    assert!(has(&warnings, "another grid needs a run of its own"), "{warnings:?}");
 }
 
 #[test]
-fn other_blocks_of_the_same_grid_are_refused_and_the_old_ones_taken_again() {
-    let block = |index, count, offset, extent| Description { block: BlockExtent { index, count, offset, extent }, ..plane(8) };
-    let columns = |count: u32| -> Vec<_> {
-        let width = 8 / u64::from(count);
-        (0..count).map(|k| block(k, count, [width * u64::from(k), 0, 0], [width, 8, 1])).collect()
-    };
-    let rows = [block(0, 2, [0, 0, 0], [8, 4, 1]), block(1, 2, [0, 4, 0], [8, 4, 1])];
-    for (name, others, told) in [("rows", rows.to_vec(), "overlaps block"), ("count", columns(4), "number of blocks")] {
+fn a_simulation_in_other_blocks_of_the_same_grid_is_gone_on_with() {
+    let block =
+        |start, index, count, offset, extent| Description { start, block: BlockExtent { index, count, offset, extent }, ..plane(8) };
+    // With numbers of their starts and without: four columns, two rows, two columns, one block.
+    for (name, starts) in [("told", [1, 2, 3, 4]), ("untold", [0; 4])] {
+        let rounds: [Vec<Description>; 4] = [
+            (0..4).map(|k| block(starts[0], k, 4, [2 * u64::from(k), 0, 0], [2, 8, 1])).collect(),
+            (0..2).map(|k| block(starts[1], k, 2, [0, 4 * u64::from(k), 0], [8, 4, 1])).collect(),
+            (0..2).map(|k| block(starts[2], k, 2, [4 * u64::from(k), 0, 0], [4, 8, 1])).collect(),
+            vec![block(starts[3], 0, 1, [0, 0, 0], [8, 8, 1])],
+        ];
         let folder = Folder::new(name);
-        let start = |blocks: Vec<Description>, first: u64| -> Vec<_> {
+        let mut window = None;
+        for (round, blocks) in (0u64..).zip(rounds) {
+            let value = round as f32 + 1.0;
             let solvers: Vec<_> = blocks.into_iter().map(|block| producer(&folder, block)).collect();
-            for n in first..first + 2 {
-                solvers.iter().for_each(|solver| publish(solver, n, n as f64, 1.0));
+            // Times go on from the step before the last whole one, as from a checkpoint; numbers begin anew.
+            let times: Vec<f64> = (0..4).map(|n| (2 * round + n) as f64).collect();
+            for (n, time) in (0..).zip(&times) {
+                solvers.iter().for_each(|solver| publish(solver, n, *time, value));
             }
-            solvers
-        };
-        let solvers = start(columns(2), 0);
-        let window = follow(&settings(&folder), 1.0);
-        take(&window, |taken| newest(taken) == 1.0);
-        drop(solvers);
-        let others = start(others, 2);
-        std::thread::sleep(Duration::from_millis(300));
-        assert!(window.next_within(Duration::from_millis(50)).is_err(), "{name}");
-        drop(others);
-        let _solvers = start(columns(2), 4);
-        let (_, warnings) = take(&window, |taken| newest(taken) == 5.0);
-        assert!(has(&warnings, told) && has(&warnings, "or other blocks, need a run of their own"), "{name}: {warnings:?}");
+            let window = window.get_or_insert_with(|| follow(&settings(&folder), 1.0));
+            let (taken, warnings) = take(window, |taken| newest(taken) == times[3] && taken.live.restarts == round);
+            assert!(taken.window.snapshots().last().unwrap().nodes.iter().all(|node| node[0] == value), "{name}, round {round}");
+            assert_eq!(has(&warnings, "started anew"), round > 0, "{name}, round {round}: {warnings:?}");
+            assert_eq!(taken.live.incomplete, round, "{name}, round {round}: {warnings:?}");
+            // It ends before the last block of its next step is there.
+            for solver in solvers.iter().skip(1) {
+                publish(solver, 4, times[3] + 1.0, value);
+            }
+        }
+        // The last step of those in several blocks expired, or was given up with its start.
+        let solver = producer(&folder, block(9, 0, 1, [0, 0, 0], [8, 8, 1]));
+        publish(&solver, 0, 20.0, 1.0);
+        publish(&solver, 1, 21.0, 1.0);
+        let (taken, _) = take(window.as_ref().unwrap(), |taken| newest(taken) == 21.0);
+        assert_eq!((taken.live.incomplete, taken.live.restarts), (3, 4), "{name}");
     }
 }
 

@@ -8,7 +8,7 @@ mod netcdf_fixture;
 use netcdf_fixture::grids::{Ocean, Wrf, packed_levels};
 use netcdf_fixture::mutants::{mutant, used};
 use netcdf_fixture::*;
-use ridgewatch::source::{NetCdfArchive, NetCdfSettings, SnapshotSource, inspect};
+use ridgewatch::source::{Archive, ArchiveSettings, SnapshotSource, inspect};
 use std::time::{Duration, Instant};
 
 #[test]
@@ -44,7 +44,7 @@ fn mutated_files_are_answered() {
     let share = count.div_ceil(cases.len() as u64);
     for (name, fixture) in cases {
         let whole = std::fs::read(fixture.write(&file)).unwrap();
-        assert!(NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()).is_ok());
+        assert!(Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()).is_ok());
         let used = used(&whole);
         let (mut read, mut refused) = (0, 0);
         for _ in 0..share {
@@ -53,7 +53,7 @@ fn mutated_files_are_answered() {
             std::fs::remove_file(&file).unwrap();
             std::fs::write(&file, &bytes).unwrap();
             let begin = Instant::now();
-            match NetCdfArchive::open(std::slice::from_ref(&file), &NetCdfSettings::default()) {
+            match Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()) {
                 Ok(mut archive) => {
                     read += 1;
                     assert!(archive.times().len() <= whole.len(), "bounded by the file: {name}");
@@ -69,7 +69,7 @@ fn mutated_files_are_answered() {
                     assert!(!error.to_string().is_empty());
                 }
             }
-            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), None) {
+            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None) {
                 assert!(inspection.to_string().contains("mutant.nc"));
             }
             // A millisecond's work; the machine may be busy.

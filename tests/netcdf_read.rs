@@ -6,12 +6,12 @@ mod netcdf_fixture;
 use netcdf_fixture::grids::{packed_levels, packed_wind};
 use netcdf_fixture::*;
 use ridgewatch::field::{EARTH_RADIUS, Geometry};
-use ridgewatch::source::{FileOrder, Metric, NetCdfArchive, NetCdfSettings, SnapshotSource, VelocityUnit, inspect, read_ahead};
+use ridgewatch::source::{Archive, ArchiveSettings, FileOrder, Metric, SnapshotSource, VelocityUnit, inspect, read_ahead};
 use std::path::PathBuf;
 use tempfile::tempdir;
 
-fn open(paths: &[PathBuf]) -> NetCdfArchive {
-    NetCdfArchive::open(paths, &NetCdfSettings::default()).unwrap()
+fn open(paths: &[PathBuf]) -> Archive {
+    Archive::open(paths, &ArchiveSettings::default()).unwrap()
 }
 
 #[test]
@@ -105,8 +105,8 @@ fn files_are_ordered_by_time_not_by_name() {
         let gaps = archive.gaps();
         assert_eq!(gaps.len(), 1);
         assert_eq!((gaps[0].missing, gaps[0].after), (1, archive.times()[1]));
-        let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
-        let indexed = NetCdfArchive::open(&[dir.path().join("*.nc")], &settings).unwrap();
+        let settings = ArchiveSettings { metric: Some(Metric::Index), ..ArchiveSettings::default() };
+        let indexed = Archive::open(&[dir.path().join("*.nc")], &settings).unwrap();
         assert_eq!(indexed.gaps(), gaps, "in snapshots every interval is one");
         let said = archive.describe().notes.join("\n");
         assert!(said.contains("between 2000-01-02T00:00:00Z and 2000-01-04T00:00:00Z"), "{said}");
@@ -146,8 +146,8 @@ fn descending_latitude_and_global_longitude() {
         assert!((east - lat - lon / 1000.0).abs() < 2e-5 && (north + lat).abs() < 2e-5, "node {i}: {east} {north}");
     }
     // A region over the seam.
-    let settings = NetCdfSettings { region: Some([-40.0, 40.0, -40.0, 10.0]), ..NetCdfSettings::default() };
-    let mut part = NetCdfArchive::open(&[file], &settings).unwrap();
+    let settings = ArchiveSettings { region: Some([-40.0, 40.0, -40.0, 10.0]), ..ArchiveSettings::default() };
+    let mut part = Archive::open(&[file], &settings).unwrap();
     assert_eq!(part.grid().axes[0].coordinates(), [-30.0, 0.0, 30.0]);
     assert_eq!(part.grid().axes[1].coordinates(), [-30.0, 0.0]);
     let snapshot = part.read(0).unwrap();
@@ -197,12 +197,12 @@ fn dimensions_in_odd_order() {
             assert!((f64::from(node[2]) / upward - 1.0).abs() < 2e-7, "node {i}: {} {upward}", node[2]);
         }
         // One level makes it two-dimensional.
-        let settings = NetCdfSettings { level: Some(500.0), ..NetCdfSettings::default() };
-        let mut flat = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+        let settings = ArchiveSettings { level: Some(500.0), ..ArchiveSettings::default() };
+        let mut flat = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
         assert_eq!(flat.grid().dimensions(), 2);
         assert_eq!(flat.read(0).unwrap().nodes[0][..3], [1040.0, 1040.0, 0.0]);
-        let settings = NetCdfSettings { level: Some(501.0), ..settings };
-        let message = NetCdfArchive::open(&[file], &settings).err().unwrap().to_string();
+        let settings = ArchiveSettings { level: Some(501.0), ..settings };
+        let message = Archive::open(&[file], &settings).err().unwrap().to_string();
         assert!(message.contains("1000, 500, 100 hPa"), "{message}");
     }
 }
@@ -221,8 +221,8 @@ fn index_metric_counts_cells_and_snapshots() {
         .variable("v", &["time", "lat", "lon"], constant(5.0))
         .with("units", "m/s");
     let file = fixture.write(&dir.path().join("index.nc"));
-    let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    let settings = ArchiveSettings { metric: Some(Metric::Index), ..ArchiveSettings::default() };
+    let mut archive = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
     assert_eq!(archive.times(), [0.0, 1.0]);
     assert_eq!(archive.date(0.5).as_deref(), Some("2000-01-01T03:00:00Z"));
     assert_eq!(archive.grid().axes[1].coordinates(), [0.0, 1.0, 2.0, 3.0]);
@@ -237,8 +237,8 @@ fn index_metric_counts_cells_and_snapshots() {
         // One rounding to f32 before the product and one after.
         assert!((f64::from(node[0]) / u - 1.0).abs() < 3e-7 && (f64::from(node[1]) / v - 1.0).abs() < 3e-7, "row {y}: {node:?}");
     }
-    let settings = NetCdfSettings { velocity_unit: VelocityUnit::Cells, ..NetCdfSettings::default() };
-    let mut cells = NetCdfArchive::open(&[file], &settings).unwrap();
+    let settings = ArchiveSettings { velocity_unit: VelocityUnit::Cells, ..ArchiveSettings::default() };
+    let mut cells = Archive::open(&[file], &settings).unwrap();
     assert_eq!(cells.read(1).unwrap().nodes[7][..2], [10.0, 5.0]);
 }
 
@@ -285,34 +285,34 @@ fn pressure_levels_on_the_sphere_become_heights() {
         assert!(snapshot.nodes[..4].iter().all(|n| n[..3].iter().all(|v| v.abs() < 1e-6)));
     }
     let file = levels("hPa", &[1000.0, 500.0]).write(&dir.path().join("scaled.nc"));
-    let settings = NetCdfSettings { vertical_scale: Some(100.0), ..NetCdfSettings::default() };
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    let settings = ArchiveSettings { vertical_scale: Some(100.0), ..ArchiveSettings::default() };
+    let mut archive = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
     assert!((archive.grid().axes[2].last() - 100.0 * height(500.0)).abs() < 1e-6);
     assert!((f64::from(archive.read(0).unwrap().nodes[4][3]) / (-7000.0 * 2.0 / 1e5 * 100.0) - 1.0).abs() < 1e-6);
     assert!(archive.describe().notes.iter().any(|n| n.contains("`vertical_scale`")));
     // One level makes it two-dimensional.
-    let settings = NetCdfSettings { level: Some(500.0), ..NetCdfSettings::default() };
-    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().grid().dimensions(), 2);
+    let settings = ArchiveSettings { level: Some(500.0), ..ArchiveSettings::default() };
+    assert_eq!(Archive::open(&[file], &settings).unwrap().grid().dimensions(), 2);
 }
 
 #[test]
 fn the_index_metric_of_levels() {
     let dir = tempdir().unwrap();
     let file = levels("hPa", &[100.0, 500.0, 1000.0]).write(&dir.path().join("levels.nc"));
-    let settings = NetCdfSettings { metric: Some(Metric::Index), ..NetCdfSettings::default() };
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+    let settings = ArchiveSettings { metric: Some(Metric::Index), ..ArchiveSettings::default() };
+    let mut archive = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
     assert_eq!((archive.grid().axes[0].period(), archive.grid().shape()), (Some(4.0), [4, 3, 3]));
     // 2 Pa/s for an hour, in cells of 400, 450 and 500 hPa.
     let w: Vec<f32> = archive.read(0).unwrap().nodes.iter().step_by(12).map(|n| n[2]).collect();
     assert_eq!(w, [7200.0 / 40_000.0, 7200.0 / 45_000.0, 7200.0 / 50_000.0]);
-    let settings = NetCdfSettings { periodic: Some("none".into()), ..settings };
-    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().grid().axes[0].period(), None);
+    let settings = ArchiveSettings { periodic: Some("none".into()), ..settings };
+    assert_eq!(Archive::open(&[file], &settings).unwrap().grid().axes[0].period(), None);
     // Levels without a unit have no height.
     let bare = levels("level", &[1.0, 2.0, 3.0]).write(&dir.path().join("bare.nc"));
-    let settings = NetCdfSettings { w: Some("none".into()), ..NetCdfSettings::default() };
-    assert_eq!(NetCdfArchive::open(std::slice::from_ref(&bare), &settings).unwrap().metric(), Metric::Index);
-    let settings = NetCdfSettings { metric: Some(Metric::Sphere), ..settings };
-    let message = NetCdfArchive::open(&[bare], &settings).err().unwrap().to_string();
+    let settings = ArchiveSettings { w: Some("none".into()), ..ArchiveSettings::default() };
+    assert_eq!(Archive::open(std::slice::from_ref(&bare), &settings).unwrap().metric(), Metric::Index);
+    let settings = ArchiveSettings { metric: Some(Metric::Sphere), ..settings };
+    let message = Archive::open(&[bare], &settings).err().unwrap().to_string();
     assert!(message.contains("level = ..."), "{message}");
 }
 
@@ -345,24 +345,24 @@ fn settings_outweigh_conventions() {
         .with("units", "minutes");
     let file = fixture.write(&dir.path().join("named.nc"));
     let settings =
-        NetCdfSettings { u: Some("fast".into()), time: Some("runtime".into()), slab: Some([1.0, 2.0]), ..NetCdfSettings::default() };
-    let mut archive = NetCdfArchive::open(std::slice::from_ref(&file), &settings).unwrap();
+        ArchiveSettings { u: Some("fast".into()), time: Some("runtime".into()), slab: Some([1.0, 2.0]), ..ArchiveSettings::default() };
+    let mut archive = Archive::open(std::slice::from_ref(&file), &settings).unwrap();
     assert_eq!(archive.times(), [600.0, 1200.0]);
     assert_eq!(archive.grid().slab, (1.0, 2.0));
     assert_eq!(archive.read(0).unwrap().nodes[0][0], (7.0 / 3.6) as f32);
     assert!(archive.describe().variables[0].contains("named by the setting"));
-    let settings = NetCdfSettings { u: Some("fats".into()), ..NetCdfSettings::default() };
-    let message = NetCdfArchive::open(&[file], &settings).err().unwrap().to_string();
+    let settings = ArchiveSettings { u: Some("fats".into()), ..ArchiveSettings::default() };
+    let message = Archive::open(&[file], &settings).err().unwrap().to_string();
     assert!(message.contains("`u = \"fats\"`") && message.contains("is `fast` meant?"), "{message}");
 }
 
 #[test]
 fn settings_are_read_from_toml() {
-    let settings: NetCdfSettings =
+    let settings: ArchiveSettings =
         toml::from_str("files = \"a/*.nc\"\nmetric = \"index\"\nvelocity_unit = \"cells\"\nregion = [0, 1, 2, 3.5]").unwrap();
     assert_eq!(settings.files, [PathBuf::from("a/*.nc")]);
     assert_eq!((settings.metric, settings.region), (Some(Metric::Index), Some([0.0, 1.0, 2.0, 3.5])));
-    assert!(toml::from_str::<NetCdfSettings>("colour = 1").unwrap_err().to_string().contains("colour"));
+    assert!(toml::from_str::<ArchiveSettings>("colour = 1").unwrap_err().to_string().contains("colour"));
 }
 
 #[test]
@@ -393,7 +393,7 @@ fn inspection_says_what_and_why() {
         .variable("sst", &["time", "y", "x"], Data::F64(vec![0.0; 48]))
         .with("units", "K");
     let file = fixture.write(&dir.path().join("inspected.nc"));
-    let inspection = inspect(std::slice::from_ref(&file), &NetCdfSettings::default(), Some(7200.0)).unwrap();
+    let inspection = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), Some(7200.0)).unwrap();
     let resolution = inspection.resolution.as_ref().unwrap();
     // u crosses half a cell an hour; stored as f32.
     assert!((resolution.rms_cells - 0.5).abs() < 1e-6 && (resolution.max_cells - 0.5).abs() < 1e-6);
@@ -415,7 +415,7 @@ fn inspection_says_what_and_why() {
     assert!(serde_json::to_string(&inspection).unwrap().contains("\"role\":\"time\""));
     // A file that is no archive is still shown.
     let lone = Fixture::new(CLASSIC, &[("y", 2), ("x", 2)]).variable("sst", &["y", "x"], Data::F32(vec![0.0; 4]));
-    let inspection = inspect(&[lone.write(&dir.path().join("lone.nc"))], &NetCdfSettings::default(), None).unwrap();
+    let inspection = inspect(&[lone.write(&dir.path().join("lone.nc"))], &ArchiveSettings::default(), None).unwrap();
     assert!(inspection.problem.unwrap().contains("no velocity found"));
     assert_eq!(inspection.variables.len(), 1);
 }
@@ -438,7 +438,7 @@ fn pressure_levels_come_in_any_order() {
                 // Packed in steps of 0.01 m/s; both components are the same.
                 assert!(node.iter().all(|v| (v - expected).abs() < 5.01e-3 + 1e-5), "{levels:?}, node {i}: {node:?}, {expected}");
             }
-            let inspection = inspect(&files, &NetCdfSettings::default(), None).unwrap().to_string();
+            let inspection = inspect(&files, &ArchiveSettings::default(), None).unwrap().to_string();
             let order = ["1000 to 200 hPa, unsorted", "200 to 1000 hPa, ascending", "1000 to 200 hPa, descending"][n];
             assert!(inspection.contains(order), "{inspection}");
         }
@@ -499,6 +499,6 @@ fn later_files_have_packing_and_time_units_of_their_own() {
         assert_eq!((snapshot.nodes[4][0], snapshot.nodes[4][1]), (4.0 * scale, 0.04));
         assert!(snapshot.nodes[3][3].is_nan() && snapshot.missing() == 1);
     }
-    let error = NetCdfArchive::open(&[first, file("c.nc", "days since 2000-01-05", 1.0, true)], &NetCdfSettings::default()).err().unwrap();
+    let error = Archive::open(&[first, file("c.nc", "days since 2000-01-05", 1.0, true)], &ArchiveSettings::default()).err().unwrap();
     assert!(error.to_string().contains("c.nc") && error.to_string().contains("do not belong to one archive"), "{error}");
 }

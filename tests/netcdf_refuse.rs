@@ -4,16 +4,16 @@
 mod netcdf_fixture;
 
 use netcdf_fixture::*;
-use ridgewatch::source::{NetCdfArchive, NetCdfSettings, SnapshotSource, SourceError};
+use ridgewatch::source::{Archive, ArchiveSettings, SnapshotSource, SourceError};
 use std::path::{Path, PathBuf};
 use tempfile::tempdir;
 
 fn refused(paths: &[PathBuf]) -> SourceError {
-    refused_with(paths, &NetCdfSettings::default())
+    refused_with(paths, &ArchiveSettings::default())
 }
 
-fn refused_with(paths: &[PathBuf], settings: &NetCdfSettings) -> SourceError {
-    match NetCdfArchive::open(paths, settings) {
+fn refused_with(paths: &[PathBuf], settings: &ArchiveSettings) -> SourceError {
+    match Archive::open(paths, settings) {
         Ok(archive) => panic!("{paths:?} was read: {:?}", archive.describe()),
         Err(error) => error,
     }
@@ -69,7 +69,7 @@ fn a_file_that_shrinks_after_opening() {
     let dir = tempdir().unwrap();
     let first = plane(CLASSIC, &[0.0], DAYS).write(&dir.path().join("a.nc"));
     let second = plane(CLASSIC, &[1.0], DAYS).write(&dir.path().join("b.nc"));
-    let mut archive = NetCdfArchive::open(&[first.clone(), second], &NetCdfSettings::default()).unwrap();
+    let mut archive = Archive::open(&[first.clone(), second], &ArchiveSettings::default()).unwrap();
     let whole = std::fs::read(&first).unwrap();
     std::fs::write(&first, &whole[..whole.len() - 20]).unwrap();
     assert!(matches!(archive.read(0), Err(SourceError::Truncated { .. })));
@@ -133,8 +133,8 @@ fn units_and_calendars_that_are_unknown() {
     }
     let file = fixture.write(&dir.path().join("mixed_unit.nc"));
     says(&file, &["`w`", "unit `m/s` does not fit the axis `plev` in `Pa`", "w = \"none\""]);
-    let settings = NetCdfSettings { w: Some("none".into()), ..NetCdfSettings::default() };
-    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][..3], [1.0, 1.0, 0.0]);
+    let settings = ArchiveSettings { w: Some("none".into()), ..ArchiveSettings::default() };
+    assert_eq!(Archive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][..3], [1.0, 1.0, 0.0]);
     says(&plane(CLASSIC, &[0.0], "moons since 2000-01-01").write(&dir.path().join("moon.nc")), &["moons since", "seconds|minutes|hours"]);
     let fixture = Fixture::new(CLASSIC, &[("time", 1), ("y", 2), ("x", 2)])
         .axis("x", "furlong", &[0.0, 1.0])
@@ -144,7 +144,7 @@ fn units_and_calendars_that_are_unknown() {
         .variable("u", &["time", "y", "x"], Data::F32(vec![0.0; 4]))
         .variable("v", &["time", "y", "x"], Data::F32(vec![0.0; 4]));
     says(&fixture.write(&dir.path().join("mayan.nc")), &["mayan", "360_day"]);
-    let settings = NetCdfSettings { time: Some("y".into()), ..NetCdfSettings::default() };
+    let settings = ArchiveSettings { time: Some("y".into()), ..ArchiveSettings::default() };
     assert!(refused_with(&[dir.path().join("mayan.nc")], &settings).to_string().contains("mayan.nc"));
 }
 
@@ -174,8 +174,8 @@ fn axes_that_are_none() {
         .with("units", "degrees_east");
     let file = bare.write(&dir.path().join("bare.nc"));
     says(&file, &["dimension `i` has only coordinates of two dimensions (nav_lon)", "velocity_unit = \"cells\""]);
-    let settings: NetCdfSettings = toml::from_str("velocity_unit = \"cells\"").unwrap();
-    assert_eq!(NetCdfArchive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][0], 2.0, "unless cells are meant");
+    let settings: ArchiveSettings = toml::from_str("velocity_unit = \"cells\"").unwrap();
+    assert_eq!(Archive::open(&[file], &settings).unwrap().read(0).unwrap().nodes[0][0], 2.0, "unless cells are meant");
     // An ensemble.
     let fixture = Fixture::new(CLASSIC, &[("time", 1), ("member", 5), ("y", 2), ("x", 2)])
         .axis("x", "m", &[0.0, 1.0])
@@ -218,7 +218,7 @@ fn times_that_repeat_turn_back_or_are_missing() {
     says(&file, &["no time variable", "time = \"...\""]);
     // The same file twice is one file.
     let once = at("once.nc", &[0.0, 1.0]);
-    assert_eq!(NetCdfArchive::open(&[once.clone(), once], &NetCdfSettings::default()).unwrap().times().len(), 2);
+    assert_eq!(Archive::open(&[once.clone(), once], &ArchiveSettings::default()).unwrap().times().len(), 2);
 }
 
 #[test]
@@ -259,7 +259,7 @@ fn tau_against_the_archive() {
     let dir = tempdir().unwrap();
     let times: Vec<f64> = (0..11).map(f64::from).collect();
     let file = plane(CLASSIC, &times, DAYS).write(&dir.path().join("long.nc"));
-    let archive = NetCdfArchive::open(&[file], &NetCdfSettings::default()).unwrap();
+    let archive = Archive::open(&[file], &ArchiveSettings::default()).unwrap();
     let day = 86_400.0;
     assert_eq!(archive.default_tau().unwrap(), 5.0 * day);
     assert!(archive.check_tau(10.0 * day).is_ok());
@@ -268,10 +268,10 @@ fn tau_against_the_archive() {
     assert!(message.contains("needs 31 snapshots") && message.contains("has 11"), "{message}");
     assert!(archive.check_tau(0.0).is_err() && archive.check_tau(f64::NAN).is_err());
     let short = plane(CLASSIC, &[0.0, 1.0], DAYS).write(&dir.path().join("short.nc"));
-    let archive = NetCdfArchive::open(&[short], &NetCdfSettings::default()).unwrap();
+    let archive = Archive::open(&[short], &ArchiveSettings::default()).unwrap();
     assert!(matches!(archive.default_tau(), Err(SourceError::TooShort { needed: 3, found: 2, .. })));
     let one = plane(CLASSIC, &[1.0], DAYS).write(&dir.path().join("one.nc"));
-    let archive = NetCdfArchive::open(&[one], &NetCdfSettings::default()).unwrap();
+    let archive = Archive::open(&[one], &ArchiveSettings::default()).unwrap();
     for message in [archive.default_tau().unwrap_err().to_string(), archive.check_tau(day).unwrap_err().to_string()] {
         for piece in ["one.nc holds one time (", "-02T00:00:00Z)", "archive.steady = true", "time.tau"] {
             assert!(message.contains(piece), "{message}");
@@ -295,7 +295,7 @@ fn packing_that_unpacks_nothing() {
     for (attribute, value, found) in
         [("scale_factor", 0.0, "is 0"), ("scale_factor", f64::NAN, "is NaN"), ("add_offset", f64::INFINITY, "is inf")]
     {
-        let message = refused_with(&[packed(attribute, value)], &NetCdfSettings::default()).to_string();
+        let message = refused_with(&[packed(attribute, value)], &ArchiveSettings::default()).to_string();
         for piece in ["packed.nc", "`v`", attribute, found, "accepted is a finite number"] {
             assert!(message.contains(piece), "{message}");
         }

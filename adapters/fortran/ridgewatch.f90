@@ -33,6 +33,7 @@ module ridgewatch
     procedure :: rectilinear => publisher_rectilinear
     procedure :: sphere => publisher_sphere
     procedure :: block => publisher_block
+    procedure :: start => publisher_start
     procedure :: slots => publisher_slots
     procedure :: wait => publisher_wait
     procedure :: open => publisher_open
@@ -80,6 +81,12 @@ module ridgewatch
       integer(c_int32_t), value :: index, count
       integer(c_int64_t), intent(in) :: offset(*), extent(*)
       integer(c_int) :: c_block
+    end function
+    function c_start(description, start) bind(c, name="rw_describe_start")
+      import
+      type(c_ptr), value :: description
+      integer(c_int64_t), value :: start
+      integer(c_int) :: c_start
     end function
     function c_slots(description, slots) bind(c, name="rw_describe_slots")
       import
@@ -218,6 +225,14 @@ contains
     nodes(:self%dimensions) = extent(:self%dimensions)
     self%extent = nodes
     call give(c_block(self%description, int(index, c_int32_t), int(count, c_int32_t), offset, nodes), status)
+  end subroutine
+
+  !> A number that all blocks of this start of the simulation name, and those of its next start do not; 0: none.
+  subroutine publisher_start(self, start, status)
+    class(rw_publisher), intent(inout) :: self
+    integer(int64), intent(in) :: start
+    integer, intent(out), optional :: status
+    call give(c_start(self%description, int(start, c_int64_t)), status)
   end subroutine
 
   !> Steps that the ring holds.

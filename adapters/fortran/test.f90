@@ -1,6 +1,6 @@
 !> Each kind of call once, with values that the test behind it knows: u = i + 10 j + 100 k, v = 2 u, w = 3 u.
 program test
-  use, intrinsic :: iso_fortran_env, only: real32, real64
+  use, intrinsic :: iso_fortran_env, only: real32, real64, int64
   use ridgewatch
   implicit none
   type(rw_publisher) :: publisher, second
@@ -14,6 +14,7 @@ program test
   call publisher%rectilinear(2, [0d0, 1d0, 4d0])
   call publisher%uniform(3, 0d0, 1d0, 2, period=5d0)
   call publisher%slots(8)
+  call publisher%start(20261122_int64)
   call publisher%open(status)
   call want(status == rw_ok, 1)
   do k = 1, 2

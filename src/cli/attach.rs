@@ -49,9 +49,10 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         }
     }
     options.run.apply(&mut scene)?;
-    // SAFETY: changes this process's priority and touches no memory. Threads that are started later have it too.
-    if options.nice > 0 && unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, options.nice) } != 0 {
-        messages::note(format_args!("priority stays as it is: {}", std::io::Error::last_os_error()));
+    if options.nice > 0
+        && let Err(error) = step_back(options.nice)
+    {
+        messages::note(format_args!("priority stays as it is: {error}"));
     }
     let open = |scene: &SceneFile, stop: &AtomicBool| {
         let refused = |error| located(scene, error, SourceError::refused);
@@ -60,6 +61,22 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, EngineError::refused))
     };
     conduct(common, &options.run, scene, Some(CHECKPOINT_SECONDS), open)
+}
+
+/// Lowers the priority of all threads that are there; those that they start later have it too.
+fn step_back(nice: i32) -> std::io::Result<()> {
+    for task in std::fs::read_dir("/proc/self/task")? {
+        let Some(thread) = task?.file_name().to_str().and_then(|name| name.parse().ok()) else { continue };
+        // SAFETY: changes a priority and touches no memory.
+        if unsafe { libc::setpriority(libc::PRIO_PROCESS, thread, nice) } != 0 {
+            let error = std::io::Error::last_os_error();
+            // One that has ended meanwhile.
+            if error.raw_os_error() != Some(libc::ESRCH) {
+                return Err(error);
+            }
+        }
+    }
+    Ok(())
 }
 
 /// The scene that the paths mean.

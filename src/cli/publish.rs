@@ -9,7 +9,7 @@ use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field,
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Options of `publish`.
 #[derive(Debug, clap::Args)]
@@ -59,7 +59,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         bail!(Usage(format!("--blocks {:?}: the grid has {shape:?} nodes", options.blocks)));
     }
     let policy = if options.wait == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(options.wait)) };
-    let whole = description(&grid, &source.describe().time_unit);
+    // Of this start: another one may come with other blocks.
+    let start = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
+    let whole = Description { start, ..description(&grid, &source.describe().time_unit) };
     let producers: Result<Vec<Producer>, _> = parts(shape, options.blocks)
         .into_iter()
         .map(|block| Producer::open(&ring, Description { block, ..whole.clone() }, options.slots, policy))

@@ -8,8 +8,7 @@ use crate::flow::{Direction, VelocitySource};
 use crate::setting::Refused;
 use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
-    DEFAULT_READ_AHEAD, Listener, MemorySource, NetCdfArchive, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading,
-    read_ahead,
+    Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
 };
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -118,7 +117,7 @@ pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, Engin
         );
     }
     if source.kind == SourceKind::Archive {
-        return Ok(Box::new(NetCdfArchive::open(&scene.archive.files, &scene.archive)?));
+        return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?));
     }
     let nodes = source.nodes.unwrap_or([96, 48, 48]);
     let turbulence = Turbulence::new(

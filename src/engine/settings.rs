@@ -4,7 +4,7 @@ use crate::flow::{Direction, FlowSettings};
 use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, count, require};
 use crate::source::live::LiveSettings;
-use crate::source::{DomainSettings, NetCdfSettings, SourceKind, SourceSettings};
+use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};
 use crate::surrogate::{
     SurrogateSettings,
     network::{NetworkSettings, Size},
@@ -22,7 +22,7 @@ pub struct Settings {
     /// Where velocity comes from.
     pub source: SourceSettings,
     /// Which files, variables and metric, for archives.
-    pub archive: NetCdfSettings,
+    pub archive: ArchiveSettings,
     /// Which simulation, for those that run now.
     pub live: LiveSettings,
     /// The box in which seeds lie; needed by closed forms.

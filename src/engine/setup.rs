@@ -122,7 +122,11 @@ impl Setup {
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
         }
-        check_picture(&scene, &domain, tau)?;
+        // What is left open follows from the grid: where that is odd, the message says whose it is.
+        check_picture(&scene, &domain, tau).map_err(|refused| match &snapshots {
+            Some(source) => refused.over(&source.name()),
+            None => refused,
+        })?;
         scene.surrogate.check_nodes(domain.dimensions)?;
         if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
             notes.push("training.resume is not read: neither method reference nor a table goes on from a checkpoint".to_owned());
@@ -150,7 +154,7 @@ fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> 
 }
 
 /// Refuses a camera, light or transfer function before anything is read, rendered or written.
-fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), EngineError> {
+fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), Refused> {
     let mut picture = assemble(scene, domain);
     // What is left open is scaled later, to values that are accepted.
     picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);

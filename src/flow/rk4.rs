@@ -56,6 +56,11 @@ impl<L: Lanes> Fates<L> {
         Self { alive: inside, left: !inside, steps: L::select(inside, L::of(steps as f64), L::zero()) }
     }
 
+    /// Share of `steps` that was lived. A quotient, since a product with a rounded inverse is not 1 for all who lived them all.
+    fn share(&self, steps: usize) -> L {
+        self.steps / L::of(steps as f64)
+    }
+
     /// Takes a step's verdict; true when all go on.
     #[inline(always)]
     fn judge(&mut self, step: usize, inside: L::Mask, known: L::Mask) -> bool {
@@ -125,7 +130,7 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
     }
     let metric = field.metric(&x, &m);
     let log_stretch = exponent.mul_add(L::of(std::f64::consts::LN_2), log_stretch(&metric));
-    Paths { log_stretch, lived: fates.steps * L::of(1.0 / steps as f64), left: fates.left, state: x, metric, exponent }
+    Paths { log_stretch, lived: fates.share(steps), left: fates.left, state: x, metric, exponent }
 }
 
 /// One step of one particle; its end and its mark.
@@ -198,12 +203,5 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
     let mut state = array(|i| pairs.iter().flatten().fold(L::zero(), |sum, x| half.mul_add(x[i], sum)));
     field.settle(&mut state);
     let metric = field.metric(&state, &m);
-    Paths {
-        log_stretch: log_stretch(&metric),
-        lived: fates.steps * L::of(1.0 / steps as f64),
-        left: fates.left,
-        state,
-        metric,
-        exponent: L::zero(),
-    }
+    Paths { log_stretch: log_stretch(&metric), lived: fates.share(steps), left: fates.left, state, metric, exponent: L::zero() }
 }

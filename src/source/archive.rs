@@ -1,4 +1,4 @@
-//! Many NetCDF files as one sequence of snapshots.
+//! Many files as one sequence of snapshots.
 
 use super::axes::AxisPlan;
 use super::cf::calendar::Calendar;
@@ -9,7 +9,7 @@ use super::files::expand;
 use super::hyperslab::{Orders, read_component};
 use super::layout::{ComponentPlan, Layout, Resampling, difference, plan};
 use super::poles::Poles;
-use super::settings::{Metric, NetCdfSettings, Staggering, VelocityUnit};
+use super::settings::{ArchiveSettings, Metric, Staggering, VelocityUnit};
 use super::synthetic::synthesized;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
 use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -32,7 +32,7 @@ struct Place {
 
 /// Velocity in NetCDF files with CF conventions, of WRF, on curvilinear grids, or in HDF5 files. Opening reads headers, coordinates and
 /// times; velocities are read one snapshot at a time. One file is open at any moment.
-pub struct NetCdfArchive {
+pub struct Archive {
     files: Vec<ArchiveFile>,
     /// In time order.
     places: Vec<Place>,
@@ -54,18 +54,18 @@ pub struct NetCdfArchive {
     like: Option<Header>,
 }
 
-impl NetCdfArchive {
-    /// Opens files, folders (their `*.nc`) and patterns; where there are none, those of the settings. Snapshots are sorted by time.
+impl Archive {
+    /// Opens files, folders and patterns; where there are none, those of the settings. Snapshots are sorted by time.
     ///
     /// # Errors
     /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
     /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each names the file.
-    pub fn open(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<Self, SourceError> {
+    pub fn open(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Self, SourceError> {
         Self::open_files(files_of(paths, settings)?, settings)
     }
 
     /// Opens files that are already a list.
-    pub(super) fn open_files(paths: Vec<PathBuf>, settings: &NetCdfSettings) -> Result<Self, SourceError> {
+    pub(super) fn open_files(paths: Vec<PathBuf>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         check(settings)?;
         let mut first: Option<(Layout, &'static str)> = None;
         let mut entries: Vec<(f64, Place)> = Vec::new();
@@ -264,6 +264,11 @@ impl NetCdfArchive {
         Ok(components)
     }
 
+    /// What resampling does, in words; none where nothing is resampled.
+    pub(super) fn resampled(&self) -> Option<&str> {
+        self.resampling.as_deref().map(Resampling::what)
+    }
+
     /// How far resampling is off, measured on the first snapshot; none where nothing is resampled. See [`Resampling::error`].
     pub(super) fn resampling_error(&mut self) -> Result<Option<[f64; 2]>, SourceError> {
         let Some(resampling) = self.resampling.clone() else { return Ok(None) };
@@ -274,7 +279,7 @@ impl NetCdfArchive {
     }
 }
 
-impl SnapshotSource for NetCdfArchive {
+impl SnapshotSource for Archive {
     fn grid(&self) -> &Arc<Grid> {
         &self.grid
     }
@@ -342,7 +347,7 @@ fn is_sphere(axes: &[AxisPlan]) -> bool {
 }
 
 /// The files that are meant: those given, else those of the settings, else a synthetic archive.
-pub(super) fn files_of(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<Vec<PathBuf>, SourceError> {
+pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Vec<PathBuf>, SourceError> {
     let paths = if paths.is_empty() { &settings.files } else { paths };
     match &settings.synthetic {
         Some(synthetic) if paths.is_empty() => expand(&[synthesized(synthetic)?]),
@@ -351,7 +356,7 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &NetCdfSettings) -> Result<V
 }
 
 /// Settings that are wrong whatever the files are.
-fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
+fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
     let fault = |key, found: String, accepted: &str| Err(SourceError::Setting { key, found, accepted: accepted.into() });
     if let Some(region) = settings.region
         && !(region.iter().all(|v| v.is_finite()) && region[2] < region[3] && region[0] != region[1])
@@ -375,7 +380,7 @@ fn check(settings: &NetCdfSettings) -> Result<(), SourceError> {
 }
 
 /// Settings that would do nothing for files of this kind.
-fn check_fit(settings: &NetCdfSettings, layout: &Layout, format: &str) -> Result<(), SourceError> {
+fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: &str) -> Result<(), SourceError> {
     let s = settings;
     let hdf5 = format == Format::Hdf5.name();
     let (staggered, curvilinear) = match layout.resampling.as_deref() {
@@ -433,7 +438,7 @@ fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: O
     }
 }
 
-fn build_grid(path: &Path, layout: &Layout, settings: &NetCdfSettings) -> Result<Grid, SourceError> {
+fn build_grid(path: &Path, layout: &Layout, settings: &ArchiveSettings) -> Result<Grid, SourceError> {
     let index_axis = |plan: &AxisPlan| {
         let n = plan.axis.len();
         let axis = Axis::uniform(plan.axis.name(), "cells", 0.0, (n - 1) as f64, n);

@@ -238,6 +238,18 @@ impl Container {
         Ok(Self { path: path.to_path_buf(), format, header, store, length })
     }
 
+    /// Number of values in a block of a variable; refused where the file is too short for so many.
+    pub(crate) fn check_count(&self, variable: usize, count: &[usize]) -> Result<usize, SourceError> {
+        let header = &self.header.variables[variable];
+        let failed = |what: String| SourceError::Read { path: self.path.clone(), variable: header.name.clone(), what };
+        let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
+        let largest = self.length.saturating_mul(LARGEST_SHRINKAGE) / header.number.bytes();
+        if total as u64 <= largest.max(ALWAYS_ALLOWED) {
+            return Ok(total);
+        }
+        Err(failed(format!("{total} values cannot come from a file of {} bytes: it is damaged or was never written", self.length)))
+    }
+
     /// Raw values of a hyperslab as `f64` (no unpacking), in the file's order, slowest dimension first.
     pub(crate) fn read(&self, variable: usize, start: &[usize], count: &[usize]) -> Result<Vec<f64>, SourceError> {
         let header = &self.header.variables[variable];
@@ -250,14 +262,7 @@ impl Container {
         if header.number == NumberType::Other {
             return Err(failed("it holds no numbers".into()));
         }
-        let total = count.iter().try_fold(1usize, |n, &c| n.checked_mul(c)).ok_or_else(|| failed(format!("{count:?} values overflow")))?;
-        let largest = self.length.saturating_mul(LARGEST_SHRINKAGE) / header.number.bytes();
-        if total as u64 > largest.max(ALWAYS_ALLOWED) {
-            return Err(failed(format!(
-                "{total} values cannot come from a file of {} bytes: it is damaged or was never written",
-                self.length
-            )));
-        }
+        let total = self.check_count(variable, count)?;
         let mut values: Vec<f64> = Vec::new();
         values.try_reserve_exact(total).map_err(|_| failed(format!("no memory for {total} values")))?;
         if total > 0 {

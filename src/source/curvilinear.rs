@@ -30,9 +30,16 @@ pub(super) struct Curvilinear {
     directions: [Vec<[f32; 3]>; 2],
     /// East and north, at each node of the grid.
     bases: [Vec<[f32; 3]>; 2],
+    /// See [`Self::what`].
+    what: String,
 }
 
 impl Curvilinear {
+    /// What is done, in words.
+    pub(super) fn what(&self) -> &str {
+        &self.what
+    }
+
     /// One time, onto the grid; `levels` are the file's entries of the grid's levels.
     pub(super) fn read(
         &self,
@@ -332,10 +339,11 @@ impl Planner<'_> {
         let (along, why) = self.runs_along_grid(u);
         let directions = std::array::from_fn(|k| meshes[k].1.directions(along).into_iter().map(|both| both[k]).collect());
         let names = pairs[0].map(|i| self.header().variables[i].name.clone());
-        self.notes.push(format!(
+        let what = format!(
             "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
             names[0], names[1], of_u.shape[0], of_u.shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
-        ));
+        );
+        self.notes.push(what.clone());
         let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
         self.notes.push(format!("velocities run along {which} ({why})"));
         let path = self.path().to_path_buf();
@@ -351,6 +359,7 @@ impl Planner<'_> {
             axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
         }
         let meshes = meshes.into_iter().map(|(_, m)| m).collect();
-        Ok((Arc::new(Resampling::Curvilinear(Curvilinear { locators, meshes, target, directions, bases: target.bases() })), axes))
+        let resampled = Curvilinear { locators, meshes, target, directions, bases: target.bases(), what };
+        Ok((Arc::new(Resampling::Curvilinear(Box::new(resampled))), axes))
     }
 }

@@ -63,7 +63,7 @@ pub enum SourceError {
     },
     /// No pair of variables is a horizontal velocity.
     #[error(
-        "{}: no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive]. \
+        "{}: no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
          Variables in the file:\n{candidates}",
         path.display()
     )]
@@ -188,9 +188,11 @@ pub enum SourceError {
     },
     /// The archive is shorter than tau.
     #[error(
-        "tau = {tau} needs {needed} snapshots {interval} apart, but the archive has {found}, which span {span}: shorten tau or add files"
+        "tau = {tau} needs {needed} snapshots {interval} apart, but {source_name} has {found}, which span {span}: shorten tau or add files"
     )]
     TooShort {
+        /// The archive.
+        source_name: String,
         /// |tau| in time units.
         tau: f64,
         /// Snapshots needed at the archive's median interval.

@@ -92,6 +92,9 @@ impl Planner<'_> {
                 );
             }
         }
+        // Before coordinates are made for a shape that is damaged.
+        let nodes: Vec<usize> = order.iter().zip(&shape).filter(|(letter, _)| b"xyz".contains(letter)).map(|(_, &n)| n).collect();
+        self.file.check_count(first, &nodes)?;
         let mut axes = Vec::new();
         for (k, letter) in [b'x', b'y', b'z'].into_iter().enumerate().take(if three { 3 } else { 2 }) {
             let Some(place) = order.iter().position(|&o| o == letter) else { continue };

@@ -1,10 +1,10 @@
 //! What would be read from an archive, and why.
 
-use super::archive::{Displacement, NetCdfArchive, files_of};
+use super::archive::{Archive, Displacement, files_of};
 use super::axes::{InFile, Quantity};
 use super::cf::velocity;
 use super::container::{Container, Header};
-use super::settings::NetCdfSettings;
+use super::settings::ArchiveSettings;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
 use crate::setting::Refused;
 use serde::Serialize;
@@ -113,7 +113,7 @@ pub struct TimeReport {
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ResamplingReport {
     /// What is done, in words.
-    pub what: Vec<String>,
+    pub what: String,
     /// Root mean square of what interpolation on the new grid gives less what the file has, in m/s.
     pub error: f64,
     /// Root mean square of what the file has, in m/s.
@@ -132,7 +132,7 @@ pub struct MissingReport {
 /// Displacement between two snapshots, measured on a few of them.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ResolutionReport {
-    /// Root mean square of the displacement in one interval, in cells.
+    /// Root mean square of the displacement in one interval, in cells of the grid that is read: of a resampled one, where it is that.
     pub rms_cells: f64,
     /// Greatest displacement in one interval, in cells.
     pub max_cells: f64,
@@ -146,7 +146,7 @@ pub struct ResolutionReport {
 ///
 /// # Errors
 /// No file, or a first file that is missing, damaged or of another format.
-pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
+pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
     let files = files_of(paths, settings)?;
     let Some(file) = files.first().cloned() else { return Err(SourceError::NoFiles) };
     let first = Container::open(&file)?;
@@ -164,7 +164,7 @@ pub fn inspect(paths: &[PathBuf], settings: &NetCdfSettings, tau: Option<f64>) -
         missing: None,
         resolution: None,
     };
-    match NetCdfArchive::open_files(files, settings) {
+    match Archive::open_files(files, settings) {
         Ok(archive) => inspection.fill(archive, settings.steady, tau)?,
         Err(error) => (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused()),
     }
@@ -190,7 +190,7 @@ fn variables(header: &Header) -> Vec<VariableReport> {
 }
 
 impl Inspection {
-    fn fill(&mut self, mut archive: NetCdfArchive, steady: bool, tau: Option<f64>) -> Result<(), SourceError> {
+    fn fill(&mut self, mut archive: Archive, steady: bool, tau: Option<f64>) -> Result<(), SourceError> {
         let description = archive.describe();
         let mut give = |name: &str, role: &str, why: String| {
             if let Some(variable) = self.variables.iter_mut().find(|v| v.name == name) {
@@ -218,8 +218,9 @@ impl Inspection {
                 period: plan.axis.period(),
             });
         }
-        let what = description.notes.iter().filter(|n| n.contains("resampled") || n.contains("components on faces")).cloned().collect();
-        self.resampling = archive.resampling_error()?.map(|[error, velocity]| ResamplingReport { what, error, velocity });
+        let error = archive.resampling_error()?;
+        self.resampling =
+            archive.resampled().zip(error).map(|(what, [error, velocity])| ResamplingReport { what: what.to_owned(), error, velocity });
         self.time = Some(times(&archive, &description, steady, tau));
         let count = archive.times().len();
         let sampled = count.min(SAMPLED);
@@ -253,7 +254,7 @@ fn fullest_window(times: &[f64], tau: f64) -> usize {
     (0..times.len()).map(|i| (i, end(i))).filter(|&(_, j)| j < times.len()).map(|(i, j)| j - i + 1).max().unwrap_or(times.len())
 }
 
-fn times(archive: &NetCdfArchive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
+fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
     let interval = median_interval(times);
@@ -336,7 +337,7 @@ impl fmt::Display for Inspection {
                 Short(r.error),
                 Short(r.velocity),
                 100.0 * r.error / r.velocity.max(f64::MIN_POSITIVE),
-                r.what.join("\n  ")
+                r.what
             )?,
             None => writeln!(f, "\nresampling\n  none: nodes are the file's own")?,
         }
@@ -346,7 +347,8 @@ impl fmt::Display for Inspection {
         if let Some(r) = &self.resolution {
             let rms: Vec<String> = r.rms_velocity.iter().map(|v| Short(*v).to_string()).collect();
             writeln!(f, "  root mean square of the components {}", rms.join(", "))?;
-            writeln!(f, "  displacement in one interval: {:.2} cells (root mean square), {:.2} at most", r.rms_cells, r.max_cells)?;
+            let of = if self.resampling.is_some() { " of the grid that it is resampled to" } else { "" };
+            writeln!(f, "  displacement in one interval: {:.2} cells{of} (root mean square), {:.2} at most", r.rms_cells, r.max_cells)?;
             if let Some(warning) = &r.warning {
                 writeln!(f, "  {warning}")?;
             }

@@ -1,6 +1,6 @@
 //! `[source]` and `[domain]` of a scene file: which velocity, and the box of a closed form.
 
-use super::NetCdfSettings;
+use super::ArchiveSettings;
 use crate::setting::{Refused, count, require, shown};
 use serde::{Deserialize, Serialize};
 
@@ -70,7 +70,7 @@ pub struct DomainSettings {
 
 impl SourceSettings {
     /// Checks ranges, and that a closed form has its box (`domain`) and an archive its files (or what to synthesize).
-    pub fn check(&self, domain: Option<&DomainSettings>, archive: &NetCdfSettings) -> Result<(), Refused> {
+    pub fn check(&self, domain: Option<&DomainSettings>, archive: &ArchiveSettings) -> Result<(), Refused> {
         let source = self;
         let kind = source.kind;
         use SourceKind::*;

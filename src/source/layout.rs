@@ -11,7 +11,7 @@ use super::container::{Container, Format, Header};
 use super::curvilinear::Curvilinear;
 use super::dimensions::Extent;
 use super::poles::Poles;
-use super::settings::{Metric, NetCdfSettings, VelocityUnit};
+use super::settings::{ArchiveSettings, Metric, VelocityUnit};
 use super::staggered::Staggered;
 use super::times::TimePlan;
 use super::vertical::to_heights;
@@ -90,7 +90,7 @@ impl Layout {
 #[derive(Debug)]
 pub(super) enum Resampling {
     Staggered(Box<Staggered>),
-    Curvilinear(Curvilinear),
+    Curvilinear(Box<Curvilinear>),
 }
 
 impl Resampling {
@@ -108,6 +108,14 @@ impl Resampling {
         }
     }
 
+    /// What is done, in words.
+    pub(super) fn what(&self) -> &str {
+        match self {
+            Self::Staggered(s) => s.what(),
+            Self::Curvilinear(c) => c.what(),
+        }
+    }
+
     /// Root mean square, over the nodes of the file, of what interpolation on the grid gives less what the file has; and of what it has.
     pub(super) fn error(&self, file: &Container, frame: &[ComponentPlan], entry: usize) -> Result<[f64; 2], SourceError> {
         match self {
@@ -116,15 +124,16 @@ impl Resampling {
         }
     }
 }
+
 /// The planning of one file, step by step.
 pub(super) struct Planner<'a> {
     pub(super) file: &'a Container,
-    pub(super) settings: &'a NetCdfSettings,
+    pub(super) settings: &'a ArchiveSettings,
     pub(super) notes: Vec<String>,
 }
 
 /// Plans how to read a file. What is dear to plan is taken from the archive's first file, where there is one.
-pub(super) fn plan(file: &Container, settings: &NetCdfSettings, first: Option<&Layout>) -> Result<Layout, SourceError> {
+pub(super) fn plan(file: &Container, settings: &ArchiveSettings, first: Option<&Layout>) -> Result<Layout, SourceError> {
     let planner = Planner { file, settings, notes: Vec::new() };
     if file.format == Format::Hdf5 { planner.plan_hdf5() } else { planner.plan(first) }
 }

@@ -23,6 +23,10 @@ pub(super) struct Target {
 const NOWHERE: u32 = u32::MAX;
 /// A grid has at most so many nodes a point of the mesh: a mesh that is dense in one place must not fill the memory.
 const MOST_NODES: usize = 4;
+/// Extent of a mesh in degrees (0.1 m) below which it has no cells: a grid on it would have steps of 0.
+const NARROWEST: f64 = 1e-6;
+/// Columns at a seam that a mesh may have twice.
+const MOST_REPEATED: usize = 4;
 /// How far outside a cell, in its own units, a node may seem to lie: rounding must open no seams.
 const SLACK: f64 = 1e-7;
 
@@ -111,16 +115,19 @@ impl Mesh {
                 let [x, y] = if along {
                     let own = vector(here[0], here[1]);
                     let at = |i: usize| self.point(i, j).map_or(own, |p| vector(p[0], p[1]));
-                    let (first, last) = (i == 0, i + 1 == nx);
-                    let a = if first && round { at(nx - 1) } else { at(i.saturating_sub(1)) };
-                    let b = if last && round { at(0) } else { at((i + 1).min(nx - 1)) };
-                    let (before, after) = ([0, 1, 2].map(|k| own[k] - a[k]), [0, 1, 2].map(|k| b[k] - own[k]));
-                    // Where columns overlap at the seam, the one beyond lies behind.
-                    let step = match dot(before, after) > 0.0 {
-                        false if first => after,
-                        false if last => before,
-                        _ => [0, 1, 2].map(|k| before[k] + after[k]),
+                    let way = |a: Vector, b: Vector| -> Vector { std::array::from_fn(|k| b[k] - a[k]) };
+                    let (mut before, mut after) = (way(at(i.saturating_sub(1)), own), way(own, at((i + 1).min(nx - 1))));
+                    // Beyond the seam, behind the columns that are there twice: the first one that lies ahead.
+                    let beyond = |onward: Vector, step: &dyn Fn(usize) -> Vector| {
+                        let ahead = |s: &Vector| dot(*s, onward) > 1e-6 * dot(onward, onward);
+                        (0..=MOST_REPEATED.min(nx - 1)).map(step).find(ahead).unwrap_or([0.0; 3])
                     };
+                    if round && i == 0 {
+                        before = beyond(after, &|k| way(at(nx - 1 - k), own));
+                    } else if round && i + 1 == nx {
+                        after = beyond(before, &|k| way(own, at(k)));
+                    }
+                    let step = std::array::from_fn(|k| before[k] + after[k]);
                     let (x, y) = (dot(step, east), dot(step, north));
                     let length = x.hypot(y);
                     if length > 0.0 { [x / length, y / length] } else { [f64::NAN; 2] }
@@ -157,6 +164,9 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
     let (south, north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
     let mut middle = latitudes;
     middle.sort_by(f64::total_cmp);
+    if north - south <= NARROWEST {
+        return Err(format!("its points lie on one parallel, at {south} degrees north: they make no cell"));
+    }
     let cosine = middle[middle.len() / 2].to_radians().cos().max(0.1);
     let mut step = resolution.unwrap_or([along_x / cosine, along_y]);
 
@@ -176,6 +186,9 @@ pub(super) fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target
         start -= 360.0;
     }
     let width = if round { 360.0 } else { 360.0 - hole };
+    if width <= NARROWEST {
+        return Err(format!("its points lie on one meridian, at {start} degrees east: they make no cell"));
+    }
     loop {
         let across = ((width / step[0]).round() as usize).max(1);
         let up = (((north - south) / step[1]).round() as usize).max(1);
@@ -276,9 +289,8 @@ impl Locator {
             let more = 0.1 * (high[k] - low[k]);
             (low[k], high[k]) = (low[k] - more, high[k] + more);
         }
-        if high[0] - low[0] > 180.0 {
-            // A pole inside.
-            (low[0], high[0]) = (-180.0, 180.0);
+        let pole_inside = high[0] - low[0] > 180.0;
+        if pole_inside {
             if latitude > 0.0 { high[1] = 90.0 } else { low[1] = -90.0 }
         }
         let row = |l: f64| (l - target.first[1]) / target.step[1];
@@ -287,10 +299,11 @@ impl Locator {
         if row(high[1]) < 0.0 {
             return;
         }
+        let column = |l: f64| (l + longitude - target.first[0]) / target.step[0];
+        let (first, last) =
+            if pole_inside { (0, target.nodes[0] as i64 - 1) } else { (column(low[0]).ceil() as i64, column(high[0]).floor() as i64) };
+        let turn_nodes = (360.0 / target.step[0]).round() as i64;
         for y in rows {
-            let first = ((low[0] + longitude - target.first[0]) / target.step[0]).ceil() as i64;
-            let last = ((high[0] + longitude - target.first[0]) / target.step[0]).floor() as i64;
-            let turn_nodes = (360.0 / target.step[0]).round() as i64;
             for x in first..=last {
                 let column = if target.round { x.rem_euclid(target.nodes[0] as i64) } else { x.rem_euclid(turn_nodes.max(1)) };
                 if column >= target.nodes[0] as i64 {
@@ -397,6 +410,25 @@ mod tests {
         assert!((dot(x, north).atan2(dot(x, east)).to_degrees() - 25.0).abs() < 3.0);
         assert!(dot(x, y).abs() < 1e-6 && (dot(y, north) - dot(x, east)).abs() < 1e-6, "{x:?} {y:?}");
         assert_eq!(mesh.directions(false)[middle], [east, north].map(|e| e.map(|v| v as f32)));
+    }
+
+    #[test]
+    fn a_mesh_without_width_is_refused() {
+        let line = |longitude: fn(f64) -> f64, latitude: fn(f64) -> f64| {
+            let at = |f: fn(f64) -> f64| (0..9).map(|n| f(f64::from(n))).collect();
+            target(&Mesh { shape: [3, 3], longitude: at(longitude), latitude: at(latitude) }, Some([0.5, 0.5]))
+        };
+        // Along a meridian, the one at 180 degrees, a parallel, and a parallel that goes round.
+        for (longitude, latitude, word) in [
+            ((|_| 20.0) as fn(f64) -> f64, (|n| 10.0 + n) as fn(f64) -> f64, "meridian"),
+            (|n| if n > 4.0 { 180.0 } else { -180.0 }, |n| n, "meridian"),
+            (|n| 20.0 + n, |_| 10.0, "parallel"),
+            (|n| 40.0 * n, |_| 10.0, "parallel"),
+        ] {
+            let message = line(longitude, latitude).unwrap_err();
+            assert!(message.contains(word), "{message}");
+        }
+        assert!(line(|n| 20.0 + n % 3.0, |n| 10.0 + (n / 3.0).floor()).is_ok());
     }
 
     #[test]

@@ -2,7 +2,7 @@
 //!
 //! In: settings and files. Out: snapshots in time order, read ahead by one I/O thread. Calls `field`.
 //!
-//! [`NetCdfArchive`] and [`MemorySource`] are [`SnapshotSource`]s; [`read_ahead`] puts one on its thread; [`inspect`] tells what
+//! [`Archive`] and [`MemorySource`] are [`SnapshotSource`]s; [`read_ahead`] puts one on its thread; [`inspect`] tells what
 //! would be read and why.
 
 mod archive;
@@ -37,7 +37,7 @@ mod synthetic;
 mod times;
 mod vertical;
 
-pub use archive::NetCdfArchive;
+pub use archive::Archive;
 pub use axes::{FileOrder, InFile};
 pub use crash::report_crashes;
 pub use error::SourceError;
@@ -46,7 +46,7 @@ pub use kinds::{DomainSettings, SourceKind, SourceSettings};
 pub use libraries::{hdf5_version, netcdf_version};
 pub use memory::MemorySource;
 pub use reader::{DEFAULT_READ_AHEAD, Listener, ReadAhead, StillReading, read_ahead};
-pub use settings::{Metric, NetCdfSettings, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
+pub use settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use steady::Steady;
 pub use synthetic::{GlobeTurbulence, synthesize};
 
@@ -92,7 +92,7 @@ pub trait SnapshotSource: Send {
         let (span, interval) = (span(times), median_interval(times));
         let tau = (span / 2.0).max(2.0 * interval);
         if times.len() < 3 {
-            return Err(SourceError::TooShort { tau, needed: 3, found: times.len(), interval, span });
+            return Err(SourceError::TooShort { source_name: self.name(), tau, needed: 3, found: times.len(), interval, span });
         }
         // Uneven steps: two median intervals may be longer than the archive.
         Ok(tau.min(span))
@@ -121,7 +121,8 @@ pub trait SnapshotSource: Send {
             return Ok(());
         }
         let needed = if interval > 0.0 { ((tau / interval * (1.0 - 1e-9)).ceil() as usize).saturating_add(1) } else { 2 };
-        Err(SourceError::TooShort { tau, needed: needed.max(times.len() + 1), found: times.len(), interval, span })
+        let needed = needed.max(times.len() + 1);
+        Err(SourceError::TooShort { source_name: self.name(), tau, needed, found: times.len(), interval, span })
     }
 }
 

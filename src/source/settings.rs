@@ -120,7 +120,7 @@ impl SyntheticSettings {
 /// Which files to read and, where the conventions do not say enough, how.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct NetCdfSettings {
+pub struct ArchiveSettings {
     /// Files, folders and patterns: one or a list.
     #[serde(deserialize_with = "one_or_many")]
     pub files: Vec<PathBuf>,

@@ -41,6 +41,8 @@ pub(super) struct Staggered {
     nest: Option<Nest>,
     /// The places that the grid takes at the times of the archive.
     reach: Reach,
+    /// See [`Self::what`].
+    what: String,
 }
 
 /// The least and the greatest shift along x and y.
@@ -111,6 +113,11 @@ fn in_column(z: f32, count: usize, height: impl Fn(usize) -> f32, value: impl Fn
 }
 
 impl Staggered {
+    /// What is done, in words.
+    pub(super) fn what(&self) -> &str {
+        &self.what
+    }
+
     /// Places along x or y of the nodes on the file's cells.
     fn places(&self, axis: usize) -> Vec<f64> {
         (0..(self.cells[axis] - 1) * self.fineness + 1).map(|a| a as f64 / self.fineness as f64).collect()
@@ -413,13 +420,14 @@ impl Planner<'_> {
             None => self.notes.push("no XLONG and XLAT of its centres: the grid is taken to stay where it is".into()),
         }
         let reach = same.map_or(own_reach, |s| s.reach.with(own_reach));
-        let mut staggered = Staggered { geopotential, scale, cells, fineness, heights: Vec::new(), step: [dx, dy], nest, reach };
+        let mut staggered =
+            Staggered { geopotential, scale, cells, fineness, heights: Vec::new(), step: [dx, dy], nest, reach, what: String::new() };
         staggered.heights = match (same.map(|s| s.heights.clone()), &s.heights) {
             (Some(heights), _) => heights,
             (None, Some(heights)) => heights.clone(),
             (None, None) => mean_heights(&staggered, &staggered.full_levels(self.file, 0)?),
         };
-        self.notes.push(format!(
+        staggered.what = format!(
             "components on faces: read on a grid of {}, {} onto {} heights from {:.0} to {:.0} m ({})",
             if fineness == 2 { "faces and centres" } else { "centres" },
             "each column interpolated between its own levels, whose heights are (PH + PHB) / g,",
@@ -427,7 +435,8 @@ impl Planner<'_> {
             staggered.heights.first().copied().unwrap_or(0.0),
             staggered.heights.last().copied().unwrap_or(0.0),
             if s.heights.is_some() { "as set" } else { "the mean heights of its full and half levels; others with `heights`" }
-        ));
+        );
+        self.notes.push(staggered.what.clone());
         self.notes.push(match staggered.scale {
             [Some(_), Some(_)] => "metres are those of the map projection: u and v are multiplied by its scale factors MAPFAC".into(),
             _ => "no map scale factors (MAPFAC_U, MAPFAC_V): metres of the projection are taken for metres on the ground".into(),
@@ -499,6 +508,7 @@ mod tests {
             step: [1.0; 2],
             nest: None,
             reach: Reach::default(),
+            what: String::new(),
         };
         let places = staggered.places(0);
         assert_eq!(places, [0.0, 0.5, 1.0, 1.5, 2.0]);

@@ -8,7 +8,7 @@ use burn::backend::Flex;
 use burn::module::Param;
 use burn::optim::{AdamConfig, SimpleOptimizer};
 use burn::tensor::{Tensor, TensorData};
-use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining};
+use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
@@ -162,6 +162,37 @@ fn gradients_equal_finite_differences_and_burns() {
         println!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
         // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
         assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
+    }
+}
+
+/// What does not fit into a warp's registers goes through the network in parts: these batches are of several.
+#[test]
+#[ignore = "needs a GPU"]
+fn parts_of_a_batch_add_up() {
+    const MANY: usize = 150_000;
+    for name in ["wide, tables", "deep, frequency"] {
+        let case = cases().into_iter().find(|case| case.name == name).unwrap();
+        let (model, objective, _) = prepare(&case);
+        assert!(!is_fused(&model.shape), "{name}");
+        let (model, samples) = (settled(&model), labels(MANY, 12));
+        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
+        let found = predict(&network, &samples.points);
+        let reference = Reference::in_halves(&model);
+        for i in (0..MANY).step_by(97).chain([MANY - 1]) {
+            let expected = read(&objective, reference.outputs(samples.points[i])[0][0]);
+            assert!((f64::from(found[i]) - expected).abs() < 1e-2, "{name}, {i}: {} and {expected}", found[i]);
+        }
+        let mut device = training(&model, &objective);
+        let pool = device.upload(&samples, None).unwrap();
+        device.train_steps(&pool, None, &[step(MANY, 1e-9)]).unwrap();
+        let found = gradients(&stored(&device, &model));
+        let mut stock = model.clone();
+        stock_step(&mut stock, &objective, &samples, MANY, 1e-9);
+        let burns = gradients(&stock);
+        let apart: Vec<f64> = found.iter().zip(&burns).map(|(a, b)| a - b).collect();
+        let from_burn = norm(&apart) / norm(&burns);
+        println!("{name}: gradients of {MANY} samples off burn's by {from_burn:.1e}");
+        assert!(from_burn < 3e-3, "{name}: {from_burn}");
     }
 }
 
@@ -337,8 +368,6 @@ fn what_the_kernels_do_not_take_is_refused() {
     };
     let usual = NetworkSettings { log2_table: 10, ..NetworkSettings::default() };
     for settings in [
-        NetworkSettings { width: 129, ..usual.clone() },
-        NetworkSettings { hidden_layers: 5, ..usual.clone() },
         NetworkSettings { target: Target::FlowMap, ..usual.clone() },
         NetworkSettings { loss: Loss::Published, mean_penalty: 1.0, ..usual },
     ] {

@@ -1,9 +1,10 @@
 """Log-stretch of the flow map by other tools than ridgewatch's: netCDF4 reads, SciPy integrates (DOP853), neighbours 2 gap apart are
 differenced. The interpolation is written here, straight from what the files hold.
 
-Standard input: {"kind": "era5" | "wrf", "files": [...], "points": [[x, y, z], ...], "from": seconds, "tau": seconds (signed),
-"vertical_scale": 1}. Coordinates in metres, heights above the sea (ERA5: -7000 ln(p / 1000 hPa)). Standard output: a list of
-log-stretches, null where a particle met missing values."""
+Standard input: {"kind": "era5" | "wrf" | "globcurrent", "files": [...], "points": [[x, y, z], ...], "count": how many are wanted,
+"from": seconds, "tau": seconds (signed)}. Coordinates in metres, heights above the sea (ERA5: -7000 ln(p / 1000 hPa)); of GlobCurrent
+longitude and latitude in degrees. Standard output: log-stretches of the points, null where a particle met missing values, up to the one by
+which as many as wanted are known."""
 
 import json
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 EPOCH = "seconds since 1970-01-01"
+EARTH_RADIUS = 6_371_008.8
 
 
 def seconds(variable, calendar="standard"):
@@ -32,8 +34,44 @@ def cell(axis, x):
     return i, (x - axis[i]) / (axis[i + 1] - axis[i])
 
 
+class GlobCurrent:
+    """Currents by longitude and latitude: bilinear in both, linear in time. A particle is carried in degrees."""
+
+    # Degrees: a metre, and a millionth of it in a step.
+    gaps, tolerance = [1e-5, 1e-5], 1e-11
+
+    def __init__(self, files):
+        sets = sorted((netCDF4.Dataset(f) for f in files), key=lambda d: d["time"][0])
+        # Files have `Unit` instead of `units`: days since 1900.
+        self.time = np.array([(float(d["time"][0]) - 25567.0) * 86400.0 for d in sets])
+        self.x, self.y = filled(sets[0]["lon"][:]), filled(sets[0]["lat"][:])
+        read = lambda name: np.stack([filled(d[f"{name}ward_eulerian_current_velocity"][0]) for d in sets])
+        self.v = np.stack([read("east"), read("north")])
+
+    def at(self, place, t):
+        found = [cell(a, q) for a, q in zip((self.y, self.x, self.time), (place[1], place[0], t))]
+        if any(f is None for f in found):
+            return np.full(2, np.nan)
+        (j, b), (i, a), (n, s) = found
+        out = 0.0
+        for dn, wn in ((0, 1 - s), (1, s)):
+            if wn == 0.0:
+                continue
+            block = self.v[:, n + dn, j : j + 2, i : i + 2]
+            along = block[..., 0] * (1 - a) + block[..., 1] * a
+            out = out + wn * (along[..., 0] * (1 - b) + along[..., 1] * b)
+        return np.degrees(out / self.metres(place))
+
+    @staticmethod
+    def metres(place):
+        """Metres a radian, along longitude and latitude."""
+        return EARTH_RADIUS * np.array([np.cos(np.radians(place[1])), 1.0])
+
+
 class Era5:
     """Pressure levels on a projected grid: trilinear in x, y and height, linear in time."""
+
+    gaps, tolerance = [1.0, 1.0, 0.05], 1e-6
 
     def __init__(self, files):
         sets = sorted((netCDF4.Dataset(f) for f in files), key=lambda d: seconds(d["time"])[0])
@@ -65,6 +103,8 @@ class Era5:
 
 class Wrf:
     """Arakawa C: each component from its own faces, each column between its own levels at the particle's place."""
+
+    gaps, tolerance = [1.0, 1.0, 0.05], 1e-6
 
     def __init__(self, files):
         d = netCDF4.Dataset(files[0])
@@ -128,28 +168,33 @@ def arrive(flow, start, begin, tau):
     ends = sorted(ends, reverse=tau < 0) + [begin + tau]
     x, t = np.asarray(start, dtype=float), begin
     for end in ends:
-        solution = solve_ivp(lambda t, x: flow.at(x, t), (t, end), x, method="DOP853", rtol=1e-9, atol=1e-6, max_step=abs(tau) / 20)
+        solution = solve_ivp(lambda t, x: flow.at(x, t), (t, end), x, method="DOP853", rtol=1e-13, atol=flow.tolerance, max_step=abs(tau) / 20)
         x, t = solution.y[:, -1], end
         if not solution.success or not np.isfinite(x).all():
-            return np.full(3, np.nan)
+            return np.full(len(start), np.nan)
     return x
 
 
 def main():
     task = json.load(sys.stdin)
-    flow = {"era5": Era5, "wrf": Wrf}[task["kind"]](task["files"])
-    gaps = task.get("gaps", [1.0, 1.0, 0.05])
+    flow = {"era5": Era5, "wrf": Wrf, "globcurrent": GlobCurrent}[task["kind"]](task["files"])
     out = []
     for point in task["points"]:
-        columns = []
-        for axis in range(3):
+        if sum(value is not None for value in out) == task["count"]:
+            break
+        point = np.array(point[: len(flow.gaps)], dtype=float)
+        columns, middles = [], []
+        for axis, gap in enumerate(flow.gaps):
             ends = []
             for sign in (1, -1):
-                moved = np.array(point, dtype=float)
-                moved[axis] += sign * gaps[axis]
+                moved = point.copy()
+                moved[axis] += sign * gap
                 ends.append(arrive(flow, moved, task["from"], task["tau"]))
-            columns.append((ends[0] - ends[1]) / (2 * gaps[axis]))
+            columns.append((ends[0] - ends[1]) / (2 * gap))
+            middles.append((ends[0] + ends[1]) / 2)
         jacobian = np.stack(columns, axis=1)
+        if isinstance(flow, GlobCurrent):
+            jacobian = jacobian * flow.metres(np.mean(middles, axis=0))[:, None] / flow.metres(point)[None, :]
         known = np.isfinite(jacobian).all()
         out.append(float(np.log(np.linalg.svd(jacobian, compute_uv=False)[0])) if known else None)
     json.dump(out, sys.stdout)

@@ -145,6 +145,8 @@ pub fn cases() -> Vec<Case> {
         case("1 feature, 1 axis, odd width", &[1], |s| (s.features, s.width) = (1, 21)),
         case("one hidden layer", plane, |s| s.hidden_layers = 1),
         case("frequency, 4 layers of 40", plane, |s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 4, 40)),
+        case("wide, tables", space, |s| s.width = 130),
+        case("deep, frequency", plane, |s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 6, 24)),
         case("published loss", plane, |s| (s.loss, s.mean_penalty) = (Loss::Published, 0.7)),
         case("flow map, 2 axes", plane, flow_map),
         case("flow map, 3 axes", space, flow_map),

@@ -38,6 +38,12 @@ int main(int argc, char **argv) {
     rw_description *grid = rw_describe(3);
     for (uint32_t axis = 0; axis < 3; axis++) rw_describe_uniform(grid, axis, 0.0, box * (n - 1) / n, n, box);
     rw_describe_block(grid, (uint32_t)rank, (uint32_t)ranks, offset, extent);
+    /* One number for this start, so that a restart with more or fewer ranks is not mistaken for it. */
+    struct timespec now;
+    clock_gettime(CLOCK_REALTIME, &now);
+    uint64_t start = (uint64_t)now.tv_sec * 1000000000 + (uint64_t)now.tv_nsec;
+    MPI_Bcast(&start, 1, MPI_UINT64_T, 0, MPI_COMM_WORLD);
+    rw_describe_start(grid, start);
     rw_describe_wait(grid, (uint32_t)wait);
     rw_field *field = NULL;
     if (rw_open(NULL, grid, &field) > RW_OFF) fprintf(stderr, "rank %d: not published: %s\n", rank, rw_error());

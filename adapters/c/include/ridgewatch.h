@@ -41,7 +41,7 @@ typedef struct rw_description rw_description;
 typedef struct rw_field rw_field;
 
 /* Of this version of the header. */
-#define RW_VERSION 1
+#define RW_VERSION 2
 
 /* The library's version; another number than RW_VERSION: another header. */
 uint32_t rw_version(void);
@@ -68,6 +68,10 @@ rw_status rw_describe_sphere(rw_description *description, double radius);
 /* This process has a block of the global grid: nodes [offset, offset + extent) along x, y, z; blocks must not overlap (leave
  * ghost cells out) and cover the grid together. Block index is of count. Arrays have one value for each of dimensions. */
 rw_status rw_describe_block(rw_description *description, uint32_t index, uint32_t count, const uint64_t *offset, const uint64_t *extent);
+
+/* A number that all blocks of this start of the simulation name, and those of its next start do not: the clock of one rank, for example, that it
+ * tells the others. Steps of two starts are then never put together, whatever their blocks are. 0 (default): none. */
+rw_status rw_describe_start(rw_description *description, uint64_t start);
 
 /* Unit of the times, for people; default "s". */
 rw_status rw_describe_time_unit(rw_description *description, const char *unit);

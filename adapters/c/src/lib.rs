@@ -34,13 +34,14 @@ pub enum Status {
     Internal = 8,
 }
 
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 const DEFAULT_SLOTS: u32 = 4;
 
 /// A grid as far as it is described.
 #[derive(Debug)]
 pub struct RwDescription {
     geometry: Geometry,
+    start: u64,
     axes: Vec<Option<AxisDescription>>,
     block: Option<BlockExtent>,
     time_unit: String,
@@ -169,6 +170,7 @@ pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
         }
         made = Box::into_raw(Box::new(RwDescription {
             geometry: Geometry::Cartesian,
+            start: 0,
             axes: vec![None; dimensions as usize],
             block: None,
             time_unit: "s".into(),
@@ -302,6 +304,20 @@ pub unsafe extern "C" fn rw_describe_block(
     unsafe { describe(description, change) }
 }
 
+/// The number that the blocks of one start share.
+///
+/// # Safety
+/// As [`rw_describe_uniform`].
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, start: u64) -> Status {
+    let change = |d: &mut RwDescription| {
+        d.start = start;
+        Ok(())
+    };
+    // SAFETY: the caller's promise.
+    unsafe { describe(description, change) }
+}
+
 /// Unit of the times.
 ///
 /// # Safety
@@ -371,6 +387,7 @@ pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDesc
         let axes: Option<Vec<_>> = given.axes.iter().cloned().collect();
         let axes = axes.ok_or(Failure::Argument("description: an axis is missing"))?;
         let mut description = Description::whole(given.geometry, axes, &given.time_unit);
+        description.start = given.start;
         if let Some(block) = given.block {
             description.block = block;
         }

@@ -39,6 +39,7 @@ fn fortran_arrays_arrive_as_they_are() {
     let out = Command::new(&program).env("LD_LIBRARY_PATH", &library).env("RIDGEWATCH_RING", &ring).output().unwrap();
     assert!(out.status.success(), "{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
     let mut reader = RingReader::open(&ring, 0, &Limits::default()).unwrap();
+    assert_eq!(reader.header().description.start, 20_261_122);
     let axes = &reader.header().description.axes;
     assert_eq!((axes[1].coordinates.as_slice(), axes[2].period), (&[0.0, 1.0, 4.0][..], Some(5.0)));
     let mut values = Vec::new();

@@ -83,7 +83,7 @@ fn coordinates(given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
 #[pymethods]
 impl Publisher {
     #[new]
-    #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, slots=4, wait_ms=0, time_unit="s", order="zyx"))]
+    #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, start=0, slots=4, wait_ms=0, time_unit="s", order="zyx"))]
     #[allow(clippy::too_many_arguments)]
     fn new(
         x: &Bound<'_, PyAny>,
@@ -93,6 +93,7 @@ impl Publisher {
         periods: Option<Vec<Option<f64>>>,
         radius: Option<f64>,
         block: Option<(u32, u32, Vec<u64>, Vec<u64>)>,
+        start: u64,
         slots: u32,
         wait_ms: u64,
         time_unit: &str,
@@ -116,7 +117,7 @@ impl Publisher {
         }
         let dimensions = axes.len();
         let geometry = radius.map_or(Geometry::Cartesian, |radius| Geometry::Sphere { radius });
-        let mut description = Description::whole(geometry, axes, time_unit);
+        let mut description = Description { start, ..Description::whole(geometry, axes, time_unit) };
         if let Some((index, count, offset, extent)) = block {
             if offset.len() != dimensions || extent.len() != dimensions {
                 return Err(PyValueError::new_err(format!("block: accepted: {dimensions} offsets and extents")));

@@ -49,6 +49,18 @@ def test_arrays_arrive(ring):
     assert not publisher.is_open and not os.path.exists(ring)
 
 
+def test_a_block_of_a_start(ring):
+    x, y = np.arange(6.0), np.arange(4.0)
+    part = np.ones((4, 2), np.float32)
+    with Publisher(x, y, block=(1, 3, [2, 0], [2, 4]), start=20261122) as publisher:
+        assert publisher.publish(3, 1.0, part, 2 * part)
+        data = open(os.path.join(ring, "block-00001.ring"), "rb").read()
+        assert struct.unpack_from("<I", data, 8) == (2,)
+        # The description: geometry, axes, radius, start, block and count, offset, extent.
+        told = struct.unpack_from("<IIdQII3Q3Q", data, 8192)
+        assert told == (0, 2, 0.0, 20261122, 1, 3, 2, 0, 0, 2, 4, 1)
+
+
 def test_order_xyz(ring):
     field = np.random.default_rng(1).random((2, 5, 3)).astype(np.float32)
     with Publisher(np.arange(5.0), np.arange(3.0), order="xyz") as publisher:

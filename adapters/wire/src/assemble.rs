@@ -1,8 +1,15 @@
 //! Blocks of a decomposed domain become steps of the global field.
+//!
+//! The blocks of one start of a simulation name the same start (0 where they name none) and the same number of blocks. One start is followed; blocks
+//! of another gather beside it, and its first whole step takes over. So a simulation may come back in other blocks, and what two starts
+//! have published is never put together.
 
-use crate::{Description, WireError};
+use crate::{BlockExtent, Description, WireError};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
+
+/// Starts that are known at once: the one that is followed, and those that gather.
+const STARTS: usize = 4;
 
 /// A step of the global field.
 #[derive(Debug, Clone, PartialEq)]
@@ -13,6 +20,8 @@ pub struct Step {
     pub time: f64,
     /// When its last block was published, nanoseconds since 1970.
     pub published: u64,
+    /// The first since a block was opened: the simulation was started, or started anew.
+    pub anew: bool,
     /// Components of all nodes, one behind the other, x fastest.
     pub values: Vec<f32>,
 }
@@ -32,137 +41,194 @@ pub struct Incomplete {
     pub why: &'static str,
 }
 
-/// Puts blocks together. At most `pending` steps are held at once.
+/// Puts blocks together.
 #[derive(Debug)]
 pub struct Assembler {
+    /// Of any block: what counts is its grid.
     global: Description,
-    /// Extents by block, once known.
-    blocks: Vec<Option<([u64; 3], [u64; 3])>>,
+    /// First the one that is followed, then those that gather, as they were found.
+    starts: VecDeque<Start>,
+    /// As they began.
     steps: VecDeque<Pending>,
     pending: usize,
     limit: Duration,
-    /// Newest step that was finished or given up.
-    newest: Option<u64>,
+    given_up: Vec<Incomplete>,
     /// Buffers to use again.
     spare: Vec<Vec<f32>>,
 }
 
+/// The number that its blocks name, and how many they are.
+type StartKey = (u64, u32);
+
+#[derive(Debug)]
+struct Start {
+    key: StartKey,
+    /// By index, once known.
+    blocks: Vec<Option<Block>>,
+    /// Newest step that was finished or given up.
+    newest: Option<u64>,
+    /// A block was opened since the last whole step.
+    anew: bool,
+}
+
+#[derive(Debug)]
+struct Block {
+    generation: u64,
+    extent: BlockExtent,
+    ended: bool,
+}
+
 #[derive(Debug)]
 struct Pending {
+    start: StartKey,
     step: Step,
     came: Vec<bool>,
     missing: u32,
     since: Instant,
 }
 
+impl Start {
+    fn new(key: StartKey) -> Self {
+        Self { key, blocks: (0..key.1).map(|_| None).collect(), newest: None, anew: true }
+    }
+
+    fn block(&self, index: u32, generation: u64) -> Option<&Block> {
+        self.blocks.get(index as usize)?.as_ref().filter(|block| block.generation == generation)
+    }
+
+    fn is_complete(&self) -> bool {
+        self.blocks.iter().all(Option::is_some)
+    }
+
+    /// Nodes of its blocks, which share none.
+    fn covered(&self) -> u64 {
+        self.blocks.iter().flatten().map(|block| block.extent.extent.iter().product::<u64>()).sum()
+    }
+}
+
 impl Assembler {
-    /// For the field that one of the blocks describes; a step waits for its blocks for `limit` at most, and at most `pending` steps wait.
+    /// For the grid that one of the blocks describes; a step waits for its blocks for `limit` at most, and at most `pending` steps wait.
     pub fn new(description: &Description, limit: Duration, pending: usize) -> Self {
-        let blocks = vec![None; description.block.count as usize];
         Self {
             global: description.clone(),
-            blocks,
+            starts: VecDeque::new(),
             steps: VecDeque::new(),
             pending: pending.max(1),
             limit,
-            newest: None,
+            given_up: Vec::new(),
             spare: Vec::new(),
         }
     }
 
-    /// Makes a block known.
+    /// Makes a block known that a producer has opened. In its start it takes the place of an earlier opening, and of blocks that it overlaps.
     ///
     /// # Errors
-    /// It belongs to another field, or overlaps another block, or all have come and leave nodes uncovered.
-    pub fn introduce(&mut self, description: &Description) -> Result<(), WireError> {
-        let block = description.block;
-        let refuse = |found: String, accepted: &str| Err(WireError::Block { block: block.index, found, accepted: accepted.into() });
-        if !self.global.same_field(description) {
-            return refuse("it describes another field (grid, time unit or number of blocks)".into(), "the field of the other blocks");
+    /// It has another grid: its steps will not be taken. Or, with the block taken in: it took the place of a block that has not ended;
+    /// all blocks have come and leave nodes uncovered.
+    pub fn introduce(&mut self, description: &Description, generation: u64) -> Result<(), WireError> {
+        let extent = description.block;
+        let refuse = |found: String, accepted: &str| Err(WireError::Block { block: extent.index, found, accepted: accepted.into() });
+        if !self.global.same_grid(description) {
+            return refuse("it has another grid or time unit".into(), "that of the blocks before it; another grid needs a run of its own");
         }
-        let this = (block.offset, block.extent);
-        let overlaps =
-            |other: &([u64; 3], [u64; 3])| (0..3).all(|k| this.0[k] < other.0[k] + other.1[k] && other.0[k] < this.0[k] + this.1[k]);
-        for (index, other) in self.blocks.iter().enumerate() {
-            if index != block.index as usize
-                && let Some(other) = other
-                && overlaps(other)
-            {
-                return refuse(format!("it overlaps block {index}"), "blocks that share no node (leave ghost cells out)");
+        let key = (description.start, extent.count);
+        let at = match self.starts.iter().position(|start| start.key == key) {
+            Some(at) => at,
+            None => {
+                // Of those that gather, the oldest.
+                if self.starts.len() == STARTS
+                    && let Some(left) = self.starts.remove(1)
+                {
+                    self.give_up_if(|p| p.start == left.key, "blocks of later starts came");
+                }
+                self.starts.push_back(Start::new(key));
+                self.starts.len() - 1
             }
+        };
+        let start = &mut self.starts[at];
+        let place = extent.index as usize;
+        if let Some(known) = start.blocks[place].as_mut().filter(|known| known.generation == generation) {
+            // The way to it had broken.
+            known.ended = false;
+            return Ok(());
         }
-        let known = self.blocks[block.index as usize].replace(this);
-        if known.is_some_and(|known| known != this) {
-            // Steps that wait hold values of the old place.
-            self.steps.clear();
+        let displaced = |(index, other): (usize, &Option<Block>)| {
+            let other = other.as_ref()?;
+            (index == place || extent.overlaps(&other.extent)).then_some((index, other.ended))
+        };
+        let displaced: Vec<(usize, bool)> = start.blocks.iter().enumerate().filter_map(displaced).collect();
+        displaced.iter().for_each(|(index, _)| start.blocks[*index] = None);
+        start.blocks[place] = Some(Block { generation, extent, ended: false });
+        self.give_up_if(|p| p.start == key && displaced.iter().any(|(index, _)| p.came[*index]), "the simulation was started anew");
+        let start = &mut self.starts[at];
+        // Its steps may count from 0 again.
+        (start.anew, start.newest) = (true, None);
+        let covered = start.is_complete().then(|| start.covered());
+        if let Some((other, _)) = displaced.iter().find(|(index, ended)| *index != place && !ended) {
+            return refuse(
+                format!("it overlaps block {other}, which has not ended and is left out now"),
+                "blocks that share no node (leave ghost cells out)",
+            );
         }
-        if self.blocks.iter().all(Option::is_some) {
-            let covered: u64 = self.blocks.iter().flatten().map(|(_, extent)| extent.iter().product::<u64>()).sum();
-            let nodes = self.global.shape().iter().product::<u64>();
-            if covered != nodes {
-                self.blocks[block.index as usize] = None;
-                return refuse(format!("all blocks together have {covered} of {nodes} nodes"), "blocks that cover the grid");
+        let nodes = self.global.shape().iter().product::<u64>();
+        match covered {
+            Some(covered) if covered != nodes => {
+                refuse(format!("all blocks together have {covered} of {nodes} nodes"), "blocks that cover the grid")
             }
+            _ => Ok(()),
         }
-        Ok(())
     }
 
     /// Takes one block of a step in; the whole step when it was the last that was missing. Where one block is the whole field, its values are
-    /// taken out of `values`, which gets another buffer, and not copied.
+    /// taken out of `values`, which gets another buffer, and not copied. Blocks that were not introduced, or are followed no more, give nothing.
     ///
     /// # Errors
-    /// An unknown block, another number of values, or another time than the step's other blocks have.
+    /// Another number of values, or another time than the step's other blocks have.
     pub fn block(
         &mut self,
         block: u32,
+        generation: u64,
         step: u64,
         time: f64,
         published: u64,
         values: &mut Vec<f32>,
-    ) -> Result<(Option<Step>, Vec<Incomplete>), WireError> {
+    ) -> Result<Option<Step>, WireError> {
         let refuse = |found: String, accepted: &str| Err(WireError::Block { block, found, accepted: accepted.into() });
-        let Some((offset, extent)) = self.blocks.get(block as usize).copied().flatten() else {
-            return refuse("it was not introduced".into(), "a block that described itself");
-        };
-        let components = self.global.components();
-        let nodes = extent.iter().product::<u64>() as usize;
+        let found = self.starts.iter().enumerate().find_map(|(at, start)| Some((at, start, start.block(block, generation)?.extent)));
+        let Some((at, start, extent)) = found else { return Ok(None) };
+        let (key, shape, components) = (start.key, self.global.shape(), self.global.components());
+        let nodes = extent.extent.iter().product::<u64>() as usize;
         if values.len() != nodes * components {
             return refuse(format!("{} values", values.len()), &format!("{} values", nodes * components));
         }
-        let mut given_up = Vec::new();
         // The newest: what came before it and is not whole by now will not be asked for.
-        if self.newest.is_some_and(|newest| step <= newest) {
-            return Ok((None, given_up));
+        if start.newest.is_some_and(|newest| step <= newest) {
+            return Ok(None);
         }
-        if self.blocks.len() == 1 {
-            self.newest = Some(step);
+        if key.1 == 1 {
             let values = std::mem::replace(values, self.spare.pop().unwrap_or_default());
-            return Ok((Some(Step { step, time, published, values }), given_up));
+            return Ok(Some(self.whole(at, Step { step, time, published, anew: false, values })));
         }
-        let place = match self.steps.iter().position(|p| p.step.step == step) {
+        let place = match self.steps.iter().position(|p| p.start == key && p.step.step == step) {
             Some(place) => place,
             None => {
                 if self.steps.len() >= self.pending
                     && let Some(old) = self.steps.pop_front()
                 {
-                    given_up.push(self.give_up(old, "newer steps came"));
+                    self.give_up(old, "newer steps came");
                 }
-                let place = self.steps.partition_point(|p| p.step.step < step);
-                let shape = self.global.shape();
                 let mut whole = self.spare.pop().unwrap_or_default();
                 whole.resize(shape.iter().product::<u64>() as usize * components, f32::NAN);
-                let count = self.blocks.len();
-                let pending = Pending {
-                    step: Step { step, time, published, values: whole },
-                    came: vec![false; count],
-                    missing: count as u32,
+                self.steps.push_back(Pending {
+                    start: key,
+                    step: Step { step, time, published, anew: false, values: whole },
+                    came: vec![false; key.1 as usize],
+                    missing: key.1,
                     since: Instant::now(),
-                };
-                self.steps.insert(place, pending);
-                place
+                });
+                self.steps.len() - 1
             }
         };
-        let shape = self.global.shape();
         let pending = &mut self.steps[place];
         if pending.step.time != time {
             return refuse(
@@ -170,32 +236,51 @@ impl Assembler {
                 &format!("{}, the time that its other blocks have", pending.step.time),
             );
         }
-        put(&mut pending.step.values, shape, values, offset, extent, components);
+        put(&mut pending.step.values, shape, values, &extent, components);
         pending.step.published = pending.step.published.max(published);
         if !std::mem::replace(&mut pending.came[block as usize], true) {
             pending.missing -= 1;
         }
         if pending.missing > 0 {
-            return Ok((None, given_up));
+            return Ok(None);
         }
-        // Older ones would come out of order.
-        for old in self.steps.drain(..place).collect::<Vec<_>>() {
-            given_up.push(self.give_up(old, "a newer step was whole before it"));
+        let Some(pending) = self.steps.remove(place) else { return Ok(None) };
+        if self.starts[at].covered() != shape.iter().product::<u64>() {
+            self.give_up(pending, "its blocks do not cover the grid");
+            return Ok(None);
         }
-        let whole = self.steps.pop_front().map(|p| p.step);
-        self.newest = whole.as_ref().map(|s| s.step).or(self.newest);
-        Ok((whole, given_up))
+        Ok(Some(self.whole(at, pending.step)))
     }
 
-    /// Gives up the steps that have waited longer than the limit.
-    pub fn expire(&mut self) -> Vec<Incomplete> {
-        let mut given_up = Vec::new();
-        while self.steps.front().is_some_and(|p| p.since.elapsed() > self.limit)
-            && let Some(old) = self.steps.pop_front()
-        {
-            given_up.push(self.give_up(old, "blocks did not come in time"));
+    /// A step of the start at a place is whole: what came before it is given up.
+    fn whole(&mut self, at: usize, mut step: Step) -> Step {
+        let left: Vec<StartKey> = self.starts.drain(..at).map(|start| start.key).collect();
+        self.give_up_if(|p| left.contains(&p.start), "the simulation was started anew");
+        // Older ones would come out of order.
+        let key = self.starts[0].key;
+        self.give_up_if(|p| p.start == key && p.step.step < step.step, "a newer step was whole before it");
+        let start = &mut self.starts[0];
+        start.newest = start.newest.max(Some(step.step));
+        step.anew = std::mem::take(&mut start.anew);
+        step
+    }
+
+    /// The steps that were given up since the last call, those that have waited longer than the limit with them.
+    pub fn incomplete(&mut self) -> Vec<Incomplete> {
+        let limit = self.limit;
+        self.give_up_if(|p| p.since.elapsed() > limit, "blocks did not come in time");
+        std::mem::take(&mut self.given_up)
+    }
+
+    /// A producer has closed a block, or its process ended. Whether the simulation has: all blocks of the start that is followed are known, and none
+    /// of any start lives.
+    pub fn ended(&mut self, block: u32, generation: u64) -> bool {
+        for start in &mut self.starts {
+            if let Some(known) = start.blocks.get_mut(block as usize).and_then(Option::as_mut).filter(|b| b.generation == generation) {
+                known.ended = true;
+            }
         }
-        given_up
+        self.starts.front().is_some_and(Start::is_complete) && self.starts.iter().flat_map(|s| &s.blocks).flatten().all(|b| b.ended)
     }
 
     /// A buffer that is no longer needed, to be used again.
@@ -205,26 +290,30 @@ impl Assembler {
         }
     }
 
-    /// Forgets steps, after a restart: numbers may begin anew.
-    pub fn restart(&mut self) {
-        self.steps.clear();
-        self.newest = None;
+    fn give_up_if(&mut self, is: impl Fn(&Pending) -> bool, why: &'static str) {
+        while let Some(place) = self.steps.iter().position(&is) {
+            if let Some(old) = self.steps.remove(place) {
+                self.give_up(old, why);
+            }
+        }
     }
 
-    fn give_up(&mut self, old: Pending, why: &'static str) -> Incomplete {
-        self.newest = self.newest.max(Some(old.step.step));
-        let wanted = self.blocks.len() as u32;
-        let incomplete = Incomplete { step: old.step.step, time: old.step.time, blocks: wanted - old.missing, wanted, why };
+    fn give_up(&mut self, old: Pending, why: &'static str) {
+        let wanted = old.start.1;
+        // Its other blocks come too late.
+        if let Some(start) = self.starts.iter_mut().find(|start| start.key == old.start) {
+            start.newest = start.newest.max(Some(old.step.step));
+        }
+        self.given_up.push(Incomplete { step: old.step.step, time: old.step.time, blocks: wanted - old.missing, wanted, why });
         self.recycle(old.step.values);
-        incomplete
     }
 }
 
 /// Puts a block's values into the global field's.
-fn put(to: &mut [f32], shape: [u64; 3], from: &[f32], offset: [u64; 3], extent: [u64; 3], components: usize) {
+fn put(to: &mut [f32], shape: [u64; 3], from: &[f32], block: &BlockExtent, components: usize) {
     let [sx, sy, sz] = shape.map(|n| n as usize);
-    let [ox, oy, oz] = offset.map(|n| n as usize);
-    let [ex, ey, ez] = extent.map(|n| n as usize);
+    let [ox, oy, oz] = block.offset.map(|n| n as usize);
+    let [ex, ey, ez] = block.extent.map(|n| n as usize);
     let mut rows = from.chunks_exact(ex);
     for c in 0..components {
         for k in 0..ez {

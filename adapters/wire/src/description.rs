@@ -110,11 +110,20 @@ pub struct BlockExtent {
     pub extent: [u64; 3],
 }
 
+impl BlockExtent {
+    /// Whether two blocks share a node.
+    pub fn overlaps(&self, other: &Self) -> bool {
+        (0..3).all(|k| self.offset[k] < other.offset[k] + other.extent[k] && other.offset[k] < self.offset[k] + self.extent[k])
+    }
+}
+
 /// What a producer says of its field.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Description {
     /// Metric.
     pub geometry: Geometry,
+    /// A number that the blocks of one start of the simulation share, and those of another start do not; 0: none was given.
+    pub start: u64,
     /// Two or three axes of the global grid; as many components has the velocity.
     pub axes: Vec<AxisDescription>,
     /// This producer's block.
@@ -142,7 +151,7 @@ impl Description {
     pub fn whole(geometry: Geometry, axes: Vec<AxisDescription>, time_unit: &str) -> Self {
         let extent = std::array::from_fn(|k| axes.get(k).map_or(1, |a| a.coordinates.len() as u64));
         let block = BlockExtent { index: 0, count: 1, offset: [0; 3], extent };
-        Self { geometry, axes, block, time_unit: time_unit.into() }
+        Self { geometry, start: 0, axes, block, time_unit: time_unit.into() }
     }
 
     /// Components of the velocity: as many as axes.
@@ -165,9 +174,9 @@ impl Description {
         self.block_nodes().saturating_mul(4 * self.components() as u64)
     }
 
-    /// Whether two producers speak of the same global field.
-    pub fn same_field(&self, other: &Self) -> bool {
-        (self.geometry, &self.axes, &self.time_unit, self.block.count) == (other.geometry, &other.axes, &other.time_unit, other.block.count)
+    /// Whether two producers speak of the same global grid and unit of time.
+    pub fn same_grid(&self, other: &Self) -> bool {
+        (self.geometry, &self.axes, &self.time_unit) == (other.geometry, &other.axes, &other.time_unit)
     }
 
     /// Checks everything.
@@ -230,6 +239,7 @@ impl Description {
         out.u32(kind);
         out.u32(self.axes.len() as u32);
         out.f64(radius);
+        out.u64(self.start);
         out.u32(self.block.index);
         out.u32(self.block.count);
         out.three(self.block.offset);
@@ -241,7 +251,7 @@ impl Description {
 
     pub(crate) fn decode(bytes: &[u8], limits: &Limits) -> Result<Self, WireError> {
         let mut input = Parser::new("the description", bytes);
-        let (kind, axes, radius) = (input.u32()?, input.u32()?, input.f64()?);
+        let (kind, axes, radius, start) = (input.u32()?, input.u32()?, input.f64()?, input.u64()?);
         let geometry = match kind {
             0 => Geometry::Cartesian,
             1 => Geometry::Sphere { radius },
@@ -254,7 +264,7 @@ impl Description {
         let time_unit = input.text("time_unit", TEXT)?;
         let axes = (0..axes).map(|_| AxisDescription::decode(&mut input)).collect::<Result<_, _>>()?;
         input.end()?;
-        let description = Self { geometry, axes, block, time_unit };
+        let description = Self { geometry, start, axes, block, time_unit };
         description.check(limits)?;
         Ok(description)
     }

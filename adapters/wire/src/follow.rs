@@ -1,7 +1,7 @@
 //! Following blocks, wherever they come from: rings of this node, or relays of others.
 
 use crate::lock::{Following, blocks, producer_lives};
-use crate::reader::{Read, RingReader};
+use crate::reader::{Read, RingReader, StepInfo};
 use crate::{Description, Limits, WireError};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -24,6 +24,8 @@ pub enum Event {
     Step {
         /// Which block.
         block: u32,
+        /// When its producer opened it.
+        generation: u64,
         /// The solver's number.
         step: u64,
         /// Its time.
@@ -37,7 +39,9 @@ pub enum Event {
     Ended {
         /// Which block.
         block: u32,
-        /// Whether it was closed; else its process ended without that.
+        /// When its producer opened it.
+        generation: u64,
+        /// Whether it was closed; else its process ended without that, or the relay is gone.
         closed: bool,
     },
     /// Something was refused; following goes on.
@@ -47,6 +51,8 @@ pub enum Event {
 /// One block's ring.
 struct Followed {
     reader: RingReader,
+    /// Nothing more is read, since what was read could not be: until a new producer takes its place.
+    refused: bool,
     /// Its end was told.
     ended: bool,
     looked: Instant,
@@ -62,6 +68,8 @@ pub struct RingFollower {
     looked: Option<Instant>,
     /// The block to be asked next, so that none is starved.
     turn: u32,
+    /// Which of the rings' marks is this follower's.
+    mark: u32,
     #[allow(dead_code)]
     following: Following,
 }
@@ -70,10 +78,11 @@ impl RingFollower {
     /// Begins; the folder is made where it is not there.
     ///
     /// # Errors
-    /// The folder is not this user's alone.
+    /// The folder is not this user's alone, or has too many followers.
     pub fn begin(ring: &Path, limits: Limits) -> Result<Self, WireError> {
         let following = Following::begin(ring)?;
-        Ok(Self { ring: ring.into(), limits, rings: BTreeMap::new(), refused: BTreeMap::new(), looked: None, turn: 0, following })
+        let mark = following.mark()?;
+        Ok(Self { ring: ring.into(), limits, rings: BTreeMap::new(), refused: BTreeMap::new(), looked: None, turn: 0, mark, following })
     }
 
     /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
@@ -87,16 +96,18 @@ impl RingFollower {
         let order: Vec<u32> = self.rings.range(self.turn..).chain(self.rings.range(..self.turn)).map(|(block, _)| *block).collect();
         for block in order {
             let Some(followed) = self.rings.get_mut(&block) else { continue };
-            let event = match followed.reader.read(values) {
+            let generation = followed.reader.header().generation;
+            let event = match if followed.refused { Ok(Read::Nothing) } else { followed.reader.read(values) } {
                 Ok(Read::Step(info)) => {
                     self.turn = block + 1;
                     // A ring that cannot be written to is one that nobody waits for.
-                    let _ = followed.reader.acknowledge();
-                    Some(Event::Step { block, step: info.step, time: info.time, published: info.published, missed: info.missed })
+                    let _ = followed.reader.acknowledge(self.mark);
+                    let StepInfo { step, time, published, missed, .. } = info;
+                    Some(Event::Step { block, generation, step, time, published, missed })
                 }
                 Ok(Read::Ended) if !followed.ended => {
                     followed.ended = true;
-                    Some(Event::Ended { block, closed: true })
+                    Some(Event::Ended { block, generation, closed: true })
                 }
                 Ok(Read::Nothing) if !followed.ended && followed.looked.elapsed() > LOOK => {
                     followed.looked = Instant::now();
@@ -104,13 +115,12 @@ impl RingFollower {
                     let gone = !followed.reader.is_current() || !producer_lives(&self.ring, block);
                     gone.then(|| {
                         followed.ended = true;
-                        Event::Ended { block, closed: false }
+                        Event::Ended { block, generation, closed: false }
                     })
                 }
                 Ok(_) => None,
                 Err(error) => {
-                    self.rings.remove(&block);
-                    self.refused.insert(block, error.to_string());
+                    followed.refused = true;
                     Some(Event::Refused(error))
                 }
             };
@@ -123,8 +133,8 @@ impl RingFollower {
 
     /// Tells producers that somebody follows, without taking anything: they wait as long as their policy lets them.
     pub fn hold(&self) {
-        for followed in self.rings.values() {
-            let _ = followed.reader.acknowledge();
+        for followed in self.rings.values().filter(|followed| !followed.refused) {
+            let _ = followed.reader.acknowledge(self.mark);
         }
     }
 
@@ -145,16 +155,11 @@ impl RingFollower {
                     if known == Some(reader.header().producer) {
                         continue;
                     }
-                    if known.is_some() {
-                        // The old run's other blocks go with it, unless they live.
-                        let ring = &self.ring;
-                        self.rings.retain(|b, f| *b == block || (f.reader.is_current() && producer_lives(ring, *b)));
-                    }
                     self.refused.remove(&block);
-                    let _ = reader.acknowledge();
+                    let _ = reader.acknowledge(self.mark);
                     let header = reader.header();
                     let event = Event::Opened { description: Box::new(header.description.clone()), generation: header.generation };
-                    self.rings.insert(block, Followed { reader, ended: false, looked: Instant::now() });
+                    self.rings.insert(block, Followed { reader, refused: false, ended: false, looked: Instant::now() });
                     return Some(event);
                 }
                 Err(WireError::Io { .. }) => {}
@@ -174,5 +179,13 @@ impl RingFollower {
     fn closed_in_order(&self, block: u32) -> bool {
         !self.rings.contains_key(&block)
             && RingReader::open(&self.ring, block, &self.limits).and_then(|reader| reader.is_closed()).unwrap_or(false)
+    }
+}
+
+impl Drop for RingFollower {
+    fn drop(&mut self) {
+        for followed in self.rings.values() {
+            let _ = followed.reader.leave(self.mark);
+        }
     }
 }

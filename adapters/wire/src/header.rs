@@ -6,7 +6,7 @@
 //! | 16 | bytes of the file u64, slots u32, components u32, bytes from slot to slot u64, offset of the first slot u64 |
 //! | 48 | producer id u64 (random), generation u64 (nanoseconds since 1970 when it was opened), process id u64, checksum u64 of 0..72 and the description |
 //! | 1024 | steps published u64, state u64 (1 open, 2 ended), steps that overwrote one that no follower had taken u64 |
-//! | 4096 | written by the follower: steps taken u64, heartbeat u64 (nanoseconds, CLOCK_MONOTONIC) |
+//! | 4096 | 64 marks, each written by one follower: steps taken u64, heartbeat u64 (nanoseconds, CLOCK_MONOTONIC; 0: nobody) |
 //! | 8192 | the description |
 //! | slots | sequence u64 (2n + 1 while step n is written, 2n + 2 when it is whole), step number u64, time f64, published at u64 (nanoseconds since 1970); from 64 on the components as f32, one after another, x fastest |
 
@@ -16,7 +16,7 @@ use crate::{Description, Limits, WireError};
 /// First bytes of a ring.
 pub const MAGIC: [u8; 8] = *b"RIDGERNG";
 /// Version of the layout.
-pub const VERSION: u32 = 1;
+pub const VERSION: u32 = 2;
 /// Most slots.
 pub(crate) const SLOTS: u32 = 4096;
 /// Bytes before the checksum.
@@ -26,8 +26,12 @@ pub(crate) const FIXED: usize = 80;
 pub(crate) const PUBLISHED: usize = 1024;
 pub(crate) const STATE: usize = 1032;
 pub(crate) const OVERWRITTEN: usize = 1040;
-pub(crate) const TAKEN: usize = 4096;
-pub(crate) const HEARTBEAT: usize = 4104;
+/// The first follower's mark: steps taken, heartbeat.
+pub(crate) const MARK: usize = 4096;
+/// Bytes from mark to mark.
+pub(crate) const MARK_BYTES: usize = 16;
+/// Followers of one ring at once.
+pub(crate) const MARKS: u32 = 64;
 pub(crate) const DESCRIPTION: usize = 8192;
 /// Bytes of a slot before its values.
 pub(crate) const SLOT_HEADER: usize = 64;

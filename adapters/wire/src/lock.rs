@@ -1,5 +1,6 @@
 //! Who publishes under a name, and who follows: locks that the system takes back when their holder ends, however it ends.
 
+use crate::header::MARKS;
 use crate::system::{create_private, foreign};
 use crate::{WireError, block_path, followers_path, lock_path, system};
 use std::fs::File;
@@ -15,12 +16,19 @@ struct FileLock {
     file: File,
 }
 
-/// A lock over a whole file.
+/// A lock over a file's byte 0, which stands for the file.
 fn whole(kind: libc::c_int) -> libc::flock {
+    over(kind, 0)
+}
+
+/// A lock over one byte of a file; it need not be there.
+fn over(kind: libc::c_int, byte: u32) -> libc::flock {
     // SAFETY: all of its fields are integers.
     let mut lock: libc::flock = unsafe { std::mem::zeroed() };
     lock.l_type = kind as libc::c_short;
     lock.l_whence = libc::SEEK_SET as libc::c_short;
+    lock.l_start = libc::off_t::from(byte);
+    lock.l_len = 1;
     lock
 }
 
@@ -130,6 +138,26 @@ impl Following {
             }
         };
         Ok(Self { ring: ring.to_owned(), lock: Some(lock) })
+    }
+
+    /// Takes a number for the marks that this follower leaves in the rings, which nobody else has until it is dropped.
+    ///
+    /// # Errors
+    /// All 64 are taken.
+    pub fn mark(&self) -> Result<u32, WireError> {
+        let path = followers_path(&self.ring);
+        let Some(lock) = &self.lock else { unreachable!("taken only by drop") };
+        for mark in 0..MARKS {
+            // SAFETY: the descriptor is open, and the lock outlives the call. Byte 0 is the presence of all.
+            if unsafe { libc::fcntl(lock.file.as_raw_fd(), libc::F_OFD_SETLK, &over(libc::F_WRLCK, mark + 1)) } == 0 {
+                return Ok(mark);
+            }
+            let error = io::Error::last_os_error();
+            if !matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) {
+                return Err(WireError::io(&path, "cannot be locked", error));
+            }
+        }
+        Err(WireError::field("followers", format_args!("{} follow {} already", MARKS, self.ring.display()), format!("at most {MARKS}")))
     }
 }
 

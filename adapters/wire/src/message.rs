@@ -2,12 +2,12 @@
 //!
 //! Both sides know the key of a [`ConnectionFile`]. They greet each other with random numbers, prove the key, and derive a session key from both:
 //! a message of another session never fits. Each message is a head of fixed length with its signature (HMAC-SHA256), then the
-//! description (first, and when it changed) and the values, for whose BLAKE3 hash the head vouches. Its number rises strictly within the
-//! session. So nothing is believed, and no memory taken, before the signature has been checked.
+//! description (of a block that was opened) and the values, for whose BLAKE3 hash the head vouches. Its number rises strictly within the
+//! session. So nothing is believed, and no memory taken, before the signature has been checked. A follower asks for each message but pulses
+//! (signed and numbered as well), so that nothing is on its way to one that does not take it.
 //!
 //! TCP with these frames and not ZeroMQ: the `zeromq` crate takes memory for any length that a peer announces, before a signature could be
-//! looked at, is half as fast with steps of 340 MB (`benches/relay.rs`), and has no limit on what waits for a slow peer. Here a slow peer just
-//! reads the ring more rarely.
+//! looked at, and is half as fast with steps of 340 MB (`benches/relay.rs`).
 
 use crate::bytes::{Parser, Writer};
 use crate::header::DESCRIPTION_BYTES;
@@ -25,7 +25,11 @@ compile_error!("rings and messages are little-endian and are not converted");
 const GREETING: [u8; 12] = *b"RIDGEWIRE\0\0\0";
 /// First bytes of a message.
 const MAGIC: [u8; 4] = *b"RWMS";
-const VERSION: u32 = 1;
+/// First bytes of what a follower asks.
+const ASK_MAGIC: [u8; 4] = *b"RWAS";
+const VERSION: u32 = 2;
+/// Bytes of what a follower asks, with its signature.
+pub const ASK_BYTES: usize = 20 + SIGNATURE;
 /// Bytes of a message's head, and of its signature.
 const HEAD: usize = 100;
 const SIGNATURE: usize = 32;
@@ -139,6 +143,17 @@ pub enum Kind {
     Ended,
     /// Nothing new; the relay lives.
     Pulse,
+    /// A producer has opened a block, or had before the session began; its description comes with it.
+    Opened,
+}
+
+/// What a follower says.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Ask {
+    /// The next message, please.
+    Next,
+    /// Nothing yet, but the follower lives and will ask again.
+    Hold,
 }
 
 /// A message's facts; a step's values come with it.
@@ -163,7 +178,10 @@ pub struct Facts {
 /// One side's end of a session.
 pub struct Session {
     key: Key,
+    /// Of the newest message that was sent or received.
     number: u64,
+    /// The same for what was asked.
+    asked: u64,
 }
 
 fn failed(e: std::io::Error) -> WireError {
@@ -183,7 +201,7 @@ impl Session {
         stream.read_exact(&mut signature).map_err(failed)?;
         key.verify(&[b"follower", &mine, &theirs], &signature)?;
         stream.write_all(&key.signature(&[b"relay", &mine, &theirs])).map_err(failed)?;
-        Ok(Self { key: Key(key.signature(&[b"session", &mine, &theirs])), number: 0 })
+        Ok(Self { key: Key(key.signature(&[b"session", &mine, &theirs])), number: 0, asked: 0 })
     }
 
     /// Greets as the follower.
@@ -198,10 +216,59 @@ impl Session {
         let mut signature = [0; SIGNATURE];
         stream.read_exact(&mut signature).map_err(failed)?;
         key.verify(&[b"relay", &theirs, &mine], &signature)?;
-        Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0 })
+        Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0, asked: 0 })
     }
 
-    /// Sends a message; `description` first and when it changed, `values` with a step.
+    /// Asks, as the follower.
+    ///
+    /// # Errors
+    /// The connection broke.
+    pub fn ask(&mut self, to: &mut impl Write, ask: Ask) -> Result<(), WireError> {
+        self.asked += 1;
+        let mut out = Writer(ASK_MAGIC.to_vec());
+        out.u32(VERSION);
+        out.u64(self.asked);
+        out.u32(match ask {
+            Ask::Next => 1,
+            Ask::Hold => 2,
+        });
+        let signature = self.key.signature(&[&out.0]);
+        out.0.extend_from_slice(&signature);
+        to.write_all(&out.0).map_err(failed)
+    }
+
+    /// What the follower asks, to the relay.
+    ///
+    /// # Errors
+    /// Wrong key, a changed or replayed message: the session is over.
+    pub fn check_ask(&mut self, bytes: &[u8; ASK_BYTES]) -> Result<Ask, WireError> {
+        let (head, rest) = bytes.split_at(ASK_BYTES - SIGNATURE);
+        let mut signature = [0; SIGNATURE];
+        signature.copy_from_slice(rest);
+        self.key.verify(&[head], &signature)?;
+        let mut input = Parser::new("what a follower asks", head);
+        let magic: [u8; 4] = input.array()?;
+        if magic != ASK_MAGIC {
+            return Err(WireError::field("magic", format_args!("{magic:02x?}"), "what a follower asks"));
+        }
+        let version = input.u32()?;
+        if version != VERSION {
+            return Err(WireError::Version { found: version, known: VERSION });
+        }
+        let number = input.u64()?;
+        if number <= self.asked {
+            return Err(WireError::Replayed { found: number, newest: self.asked });
+        }
+        let ask = match input.u32()? {
+            1 => Ask::Next,
+            2 => Ask::Hold,
+            other => return Err(WireError::field("ask", other, "1 (next) or 2 (hold)")),
+        };
+        self.asked = number;
+        Ok(ask)
+    }
+
+    /// Sends a message; `description` when a block was opened, `values` with a step.
     ///
     /// # Errors
     /// The connection broke, or the peer takes nothing any more.
@@ -217,6 +284,7 @@ impl Session {
             Kind::Step => 1,
             Kind::Ended => 2,
             Kind::Pulse => 3,
+            Kind::Opened => 4,
         });
         head.u32(facts.block);
         head.u64(facts.generation);
@@ -300,7 +368,8 @@ impl Session {
             1 => Kind::Step,
             2 => Kind::Ended,
             3 => Kind::Pulse,
-            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended) or 3 (pulse)")),
+            4 => Kind::Opened,
+            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended), 3 (pulse) or 4 (opened)")),
         };
         let (block, generation, step, time) = (input.u32()?, input.u64()?, input.u64()?, input.f64()?);
         let (published, missed) = (input.u64()?, input.u64()?);
@@ -368,7 +437,8 @@ mod tests {
         let (mut taken, mut refused) = (0u64, [0u64; 4]);
         let mut most = 0;
         for case in 0..cases {
-            let (mut from, mut to) = (Session { key: Key([1; 32]), number: 7 }, Session { key: Key([1; 32]), number: 7 });
+            let (mut from, mut to) =
+                (Session { key: Key([1; 32]), number: 7, asked: 0 }, Session { key: Key([1; 32]), number: 7, asked: 0 });
             let mut message = Vec::new();
             from.send(&mut message, &facts, Some(&description), &[0.5; 40]).unwrap();
             let begin = HEAD + SIGNATURE;

@@ -1,7 +1,7 @@
 //! The solver's side: copy a step into the next slot, and go on.
 
 use crate::copy::Field;
-use crate::header::{DESCRIPTION, ENDED, HEARTBEAT, Header, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, SLOTS, STATE, TAKEN};
+use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, SLOTS, STATE};
 use crate::lock::{NameLock, is_followed};
 use crate::system::{self, Map, create_private, open_private};
 use crate::{Description, Limits, WireError, block_path};
@@ -53,6 +53,15 @@ struct Writer {
     count: u64,
     /// The follower's count when it was given up waiting for.
     given_up_at: Option<u64>,
+}
+
+/// What followers have taken.
+#[derive(Debug, Clone, Copy)]
+struct Taken {
+    /// Steps that all of them have.
+    steps: u64,
+    /// Followers came, and none of them is heard of any more: nobody waits for them. One that never came is waited for.
+    silent: bool,
 }
 
 impl Producer {
@@ -162,32 +171,47 @@ impl Producer {
     /// Whether the next slot is free, after waiting as the policy says.
     fn has_room(&self, writer: &mut Writer) -> bool {
         let slots = u64::from(self.header.slots);
-        let taken = || self.word(TAKEN).load(Ordering::Acquire);
         let free = |taken: u64| writer.count < taken.saturating_add(slots);
-        if free(taken()) {
+        let mut seen = self.taken();
+        if free(seen.steps) {
             return true;
         }
         let Policy::Wait(limit) = self.policy else { return false };
-        if writer.given_up_at == Some(taken()) {
+        if writer.given_up_at == Some(seen.steps) {
             return false;
         }
         let begin = system::monotonic();
         let (mut nap, limit) = (Duration::from_micros(20), limit.as_nanos() as u64);
-        while system::monotonic().saturating_sub(begin) < limit {
+        while !seen.silent && system::monotonic().saturating_sub(begin) < limit {
             std::thread::sleep(nap);
             nap = (nap * 2).min(Duration::from_millis(1));
-            let seen = taken();
-            if free(seen) {
+            seen = self.taken();
+            if free(seen.steps) {
                 return true;
             }
-            // One that came and fell silent is not waited for; one that never came is.
-            let beat = self.word(HEARTBEAT).load(Ordering::Relaxed);
-            if beat != 0 && system::monotonic().saturating_sub(beat) > SILENCE.as_nanos() as u64 {
-                break;
+        }
+        writer.given_up_at = Some(seen.steps);
+        false
+    }
+
+    /// What the followers' marks say: those that fell silent count only where no other is left.
+    fn taken(&self) -> Taken {
+        let now = system::monotonic();
+        let (mut least, mut left) = (None, None);
+        for mark in 0..MARKS as usize {
+            let place = MARK + MARK_BYTES * mark;
+            let beat = self.word(place + 8).load(Ordering::Relaxed);
+            if beat == 0 {
+                continue;
+            }
+            let steps = self.word(place).load(Ordering::Acquire);
+            if now.saturating_sub(beat) <= SILENCE.as_nanos() as u64 {
+                least = Some(least.map_or(steps, |least: u64| least.min(steps)));
+            } else {
+                left = left.max(Some(steps));
             }
         }
-        writer.given_up_at = Some(taken());
-        false
+        Taken { steps: least.or(left).unwrap_or(0), silent: least.is_none() && left.is_some() }
     }
 
     /// The word at a multiple of 8.

@@ -3,7 +3,7 @@
 //! Everything is read through the file, not through a mapping: a ring that is cut short under the reader's hands gives an error and no
 //! signal, and what a producer writes meanwhile is seen by the sequence numbers.
 
-use crate::header::{DESCRIPTION, ENDED, FIXED, HEARTBEAT, Header, PUBLISHED, SLOT_HEADER, STATE, TAKEN};
+use crate::header::{DESCRIPTION, ENDED, FIXED, Header, MARK, MARK_BYTES, MARKS, PUBLISHED, SLOT_HEADER, STATE};
 use crate::system::{self, open_private};
 use crate::{Limits, WireError, block_path};
 use std::fs::File;
@@ -167,11 +167,30 @@ impl<F: ReadAt> RingReader<F> {
         }
     }
 
-    /// Tells the producer that all steps before the next are taken, and that somebody follows.
-    pub fn acknowledge(&self) -> Result<(), WireError> {
-        let failed = |e| WireError::io(&self.path, "cannot be written", e);
-        self.file.write_at(&system::monotonic().to_ne_bytes(), HEARTBEAT as u64).map_err(failed)?;
-        self.file.write_at(&self.next.to_ne_bytes(), TAKEN as u64).map_err(failed)
+    /// Tells the producer that this follower has taken all steps before the next, and lives. Which of the 64 marks is its own says
+    /// [`crate::Following::mark`].
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn acknowledge(&self, mark: u32) -> Result<(), WireError> {
+        self.put_mark(mark, system::monotonic())
+    }
+
+    /// Tells the producer that this follower goes: nobody waits for it any more.
+    ///
+    /// # Errors
+    /// The file cannot be written.
+    pub fn leave(&self, mark: u32) -> Result<(), WireError> {
+        // Long ago.
+        self.put_mark(mark, 1)
+    }
+
+    fn put_mark(&self, mark: u32, heartbeat: u64) -> Result<(), WireError> {
+        let mut words = [0; MARK_BYTES];
+        words[..8].copy_from_slice(&self.next.to_ne_bytes());
+        words[8..].copy_from_slice(&heartbeat.to_ne_bytes());
+        let place = MARK + MARK_BYTES * (mark % MARKS) as usize;
+        self.file.write_at(&words, place as u64).map_err(|e| WireError::io(&self.path, "cannot be written", e))
     }
 
     /// Whether the producer has closed the ring.

@@ -1,18 +1,19 @@
 //! From a node's rings to followers elsewhere.
 //!
-//! The relay gives each follower a thread and a view of the rings of its own: a follower that is slow reads more rarely and sees newer steps, and
-//! costs nothing but one step's memory. One that takes nothing for [`PATIENCE`] is cut off.
+//! The relay gives each follower a thread and a view of the rings of its own, and sends the next step when the follower asks for it: one that is slow
+//! sees newer steps, or holds a producer that waits, and costs nothing but one step's memory. One that takes nothing and says nothing for
+//! [`PATIENCE`] is cut off.
 
 use crate::follow::{Event, RingFollower};
-use crate::message::{ConnectionFile, Facts, Key, Kind, Session};
-use crate::{Description, Limits, WireError};
-use std::collections::BTreeMap;
-use std::io::BufReader;
-use std::net::{TcpListener, TcpStream, ToSocketAddrs};
+use crate::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
+use crate::{Description, Limits, WireError, system};
+use std::collections::{BTreeMap, VecDeque};
+use std::io::{BufReader, ErrorKind, Read, Write};
+use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, sync_channel};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 /// Longest that a peer may take for a piece of a message.
@@ -21,10 +22,14 @@ pub const PATIENCE: Duration = Duration::from_secs(5);
 const PULSE: Duration = Duration::from_secs(1);
 /// How often an idle thread looks for new steps.
 const IDLE: Duration = Duration::from_millis(1);
+/// How often a relay whose follower holds tells the producers that somebody follows.
+const HOLD: Duration = Duration::from_millis(50);
 /// Pause before a follower tries again to connect.
 const AGAIN: Duration = Duration::from_millis(500);
 /// Followers at once.
 const FOLLOWERS: usize = 16;
+/// Connections at once that have not proved the key yet.
+const STRANGERS: usize = 16;
 
 /// What a relay has done.
 #[derive(Debug, Default)]
@@ -41,10 +46,76 @@ pub struct RelayCounts {
     pub bytes: AtomicU64,
 }
 
-fn timeouts(stream: &TcpStream) -> std::io::Result<()> {
-    stream.set_nodelay(true)?;
-    stream.set_read_timeout(Some(PATIENCE))?;
-    stream.set_write_timeout(Some(PATIENCE))
+/// A stream of which a piece of work must be done by a certain time, however slowly the peer dribbles.
+struct Within<'a> {
+    stream: &'a TcpStream,
+    until: Instant,
+}
+
+impl Within<'_> {
+    fn left(&self) -> std::io::Result<Duration> {
+        let left = self.until.saturating_duration_since(Instant::now());
+        if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left) }
+    }
+}
+
+impl Read for Within<'_> {
+    fn read(&mut self, to: &mut [u8]) -> std::io::Result<usize> {
+        self.stream.set_read_timeout(Some(self.left()?))?;
+        (&mut &*self.stream).read(to)
+    }
+}
+
+impl Write for Within<'_> {
+    fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
+        self.stream.set_write_timeout(Some(self.left()?))?;
+        (&mut &*self.stream).write(from)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+/// Both sides' greetings take [`PATIENCE`] in all; afterwards each piece of a message may.
+fn greet(stream: &TcpStream, greeting: impl FnOnce(&mut Within) -> Result<Session, WireError>) -> Result<Session, WireError> {
+    let broken = |e| WireError::io(Path::new("connection"), "broke", e);
+    stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true)).map_err(broken)?;
+    let session = greeting(&mut Within { stream, until: Instant::now() + PATIENCE })?;
+    stream.set_read_timeout(Some(PATIENCE)).and_then(|()| stream.set_write_timeout(Some(PATIENCE))).map_err(broken)?;
+    Ok(session)
+}
+
+/// Connections that have not proved the key yet.
+#[derive(Default)]
+struct Strangers(Mutex<VecDeque<(SocketAddr, TcpStream)>>);
+
+impl Strangers {
+    /// One more; where there are too many, the oldest is cut off.
+    fn come(&self, peer: SocketAddr, stream: &TcpStream) -> std::io::Result<()> {
+        let mut there = self.0.lock().unwrap_or_else(|broken| broken.into_inner());
+        there.push_back((peer, stream.try_clone()?));
+        if there.len() > STRANGERS
+            && let Some((_, oldest)) = there.pop_front()
+        {
+            oldest.shutdown(Shutdown::Both)?;
+        }
+        Ok(())
+    }
+
+    fn go(&self, peer: SocketAddr) {
+        self.0.lock().unwrap_or_else(|broken| broken.into_inner()).retain(|(one, _)| *one != peer);
+    }
+}
+
+/// What the connections of a relay share.
+struct Relay {
+    ring: PathBuf,
+    key: Key,
+    counts: Arc<RelayCounts>,
+    strangers: Strangers,
+    stop: Arc<AtomicBool>,
+    tell: Arc<dyn Fn(String) + Send + Sync>,
 }
 
 /// Serves the rings of a folder until `stop` is set. `tell` hears of followers that come and go, and why.
@@ -63,34 +134,31 @@ pub fn serve(
     // Steps are kept for followers that come later only as long as somebody follows: the relay itself does.
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
+    let (ring, key, counts, strangers) = (ring.to_owned(), key.clone(), counts.clone(), Strangers::default());
+    let relay = Arc::new(Relay { ring, key, counts, strangers, stop: stop.clone(), tell });
     let mut threads: Vec<std::thread::JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
         let (stream, peer) = match listener.accept() {
+            // Whoever was cut off is about to end its thread.
+            Ok((_, peer)) if threads.len() > FOLLOWERS + 2 * STRANGERS => {
+                relay.refuse(peer, "too many come at once".to_owned());
+                continue;
+            }
             Ok(came) => came,
-            Err(e) if e.kind() == std::io::ErrorKind::WouldBlock => {
+            Err(e) if e.kind() == ErrorKind::WouldBlock => {
                 std::thread::sleep(Duration::from_millis(20));
                 continue;
             }
             // A peer that went before it was taken, or no descriptor left: later ones may fare better.
             Err(e) => {
-                tell(format!("a connection was lost: {e}"));
+                (relay.tell)(format!("a connection was lost: {e}"));
                 std::thread::sleep(Duration::from_millis(100));
                 continue;
             }
         };
-        if threads.len() >= FOLLOWERS {
-            counts.refused.fetch_add(1, Ordering::Relaxed);
-            tell(format!("{peer} was sent away: {FOLLOWERS} are there"));
-            continue;
-        }
-        let (ring, key, counts, stop, tell) = (ring.to_owned(), key.clone(), counts.clone(), stop.clone(), tell.clone());
-        let work = move || {
-            let ended = follower(stream, ring, &key, &counts, &stop);
-            if let Err(error) = ended {
-                tell(format!("follower {peer}: {error}"));
-            }
-        };
+        let relay = relay.clone();
+        let work = move || relay.connection(&stream, peer);
         let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
         threads.extend(started.map_err(broken));
     }
@@ -100,62 +168,95 @@ pub fn serve(
     Ok(())
 }
 
-/// One follower.
-fn follower(mut stream: TcpStream, ring: PathBuf, key: &Key, counts: &RelayCounts, stop: &AtomicBool) -> Result<(), WireError> {
-    let broken = |e| WireError::io(Path::new("connection"), "broke", e);
-    stream.set_nonblocking(false).and_then(|()| timeouts(&stream)).map_err(broken)?;
-    let mut session = Session::accept(&mut stream, key).inspect_err(|_| {
-        counts.refused.fetch_add(1, Ordering::Relaxed);
-    })?;
-    counts.accepted.fetch_add(1, Ordering::Relaxed);
-    counts.followers.fetch_add(1, Ordering::Relaxed);
-    let ended = send_steps(&mut stream, &mut session, &ring, counts, stop);
-    counts.followers.fetch_sub(1, Ordering::Relaxed);
-    ended
+impl Relay {
+    fn refuse(&self, peer: SocketAddr, why: String) {
+        self.counts.refused.fetch_add(1, Ordering::Relaxed);
+        (self.tell)(format!("{peer} was sent away: {why}"));
+    }
+
+    /// One that came, until it goes.
+    fn connection(&self, stream: &TcpStream, peer: SocketAddr) {
+        let broken = |e| WireError::io(Path::new("connection"), "broke", e);
+        let greeted = self.strangers.come(peer, stream).map_err(broken);
+        let greeted = greeted.and_then(|()| greet(stream, |within| Session::accept(within, &self.key)));
+        self.strangers.go(peer);
+        let session = match greeted {
+            Ok(session) => session,
+            Err(error) => return self.refuse(peer, error.to_string()),
+        };
+        let followers = &self.counts.followers;
+        if followers.fetch_add(1, Ordering::Relaxed) < FOLLOWERS {
+            self.counts.accepted.fetch_add(1, Ordering::Relaxed);
+            if let Err(error) = self.send_steps(stream, session) {
+                (self.tell)(format!("follower {peer}: {error}"));
+            }
+        } else {
+            self.refuse(peer, format!("{FOLLOWERS} followers are there"));
+        }
+        followers.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// Answers each time that the follower asks with the next thing that happens.
+    fn send_steps(&self, mut stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
+        let mut rings = RingFollower::begin(&self.ring, Limits { step_bytes: u64::MAX })?;
+        let (mut values, mut asked) = (Vec::new(), false);
+        let (mut sent, mut heard) = (Instant::now(), Instant::now());
+        let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
+        while !self.stop.load(Ordering::Relaxed) {
+            let event = if asked { rings.poll(&mut values) } else { None };
+            if event.is_none() {
+                if !asked {
+                    rings.hold();
+                }
+                if let Some(ask) = hear(stream, &mut session, if asked { IDLE } else { HOLD })? {
+                    asked |= ask == Ask::Next;
+                    heard = Instant::now();
+                }
+                if heard.elapsed() > PATIENCE {
+                    return Err(WireError::io(Path::new("connection"), "nothing was heard of it", ErrorKind::TimedOut.into()));
+                }
+                if !asked {
+                    continue;
+                }
+            }
+            let (facts, description) = match event {
+                Some(Event::Opened { description, generation }) => {
+                    let facts = Facts { kind: Kind::Opened, block: description.block.index, generation, ..quiet };
+                    (facts, Some(description))
+                }
+                Some(Event::Step { block, generation, step, time, published, missed }) => {
+                    self.counts.steps.fetch_add(1, Ordering::Relaxed);
+                    self.counts.bytes.fetch_add(size_of_val(values.as_slice()) as u64, Ordering::Relaxed);
+                    (Facts { kind: Kind::Step, block, generation, step, time, published, missed }, None)
+                }
+                // What went without closing ends for the follower too.
+                Some(Event::Ended { block, generation, .. }) => (Facts { kind: Kind::Ended, block, generation, ..quiet }, None),
+                Some(Event::Refused(error)) => {
+                    (self.tell)(format!("refused: {error}"));
+                    continue;
+                }
+                None if sent.elapsed() > PULSE => (quiet, None),
+                None => continue,
+            };
+            let step: &[f32] = if facts.kind == Kind::Step { &values } else { &[] };
+            session.send(&mut stream, &facts, description.as_deref(), step)?;
+            // A pulse is no answer. And what takes long to send is taken.
+            asked = facts.kind == Kind::Pulse;
+            (sent, heard) = (Instant::now(), if asked { heard } else { Instant::now() });
+        }
+        Ok(())
+    }
 }
 
-fn send_steps(
-    stream: &mut TcpStream,
-    session: &mut Session,
-    ring: &Path,
-    counts: &RelayCounts,
-    stop: &AtomicBool,
-) -> Result<(), WireError> {
-    let mut rings = RingFollower::begin(ring, Limits { step_bytes: u64::MAX })?;
-    // Descriptions that the follower does not have yet, by block, and generations.
-    let mut fresh: BTreeMap<u32, Box<Description>> = BTreeMap::new();
-    let mut generations: BTreeMap<u32, u64> = BTreeMap::new();
-    let (mut values, mut sent) = (Vec::new(), Instant::now());
-    let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
-    while !stop.load(Ordering::Relaxed) {
-        match rings.poll(&mut values) {
-            Some(Event::Opened { description, generation }) => {
-                generations.insert(description.block.index, generation);
-                fresh.insert(description.block.index, description);
-            }
-            Some(Event::Step { block, step, time, published, missed }) => {
-                let generation = generations.get(&block).copied().unwrap_or(0);
-                let facts = Facts { kind: Kind::Step, block, generation, step, time, published, missed };
-                session.send(stream, &facts, fresh.remove(&block).as_deref(), &values)?;
-                counts.steps.fetch_add(1, Ordering::Relaxed);
-                counts.bytes.fetch_add(size_of_val(values.as_slice()) as u64, Ordering::Relaxed);
-                sent = Instant::now();
-            }
-            // What went without closing ends for the follower too.
-            Some(Event::Ended { block, .. }) => {
-                let generation = generations.get(&block).copied().unwrap_or(0);
-                session.send(stream, &Facts { kind: Kind::Ended, block, generation, ..quiet }, fresh.remove(&block).as_deref(), &[])?;
-                sent = Instant::now();
-            }
-            Some(Event::Refused(_)) => {}
-            None if sent.elapsed() > PULSE => {
-                session.send(stream, &quiet, None, &[])?;
-                sent = Instant::now();
-            }
-            None => std::thread::sleep(IDLE),
-        }
+/// What the follower asks, if it does so within the limit.
+fn hear(mut stream: &TcpStream, session: &mut Session, limit: Duration) -> Result<Option<Ask>, WireError> {
+    let broken = |e| WireError::io(Path::new("connection"), "broke", e);
+    if !system::readable(stream, limit).map_err(broken)? {
+        return Ok(None);
     }
-    Ok(())
+    let mut bytes = [0; ASK_BYTES];
+    stream.read_exact(&mut bytes).map_err(broken)?;
+    session.check_ask(&bytes).map(Some)
 }
 
 /// Where a relay is; usually what its connection file says now.
@@ -171,16 +272,19 @@ pub struct RelayFollower {
 
 impl RelayFollower {
     /// Starts the thread that receives. `place` is asked before each attempt to connect: a relay that was started anew has another address
-    /// and key.
+    /// and key. When none could be reached for as long as `gone`, its blocks count as ended.
     ///
     /// # Errors
     /// The thread could not be started.
-    pub fn begin(place: Place, limits: Limits) -> Result<Self, WireError> {
+    pub fn begin(place: Place, limits: Limits, gone: Duration) -> Result<Self, WireError> {
         // One step waits, one is being received, and the rest waits at the relay: newest wins there.
         let ((sender, events), (spare, back)) = (sync_channel(1), sync_channel(2));
         let stop = Arc::new(AtomicBool::new(false));
-        let flag = stop.clone();
-        let work = move || receive(&*place, limits, &sender, &back, &flag);
+        let blocks = BTreeMap::new();
+        let told = String::new();
+        let mut receiving = Receiving { place, limits, gone, to: sender, spare: back, stop: stop.clone(), blocks, told };
+        // Whoever listened has left, or there is nothing to say.
+        let work = move || drop(receiving.run());
         let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
         started.map_err(|e| WireError::io(Path::new("thread"), "could not be started", e))?;
         Ok(Self { events, spare, stop })
@@ -209,82 +313,158 @@ impl Drop for RelayFollower {
     }
 }
 
-/// Connects, receives, and does so again until nobody listens.
-fn receive(
-    place: &dyn Fn() -> Result<ConnectionFile, WireError>,
+/// A block as a relay announced it.
+struct Known {
+    description: Description,
+    generation: u64,
+    /// In the session that is.
+    announced: bool,
+}
+
+/// The thread that receives.
+struct Receiving {
+    place: Place,
     limits: Limits,
-    to: &SyncSender<(Event, Vec<f32>)>,
-    spare: &Receiver<Vec<f32>>,
-    stop: &AtomicBool,
-) {
-    let mut told = String::new();
-    // Blocks as they were last announced in a session.
-    let mut blocks: BTreeMap<u32, (Description, u64)> = BTreeMap::new();
-    while !stop.load(Ordering::Relaxed) {
-        let found = place();
-        let ended = found.and_then(|found| session(&found.address, &found.key, limits, to, spare, stop, &mut blocks, &mut told));
-        let Err(error) = ended else { return };
-        // Once for each reason: a relay that is not there yet is no news every half second.
-        let words = error.to_string();
-        if words != told {
-            told = words;
-            if to.send((Event::Refused(error), Vec::new())).is_err() {
-                return;
+    gone: Duration,
+    to: SyncSender<(Event, Vec<f32>)>,
+    spare: Receiver<Vec<f32>>,
+    stop: Arc<AtomicBool>,
+    /// Blocks that have not ended.
+    blocks: BTreeMap<u32, Known>,
+    /// Why the last attempt to connect failed; empty: it did not.
+    told: String,
+}
+
+/// Nobody listens any more.
+struct Left;
+
+impl Receiving {
+    /// Connects, receives, and does so again until nobody listens.
+    fn run(&mut self) -> Result<(), Left> {
+        let mut reached = Instant::now();
+        while !self.stop.load(Ordering::Relaxed) {
+            let found = (self.place)();
+            let connected = found.and_then(|found| connect(&found));
+            let error = match connected {
+                Ok((stream, session)) => {
+                    self.told.clear();
+                    let Err(error) = self.session(&stream, session)? else { return Ok(()) };
+                    reached = Instant::now();
+                    error
+                }
+                Err(error) => error,
+            };
+            // Once for each reason: a relay that is not there yet is no news every half second.
+            let words = error.to_string();
+            if words != self.told {
+                self.told = words;
+                self.pass_on(Event::Refused(error), Vec::new())?;
+            }
+            if reached.elapsed() > self.gone {
+                self.blocks.values_mut().for_each(|known| known.announced = false);
+                self.end_unannounced()?;
+            }
+            std::thread::sleep(AGAIN);
+        }
+        Ok(())
+    }
+
+    fn pass_on(&self, event: Event, values: Vec<f32>) -> Result<(), Left> {
+        self.to.send((event, values)).map_err(|_| Left)
+    }
+
+    /// Ends blocks that a relay no longer has.
+    fn end_unannounced(&mut self) -> Result<(), Left> {
+        while let Some((block, generation)) =
+            self.blocks.iter().find_map(|(block, known)| (!known.announced).then_some((*block, known.generation)))
+        {
+            self.blocks.remove(&block);
+            self.pass_on(Event::Ended { block, generation, closed: false }, Vec::new())?;
+        }
+        Ok(())
+    }
+
+    /// Receives until the session breaks.
+    fn session(&mut self, stream: &TcpStream, mut session: Session) -> Result<Result<(), WireError>, Left> {
+        let mut from = BufReader::with_capacity(1 << 16, stream);
+        self.blocks.values_mut().for_each(|known| known.announced = false);
+        while !self.stop.load(Ordering::Relaxed) {
+            if let Err(error) = session.ask(&mut &*stream, Ask::Next) {
+                return Ok(Err(error));
+            }
+            let mut values = self.spare.try_recv().unwrap_or_default();
+            let mut announced = None;
+            let mut note = |block: u32, description: Option<Description>| {
+                announced = description;
+                announced.as_ref().or(self.blocks.get(&block).map(|known| &known.description)).map(Description::block_bytes)
+            };
+            let facts = match session.receive(&mut from, &self.limits, &mut note, &mut values) {
+                Ok(facts) => facts,
+                Err(error) => return Ok(Err(error)),
+            };
+            let Facts { block, generation, step, time, published, missed, .. } = facts;
+            // All that is there is announced before the first step.
+            if facts.kind != Kind::Opened {
+                self.end_unannounced()?;
+            }
+            let event = match (facts.kind, announced) {
+                (Kind::Opened, Some(description)) => {
+                    let known = Known { description: description.clone(), generation, announced: true };
+                    let before = self.blocks.insert(block, known);
+                    // After a mere break of the connection nothing was opened.
+                    if before.is_some_and(|before| before.generation == generation && before.description == description) {
+                        continue;
+                    }
+                    Event::Opened { description: Box::new(description), generation }
+                }
+                (Kind::Opened, None) => {
+                    let error = WireError::field("description", "missing", "one with each block that was opened");
+                    return Ok(Err(error));
+                }
+                (Kind::Step, _) => Event::Step { block, generation, step, time, published, missed },
+                (Kind::Ended, _) => {
+                    self.blocks.remove(&block);
+                    Event::Ended { block, generation, closed: true }
+                }
+                (Kind::Pulse, _) => continue,
+            };
+            if let Err(error) = self.hand_over(event, values, stream, &mut session)? {
+                return Ok(Err(error));
             }
         }
-        std::thread::sleep(AGAIN);
+        Ok(Ok(()))
+    }
+
+    /// Waits until the event is taken, and says so to the relay, which would take the silence for an end.
+    fn hand_over(&self, event: Event, values: Vec<f32>, stream: &TcpStream, session: &mut Session) -> Result<Result<(), WireError>, Left> {
+        let (mut said, mut item) = (Instant::now(), (event, values));
+        loop {
+            item = match self.to.try_send(item) {
+                Ok(()) => return Ok(Ok(())),
+                Err(TrySendError::Full(item)) => item,
+                Err(TrySendError::Disconnected(_)) => return Err(Left),
+            };
+            if self.stop.load(Ordering::Relaxed) {
+                return Err(Left);
+            }
+            if said.elapsed() > PULSE {
+                if let Err(error) = session.ask(&mut &*stream, Ask::Hold) {
+                    return Ok(Err(error));
+                }
+                said = Instant::now();
+            }
+            std::thread::sleep(IDLE);
+        }
     }
 }
 
-fn session(
-    address: &str,
-    key: &Key,
-    limits: Limits,
-    to: &SyncSender<(Event, Vec<f32>)>,
-    spare: &Receiver<Vec<f32>>,
-    stop: &AtomicBool,
-    blocks: &mut BTreeMap<u32, (Description, u64)>,
-    told: &mut String,
-) -> Result<(), WireError> {
+/// A session with the relay at a place.
+fn connect(place: &ConnectionFile) -> Result<(TcpStream, Session), WireError> {
+    let address = place.address.as_str();
     let broken = |e| WireError::io(Path::new(address), "cannot be reached", e);
     let found = address.to_socket_addrs().map_err(broken)?.next();
     let found = found.ok_or_else(|| WireError::field("address", address, "HOST:PORT of a relay"))?;
     let stream = TcpStream::connect_timeout(&found, PATIENCE).map_err(broken)?;
-    timeouts(&stream).map_err(broken)?;
-    let mut plain = stream;
-    let mut session = Session::connect(&mut plain, key)?;
-    told.clear();
-    let mut from = BufReader::with_capacity(1 << 16, plain);
-    while !stop.load(Ordering::Relaxed) {
-        let mut values = spare.try_recv().unwrap_or_default();
-        let mut announced = None;
-        let mut note = |block: u32, description: Option<Description>| {
-            if description.is_some() {
-                announced = description;
-            }
-            announced.as_ref().or(blocks.get(&block).map(|(known, _)| known)).map(Description::block_bytes)
-        };
-        let facts = session.receive(&mut from, &limits, &mut note, &mut values)?;
-        if let Some(description) = announced {
-            let same = blocks.get(&facts.block).is_some_and(|(known, generation)| *known == description && *generation == facts.generation);
-            blocks.insert(facts.block, (description.clone(), facts.generation));
-            // After a mere break of the connection nothing was opened.
-            if !same {
-                let event = Event::Opened { description: Box::new(description), generation: facts.generation };
-                if to.send((event, Vec::new())).is_err() {
-                    return Ok(());
-                }
-            }
-        }
-        let Facts { block, step, time, published, missed, .. } = facts;
-        let event = match facts.kind {
-            Kind::Step => Event::Step { block, step, time, published, missed },
-            Kind::Ended => Event::Ended { block, closed: true },
-            Kind::Pulse => continue,
-        };
-        if to.send((event, values)).is_err() {
-            return Ok(());
-        }
-    }
-    Ok(())
+    let session = greet(&stream, |within| Session::connect(within, &place.key))?;
+    Ok((stream, session))
 }

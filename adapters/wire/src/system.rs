@@ -6,6 +6,8 @@ use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
 use std::path::Path;
+#[cfg(feature = "messages")]
+use std::time::Duration;
 use std::time::{SystemTime, UNIX_EPOCH};
 
 /// The user that this process acts as.
@@ -43,6 +45,20 @@ pub(crate) fn random<const N: usize>() -> io::Result<[u8; N]> {
         }
     }
     Ok(bytes)
+}
+
+/// Whether something can be read, its end too, within a limit (in whole milliseconds).
+#[cfg(feature = "messages")]
+pub(crate) fn readable(from: &impl AsRawFd, limit: Duration) -> io::Result<bool> {
+    let mut what = libc::pollfd { fd: from.as_raw_fd(), events: libc::POLLIN, revents: 0 };
+    // SAFETY: one entry, which outlives the call.
+    match unsafe { libc::poll(&mut what, 1, limit.as_millis() as libc::c_int) } {
+        -1 => match io::Error::last_os_error() {
+            error if error.kind() == io::ErrorKind::Interrupted => Ok(false),
+            error => Err(error),
+        },
+        found => Ok(found > 0),
+    }
 }
 
 /// Makes a file that only this user may open.

@@ -150,6 +150,177 @@ fn a_solver_that_is_killed_and_replaced_at_once_is_followed() {
     }
 }
 
+/// A relay of a folder's rings, and the way to it.
+struct Relay {
+    address: std::net::SocketAddr,
+    key: Key,
+    counts: Arc<RelayCounts>,
+    stop: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Relay {
+    fn start(folder: &Folder, address: &str, key: &Key) -> Self {
+        let listener = TcpListener::bind(address).unwrap();
+        let address = listener.local_addr().unwrap();
+        let (counts, stop) = (Arc::new(RelayCounts::default()), Arc::new(AtomicBool::new(false)));
+        let (ring, key, told, flag) = (folder.0.clone(), key.clone(), counts.clone(), stop.clone());
+        let served = key.clone();
+        let thread = std::thread::spawn(move || serve(&ring, &listener, &served, &told, &flag, Arc::new(|_| {})).unwrap());
+        Self { address, key, counts, stop, thread: Some(thread) }
+    }
+
+    fn follow(&self, gone: Duration) -> RelayFollower {
+        let file = ConnectionFile { address: self.address.to_string(), key: self.key.clone() };
+        RelayFollower::begin(Box::new(move || Ok(file.clone())), Limits::default(), gone).unwrap()
+    }
+}
+
+impl Drop for Relay {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+const LONG: Duration = Duration::from_secs(30);
+
+#[test]
+fn a_ring_that_lies_is_left_until_a_new_one_comes() {
+    let folder = Folder::new("lies");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 1);
+    assert_eq!(events(&mut poll, "step 1"), ["opened 4", "step 1 missed 0"]);
+    publish(&producer, 2);
+    // The time of the second step is no number any more: the first slot begins behind a description of less than a page.
+    let ring = std::fs::OpenOptions::new().write(true).open(ridgewatch_wire::block_path(&folder.0, 0)).unwrap();
+    std::os::unix::fs::FileExt::write_all_at(&ring, &f64::NAN.to_ne_bytes(), 12288 + 4096 + 16).unwrap();
+    assert_eq!(events(&mut poll, "refused"), ["refused `time` is NaN; accepted: a finite number"]);
+    // Neither opened nor refused again; its end is told.
+    (3..6).for_each(|n| publish(&producer, n));
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_millis(500) {
+        assert!(poll(&mut Vec::new()).is_none());
+    }
+    drop(producer);
+    assert_eq!(events(&mut poll, "ended"), ["ended false"]);
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 7);
+    assert_eq!(events(&mut poll, "step 7"), ["opened 4", "step 7 missed 0"]);
+}
+
+#[test]
+fn strangers_take_no_followers_place() {
+    let folder = Folder::new("strangers");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    // They come and say nothing.
+    let strangers: Vec<TcpStream> = (0..100).map(|_| TcpStream::connect(relay.address).unwrap()).collect();
+    let producer = Producer::open(&folder.0, description(8), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    let begin = Instant::now();
+    let mut follower = relay.follow(LONG);
+    let seen = events(&mut |values| follower.poll(values, Duration::from_millis(10)), "step 0");
+    assert_eq!(seen.last().unwrap(), "step 0 missed 0", "{seen:?}");
+    // Well before the first of them has used up its time.
+    assert!(begin.elapsed() < Duration::from_secs(4), "{:?}", begin.elapsed());
+    assert_eq!(relay.counts.followers.load(Ordering::Relaxed), 1);
+    drop(strangers);
+}
+
+#[test]
+fn two_followers_of_a_relay_lose_nothing_of_a_solver_that_waits() {
+    let folder = Folder::new("two");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let producer = Producer::open(&folder.0, description(64), 4, Policy::Wait(LONG)).unwrap();
+    let followers: Vec<_> = [0, 2]
+        .map(|pause| {
+            let mut follower = relay.follow(LONG);
+            std::thread::spawn(move || {
+                let mut poll = |values: &mut Vec<f32>| {
+                    std::thread::sleep(Duration::from_millis(pause));
+                    follower.poll(values, Duration::from_millis(10))
+                };
+                events(&mut poll, "step 199")
+            })
+        })
+        .into();
+    // Both are there before the ring has turned once.
+    let begin = Instant::now();
+    while relay.counts.followers.load(Ordering::Relaxed) < 2 {
+        assert!(begin.elapsed() < LONG);
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    publish(&producer, 0);
+    std::thread::sleep(Duration::from_millis(300));
+    (1..200).for_each(|n| publish(&producer, n));
+    let expected: Vec<String> = ["opened 64".to_owned()].into_iter().chain((0..200).map(|n| format!("step {n} missed 0"))).collect();
+    for follower in followers {
+        assert_eq!(follower.join().unwrap(), expected);
+    }
+}
+
+#[test]
+fn a_follower_that_holds_is_not_cut_off_and_holds_the_solver() {
+    let folder = Folder::new("holds");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let producer = Producer::open(&folder.0, description(64), 2, Policy::Wait(LONG)).unwrap();
+    let mut follower = relay.follow(LONG);
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    publish(&producer, 0);
+    assert_eq!(events(&mut poll, "step 0"), ["opened 64", "step 0 missed 0"]);
+    let published = Arc::new(std::sync::atomic::AtomicU64::new(0));
+    let count = published.clone();
+    let solver = std::thread::spawn(move || {
+        for n in 1..30 {
+            publish(&producer, n);
+            count.store(n, Ordering::Relaxed);
+        }
+        producer
+    });
+    // Longer than the relay's patience, and than a producer waits for one that it does not hear of.
+    std::thread::sleep(ridgewatch_wire::relay::PATIENCE + Duration::from_secs(2));
+    let ahead = published.load(Ordering::Relaxed);
+    assert!(ahead < 10, "{ahead} steps were published while the follower held");
+    let seen = events(&mut poll, "step 29");
+    assert_eq!(seen, (1..30).map(|n| format!("step {n} missed 0")).collect::<Vec<_>>());
+    assert_eq!(relay.counts.accepted.load(Ordering::Relaxed), 1, "one connection all the while");
+    drop(solver.join().unwrap());
+    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+}
+
+#[test]
+fn what_a_relay_no_longer_has_is_ended() {
+    let folder = Folder::new("dying");
+    let key = Key::random().unwrap();
+    let relay = Relay::start(&folder, "127.0.0.1:0", &key);
+    let address = relay.address.to_string();
+    let mut follower = relay.follow(LONG);
+    let mut brief = relay.follow(Duration::from_millis(300));
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    let mut poll_brief = |values: &mut Vec<f32>| brief.poll(values, Duration::from_millis(10));
+    let producer = Producer::open(&folder.0, description(8), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    for poll in [&mut poll as &mut dyn FnMut(&mut Vec<f32>) -> Option<Event>, &mut poll_brief] {
+        assert_eq!(events(poll, "step 0"), ["opened 8", "step 0 missed 0"]);
+    }
+    drop(relay);
+    // Whoever has no patience takes the solver for ended, and hears of it when the relay is back.
+    assert_eq!(events(&mut poll_brief, "ended").last().unwrap(), "ended false");
+    let relay = Relay::start(&folder, &address, &key);
+    let seen = events(&mut poll_brief, "step 0");
+    assert_eq!(seen[seen.len() - 2..], ["opened 8", "step 0 missed 0"], "{seen:?}");
+    let seen = events(&mut poll, "step 0");
+    assert!(seen.iter().all(|words| !words.starts_with("ended") && !words.starts_with("opened")), "{seen:?}");
+    drop(relay);
+    // The solver ends while no relay is there: the next one has nothing of it.
+    drop(producer);
+    let relay = Relay::start(&folder, &address, &key);
+    assert_eq!(events(&mut poll, "ended").last().unwrap(), "ended false");
+    drop(relay);
+}
+
 #[test]
 fn a_relay_ships_steps_to_those_who_have_the_key() {
     let folder = Folder::new("relay");
@@ -163,7 +334,7 @@ fn a_relay_ships_steps_to_those_who_have_the_key() {
     let mut stranger = TcpStream::connect(address).unwrap();
     assert!(matches!(Session::connect(&mut stranger, &Key::random().unwrap()), Err(WireError::Signature | WireError::Io { .. })));
     let file = ConnectionFile { address: address.to_string(), key: key.clone() };
-    let mut follower = RelayFollower::begin(Box::new(move || Ok(file.clone())), Limits::default()).unwrap();
+    let mut follower = RelayFollower::begin(Box::new(move || Ok(file.clone())), Limits::default(), Duration::from_secs(30)).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
     let producer = Producer::open(&folder.0, description(64), 4, Policy::NewestWins).unwrap();
     // One after another, so that none is overwritten.

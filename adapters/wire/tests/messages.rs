@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch_wire::message::{ConnectionFile, Facts, Key, Kind, Session};
+use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::{AxisDescription, Description, Geometry, Limits, WireError};
 use std::io::{Cursor, Read, Write};
 use std::net::{TcpListener, TcpStream};
@@ -75,7 +75,7 @@ fn wrong_keys_are_refused_by_either_side() {
     let address = listener.local_addr().unwrap();
     let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &Key::random().unwrap()));
     let (mut stream, _) = listener.accept().unwrap();
-    stream.write_all(b"RIDGEWIRE\0\0\0\x01\0\0\0").unwrap();
+    stream.write_all(b"RIDGEWIRE\0\0\0\x02\0\0\0").unwrap();
     stream.write_all(&[7; 32]).unwrap();
     let mut greeting = [0; 80];
     stream.read_exact(&mut greeting).unwrap();
@@ -111,6 +111,31 @@ fn every_changed_byte_is_noticed() {
     for length in [0, 1, 50, 131, 132, 200, first.len() - 1] {
         assert!(receive(&mut client, &first[..length], &mut None).is_err(), "{length}");
     }
+}
+
+#[test]
+fn what_a_follower_asks_is_believed_once_and_unchanged() {
+    let key = Key::random().unwrap();
+    let (server, client) = pair(&key, &key);
+    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let mut ask = |ask| -> [u8; ASK_BYTES] {
+        let mut bytes = Vec::new();
+        client.ask(&mut bytes, ask).unwrap();
+        bytes.try_into().unwrap()
+    };
+    let (first, second) = (ask(Ask::Next), ask(Ask::Hold));
+    for place in 0..ASK_BYTES {
+        let mut changed = first;
+        changed[place] ^= 1 << (place % 8);
+        assert!(matches!(server.check_ask(&changed), Err(WireError::Signature)), "{place}");
+    }
+    assert_eq!((server.check_ask(&first).unwrap(), server.check_ask(&second).unwrap()), (Ask::Next, Ask::Hold));
+    for replay in [&first, &second] {
+        assert!(matches!(server.check_ask(replay), Err(WireError::Replayed { newest: 2, .. })));
+    }
+    // In another session of the same key.
+    let (other, _) = pair(&key, &key);
+    assert!(matches!(other.unwrap().check_ask(&first), Err(WireError::Signature)));
 }
 
 #[test]

@@ -234,7 +234,7 @@ fn sessions(key: &Key) -> (Session, Session) {
 fn mutated_greetings() {
     let key = Key::random().unwrap();
     // What a follower would send; it cannot fit the relay's fresh numbers, so nothing of it is ever accepted.
-    let mut good = b"RIDGEWIRE\0\0\0\x01\0\0\0".to_vec();
+    let mut good = b"RIDGEWIRE\0\0\0\x02\0\0\0".to_vec();
     good.extend([9; 64]);
     let mut random = Random(3);
     for _ in 0..cases().min(100_000) {

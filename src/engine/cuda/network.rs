@@ -3,7 +3,8 @@
 //! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads them.
 
 use super::layout::TableArgument;
-use super::network_layout::{GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
+use super::network_batched::{Batched, GradientTo, batched_define};
+use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Target};
@@ -22,10 +23,17 @@ const DEEPEST: usize = 4;
 /// Oldest device with the matrix instruction.
 const OLDEST: (i32, i32) = (8, 0);
 
-/// The macros that `network.cu` is compiled with for an architecture; none where it is too wide or too deep, or has several outputs.
+/// Whether a warp's registers hold a network of this architecture (`network_fused.cu`); others go through it batch by batch
+/// (`network_batched.cu`).
+pub fn is_fused(shape: &Architecture) -> bool {
+    let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
+    hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST
+}
+
+/// The macros that `network*.cu` are compiled with for an architecture; none where it has several outputs.
 pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
-    if shape.target != Target::Ftle || hidden == 0 || hidden > DEEPEST || width > WIDEST || shape.encoded() > WIDEST {
+    if shape.target != Target::Ftle || hidden == 0 {
         return None;
     }
     let axes: Vec<String> = shape.axes.iter().map(usize::to_string).collect();
@@ -40,10 +48,11 @@ pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
         format!("RW_HIDDEN={hidden}"),
         format!("RW_WEIGHTS_BYTES={weights}"),
         format!("RW_WORKSPACE_BYTES={workspace}"),
+        batched_define(),
     ])
 }
 
-/// Sizes of `Weights` in `network.cuh` and `Workspace` in `network.cu`, which assert them.
+/// Sizes of `Weights` in `network.cuh` and `Workspace` in `network_fused.cu`, which asserts them.
 fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     let hidden = shape.layers.len() - 1;
     let [encoded, width] = [shape.encoded(), shape.layers[0].outputs].map(|n| n.next_multiple_of(16));
@@ -55,8 +64,8 @@ fn shared_bytes(shape: &Architecture) -> (usize, usize) {
 
 /// A kernel that keeps its layers in shared memory, and the blocks that the device holds at once.
 #[derive(Debug)]
-pub(super) struct Resident {
-    pub(super) function: CudaFunction,
+struct Resident {
+    function: CudaFunction,
     shared: u32,
     blocks: u32,
 }
@@ -76,10 +85,17 @@ impl Resident {
     }
 
     /// As many blocks as stay, or as `count` samples keep busy.
-    pub(super) fn config(&self, count: usize) -> LaunchConfig {
+    fn config(&self, count: usize) -> LaunchConfig {
         let tiles = count.div_ceil(TILE).clamp(1, self.blocks as usize) as u32;
         LaunchConfig { grid_dim: (tiles, 1, 1), block_dim: (THREADS, 1, 1), shared_mem_bytes: self.shared }
     }
+}
+
+/// How samples go through the network.
+#[derive(Debug)]
+enum Way {
+    Fused { predict: Resident, gradient: Resident },
+    Batched(Box<Batched>),
 }
 
 /// Everything that depends on an architecture alone.
@@ -90,8 +106,7 @@ pub(super) struct NetworkKernels {
     pub(super) grid: GridArgument,
     /// Values of the padded tables.
     pub(super) padded: usize,
-    pub(super) predict: Resident,
-    pub(super) gradient: Resident,
+    way: Way,
     pub(super) adam_tables: CudaFunction,
     pub(super) adam_layers: CudaFunction,
     pub(super) average: CudaFunction,
@@ -111,20 +126,20 @@ impl NetworkKernels {
         }
         let Some(defines) = network_defines(shape) else {
             return refuse(format!(
-                "a network of {} hidden layers of {} over {} encoded values for the target {:?}; the device takes the target ftle with up to \
-                 {DEEPEST} hidden layers of up to {WIDEST} over up to {WIDEST}",
+                "a network of {} hidden layers for the target {:?}; the device takes the target ftle with at least one",
                 shape.layers.len() - 1,
-                shape.layers[0].outputs,
-                shape.encoded(),
                 shape.target
             ));
         };
         let (grid, padded) = grid(shape)?;
         let kernel = |name| gpu.kernel("network.cu", &defines, name);
         let (weights, workspace) = shared_bytes(shape);
+        let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, shared);
         Ok(Arc::new(Self {
-            predict: Resident::new(gpu, kernel("network_predict")?, weights)?,
-            gradient: Resident::new(gpu, kernel("network_gradient")?, workspace)?,
+            way: match is_fused(shape) {
+                true => Way::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? },
+                false => Way::Batched(Box::new(Batched::new(gpu, shape, grid, &defines)?)),
+            },
             adam_tables: kernel("network_adam_tables")?,
             adam_layers: kernel("network_adam_layers")?,
             average: kernel("network_average")?,
@@ -137,6 +152,49 @@ impl NetworkKernels {
             grid,
             padded,
         }))
+    }
+
+    /// Log-stretch at unit points, as device addresses.
+    ///
+    /// # Safety
+    /// As for [`DevicePredict::predict`]; `halves` are the padded tables and `layers` the flat vector of this architecture.
+    unsafe fn predict(
+        &self,
+        halves: u64,
+        layers: u64,
+        reading: &ReadingArgument,
+        points: u64,
+        count: usize,
+        out: u64,
+    ) -> Result<(), DeviceError> {
+        match &self.way {
+            // SAFETY: the caller's.
+            Way::Batched(batched) => unsafe { batched.predict(halves, layers, reading, points, count, out) },
+            Way::Fused { predict, .. } => {
+                let n = count as u32;
+                let mut call = self.gpu.work().launch_builder(&predict.function);
+                call.arg(&self.grid).arg(&halves).arg(&layers).arg(reading).arg(&points).arg(&n).arg(&out);
+                // SAFETY: the caller's, and the arguments are those of `network_predict`.
+                unsafe { launch(&mut call, predict.config(count)) }
+            }
+        }
+    }
+
+    /// Adds the gradient and the loss of a batch.
+    ///
+    /// # Safety
+    /// Device addresses as for [`Self::predict`]; the samples of `draw` are there, and room for the gradients.
+    pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
+        match &self.way {
+            // SAFETY: the caller's.
+            Way::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, to) },
+            Way::Fused { gradient, .. } => {
+                let mut call = self.gpu.work().launch_builder(&gradient.function);
+                call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&to.tables).arg(&to.layers).arg(&to.loss);
+                // SAFETY: the caller's, and the arguments are those of `network_gradient`.
+                unsafe { launch(&mut call, gradient.config(draw.batch as usize)) }
+            }
+        }
     }
 
     /// Rounds burn's tables into padded ones.
@@ -280,13 +338,8 @@ impl DevicePredict for NetworkAbove<'_> {
         }
         let DeviceNetwork { kernels, halves, layers, objective } = self.network;
         let reading = reading(objective, self.base.map(|(table, _)| table), self.base.map_or(1.0, |(_, share)| share));
-        let (halves, layers, n) = (halves.address(), layers.address(), count as u32);
-        let kernel = &kernels.predict;
-        let stream = kernels.gpu.work();
-        let mut call = stream.launch_builder(&kernel.function);
-        call.arg(&kernels.grid).arg(&halves).arg(&layers).arg(&reading).arg(&points).arg(&n).arg(&out);
-        // SAFETY: the caller's, and the arguments are those of `network_predict`.
-        unsafe { launch(&mut call, kernel.config(count)) }
+        // SAFETY: the caller's; the parameters are of these kernels' architecture.
+        unsafe { kernels.predict(halves.address(), layers.address(), &reading, points, count, out) }
     }
 }
 

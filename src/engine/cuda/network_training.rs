@@ -4,6 +4,7 @@
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
 use super::network::{DeviceNetwork, NetworkKernels, copied, copy, has_tables, reading, unit_box};
+use super::network_batched::GradientTo;
 use super::network_layout::{AdamArgument, DrawArgument};
 use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
@@ -487,10 +488,9 @@ impl DeviceTraining {
             [&tables.parameters, &tables.first, &tables.second, &tables.gradient].map(Buffer::address);
         let [layer_parameters, layer_first, layer_second, layer_gradient] =
             [&layers.parameters, &layers.first, &layers.second, &layers.gradient].map(Buffer::address);
-        let mut call = stream.launch_builder(&kernels.gradient.function);
-        call.arg(&kernels.grid).arg(&halves).arg(&layer_parameters).arg(&draw).arg(&table_gradient).arg(&layer_gradient).arg(&loss);
-        // SAFETY: the arguments of `network_gradient`; buffers are of this architecture, indices of samples below their number.
-        unsafe { launch(&mut call, kernels.gradient.config(step.count)) }?;
+        let to = GradientTo { tables: table_gradient, layers: layer_gradient, loss };
+        // SAFETY: buffers are of this architecture, indices of samples below their number.
+        unsafe { kernels.gradient(halves, layer_parameters, &draw, to) }?;
 
         self.time += 1;
         let adam = Adam::at(self.time, step.rate, self.epsilon);

@@ -141,7 +141,7 @@ impl CudaTraining {
         }
         let most = self.gpu.memory_left() / MEMORY_SHARE / size_of::<[f32; 4]>() as u64;
         // The kernels count samples, those of the ring included, in 32 bits.
-        let capacity = TIMES_THE_RING.saturating_mul(ring).min(most as usize).min(1 << 31).max(1);
+        let capacity = TIMES_THE_RING.saturating_mul(ring).min(most as usize).clamp(1, 1 << 31);
         let pool = LabelPool { writer: self.training.writer(), samples: Mutex::new(self.training.ring(capacity)?) };
         Ok(self.pool.insert(Arc::new(pool)).clone())
     }

@@ -5,9 +5,8 @@ use super::thinning::Thinning;
 use super::{AtEnd, Follow, Live, memory};
 use crate::field::{Window, WindowFault};
 use crate::source::{Listener, SourceError, StillReading};
-use ridgewatch_wire::{Assembler, Event, Incomplete, Step};
+use ridgewatch_wire::{Assembler, Event, Step};
 use serde::{Deserialize, Serialize};
-use std::collections::{BTreeMap, BTreeSet};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock};
 use std::thread::JoinHandle;
@@ -50,6 +49,8 @@ pub struct LiveRecord {
     pub restarts: u64,
     /// Snapshots in the window.
     pub snapshots: usize,
+    /// Seconds from the window's first snapshot until it covered one tenth, two tenths and so on of tau: ten numbers, since a frame needs all of it.
+    pub filling: Vec<f64>,
 }
 
 /// The window at one moment.
@@ -66,6 +67,8 @@ pub struct Taken {
 /// What both threads see.
 struct State {
     window: Window,
+    /// When the window had its first snapshot.
+    begun_at: Option<Instant>,
     /// Snapshots that moved the window since it was last taken.
     moved: usize,
     /// Whether it was ever taken.
@@ -81,6 +84,28 @@ impl State {
     fn warn(&mut self, text: String) {
         tracing::info!("{text}");
         if self.warnings.len() < WARNINGS { self.warnings.push(text) } else { self.more_warnings += 1 }
+    }
+
+    /// Empties the window.
+    fn begin_anew(&mut self) {
+        self.window = Window::new(self.window.span());
+        self.begun_at = None;
+        self.live.filling.clear();
+    }
+
+    /// Share of tau that the window covers.
+    fn filled(&self) -> f64 {
+        let covered = self.window.newest().zip(self.window.oldest()).map_or(0.0, |(newest, oldest)| newest - oldest);
+        (covered / self.window.span()).min(1.0)
+    }
+
+    /// Notes how far the window has come.
+    fn note_filling(&mut self) {
+        let begun = *self.begun_at.get_or_insert_with(Instant::now);
+        // The hair's breadth by which a sum of steps may miss tau is the window's own.
+        let tenths = if self.window.is_full() { 10 } else { (10.0 * self.filled()) as usize };
+        let known = self.live.filling.len().max(tenths);
+        self.live.filling.resize(known, begun.elapsed().as_secs_f64());
     }
 
     /// Whether a slide is due.
@@ -124,6 +149,7 @@ impl LiveWindow {
         }
         let state = State {
             window: Window::new(tau),
+            begun_at: None,
             moved: 0,
             begun: false,
             warnings: Vec::new(),
@@ -134,7 +160,7 @@ impl LiveWindow {
         let shared = Shared { state: Mutex::new(state), changed: Condvar::new(), stop: AtomicBool::new(false), listener: OnceLock::new() };
         let shared = Arc::new(shared);
         let conversion = Conversion::new(live.grid.clone())?;
-        let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), tau, stride);
+        let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), stride);
         let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
         let thread = thread.map_err(|e| SourceError::Inconsistent { what: format!("the live thread could not start: {e}") })?;
         Ok(Self { shared, stride, thread: Some(thread) })
@@ -189,9 +215,7 @@ impl LiveWindow {
 
     /// Share of tau that the window covers so far.
     pub fn filled(&self) -> f64 {
-        let state = self.shared.lock();
-        let covered = state.window.newest().zip(state.window.oldest()).map_or(0.0, |(newest, oldest)| newest - oldest);
-        (covered / state.window.span()).min(1.0)
+        self.shared.lock().filled()
     }
 }
 
@@ -212,43 +236,20 @@ struct Reader {
     assembler: Assembler,
     conversion: Conversion,
     thinning: Thinning,
-    tau: f64,
     stride: usize,
-    /// Blocks whose steps are not taken, since they describe another field.
-    barred: BTreeSet<u32>,
-    /// Blocks that are open, with their generations.
-    open: BTreeMap<u32, u64>,
-    /// Blocks whose producers are gone.
-    gone: BTreeSet<u32>,
-    /// A producer was opened since the last whole step.
-    anew: bool,
     late: u32,
 }
 
 impl Reader {
-    fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, tau: f64, stride: usize) -> Self {
+    fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
         let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
         let assembler = Assembler::new(&live.description, limit, PENDING);
-        Self {
-            live,
-            shared,
-            assembler,
-            conversion,
-            thinning,
-            tau,
-            stride,
-            barred: BTreeSet::new(),
-            open: BTreeMap::new(),
-            gone: BTreeSet::new(),
-            anew: false,
-            late: 0,
-        }
+        Self { live, shared, assembler, conversion, thinning, stride, late: 0 }
     }
 
     fn run(&mut self) {
         let (description, generation) = (self.live.description.clone(), self.live.generation);
         self.opened(&description, generation);
-        self.anew = false;
         let mut values = Vec::new();
         while !self.shared.stop.load(Ordering::Relaxed) {
             if self.live.settings.follow == Follow::Every && self.hold_back() {
@@ -256,13 +257,21 @@ impl Reader {
             }
             match self.live.link.poll(&mut values) {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
-                Some(Event::Step { block, step, time, published, missed }) => self.block(block, step, time, published, missed, &mut values),
-                Some(Event::Ended { block, closed }) => self.ended(block, closed),
+                Some(Event::Step { block, generation, step, time, published, missed }) => {
+                    self.shared.lock().live.missed += missed;
+                    let whole = self.assembler.block(block, generation, step, time, published, &mut values);
+                    self.tell_incomplete();
+                    match whole {
+                        Ok(Some(whole)) => self.whole(whole),
+                        Ok(None) => {}
+                        Err(error) => self.shared.lock().warn(format!("a step was refused: {error}")),
+                    }
+                }
+                Some(Event::Ended { block, generation, closed }) => self.ended(block, generation, closed),
                 Some(Event::Refused(error)) => self.shared.lock().warn(format!("the simulation's data were refused: {error}")),
                 None => {}
             }
-            let given_up = self.assembler.expire();
-            self.tell_incomplete(&given_up);
+            self.tell_incomplete();
         }
     }
 
@@ -278,58 +287,26 @@ impl Reader {
     }
 
     fn opened(&mut self, description: &ridgewatch_wire::Description, generation: u64) {
-        let block = description.block.index;
-        let known = self.open.insert(block, generation);
-        self.gone.remove(&block);
-        match self.assembler.introduce(description) {
-            Ok(()) => {
-                self.barred.remove(&block);
-            }
-            Err(error) => {
-                self.barred.insert(block);
-                let text = format!("the simulation was not taken in: {error}; another grid, or other blocks, need a run of their own");
-                self.shared.lock().warn(text);
-                return;
-            }
-        }
-        // Blocks of one start come one by one; only one that was there before tells of a restart.
-        if known.is_some_and(|before| before != generation) && !self.anew {
-            self.anew = true;
-            self.assembler.restart();
-            let mut state = self.shared.lock();
-            state.live.restarts += 1;
-            state.ended = false;
-            state.warn("the simulation was started anew".to_owned());
-        }
-    }
-
-    fn block(&mut self, block: u32, step: u64, time: f64, published: u64, missed: u64, values: &mut Vec<f32>) {
-        if self.barred.contains(&block) {
-            return;
-        }
-        self.shared.lock().live.missed += missed;
-        match self.assembler.block(block, step, time, published, values) {
-            Ok((whole, given_up)) => {
-                self.tell_incomplete(&given_up);
-                if let Some(whole) = whole {
-                    self.whole(whole);
-                }
-            }
-            Err(error) => self.shared.lock().warn(format!("a step was refused: {error}")),
+        if let Err(error) = self.assembler.introduce(description, generation) {
+            self.shared.lock().warn(format!("the simulation does not fit: {error}"));
         }
     }
 
     /// Takes a whole step in.
     fn whole(&mut self, step: Step) {
-        let Step { step: number, time, published, values } = step;
+        let Step { step: number, time, published, anew, values } = step;
         let mut state = self.shared.lock();
-        state.live.steps += 1;
-        if std::mem::take(&mut self.anew) && state.window.newest().is_some_and(|newest| time <= newest) {
-            let newest = state.window.newest().unwrap_or(time);
-            state.warn(format!("the simulation went back from time {newest} to {time}: the window begins anew"));
-            state.window = Window::new(self.tau);
-            self.thinning.restart();
+        if anew && state.live.steps > 0 {
+            state.live.restarts += 1;
+            state.ended = false;
+            state.warn("the simulation was started anew".to_owned());
+            if let Some(newest) = state.window.newest().filter(|newest| time <= *newest) {
+                state.warn(format!("the simulation went back from time {newest} to {time}: the window begins anew"));
+                state.begin_anew();
+                self.thinning.restart();
+            }
         }
+        state.live.steps += 1;
         // Conversion and the measurement take their time: frames are made meanwhile.
         drop(state);
         let keep = self.thinning.keeps(time, || self.conversion.snapshot(time, &values));
@@ -362,7 +339,7 @@ impl Reader {
                     state.warn(format!(
                         "{SET_BACK} steps in a row were late: the simulation was set back, the window begins anew at time {time}"
                     ));
-                    state.window = Window::new(self.tau);
+                    state.begin_anew();
                     self.thinning.restart();
                     self.thinning.kept(&kept);
                     let _ = state.window.push(kept);
@@ -370,6 +347,7 @@ impl Reader {
             }
             Err(fault) => state.warn(fault.to_string()),
         }
+        state.note_filling();
         // Only what moves the window counts toward its stride.
         if state.window.newest() != newest {
             state.moved += 1;
@@ -380,19 +358,19 @@ impl Reader {
         self.shared.changed.notify_all();
     }
 
-    fn ended(&mut self, block: u32, closed: bool) {
+    fn ended(&mut self, block: u32, generation: u64, closed: bool) {
         let mut state = self.shared.lock();
-        let how = if closed { "has ended" } else { "is gone: its process ended without closing the ring" };
+        let how = if closed { "has ended" } else { "is gone: its process ended without closing the ring, or its relay is gone" };
         state.warn(format!("the simulation {how} (block {block})"));
-        self.gone.insert(block);
-        if self.live.settings.at_end == AtEnd::Stop && self.gone.len() == self.live.description.block.count as usize {
+        if self.assembler.ended(block, generation) && self.live.settings.at_end == AtEnd::Stop {
             state.ended = true;
         }
         drop(state);
         self.shared.changed.notify_all();
     }
 
-    fn tell_incomplete(&self, given_up: &[Incomplete]) {
+    fn tell_incomplete(&mut self) {
+        let given_up = self.assembler.incomplete();
         if given_up.is_empty() {
             return;
         }

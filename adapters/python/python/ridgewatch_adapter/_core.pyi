@@ -21,6 +21,7 @@ class Publisher:
         periods: Sequence[float | None] | None = None,
         radius: float | None = None,
         block: tuple[int, int, Sequence[int], Sequence[int]] | None = None,
+        start: int = 0,
         slots: int = 4,
         wait_ms: int = 0,
         time_unit: str = "s",
@@ -32,6 +33,8 @@ class Publisher:
         periods: length after which each axis repeats, None where it does not.
         radius: x and y are longitude and latitude in degrees on a sphere of this radius.
         block: (index, count, offset, extent) of this process's part, nodes along x, y, z.
+        start: a number that all blocks of one start of the simulation name, and those of the next do not
+        (comm.bcast(time.time_ns()) with mpi4py); 0: none.
         slots: steps that the ring holds. wait_ms: how long to wait for ridgewatch; 0: never.
         order: of the arrays' axes: "zyx" is [z, y, x], "xyz" is [x, y, z].
         """

@@ -1,0 +1,189 @@
+//! Blocks that meet, and starts that take over from one another.
+
+use super::{cube, values};
+use ridgewatch_wire::{Assembler, BlockExtent, Description, Incomplete, Step};
+use std::time::Duration;
+
+/// Columns of a grid of 4 x 3 x 2 nodes, as wide as told.
+fn columns(start: u64, widths: &[u64]) -> Vec<Description> {
+    let (mut left, count) = (0, widths.len() as u32);
+    let column = |(index, width): (usize, &u64)| {
+        let block = BlockExtent { index: index as u32, count, offset: [left, 0, 0], extent: [*width, 3, 2] };
+        left += width;
+        Description { start, block, ..cube([4, 3, 2]) }
+    };
+    widths.iter().enumerate().map(column).collect()
+}
+
+/// A block of step `n`, whose nodes differ from those of every other step.
+fn cut(block: &Description, n: u64) -> Vec<f32> {
+    let [begin, width] = [block.block.offset[0], block.block.extent[0]].map(|n| n as usize);
+    values(&cube([4, 3, 2]), n).concat().chunks_exact(4).flat_map(|row| row[begin..begin + width].to_vec()).collect()
+}
+
+/// Gives a block of step `n` at time n / 2.
+fn give(assembler: &mut Assembler, block: &Description, generation: u64, n: u64) -> Option<Step> {
+    assembler.block(block.block.index, generation, n, n as f64 / 2.0, n, &mut cut(block, n)).unwrap()
+}
+
+fn numbers(given_up: &[Incomplete]) -> Vec<u64> {
+    given_up.iter().map(|g| g.step).collect()
+}
+
+#[test]
+fn blocks_meet_and_what_does_not_fit_is_told() {
+    let [left, right] = [0, 1].map(|k| columns(0, &[1, 3])[k].clone());
+    let mut assembler = Assembler::new(&left, Duration::from_millis(30), 2);
+    assembler.introduce(&left, 1).unwrap();
+    assert_eq!(give(&mut assembler, &right, 1, 0), None, "it was not introduced");
+    let stranger = Description { axes: cube([4, 3, 3]).axes, ..right.clone() };
+    assert!(assembler.introduce(&stranger, 1).unwrap_err().to_string().contains("another grid"));
+    let short = Description { block: BlockExtent { offset: [2, 0, 0], extent: [2, 3, 2], ..right.block }, ..right.clone() };
+    assert!(assembler.introduce(&short, 1).unwrap_err().to_string().contains("18 of 24 nodes"));
+    assembler.introduce(&right, 2).unwrap();
+    // Either order.
+    assert_eq!(give(&mut assembler, &right, 2, 1), None);
+    let whole = give(&mut assembler, &left, 1, 1).unwrap();
+    assert_eq!((whole.step, whole.time, whole.published, whole.anew), (1, 0.5, 1, true));
+    assert_eq!(whole.values, values(&cube([4, 3, 2]), 1).concat());
+    // Another time, another length.
+    assert_eq!(give(&mut assembler, &left, 1, 2), None);
+    let other = assembler.block(1, 2, 2, 1.5, 0, &mut cut(&right, 2)).unwrap_err().to_string();
+    assert!(other.contains("the time that its other blocks have"));
+    assert!(assembler.block(1, 2, 2, 1.0, 0, &mut cut(&left, 2)).unwrap_err().to_string().contains("18 values"));
+    // A step that lacks a block goes when a newer one is whole,
+    assert_eq!(give(&mut assembler, &left, 1, 3), None);
+    let whole = give(&mut assembler, &right, 2, 3).unwrap();
+    assert_eq!((whole.step, whole.anew), (3, false));
+    let given_up = assembler.incomplete();
+    assert_eq!((given_up.len(), given_up[0].step, given_up[0].blocks, given_up[0].wanted), (1, 2, 1, 2));
+    assert_eq!(give(&mut assembler, &right, 2, 2), None, "too late");
+    // when time is up,
+    assert_eq!(give(&mut assembler, &left, 1, 4), None);
+    assert!(assembler.incomplete().is_empty());
+    std::thread::sleep(Duration::from_millis(40));
+    assert_eq!(assembler.incomplete()[0].why, "blocks did not come in time");
+    // and when too many wait.
+    (5..9).for_each(|n| assert_eq!(give(&mut assembler, &left, 1, n), None));
+    assert_eq!(numbers(&assembler.incomplete()), [5, 6]);
+}
+
+#[test]
+fn another_start_takes_over_with_its_first_whole_step() {
+    for starts in [[1, 2, 3], [0, 0, 0]] {
+        let [four, two, one] = [columns(starts[0], &[1, 1, 1, 1]), columns(starts[1], &[2, 2]), columns(starts[2], &[4])];
+        let mut assembler = Assembler::new(&four[0], Duration::from_secs(60), 8);
+        four.iter().for_each(|block| assembler.introduce(block, 10).unwrap());
+        let whole = |assembler: &mut Assembler, blocks: &[Description], generation, n| {
+            blocks.iter().filter_map(|block| give(assembler, block, generation, n)).next()
+        };
+        assert_eq!(whole(&mut assembler, &four, 10, 57).unwrap().step, 57);
+        assert_eq!(whole(&mut assembler, &four[..3], 10, 58), None);
+        // It was killed in mid-step, and comes back in two blocks, from step 40 on: the first of them alone changes nothing.
+        assembler.introduce(&two[0], 20).unwrap();
+        assert_eq!(give(&mut assembler, &two[0], 20, 40), None);
+        assert_eq!(whole(&mut assembler, &four[..3], 10, 59), None);
+        assert!(assembler.incomplete().is_empty());
+        assembler.introduce(&two[1], 21).unwrap();
+        let step = give(&mut assembler, &two[1], 21, 40).unwrap();
+        assert_eq!((step.step, step.anew), (40, true));
+        assert_eq!(step.values, values(&cube([4, 3, 2]), 40).concat());
+        let given_up = assembler.incomplete();
+        assert_eq!(numbers(&given_up), [58, 59]);
+        assert!(given_up.iter().all(|g| (g.blocks, g.wanted, g.why) == (3, 4, "the simulation was started anew")));
+        // What the first start left comes too late, its last block with it.
+        assert_eq!(give(&mut assembler, &four[3], 10, 58), None);
+        assert!(!assembler.ended(0, 20));
+        assert_eq!(whole(&mut assembler, &two, 20, 41), None, "block 1 was opened at 21");
+        assert_eq!(give(&mut assembler, &two[1], 21, 41).map(|s| (s.step, s.anew)), Some((41, false)));
+        // And in one.
+        assert!(assembler.ended(1, 21), "all blocks of the start that is followed");
+        assembler.introduce(&one[0], 30).unwrap();
+        assert!(!assembler.ended(0, 20));
+        assert_eq!(give(&mut assembler, &one[0], 30, 3).map(|s| (s.step, s.anew)), Some((3, true)));
+        // And in four again, under the number that it had.
+        four.iter().for_each(|block| assembler.introduce(block, 40).unwrap());
+        assert_eq!(whole(&mut assembler, &four, 40, 4).map(|s| (s.step, s.anew)), Some((4, true)));
+    }
+}
+
+#[test]
+fn a_start_in_the_same_blocks_takes_nothing_of_the_one_before() {
+    let blocks = columns(0, &[2, 2]);
+    let mut assembler = Assembler::new(&blocks[0], Duration::from_secs(60), 4);
+    blocks.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
+    assert_eq!(give(&mut assembler, &blocks[0], 1, 5), None);
+    // Both were killed. What the second had published comes between the openings of the two new ones.
+    assembler.introduce(&blocks[0], 2).unwrap();
+    assert_eq!(numbers(&assembler.incomplete()), [5]);
+    assert_eq!(give(&mut assembler, &blocks[1], 1, 9), None);
+    assembler.introduce(&blocks[1], 3).unwrap();
+    assert_eq!(numbers(&assembler.incomplete()), [9]);
+    assert_eq!(give(&mut assembler, &blocks[0], 2, 0), None);
+    assert_eq!(give(&mut assembler, &blocks[1], 1, 0), None, "of the killed one");
+    assert_eq!(give(&mut assembler, &blocks[1], 3, 0).map(|s| s.anew), Some(true));
+    // A connection that broke and came back is no start.
+    assembler.introduce(&blocks[1], 3).unwrap();
+    assert_eq!(give(&mut assembler, &blocks[0], 2, 1), None);
+    assert_eq!(give(&mut assembler, &blocks[1], 3, 1).map(|s| s.anew), Some(false));
+}
+
+#[test]
+fn blocks_of_as_many_in_other_places_displace_those_that_they_overlap() {
+    let [columns, rows] = [columns(0, &[2, 2]), {
+        let row = |index: u32, from, extent| BlockExtent { index, count: 2, offset: [0, from, 0], extent: [4, extent, 2] };
+        [row(0, 0, 1), row(1, 1, 2)].map(|block| Description { block, ..cube([4, 3, 2]) }).to_vec()
+    }];
+    let mut assembler = Assembler::new(&columns[0], Duration::from_secs(60), 4);
+    columns.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
+    // As far as is known the second lives: two blocks of one start would overlap so if ghost cells were not left out.
+    assembler.ended(0, 1);
+    let error = assembler.introduce(&rows[0], 2).unwrap_err().to_string();
+    assert!(error.contains("overlaps block 1") && error.contains("ghost cells"), "{error}");
+    assembler.introduce(&rows[1], 2).unwrap();
+    let row = |n: u64, block: &Description| {
+        let [from, extent] = [block.block.offset[1], block.block.extent[1]].map(|n| 4 * n as usize);
+        values(&cube([4, 3, 2]), n).concat().chunks_exact(12).flat_map(|plane| plane[from..from + extent].to_vec()).collect::<Vec<_>>()
+    };
+    assert_eq!(assembler.block(0, 2, 7, 1.0, 0, &mut row(7, &rows[0])).unwrap(), None);
+    let whole = assembler.block(1, 2, 7, 1.0, 0, &mut row(7, &rows[1])).unwrap().unwrap();
+    assert_eq!(whole.values, values(&cube([4, 3, 2]), 7).concat());
+}
+
+#[test]
+fn starts_that_never_come_whole_are_bounded() {
+    let mut assembler = Assembler::new(&columns(1, &[2, 2])[0], Duration::from_secs(60), 8);
+    for start in 1..100 {
+        let block = &columns(start, &[2, 2])[0];
+        assembler.introduce(block, start).unwrap();
+        assert_eq!(give(&mut assembler, block, start, 0), None);
+    }
+    // The first, which is followed, and the newest three are left.
+    assert_eq!(assembler.incomplete().len(), 95);
+    for (start, whole) in [(1, true), (50, false), (99, true)] {
+        let block = &columns(start, &[2, 2])[1];
+        assembler.introduce(block, start).unwrap();
+        assert_eq!(give(&mut assembler, block, start, 0).is_some(), whole, "{start}");
+    }
+}
+
+#[test]
+fn a_block_that_is_the_whole_field_is_handed_on_and_not_copied() {
+    let grid = cube([4, 3, 2]);
+    let mut assembler = Assembler::new(&grid, Duration::from_secs(1), 2);
+    assembler.introduce(&grid, 1).unwrap();
+    let mut buffer = values(&grid, 1).concat();
+    let (address, expected) = (buffer.as_ptr(), buffer.clone());
+    let step = assembler.block(0, 1, 1, 0.5, 9, &mut buffer).unwrap().unwrap();
+    assert_eq!((step.step, step.time, step.published), (1, 0.5, 9));
+    assert_eq!(step.values, expected);
+    assert_eq!(step.values.as_ptr(), address);
+    assembler.recycle(step.values);
+    // What came already, and what has another length, stays with the caller.
+    let mut buffer = values(&grid, 2).concat();
+    assert_eq!(assembler.block(0, 1, 1, 0.5, 9, &mut buffer).unwrap(), None);
+    assert!(assembler.block(0, 1, 2, 0.5, 9, &mut vec![0.0; 7]).unwrap_err().to_string().contains("7 values"));
+    assert_eq!(buffer, values(&grid, 2).concat());
+    assembler.block(0, 1, 2, 0.6, 9, &mut buffer).unwrap();
+    assert_eq!(buffer.as_ptr(), address, "the first step's buffer came back");
+}

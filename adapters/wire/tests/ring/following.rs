@@ -1,0 +1,150 @@
+//! What a reader sees while the solver goes on, ends, or tears the ring.
+
+use super::{Folder, cube, overwrite, publish, step, values};
+use ridgewatch_wire::{Element, Field, Following, Limits, Policy, Producer, Read, ReadAt, RingReader, WireError, block_path, blocks};
+
+#[test]
+fn what_is_published_is_read_in_order_and_the_rest_is_counted() {
+    let folder = Folder::new("order");
+    let producer = Producer::open(&folder.0, cube([5, 4, 3]), 4, Policy::NewestWins).unwrap();
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    assert_eq!(reader.header().description, cube([5, 4, 3]));
+    let mut buffer = Vec::new();
+    assert_eq!(reader.read(&mut buffer).unwrap(), Read::Nothing);
+    for n in 0..3 {
+        publish(&producer, n, n as f64 / 2.0).unwrap();
+    }
+    for n in 0..3 {
+        let info = step(&mut reader, &mut buffer).unwrap();
+        assert_eq!((info.number, info.step, info.time, info.missed), (n, n, n as f64 / 2.0, 0));
+        assert_eq!(buffer, values(producer.description(), n).concat());
+    }
+    // Ten more into four slots: the oldest six are gone.
+    for n in 3..13 {
+        publish(&producer, n, n as f64).unwrap();
+    }
+    let info = step(&mut reader, &mut buffer).unwrap();
+    assert_eq!((info.step, info.missed), (9, 6));
+    assert_eq!(buffer, values(producer.description(), 9).concat());
+    // A follower that comes late begins with the oldest that is there.
+    let mut late = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    assert_eq!(step(&mut late, &mut buffer).unwrap().step, 9);
+}
+
+#[test]
+fn the_end_is_told_and_the_last_follower_sweeps_up() {
+    let folder = Folder::new("end");
+    let following = Following::begin(&folder.0).unwrap();
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    publish(&producer, 7, 1.0).unwrap();
+    drop(producer);
+    assert_eq!(blocks(&folder.0), [0], "its last step waits for the follower");
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    let mut buffer = Vec::new();
+    assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 7);
+    assert_eq!(reader.read(&mut buffer).unwrap(), Read::Ended);
+    let other = Following::begin(&folder.0).unwrap();
+    drop(following);
+    assert_eq!(blocks(&folder.0), [0], "another follows still");
+    drop(other);
+    assert!(!folder.0.exists());
+    // A living producer keeps its ring when the last follower goes.
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    drop(Following::begin(&folder.0).unwrap());
+    assert_eq!(blocks(&folder.0), [0]);
+    publish(&producer, 1, 0.0).unwrap();
+}
+
+#[test]
+fn a_step_that_is_overwritten_while_it_is_read_is_never_seen() {
+    let folder = Folder::new("torn");
+    let description = cube([64, 32, 32]);
+    let producer = Producer::open(&folder.0, description, 2, Policy::NewestWins).unwrap();
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    let seen = std::thread::scope(|scope| {
+        let reader = scope.spawn(move || {
+            let (mut buffer, mut seen, mut missed) = (Vec::new(), 0u64, 0);
+            loop {
+                match reader.read(&mut buffer).unwrap() {
+                    Read::Step(info) => {
+                        assert!(buffer.iter().all(|v| *v == info.step as f32), "step {} is torn", info.step);
+                        assert_eq!(info.time, info.step as f64);
+                        (seen, missed) = (seen + 1, missed + info.missed);
+                        if info.step == 3000 {
+                            return (seen, missed);
+                        }
+                    }
+                    _ => std::thread::yield_now(),
+                }
+            }
+        });
+        for n in 1..=3000u64 {
+            let plane = vec![n as f32; 64 * 32 * 32];
+            let pointers = [plane.as_ptr().cast::<u8>(); 3];
+            // SAFETY: the plane holds a value a node.
+            unsafe { producer.publish(n, n as f64, &Field::packed(&pointers, Element::F32, [64, 32, 32])).unwrap() };
+        }
+        reader.join().unwrap()
+    });
+    assert_eq!(seen.0 + seen.1, 3000, "each step is seen or counted");
+}
+
+/// A ring whose slots are overwritten by a newer step at the moment that their values are read.
+struct Racing(std::cell::RefCell<Vec<u8>>);
+
+impl ReadAt for Racing {
+    fn length(&self) -> std::io::Result<u64> {
+        Ok(self.0.borrow().len() as u64)
+    }
+
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+        let mut bytes = self.0.borrow_mut();
+        let begin = offset as usize;
+        let (half, end) = (to.len() / 2, begin + to.len());
+        to[..half].copy_from_slice(&bytes[begin..begin + half]);
+        if begin > 12288 && to.len() > 32 {
+            let slot = begin - 64;
+            let sequence = u64::from_ne_bytes(bytes[slot..slot + 8].try_into().unwrap()) + 3;
+            bytes[slot..slot + 8].copy_from_slice(&sequence.to_ne_bytes());
+            bytes[begin..end].fill(0x7f);
+        }
+        to[half..].copy_from_slice(&bytes[begin + half..end]);
+        Ok(())
+    }
+
+    fn write_at(&self, _: &[u8], _: u64) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+#[test]
+fn a_step_that_changes_between_two_looks_is_thrown_away() {
+    let folder = Folder::new("racing");
+    let producer = Producer::open(&folder.0, cube([4, 4, 4]), 3, Policy::NewestWins).unwrap();
+    for n in 0..3 {
+        publish(&producer, n, n as f64).unwrap();
+    }
+    let bytes = std::fs::read(block_path(&folder.0, 0)).unwrap();
+    let mut reader = RingReader::over("racing".into(), Racing(bytes.into()), &Limits::default()).unwrap();
+    assert_eq!(reader.read(&mut Vec::new()).unwrap(), Read::Nothing);
+}
+
+#[test]
+fn a_ring_that_is_cut_short_or_runs_backwards_under_the_reader_is_an_error() {
+    let folder = Folder::new("cut");
+    let producer = Producer::open(&folder.0, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+    for n in 0..3 {
+        publish(&producer, n, n as f64).unwrap();
+    }
+    let copy = folder.0.join("copy");
+    std::fs::create_dir(&copy).unwrap();
+    std::fs::copy(block_path(&folder.0, 0), block_path(&copy, 0)).unwrap();
+    let mut reader = RingReader::open(&copy, 0, &Limits::default()).unwrap();
+    let mut buffer = Vec::new();
+    assert!(matches!(reader.read(&mut buffer).unwrap(), Read::Step(_)));
+    overwrite(&block_path(&copy, 0), 1024, &1u64.to_ne_bytes());
+    assert!(matches!(reader.read(&mut buffer), Err(WireError::Field { field: "published", .. })));
+    overwrite(&block_path(&copy, 0), 1024, &3u64.to_ne_bytes());
+    std::fs::OpenOptions::new().write(true).open(block_path(&copy, 0)).unwrap().set_len(12288 + 64).unwrap();
+    assert!(matches!(reader.read(&mut buffer), Err(WireError::Io { .. })));
+}

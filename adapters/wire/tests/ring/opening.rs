@@ -1,0 +1,198 @@
+//! Rings that cannot be opened, and what opening leaves.
+
+use super::{Folder, cube, overwrite, publish, step, values};
+use ridgewatch_wire::{Description, Element, Field, Geometry, Limits, Policy, Producer, RingReader, WireError, block_path, producer_lives};
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+
+#[test]
+fn every_unaligned_value_and_lie_of_the_caller_is_refused() {
+    let folder = Folder::new("caller");
+    let description = cube([2, 2, 2]);
+    let producer = Producer::open(&folder.0, description.clone(), 2, Policy::NewestWins).unwrap();
+    let data = [0.0f32; 9];
+    let base: *const u8 = data.as_ptr().cast();
+    let good = [base; 3];
+    let refused = |components: &[*const u8], time: f64| {
+        let field = Field::packed(components, Element::F32, [2, 2, 2]);
+        // SAFETY: what is not refused reads 8 of 9 values.
+        unsafe { producer.publish(0, time, &field) }.unwrap_err().to_string()
+    };
+    assert!(refused(&good[..2], 0.0).contains("3, as many as axes"));
+    assert!(refused(&[base, std::ptr::null(), base], 0.0).contains("null"));
+    assert!(refused(&[base, base.wrapping_add(1), base], 0.0).contains("divisible by 4"));
+    assert!(refused(&good, f64::NAN).contains("finite"));
+    assert!(publish(&producer, 0, 0.0).is_ok());
+    for (what, change) in [
+        ("axis.coordinates", Box::new(|d: &mut Description| d.axes[0].coordinates.reverse()) as Box<dyn Fn(&mut Description)>),
+        ("axis.coordinates", Box::new(|d| d.axes[1].coordinates[1] = f64::NAN)),
+        ("axis.nodes", Box::new(|d| d.axes[2].coordinates.truncate(1))),
+        ("axis.period", Box::new(|d| d.axes[0].period = Some(0.5))),
+        ("radius", Box::new(|d| d.geometry = Geometry::Sphere { radius: -1.0 })),
+        ("block", Box::new(|d| d.block.offset[0] = 1)),
+        ("block", Box::new(|d| d.block.extent[2] = u64::MAX)),
+        ("block", Box::new(|d| d.block.index = 1)),
+        ("axes", Box::new(|d| d.axes.truncate(1))),
+        ("time_unit", Box::new(|d| d.time_unit = "s\n".into())),
+    ] {
+        let mut wrong = description.clone();
+        change(&mut wrong);
+        let error = Producer::open(&folder.0.join("other"), wrong, 2, Policy::NewestWins).unwrap_err().to_string();
+        assert!(error.contains(&format!("`{what}`")), "{what}: {error}");
+    }
+}
+
+#[test]
+fn two_producers_of_one_name_and_what_a_killed_one_leaves() {
+    let folder = Folder::new("names");
+    let first = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    let error = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::InUse { pid, .. } if pid == u64::from(std::process::id())), "{error}");
+    assert!(producer_lives(&folder.0, 0));
+    // As SIGKILL leaves it: the files stay, the lock goes.
+    let reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    let left = std::fs::read(block_path(&folder.0, 0)).unwrap();
+    drop(first);
+    assert!(!producer_lives(&folder.0, 0) && !folder.0.exists(), "nobody follows: the folder goes");
+    std::fs::create_dir_all(&folder.0).unwrap();
+    std::fs::write(block_path(&folder.0, 0), left).unwrap();
+    std::fs::write(folder.0.join(".block-00000.part"), "half").unwrap();
+    std::fs::set_permissions(block_path(&folder.0, 0), PermissionsExt::from_mode(0o600)).unwrap();
+    let second = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    let new = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    assert!(!reader.is_current() && new.is_current());
+    assert!(new.header().generation > reader.header().generation && new.header().producer != reader.header().producer);
+    assert!(!folder.0.join(".block-00000.part").exists());
+    drop(second);
+}
+
+#[test]
+fn rings_of_others_links_and_odd_files_are_refused() {
+    let folder = Folder::new("foreign");
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    let path = block_path(&folder.0, 0);
+    let open = || RingReader::open(&folder.0, 0, &Limits::default()).unwrap_err();
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o640)).unwrap();
+    assert!(matches!(open(), WireError::Foreign { found, .. } if found == "has mode 0640"));
+    std::fs::set_permissions(&path, PermissionsExt::from_mode(0o600)).unwrap();
+    // SAFETY: a call of the system on a path that lives.
+    if unsafe { libc::geteuid() } == 0 {
+        std::os::unix::fs::chown(&path, Some(12345), None).unwrap();
+        assert!(matches!(open(), WireError::Foreign { found, .. } if found == "belongs to user 12345"));
+        std::os::unix::fs::chown(&path, Some(0), None).unwrap();
+        let theirs = folder.0.join("theirs");
+        std::fs::create_dir(&theirs).unwrap();
+        std::os::unix::fs::chown(&theirs, Some(12345), None).unwrap();
+        let error = Producer::open(&theirs, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
+        assert!(matches!(error, WireError::Foreign { .. }), "{error}");
+        std::fs::remove_dir(&theirs).unwrap();
+    }
+    let moved = folder.0.join("moved");
+    std::fs::rename(&path, &moved).unwrap();
+    std::os::unix::fs::symlink(&moved, &path).unwrap();
+    assert!(matches!(open(), WireError::Foreign { found, .. } if found.contains("link")));
+    std::fs::remove_file(&path).unwrap();
+    std::fs::create_dir(&path).unwrap();
+    assert!(matches!(open(), WireError::Foreign { .. } | WireError::Io { .. }));
+    std::fs::remove_dir(&path).unwrap();
+    std::fs::rename(&moved, &path).unwrap();
+    // A folder that others may write into.
+    let open_to_all = folder.0.join("open");
+    std::fs::create_dir(&open_to_all).unwrap();
+    std::fs::set_permissions(&open_to_all, PermissionsExt::from_mode(0o777)).unwrap();
+    let error = Producer::open(&open_to_all, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
+    assert!(error.contains("others may write into"), "{error}");
+    std::fs::remove_dir(&open_to_all).unwrap();
+    drop(producer);
+}
+
+/// A ring that is there whole, then changed.
+fn changed(change: impl Fn(&Path), limits: &Limits) -> WireError {
+    static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
+    let folder = Folder::new(&format!("changed{}", NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed)));
+    let producer = Producer::open(&folder.0, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+    publish(&producer, 1, 1.0).unwrap();
+    // A copy, for a producer whose own file is cut short would be killed with it.
+    let copy = folder.0.join("copy");
+    std::fs::create_dir(&copy).unwrap();
+    std::fs::copy(block_path(&folder.0, 0), block_path(&copy, 0)).unwrap();
+    change(&block_path(&copy, 0));
+    let mut buffer = Vec::new();
+    match RingReader::open(&copy, 0, limits) {
+        Err(error) => error,
+        Ok(mut reader) => reader.read(&mut buffer).unwrap_err(),
+    }
+}
+
+#[test]
+fn damaged_rings_have_their_own_errors() {
+    let limits = Limits::default();
+    assert!(matches!(changed(|p| overwrite(p, 0, b"RIFF"), &limits), WireError::NotARing { .. }));
+    assert!(matches!(changed(|p| overwrite(p, 8, &[1]), &limits), WireError::Version { found: 1, known: 2 }));
+    assert!(matches!(changed(|p| overwrite(p, 12, &[255; 4]), &limits), WireError::TooLarge { .. }));
+    assert!(matches!(changed(|p| overwrite(p, 24, &[3]), &limits), WireError::Checksum { .. }));
+    assert!(matches!(changed(|p| overwrite(p, 8200, &[77]), &limits), WireError::Checksum { .. }));
+    let truncate = |length: u64| move |p: &Path| std::fs::OpenOptions::new().write(true).open(p).unwrap().set_len(length).unwrap();
+    assert!(matches!(changed(truncate(100), &limits), WireError::Short { .. }));
+    assert!(matches!(changed(truncate(8200), &limits), WireError::Short { .. }));
+    assert!(matches!(changed(truncate(12288 + 100), &limits), WireError::Short { .. }));
+    let small = Limits { step_bytes: 4 * 4 * 4 * 3 * 4 - 1 };
+    assert!(matches!(changed(|_| {}, &small), WireError::TooLarge { .. }));
+    // A time that is no number, put there behind the producer's back.
+    assert!(matches!(changed(|p| overwrite(p, 12288 + 16, &f64::NAN.to_ne_bytes()), &limits), WireError::Field { field: "time", .. }));
+}
+
+#[test]
+fn no_room_is_an_error_and_leaves_nothing() {
+    let folder = Folder::new("room");
+    // A petabyte.
+    let description = cube([1 << 15, 1 << 15, 1 << 14]);
+    let error = Producer::open(&folder.0, description, 16, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::NoSpace { .. }), "{error}");
+    assert_eq!(std::fs::read_dir(&folder.0).unwrap().count(), 0);
+}
+
+/// A file system of one megabyte that is gone when the test ends.
+struct SmallDisk(PathBuf);
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = std::process::Command::new("umount").arg("-l").arg(&self.0).status();
+        let _ = std::fs::remove_dir(&self.0);
+    }
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
+    let disk = SmallDisk(std::env::temp_dir().join(format!("rw-test-full-{}", std::process::id())));
+    std::fs::create_dir_all(&disk.0).unwrap();
+    let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m,mode=0700", "tmpfs"]).arg(&disk.0).status();
+    assert!(mounted.unwrap().success(), "mounting needs root");
+    let (first, second) = (disk.0.join("first"), disk.0.join("second"));
+    // 2 slots of 24^3 x 3 f32: 332 kB.
+    let producer = Producer::open(&first, cube([24, 24, 24]), 2, Policy::NewestWins).unwrap();
+    // Three times as much does not fit any more, and nothing of the attempt stays.
+    let error = Producer::open(&second, cube([24, 24, 24]), 6, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::NoSpace { needed, .. } if needed > 900_000), "{error}");
+    assert_eq!(std::fs::read_dir(&second).unwrap().count(), 0);
+    // Somebody else takes the rest, to the last page.
+    let mut ballast = std::fs::File::create(disk.0.join("ballast")).unwrap();
+    while std::io::Write::write_all(&mut ballast, &[1; 4096]).is_ok() {}
+    // What was reserved at opening holds: every slot is written, none faults, and a follower reads them.
+    let mut reader = RingReader::open(&first, 0, &Limits::default()).unwrap();
+    let mut buffer = Vec::new();
+    for n in 0..6 {
+        publish(&producer, n, n as f64).unwrap();
+        assert_eq!(step(&mut reader, &mut buffer).unwrap().step, n);
+        assert_eq!(buffer, values(producer.description(), n).concat());
+    }
+    assert!(matches!(
+        Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins),
+        Err(WireError::NoSpace { .. } | WireError::Io { .. })
+    ));
+    // With room again, the name that was refused is free.
+    drop(ballast);
+    std::fs::remove_file(disk.0.join("ballast")).unwrap();
+    Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+}

@@ -1,0 +1,213 @@
+//! What a solver may do: any strides, several threads, waiting.
+
+use super::{Folder, cube, publish, step, values};
+use ridgewatch_wire::{BlockExtent, Element, Field, Following, Limits, Policy, Producer, Read, RingReader, WireError, producer_lives};
+use std::time::{Duration, Instant};
+
+#[test]
+fn strides_and_f64_arrive_as_packed_f32_does() {
+    let folder = Folder::new("strides");
+    let description = cube([3, 4, 2]);
+    let producer = Producer::open(&folder.0, description.clone(), 2, Policy::NewestWins).unwrap();
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    let expected = values(&description, 1);
+    let at = |i: usize, j: usize, k: usize| i + 3 * (j + 4 * k);
+    let mut buffer = Vec::new();
+    let mut check = |field: &Field| {
+        // SAFETY: every stride below stays inside its array.
+        unsafe { producer.publish(1, 0.0, field).unwrap() };
+        step(&mut reader, &mut buffer).unwrap();
+        assert_eq!(buffer, expected.concat());
+    };
+    // Interleaved.
+    let interleaved: Vec<f32> = (0..24).flat_map(|n| (0..3).map(move |c| (c, n))).map(|(c, n): (usize, usize)| expected[c][n]).collect();
+    let pointers: Vec<*const u8> = (0..3).map(|c| interleaved[c..].as_ptr().cast()).collect();
+    check(&Field { components: &pointers, element: Element::F32, strides: [3, 9, 36] });
+    // [x][y][z], doubles.
+    let mut transposed = vec![vec![0.0f64; 24]; 3];
+    for (c, component) in transposed.iter_mut().enumerate() {
+        for (i, j, k) in (0..24).map(|n| (n % 3, n / 3 % 4, n / 12)) {
+            component[(i * 4 + j) * 2 + k] = f64::from(expected[c][at(i, j, k)]);
+        }
+    }
+    let pointers: Vec<*const u8> = transposed.iter().map(|v| v.as_ptr().cast()).collect();
+    check(&Field { components: &pointers, element: Element::F64, strides: [8, 2, 1] });
+    // With ghost cells, y downward.
+    let (px, py) = (5, 6);
+    let mut padded = vec![vec![f32::NAN; px * py * 4]; 3];
+    for (c, component) in padded.iter_mut().enumerate() {
+        for (i, j, k) in (0..24).map(|n| (n % 3, n / 3 % 4, n / 12)) {
+            component[(i + 1) + px * ((4 - j) + py * (k + 1))] = expected[c][at(i, j, k)];
+        }
+    }
+    let pointers: Vec<*const u8> = padded.iter().map(|v| v[1 + px * (4 + py)..].as_ptr().cast()).collect();
+    check(&Field { components: &pointers, element: Element::F32, strides: [1, -(px as isize), (px * py) as isize] });
+}
+
+#[test]
+fn producers_that_come_and_go_at_once_do_not_take_each_others_folder() {
+    let folder = Folder::new("crowd");
+    std::thread::scope(|scope| {
+        for index in 0..4 {
+            let ring = &folder.0;
+            scope.spawn(move || {
+                let mut description = cube([8, 2, 2]);
+                description.block = BlockExtent { index, count: 4, offset: [2 * u64::from(index), 0, 0], extent: [2, 2, 2] };
+                for _ in 0..300 {
+                    drop(Producer::open(ring, description.clone(), 2, Policy::NewestWins).unwrap());
+                }
+            });
+        }
+    });
+    assert!(!folder.0.exists());
+}
+
+#[test]
+fn waiting_is_bounded_and_happens_once() {
+    let folder = Folder::new("wait");
+    let limit = Duration::from_millis(80);
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::Wait(limit)).unwrap();
+    let timed = |n: u64| {
+        let begin = Instant::now();
+        let published = publish(&producer, n, n as f64).unwrap();
+        (published.overwrote, begin.elapsed())
+    };
+    assert!(!timed(0).0 && !timed(1).0);
+    let (overwrote, took) = timed(2);
+    assert!(overwrote && took >= limit && took < limit * 10, "{took:?}");
+    let (overwrote, took) = timed(3);
+    assert!(overwrote && took < limit, "{took:?}: nobody moved, nobody is waited for again");
+    // A follower that takes steps is waited for, and loses none.
+    let path = folder.0.clone();
+    let mut reader = RingReader::open(&path, 0, &Limits::default()).unwrap();
+    let follower = std::thread::spawn(move || {
+        let (mut buffer, mut seen) = (Vec::new(), Vec::new());
+        while seen.last() != Some(&30) {
+            match reader.read(&mut buffer).unwrap() {
+                Read::Step(info) => {
+                    seen.push(info.step);
+                    std::thread::sleep(Duration::from_millis(3));
+                    reader.acknowledge(0).unwrap();
+                }
+                _ => std::thread::yield_now(),
+            }
+        }
+        seen
+    });
+    for n in 4..=30 {
+        // The first may come before the follower has taken anything.
+        assert!(!timed(n).0 || n < 6, "step {n}");
+        if n < 6 {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+    let seen = follower.join().unwrap();
+    assert!(seen[0] <= 5 && seen == (seen[0]..=30).collect::<Vec<_>>(), "{seen:?}");
+}
+
+#[test]
+fn threads_may_publish_at_once_and_a_fork_may_not() {
+    let folder = Folder::new("threads");
+    let producer = Producer::open(&folder.0, cube([8, 8, 8]), 64, Policy::NewestWins).unwrap();
+    std::thread::scope(|scope| {
+        for thread in 0..4 {
+            let producer = &producer;
+            scope.spawn(move || {
+                for n in 0..10 {
+                    publish(producer, 10 * thread + n, n as f64).unwrap();
+                }
+            });
+        }
+    });
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    let mut buffer = Vec::new();
+    let mut steps: Vec<u64> = std::iter::from_fn(|| {
+        let info = step(&mut reader, &mut buffer)?;
+        assert_eq!(buffer, values(producer.description(), info.step).concat());
+        Some(info.step)
+    })
+    .collect();
+    steps.sort_unstable();
+    assert_eq!(steps, (0..40).collect::<Vec<_>>());
+    // SAFETY: the child calls nothing that could wait for a lock of another thread, and leaves by _exit.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        let data = [0.0f32; 512];
+        let pointers = [data.as_ptr().cast::<u8>(); 3];
+        // SAFETY: 512 values, as described.
+        let refused = unsafe { producer.publish(99, 0.0, &Field::packed(&pointers, Element::F32, [8, 8, 8])) };
+        // Closing it here must not end the parent's ring.
+        drop(producer);
+        // SAFETY: ends the child.
+        unsafe { libc::_exit(if matches!(refused, Err(WireError::Forked { .. })) { 0 } else { 1 }) };
+    }
+    let mut status = 0;
+    // SAFETY: waits for the child made above.
+    unsafe { libc::waitpid(child, &mut status, 0) };
+    assert_eq!(status, 0);
+    assert!(producer_lives(&folder.0, 0));
+    publish(&producer, 40, 0.0).unwrap();
+    assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 40);
+}
+
+#[test]
+fn the_slowest_of_several_followers_is_waited_for_and_one_that_left_is_not() {
+    let folder = Folder::new("marks");
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::Wait(Duration::from_secs(20))).unwrap();
+    let followers = [Following::begin(&folder.0).unwrap(), Following::begin(&folder.0).unwrap()];
+    let marks = followers.each_ref().map(|f| f.mark().unwrap());
+    assert_eq!(marks, [0, 1]);
+    let mut readers = [0, 1].map(|_| RingReader::open(&folder.0, 0, &Limits::default()).unwrap());
+    for n in 0..2 {
+        publish(&producer, n, n as f64).unwrap();
+    }
+    let mut buffer = Vec::new();
+    // The first has everything, the second nothing.
+    readers[1].acknowledge(marks[1]).unwrap();
+    while step(&mut readers[0], &mut buffer).is_some() {}
+    readers[0].acknowledge(marks[0]).unwrap();
+    std::thread::scope(|scope| {
+        let publishing = scope.spawn(|| publish(&producer, 2, 2.0).unwrap());
+        std::thread::sleep(Duration::from_millis(100));
+        assert!(!publishing.is_finished(), "the second has not taken step 0");
+        let mut buffer = Vec::new();
+        assert_eq!(step(&mut readers[1], &mut buffer).unwrap().step, 0);
+        readers[1].acknowledge(marks[1]).unwrap();
+        assert!(!publishing.join().unwrap().overwrote);
+    });
+    // Its number is free for the next.
+    readers[1].leave(marks[1]).unwrap();
+    let [first, second] = followers;
+    drop(second);
+    let next = Following::begin(&folder.0).unwrap();
+    assert_eq!(next.mark().unwrap(), 1);
+    // One that has left holds nobody up: the first goes on alone.
+    let mut taking = std::thread::scope(|scope| {
+        let taking = scope.spawn(|| {
+            let (mut buffer, mut seen) = (Vec::new(), Vec::new());
+            while seen.last() != Some(&6) {
+                seen.extend(step(&mut readers[0], &mut buffer).map(|info| info.step));
+                readers[0].acknowledge(marks[0]).unwrap();
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            seen
+        });
+        let begin = Instant::now();
+        let overwrote = (3..7).filter(|n| publish(&producer, *n, *n as f64).unwrap().overwrote).count();
+        assert!(overwrote == 0 && begin.elapsed() < Duration::from_secs(2), "{overwrote} {:?}", begin.elapsed());
+        taking.join().unwrap()
+    });
+    taking.sort_unstable();
+    assert_eq!(taking, (2..7).collect::<Vec<_>>());
+    drop(first);
+}
+
+#[test]
+fn there_are_64_marks() {
+    let folder = Folder::new("many");
+    let followers: Vec<_> = (0..65).map(|_| Following::begin(&folder.0).unwrap()).collect();
+    let marks: Vec<_> = followers[..64].iter().map(|f| f.mark().unwrap()).collect();
+    assert_eq!(marks, (0..64).collect::<Vec<_>>());
+    let error = followers[64].mark().unwrap_err().to_string();
+    assert!(error.contains("64 follow") && error.contains("at most 64"), "{error}");
+}
