@@ -7,11 +7,10 @@
 
 using namespace rw;
 
-// Outputs of a block of a product: TILE x TILE, summed up in steps of DEPTH, STAGES of which are in shared memory or on the way.
-constexpr int THREADS = 256, TILE = 128, DEPTH = 32, STAGES = 3;
+// Outputs of a block of a product: TILE x TILE, summed up in steps of DEPTH (whole lines of the cache), STAGES of which are in shared memory
+// or on the way.
+constexpr int THREADS = 256, TILE = 128, DEPTH = 64, STAGES = RW_STAGES;
 constexpr uint32_t PADDED = (WIDTH + TILE - 1) / TILE * TILE, ENCODED_PADDED = (ENCODED + TILE - 1) / TILE * TILE;
-// What of an encoded row is summed up.
-constexpr uint32_t ENCODED_DEPTH = (ENCODED + DEPTH - 1) / DEPTH * DEPTH;
 
 // TILE rows or columns of a matrix, DEPTH of the other kind. DOWN: what is summed up goes down the rows.
 template <bool DOWN> struct Panel {
@@ -95,9 +94,38 @@ static_assert(sizeof(Product<false, true>::Shared) <= RW_PRODUCT_BYTES && sizeof
                   sizeof(Product<true, true>::Shared) <= RW_PRODUCT_BYTES,
               "shared memory");
 
-// Two values side by side.
-RW_FN void put(uint16_t* matrix, size_t stride, uint32_t row, uint32_t column, float x, float y) {
-    *reinterpret_cast<uint32_t*>(matrix + row * stride + column) = pack(x, y);
+// A block's results in half precision, in place of its panels: they go out in whole lines.
+struct Results {
+    static constexpr int CHUNKS = TILE / 8, ROWS = THREADS / CHUNKS;
+    uint16_t values[TILE][TILE + SKEW];
+
+    static RW_FN Results& of_block() {
+        extern __shared__ __align__(16) unsigned char memory[];
+        return *reinterpret_cast<Results*>(memory);
+    }
+    // Eight columns, and the first row of several ROWS apart, that a thread takes.
+    static RW_FN uint32_t chunk() { return threadIdx.x % CHUNKS * 8u; }
+    static RW_FN uint32_t row() { return threadIdx.x / CHUNKS; }
+    RW_FN Words4& at(uint32_t row) { return *reinterpret_cast<Words4*>(&values[row][chunk()]); }
+};
+static_assert(sizeof(Results) <= RW_PRODUCT_BYTES, "shared memory");
+
+// By the whole block: each pair of sums, with its column in the product, through `change`, as halves into shared memory.
+template <class P, class Change> RW_FN Results& gather(const P& product, Change change) {
+    Results& results = Results::of_block();
+    __syncthreads();
+    RW_UNROLL for (int n = 0; n < 4; ++n) {
+        const uint32_t column = product.column(n), inside = column - blockIdx.x * TILE;
+        RW_UNROLL for (int m = 0; m < 4; ++m) {
+            RW_UNROLL for (int half = 0; half < 2; ++half) {
+                const float2 pair = change(make_float2(product.sums[m][n][2 * half], product.sums[m][n][2 * half + 1]), n);
+                const uint32_t row = product.row(m) + 8 * half - blockIdx.y * TILE;
+                *reinterpret_cast<uint32_t*>(&results.values[row][inside]) = pack(pair.x, pair.y);
+            }
+        }
+    }
+    __syncthreads();
+    return results;
 }
 
 // A layer's values from those before it. Grid: tiles of columns, tiles of rows.
@@ -106,16 +134,21 @@ batched_forward(const uint16_t* __restrict__ in, uint32_t in_stride, uint32_t de
                 const float* __restrict__ biases, uint16_t* __restrict__ out) {
     Product<false, true> product;
     product.run(in, in_stride, weights, PADDED, 0, depth);
+    float2 bias[4];
     RW_UNROLL for (int n = 0; n < 4; ++n) {
         const uint32_t column = product.column(n);
-        const float low = column < WIDTH ? biases[column] : 0.0f, high = column + 1 < WIDTH ? biases[column + 1] : 0.0f;
-        RW_UNROLL for (int m = 0; m < 4; ++m) {
-            const float(&sums)[4] = product.sums[m][n];
-            const uint32_t row = product.row(m);
-            put(out, PADDED, row, column, rectify(sums[0] + low), rectify(sums[1] + high));
-            put(out, PADDED, row + 8, column, rectify(sums[2] + low), rectify(sums[3] + high));
-        }
+        bias[n] = make_float2(column < WIDTH ? biases[column] : 0.0f, column + 1 < WIDTH ? biases[column + 1] : 0.0f);
     }
+    Results& results = gather(product, [&](float2 pair, int n) { return make_float2(rectify(pair.x + bias[n].x), rectify(pair.y + bias[n].y)); });
+    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
+        uint16_t* to = out + (blockIdx.y * TILE + row) * size_t(PADDED) + blockIdx.x * TILE + Results::chunk();
+        *reinterpret_cast<Words4*>(to) = results.at(row);
+    }
+}
+
+// Of two halves side by side, those that the activation passed.
+RW_FN uint32_t pass(uint32_t values, uint32_t active) {
+    return (active & 0x00007fffu ? values & 0x0000ffffu : 0u) | (active & 0x7fff0000u ? values & 0xffff0000u : 0u);
 }
 
 // Gradient with respect to a hidden layer's sums, from that of the layer above; adds up its biases' gradient.
@@ -124,28 +157,31 @@ batched_backward(const uint16_t* __restrict__ delta, const uint16_t* __restrict_
                  uint16_t* __restrict__ out, float* __restrict__ bias_gradient) {
     Product<false, false> product;
     product.run(delta, PADDED, weights, PADDED, 0, PADDED);
-    RW_UNROLL for (int n = 0; n < 4; ++n) {
-        const uint32_t column = product.column(n);
-        float low = 0.0f, high = 0.0f;
-        RW_UNROLL for (int m = 0; m < 4; ++m) {
-            RW_UNROLL for (int half = 0; half < 2; ++half) {
-                const uint32_t row = product.row(m) + 8 * half;
-                const uint32_t active = *reinterpret_cast<const uint32_t*>(passed + row * size_t(PADDED) + column);
-                const float x = active & 0x00007fffu ? product.sums[m][n][2 * half] : 0.0f;
-                const float y = active & 0x7fff0000u ? product.sums[m][n][2 * half + 1] : 0.0f;
-                put(out, PADDED, row, column, x, y);
-                low += x;
-                high += y;
-            }
+    Results& results = gather(product, [](float2 pair, int) { return pair; });
+    __shared__ float biases[TILE];
+    if (threadIdx.x < TILE) biases[threadIdx.x] = 0.0f;
+    __syncthreads();
+    float sums[8] = {};
+    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
+        const size_t at = (blockIdx.y * TILE + row) * size_t(PADDED) + blockIdx.x * TILE + Results::chunk();
+        const Words4 values = results.at(row), active = *reinterpret_cast<const Words4*>(passed + at);
+        const Words4 kept = {pass(values.x, active.x), pass(values.y, active.y), pass(values.z, active.z), pass(values.w, active.w)};
+        *reinterpret_cast<Words4*>(out + at) = kept;
+        const uint32_t words[4] = {kept.x, kept.y, kept.z, kept.w};
+        RW_UNROLL for (int k = 0; k < 4; ++k) {
+            const float2 pair = unpack(words[k]);
+            sums[2 * k] += pair.x;
+            sums[2 * k + 1] += pair.y;
         }
-        // Over the warp's rows.
-        for (int apart = 4; apart < 32; apart *= 2) {
-            low += __shfl_xor_sync(0xffffffffu, low, apart);
-            high += __shfl_xor_sync(0xffffffffu, high, apart);
-        }
-        if (lane() < 4u && column < WIDTH) atomicAdd(bias_gradient + column, low);
-        if (lane() < 4u && column + 1 < WIDTH) atomicAdd(bias_gradient + column + 1, high);
     }
+    RW_UNROLL for (int k = 0; k < 8; ++k) {
+        // Lanes l and l + 16 have the same columns.
+        sums[k] += __shfl_xor_sync(0xffffffffu, sums[k], 16);
+        if (lane() < 16u) atomicAdd(biases + Results::chunk() + k, sums[k]);
+    }
+    __syncthreads();
+    const uint32_t column = blockIdx.x * TILE + threadIdx.x;
+    if (threadIdx.x < TILE && column < WIDTH) atomicAdd(bias_gradient + column, biases[threadIdx.x]);
 }
 
 // Gradient with respect to the encoded points.
@@ -153,12 +189,10 @@ extern "C" __global__ void __launch_bounds__(THREADS, 2)
 batched_backward_encoded(const uint16_t* __restrict__ delta, const uint16_t* __restrict__ weights, uint16_t* __restrict__ out) {
     Product<false, false> product;
     product.run(delta, PADDED, weights, PADDED, 0, PADDED);
-    RW_UNROLL for (int n = 0; n < 4; ++n) {
-        RW_UNROLL for (int m = 0; m < 4; ++m) {
-            const float(&sums)[4] = product.sums[m][n];
-            put(out, ENCODED_PADDED, product.row(m), product.column(n), sums[0], sums[1]);
-            put(out, ENCODED_PADDED, product.row(m) + 8, product.column(n), sums[2], sums[3]);
-        }
+    Results& results = gather(product, [](float2 pair, int) { return pair; });
+    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
+        uint16_t* to = out + (blockIdx.y * TILE + row) * size_t(ENCODED_PADDED) + blockIdx.x * TILE + Results::chunk();
+        *reinterpret_cast<Words4*>(to) = results.at(row);
     }
 }
 
@@ -172,9 +206,17 @@ batched_products(const uint16_t* __restrict__ in, uint32_t in_stride, const uint
     product.run(in, in_stride, delta, PADDED, from, from + share < rows ? from + share : rows);
     RW_UNROLL for (int m = 0; m < 4; ++m) {
         RW_UNROLL for (int n = 0; n < 4; ++n) {
-            RW_UNROLL for (int k = 0; k < 4; ++k) {
-                const uint32_t row = product.row(m) + 8 * (k >> 1), column = product.column(n) + (k & 1);
-                if (row < inputs && column < WIDTH) atomicAdd(gradient + row * size_t(WIDTH) + column, product.sums[m][n][k]);
+            RW_UNROLL for (int half = 0; half < 2; ++half) {
+                const uint32_t row = product.row(m) + 8 * half, column = product.column(n);
+                float* to = gradient + row * size_t(WIDTH) + column;
+                if (row >= inputs || column >= WIDTH) continue;
+                // Two at once where they are side by side and aligned: in an even width all are.
+                if constexpr (WIDTH % 2 == 0) {
+                    add(to, product.sums[m][n][2 * half], product.sums[m][n][2 * half + 1]);
+                } else {
+                    atomicAdd(to, product.sums[m][n][2 * half]);
+                    if (column + 1 < WIDTH) atomicAdd(to + 1, product.sums[m][n][2 * half + 1]);
+                }
             }
         }
     }
@@ -293,7 +335,7 @@ batched_head(const uint16_t* __restrict__ values, const float* __restrict__ head
             weights[1] = fma_(pair.y, slopes[row], weights[1]);
             biases[0] += low;
             biases[1] += high;
-            put(delta, PADDED, uint32_t(first) + row, column, low, high);
+            *reinterpret_cast<uint32_t*>(delta + (first + row) * PADDED + column) = pack(low, high);
         }
         RW_UNROLL for (int k = 0; k < 2; ++k) {
             if (column + k >= WIDTH) continue;

@@ -5,7 +5,7 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
-use ridgewatch::engine::cuda::{is_fused, network_defines};
+use ridgewatch::engine::cuda::{batched_defines, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, NetworkSettings};
 
 /// Macros in which the gridded kernel is compiled here.
@@ -68,7 +68,10 @@ fn variants(source: &str) -> Vec<Vec<String>> {
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
         "network.cu" => networks(|_| true),
         "network_fused.cu" => networks(is_fused),
-        "network_batched.cu" => networks(|shape| !is_fused(shape)),
+        "network_batched.cu" => networks(|shape| !is_fused(shape))
+            .iter()
+            .flat_map(|defines| batched_defines().map(|more| [defines.as_slice(), more.as_slice()].concat()))
+            .collect(),
         _ => vec![Vec::new()],
     }
 }

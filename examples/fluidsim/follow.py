@@ -9,6 +9,7 @@ Only the lines between the marks are ours: a solver publishes by calling one fun
 
 import argparse
 import importlib
+import time
 
 import numpy as np
 
@@ -46,6 +47,7 @@ def main():
     parser.add_argument("--nodes", type=int, default=128)
     parser.add_argument("--end", type=float, default=10.0, help="simulated time")
     parser.add_argument("--every", type=int, default=5, help="publish every so many steps")
+    parser.add_argument("--pause", type=float, default=0.0, help="seconds to wait after each published step, for the pace of a larger simulation")
     options = parser.parse_args()
     Simul, params = parameters(options.kind, options.nodes, options.end)
     sim = Simul(params)
@@ -69,6 +71,7 @@ def main():
         while stepping.t < options.end:
             if count % options.every == 0:
                 publisher.publish(stepping.it, stepping.t, *(sim.state.get_var(name) for name in names))
+                time.sleep(options.pause)
             stepping.one_time_step()
             count += 1
         print(f"{count} steps, {publisher.published} published, {publisher.overwrote} before an older one was taken")

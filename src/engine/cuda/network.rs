@@ -3,7 +3,7 @@
 //! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads them.
 
 use super::layout::TableArgument;
-use super::network_batched::{Batched, GradientTo, batched_define};
+use super::network_batched::{Batched, GradientTo};
 use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
@@ -48,7 +48,6 @@ pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
         format!("RW_HIDDEN={hidden}"),
         format!("RW_WEIGHTS_BYTES={weights}"),
         format!("RW_WORKSPACE_BYTES={workspace}"),
-        batched_define(),
     ])
 }
 

@@ -4,26 +4,29 @@
 use super::network_layout::{DrawArgument, GridArgument, ReadingArgument};
 use super::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::surrogate::network::Architecture;
-use cudarc::driver::sys::CUfunction_attribute as Function;
+use cudarc::driver::sys::{CUdevice_attribute as Device, CUfunction_attribute as Function};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// `TILE`, `DEPTH`, `THREADS` and `HEAD_ROWS` of `network_batched.cu`.
 const TILE: usize = 128;
-const DEPTH: usize = 32;
+const DEPTH: usize = 64;
 const THREADS: u32 = 256;
 const HEAD_ROWS: usize = 64;
-/// Shared memory of a product: three stages of two panels of 128 rows of 32 values and 8 that spread them over the banks.
-const PRODUCT_BYTES: usize = 3 * 2 * TILE * (DEPTH + 8) * 2;
+/// Shared memory of a stage of a product: two panels of 128 rows of 64 halves, and 8 that spread them over the banks.
+const STAGE_BYTES: usize = 2 * TILE * (DEPTH + 8) * 2;
+/// Stages, at most and at least: where there is room for three of two blocks, more is on the way while the rest is multiplied.
+const STAGES: usize = 3;
+const FEWEST_STAGES: usize = 2;
 /// Values of a layer that prediction holds at once: two layers of them stay in the cache.
 const PREDICTED: usize = 1 << 23;
 /// Samples, and values of all layers, that training holds at once.
 const TRAINED_ROWS: usize = 1 << 16;
 const TRAINED: usize = 1 << 30;
 
-/// Macros beside those of all networks.
-pub(super) fn batched_define() -> String {
-    format!("RW_PRODUCT_BYTES={PRODUCT_BYTES}")
+/// Macros of `network_batched.cu` beside those of all networks, each way that it is compiled.
+pub fn batched_defines() -> [[String; 2]; 2] {
+    [STAGES, FEWEST_STAGES].map(|stages| [format!("RW_STAGES={stages}"), format!("RW_PRODUCT_BYTES={}", stages * STAGE_BYTES)])
 }
 
 /// The kernels, and memory between them.
@@ -48,6 +51,8 @@ pub(super) struct Batched {
     head: CudaFunction,
     /// Where there are tables: the gradient with respect to encoded points, and its way to them.
     tables: Option<[CudaFunction; 2]>,
+    /// Bytes of shared memory.
+    product_shared: usize,
     memory: Mutex<Memory>,
 }
 
@@ -88,11 +93,16 @@ pub(super) struct GradientTo {
 
 impl Batched {
     pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture, grid: GridArgument, defines: &[String]) -> Result<Self, DeviceError> {
-        let kernel = |name| gpu.kernel("network_batched.cu", defines, name);
+        let doing = DeviceError::driver("asking for shared memory");
+        let most = gpu.context().attribute(Device::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN).map_err(&doing)? as usize;
+        let [more, fewer] = batched_defines();
+        let (stages, chosen) = if most >= STAGES * STAGE_BYTES { (STAGES, more) } else { (FEWEST_STAGES, fewer) };
+        let product_shared = stages * STAGE_BYTES;
+        let defines: Vec<String> = defines.iter().cloned().chain(chosen).collect();
+        let kernel = |name| gpu.kernel("network_batched.cu", &defines, name);
         let product = |name| {
             let function = kernel(name)?;
-            let doing = DeviceError::driver("asking for shared memory");
-            function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, PRODUCT_BYTES as i32).map_err(doing)?;
+            function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, product_shared as i32).map_err(&doing)?;
             Ok::<_, DeviceError>(function)
         };
         let tables = match shape.levels.is_empty() {
@@ -114,6 +124,7 @@ impl Batched {
             answer: kernel("batched_answer")?,
             head: kernel("batched_head")?,
             tables,
+            product_shared,
             memory: Mutex::default(),
             gpu: gpu.clone(),
         })
@@ -137,7 +148,7 @@ impl Batched {
 
     fn product(&self, columns: usize, rows: usize, shares: usize) -> LaunchConfig {
         let grid_dim = ((columns / TILE) as u32, (rows / TILE) as u32, shares as u32);
-        LaunchConfig { grid_dim, block_dim: (THREADS, 1, 1), shared_mem_bytes: PRODUCT_BYTES as u32 }
+        LaunchConfig { grid_dim, block_dim: (THREADS, 1, 1), shared_mem_bytes: self.product_shared as u32 }
     }
 
     fn values(&self, what: &str, count: usize) -> Result<Buffer<u16>, DeviceError> {
