@@ -20,12 +20,14 @@ use std::sync::atomic::AtomicBool;
 static NEVER: AtomicBool = AtomicBool::new(false);
 const FRAMES: usize = 64;
 const WARM_UP: usize = 8;
+/// Rows before those of networks.
+const NETWORKS: usize = 3;
 /// In which a network is trained up.
 const LEARNING: usize = 240;
 const SLIDES: usize = 4;
-const FRAMES_A_SLIDE: usize = 250;
+const FRAMES_A_SLIDE: usize = 190;
 /// Frames of a slide whose traced share is shown, from 0.
-const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 249];
+const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 189];
 /// A network of 72 MB, and batches that keep the device busy.
 const NETWORK: [&str; 5] =
     ["network.levels=6", "network.features=4", "network.growth=2.2", "network.log2_table=22", "network.batch=262144"];
@@ -100,9 +102,7 @@ fn main() {
     (truth.time.warmup_frames, truth.time.frames_per_slide) = (1, 1);
     let (reference, records) = pictures(&truth, &device);
     let frame = &records[0];
-    println!("<!-- block gated -->");
-    println!("{size} pixels of {nodes:?} nodes, 22 steps; medians of {FRAMES} frames of one sample after {WARM_UP}.");
-    println!(
+    let reference_is = format!(
         "The reference of {} samples, seed {}: {:.1} s, {} queries, {:.0} M traced a second of tracing.\n",
         frame.samples_per_pixel,
         truth.seed,
@@ -111,11 +111,16 @@ fn main() {
         1e-6 * (frame.traced + frame.traced_ahead) as f64 / frame.seconds.trace
     );
 
-    println!(
-        "| answers | frames/s | frame, ms (and longest) | walk | trace | predict | audit | train | on the device: picture | training | steps | queries | traced | trusted volume | \
-         stated error | over tolerance | surrogate alone, dB | PSNR of {FRAMES} frames, dB |"
-    );
-    println!("|{}", "---|".repeat(18));
+    let begin = |block: &str, after: &str| {
+        println!("<!-- block {block} -->");
+        println!("{size} pixels of {nodes:?} nodes, 22 steps; medians of {FRAMES} frames of one sample after {after}.");
+        println!("{reference_is}");
+        println!(
+            "| answers | frames/s | frame, ms (and longest) | walk | trace | predict | audit | train | on the device: picture | training | \
+             steps | queries | traced | trusted volume | stated error | over tolerance | surrogate alone, dB | PSNR of {FRAMES} frames, dB |"
+        );
+        println!("|{}", "---|".repeat(18));
+    };
     let double = nodes.map(|n| 2 * n - 1);
     let rows = [
         ("RK4", None),
@@ -124,8 +129,13 @@ fn main() {
         ("network", Some((Kind::Network, nodes))),
         ("network above the table of the data's nodes", Some((Kind::Residual, nodes))),
     ];
-    for (name, surrogate) in rows {
+    for (number, (name, surrogate)) in rows.into_iter().enumerate() {
         let is_network = surrogate.is_some_and(|(kind, _)| kind != Kind::Table);
+        match number {
+            0 if asked("tables") => begin("gated", &format!("{WARM_UP}")),
+            NETWORKS if asked("networks") => begin("gated-networks", &format!("{LEARNING}, in which the network is trained too")),
+            _ => {}
+        }
         if !asked(if is_network { "networks" } else { "tables" }) {
             continue;
         }
@@ -178,7 +188,7 @@ fn main() {
     scene.time.slides = Some(SLIDES);
     scene.source.snapshots = Some(12 + SLIDES - 1);
     let mut memory = Vec::new();
-    for (name, surrogate) in &rows[3..] {
+    for (name, surrogate) in &rows[NETWORKS..] {
         let Some((kind, nodes)) = *surrogate else { continue };
         (scene.surrogate.kind, scene.surrogate.table_nodes) = (kind, Some(nodes));
         let mut seen: Vec<(FrameRecord, u64, usize)> = Vec::new();

@@ -115,7 +115,7 @@ mod bench {
                 let milliseconds = time(&gpu, || {
                     let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-2)).collect();
                     drawn += STEPS * batch as u64;
-                    training.train_steps(&pool, &steps).map(|_| ())
+                    training.train_steps(&pool, None, &steps).map(|_| ())
                 })?;
                 row += &format!("| {:.0} ", STEPS as f64 * batch as f64 / milliseconds * 1e-3);
             }
@@ -279,7 +279,7 @@ mod bench {
             let mut drawn = 0;
             let trained = time(&gpu, || {
                 drawn += 1;
-                training.train_steps(&pool, &[step(COUNT, drawn * COUNT as u64, PACE.rate)]).map(|_| ())
+                training.train_steps(&pool, None, &[step(COUNT, drawn * COUNT as u64, PACE.rate)]).map(|_| ())
             })?;
             let row = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, PACE, seconds, |network| {
                 Ok(psnr(&tested.predict(network)?, &truth))
@@ -388,7 +388,7 @@ mod bench {
                     PlannedStep { average_share, ..step(pace.batch, trained + (i * pace.batch) as u64, pace.rate) }
                 })
                 .collect();
-            training.train_steps(&ring, &steps)?;
+            training.train_steps(&ring, None, &steps)?;
             trained += (STEPS * pace.batch) as u64;
             clock += start.elapsed().as_secs_f64();
             if clock >= marks[0] {

@@ -77,10 +77,11 @@ network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t f
     }
 }
 
-// Traced points (domain coordinates) as samples: the target is what the log-stretch has beyond `base`, scaled (Objective::targets).
+// Traced points (domain coordinates) as samples: the target is what the log-stretch has beyond `base`, scaled (Objective::targets). Of every
+// 2^held_back points one gets none, the one that the host may keep as a label; with 0 all get one.
 extern "C" __global__ void __launch_bounds__(256)
 network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ Reading reading, const float* __restrict__ points,
-                const float* __restrict__ log_stretch, uint32_t n, Four* __restrict__ samples) {
+                const float* __restrict__ log_stretch, uint32_t n, uint32_t held_back, Four* __restrict__ samples) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
     if (i >= n) return;
     const float point[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
@@ -94,7 +95,7 @@ network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ 
         target = (log_stretch[i] - below - reading.mean) / reading.deviation;
     }
     // No place, no target.
-    if (!isfinite(point[0] + point[1] + point[2])) target = not_a_number();
+    if (!isfinite(point[0] + point[1] + point[2]) || (held_back && keeps_label(point, held_back))) target = not_a_number();
     samples[i] = {unit[0], unit[1], unit[2], target};
 }
 

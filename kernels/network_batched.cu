@@ -257,7 +257,7 @@ batched_encode_points(const __grid_constant__ Grid grid, const uint16_t* __restr
 // Sample number `position` of a batch; without a target beyond it.
 RW_FN Four sample_at(const Draw& draw, uint32_t position) {
     if (position >= draw.batch) return {0.0f, 0.0f, 0.0f, not_a_number()};
-    return load(draw.samples + drawn(draw, position));
+    return drawn_sample(draw, position);
 }
 
 // Of the samples of a batch from number `first` on, and their targets.

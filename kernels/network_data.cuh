@@ -33,13 +33,15 @@ RW_FN void inputs(float (&point)[DIMS], const float (&unit)[3]) {
 
 // Which samples make up a batch (Pick in train.rs).
 struct Draw {
-    const Four* samples;  // unit point, target
+    const Four* samples;  // unit point, target: the first `first` of `count`
+    const Four* more;     // those behind them
     uint64_t seed, counter;
-    uint32_t count, batch;
+    uint32_t count, first, batch;
     uint32_t random;    // 0: the first ones, in order
     uint32_t hold_out;  // samples whose number is a multiple of this are left out, where one is drawn; 0: none
+    uint32_t pad;
 };
-static_assert(sizeof(Draw) == 40, "layout");
+static_assert(sizeof(Draw) == 56, "layout");
 
 // 64 random bits (module.rs).
 RW_FN uint64_t mix(uint64_t seed, uint64_t counter) {
@@ -53,6 +55,11 @@ RW_FN uint32_t drawn(const Draw& draw, uint32_t position) {
     if (!draw.random) return position;
     const uint32_t index = uint32_t(__umul64hi(mix(draw.seed, draw.counter + position), draw.count));
     return draw.hold_out && index % draw.hold_out == 0u ? (index + 1u) % draw.count : index;
+}
+
+RW_FN Four drawn_sample(const Draw& draw, uint32_t position) {
+    const uint32_t number = drawn(draw, position);
+    return load(number < draw.first ? draw.samples + number : draw.more + (number - draw.first));
 }
 
 }  // namespace rw

@@ -135,7 +135,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         RW_UNROLL for (int row = 0; row < 2; ++row) {
             const uint32_t position = tile * ROWS + 16u * (threadIdx.x / 32u) + g + 8u * row;
             Four sample = {0.0f, 0.0f, 0.0f, not_a_number()};
-            if (position < draw.batch) sample = load(draw.samples + drawn(draw, position));
+            if (position < draw.batch) sample = drawn_sample(draw, position);
             const float unit[3] = {sample.x, sample.y, sample.z};
             inputs(points[row], unit);
             targets[row] = sample.w;

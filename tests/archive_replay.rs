@@ -118,6 +118,26 @@ fn a_variable_that_the_file_lacks_points_at_its_line() {
 }
 
 #[test]
+fn a_default_that_an_archive_makes_unacceptable_names_the_archive() {
+    // A strip of 4 m and 400,000 km: the default extinction, by the shortest edge, is too deep along it.
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("strip.nc");
+    let still = || f32s(fill(2, 5, 5, |_, _, _| 1.0));
+    Fixture::new(NETCDF4, &[("time", 2), ("y", 5), ("x", 5)])
+        .axis("x", "m", &[0.0, 1e8, 2e8, 3e8, 4e8])
+        .axis("y", "m", &[0.0, 1.0, 2.0, 3.0, 4.0])
+        .axis("time", "days since 2000-01-01", &[0.0, 1.0])
+        .variable("u", &["time", "y", "x"], still())
+        .with("units", "m/s")
+        .variable("v", &["time", "y", "x"], still())
+        .with("units", "m/s")
+        .write(&file);
+    let output = ridgewatch(&["ftle", &file.display().to_string(), "--set", "time.tau=3600"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(2) && said.contains("`transfer.extinction`") && said.contains("strip.nc"), "{said}");
+}
+
+#[test]
 fn one_snapshot_is_a_steady_flow_where_that_is_set() {
     // Half a rotation a day about (0, 0), on a plane in metres.
     let folder = tempfile::tempdir().unwrap();

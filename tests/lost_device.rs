@@ -18,9 +18,10 @@ use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_trac
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
 use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
 use ridgewatch::surrogate::{
-    DeviceLost, Learned, Offload, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
+    Brought, DeviceLost, Learned, Offload, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
 };
 use std::collections::BTreeSet;
+use std::ops::Range;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, OnceLock};
@@ -201,7 +202,7 @@ struct Network {
 }
 
 impl OffloadedTraining for Network {
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceLost> {
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
         self.there.call("bringing samples over")?;
         self.samples.points.resize(ring.len(), [f32::NAN; 3]);
         self.samples.log_stretch.resize(ring.len(), f32::NAN);
@@ -210,7 +211,8 @@ impl OffloadedTraining for Network {
             self.samples.log_stretch[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
         }
         (self.mark, self.base) = (Some(ring.mark()), base.cloned());
-        Ok(self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len()))
+        let usable = self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len());
+        Ok(Brought { usable, dropped: self.samples.len() - usable })
     }
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
         self.there.call("taking steps")?;
@@ -234,6 +236,12 @@ impl OffloadedTraining for Network {
     }
     fn restart_average(&mut self) -> Result<(), DeviceLost> {
         self.average = Average { tables: self.model.tables(), layers: self.model.layers() };
+        Ok(())
+    }
+    fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost> {
+        self.there.call("forgetting an output")?;
+        self.model.zero_output();
+        self.average.layers[range].fill(0.0);
         Ok(())
     }
     fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {

@@ -265,7 +265,7 @@ fn tau_against_the_archive() {
     assert!(archive.check_tau(10.0 * day).is_ok());
     assert!(matches!(archive.check_tau(10.5 * day), Err(SourceError::TooShort { needed: 12, found: 11, .. })));
     let message = archive.check_tau(30.0 * day).unwrap_err().to_string();
-    assert!(message.contains("needs 31 snapshots") && message.contains("has 11"), "{message}");
+    assert!(message.contains("needs 31 snapshots") && message.contains("long.nc has 11"), "{message}");
     assert!(archive.check_tau(0.0).is_err() && archive.check_tau(f64::NAN).is_err());
     let short = plane(CLASSIC, &[0.0, 1.0], DAYS).write(&dir.path().join("short.nc"));
     let archive = Archive::open(&[short], &ArchiveSettings::default()).unwrap();

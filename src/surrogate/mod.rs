@@ -20,7 +20,7 @@ mod sizing;
 mod table;
 mod trainer;
 
-pub use offload::{DeviceLost, Offload, OffloadedNetwork, OffloadedTraining};
+pub use offload::{Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining};
 pub use residual::Residual;
 pub use ring::{KEEP_STALE, RingMark, SampleRing};
 pub use sizing::{Resize, Sizing};

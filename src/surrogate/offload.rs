@@ -1,11 +1,12 @@
 //! The seam for engines that train networks on a device: what is asked of one.
 //!
-//! burn's module stays on the host. It goes over when training begins, comes back at the seams (a checkpoint, a slide that makes the network
-//! start anew, every ten seconds or so), and training goes on from what came back last when the device is lost.
+//! burn's module stays on the host. It goes over when training begins, comes back for a checkpoint and every minute or so, and training goes on
+//! from what came back last when the device is lost.
 
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::{SampleRing, Table};
 use std::any::Any;
+use std::ops::Range;
 use std::sync::Arc;
 
 /// Trains networks on a device.
@@ -22,12 +23,20 @@ pub trait Offload: Send + Sync {
 #[error("the device is lost")]
 pub struct DeviceLost;
 
+/// Samples on a device.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Brought {
+    /// Those that can be trained on. A device may hold more than the ring: labels that were traced there and never left it.
+    pub usable: usize,
+    /// Those of the ring that cannot, since they are not finite.
+    pub dropped: usize,
+}
+
 /// A network in training on a device, where any call may be the last: every one of them may fail with [`DeviceLost`].
 #[allow(clippy::missing_errors_doc)] // said above
 pub trait OffloadedTraining: Send + Sync {
-    /// Brings over what `ring` has got since the last call, with what the labels have beyond `base` as targets. Gives the number of samples that can
-    /// be trained on: those that are finite.
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceLost>;
+    /// Brings over what `ring` has got since the last call, with what the labels have beyond `base` as targets.
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost>;
 
     /// Takes steps on the samples that were brought over; the loss of each, before it.
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost>;
@@ -40,6 +49,9 @@ pub trait OffloadedTraining: Send + Sync {
 
     /// Sets the running mean to the present parameters.
     fn restart_average(&mut self) -> Result<(), DeviceLost>;
+
+    /// Sets parameters of the layers to 0, and their moments and means.
+    fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost>;
 
     /// What the running mean predicts, for good.
     fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost>;

@@ -8,8 +8,8 @@
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step};
 use super::{
-    CheckpointError, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples,
-    SurrogateError, Table, fresh_stamp,
+    Brought, CheckpointError, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing,
+    Samples, SurrogateError, Table, fresh_stamp,
 };
 use crate::field::Domain;
 use std::borrow::Cow;
@@ -39,7 +39,7 @@ const LEAST_FACTOR: f64 = 0.1;
 /// Steps that a device is told at once at most, and before it is known how long one takes.
 const GROUP: [u64; 2] = [64, 8];
 /// Seconds of a run after which what a device has learned comes back, at least: so much is lost with it.
-const FETCH_EVERY: f64 = 10.0;
+const FETCH_EVERY: f64 = 60.0;
 /// And so many times the seconds that it takes to come back, so that it costs one hundredth of the time.
 const FETCH_APART: f64 = 100.0;
 
@@ -245,14 +245,18 @@ impl Trainer {
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
-        // It goes over again with the next step.
-        if self.fetch().is_err() {
+        self.kept = None;
+        let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
+        let output = head.weights..head.biases + head.outputs;
+        if let Some(away) = &mut self.away {
+            away.frozen = OnceLock::new();
+            if away.training.zero_layers(output.clone()).is_ok() {
+                return;
+            }
             self.lose_device();
         }
-        (self.away, self.kept) = (None, None);
         self.model.zero_output();
-        let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
-        Arc::make_mut(&mut self.average).layers[head.weights..head.biases + head.outputs].fill(0.0);
+        Arc::make_mut(&mut self.average).layers[output].fill(0.0);
         self.pack();
     }
 
@@ -289,16 +293,17 @@ impl Trainer {
         }
         self.go_away();
         let sieved;
-        let usable = if let Some(away) = &mut self.away {
+        let Brought { usable, dropped } = if let Some(away) = &mut self.away {
             away.training.bring(ring, base)?
         } else {
             // Training reads the table in pieces by many threads: it had better be here before they start.
             base.map(Table::values);
             sieved = self.objective.sieve(samples);
             labels.among = sieved.as_deref();
-            labels.among.map_or(samples.len(), <[u32]>::len)
+            let usable = labels.among.map_or(samples.len(), <[u32]>::len);
+            Brought { usable, dropped: samples.len() - usable }
         };
-        learned.dropped = (samples.len() - usable) as u64;
+        learned.dropped = dropped as u64;
         if usable == 0 {
             return Ok(());
         }

@@ -3,7 +3,8 @@
 use crate::scenes::{cartesian, device, even, gpu, opened, smooth, store, turbulence};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{
-    CudaTracer, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Panel, SnapshotStore, Tuning,
+    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Panel,
+    SnapshotStore, Tuning, keeps_label,
 };
 use ridgewatch::engine::{Answers, Device, Event, Frame, RunOptions, Setup, Tally, residuals, run, stratified_points, trace};
 use ridgewatch::field::Domain;
@@ -14,6 +15,7 @@ use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::{Predict, Samples, Table};
 use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
+use std::cell::RefCell;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -83,14 +85,21 @@ impl Stage {
         Renderer::new(self.scene.clone(), self.domain(), self.host.tau()).unwrap()
     }
 
-    fn on_cpu(&self, renderer: &mut Renderer, frame: u64, samples: u32, how: &How) -> (Film, RenderStats, Tally) {
+    fn on_cpu(&self, renderer: &mut Renderer, frame: u64, samples: u32, how: &How<'_>) -> (Film, RenderStats, Tally) {
         let surrogate = how.surrogate.then_some(&self.table as &dyn Predict);
         let mut answers = Answers::new(&*self.host, surrogate, &self.gate, how.budget, 0);
         let (film, stats) = renderer.render_samples(frame, 0..samples, &mut answers, None, &NEVER).unwrap();
         (film, stats, answers.tally)
     }
 
-    fn on_gpu(&self, side: &mut Side, renderer: &mut Renderer, frame: u64, samples: u32, how: &How) -> (Film, RenderStats, Tally, Samples) {
+    fn on_gpu(
+        &self,
+        side: &mut Side,
+        renderer: &mut Renderer,
+        frame: u64,
+        samples: u32,
+        how: &How<'_>,
+    ) -> (Film, RenderStats, Tally, Samples) {
         // What a kernel reads before it has written it would show.
         side.renderer.poison().unwrap();
         side.division.poison().unwrap();
@@ -101,6 +110,7 @@ impl Stage {
                 domain: self.domain(),
                 land: self.cuda.land(),
                 surrogate: how.surrogate.then_some(&self.on_device as &dyn DevicePredict),
+                pupil: how.pupil,
                 gate: &self.gate,
                 trace_budget: how.budget,
                 keep: how.keep,
@@ -133,13 +143,14 @@ impl Side {
     }
 }
 
-struct How {
+struct How<'a> {
     surrogate: bool,
     budget: Option<f64>,
     keep: usize,
+    pupil: Option<&'a dyn DeviceLearns>,
 }
 
-const GATED: How = How { surrogate: true, budget: None, keep: 0 };
+const GATED: How<'static> = How { surrogate: true, budget: None, keep: 0, pupil: None };
 
 fn turbulent() -> Stage {
     turbulent_on(gpu(), store())
@@ -156,7 +167,7 @@ fn near(found: u64, expected: u64, what: &str) {
 }
 
 /// Frames of the same seed to 50 dB, and the same counts; the second one walks with majorants that the first has tightened.
-fn pictures_agree(stage: &Stage, how: &How, name: &str) -> Tally {
+fn pictures_agree(stage: &Stage, how: &How<'_>, name: &str) -> Tally {
     let (mut cpu, mut renderer, mut side) = (stage.renderer(), stage.renderer(), Side::new(&stage.gpu));
     let mut last = Tally::default();
     for (frame, samples) in [(0, 1), (1, 64)] {
@@ -266,6 +277,45 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
     side.renderer = side.renderer.with_look_ahead(LookAhead { camera: 1, shadow: 1 });
     let (_, _, tally, labels) = stage.on_gpu(&mut side, &mut stage.renderer(), 0, 1, &How { keep: 1 << 21, ..GATED });
     assert_eq!(labels.len() as u64, tally.traced);
+}
+
+/// Keeps what it is told to learn from.
+struct Heard(RefCell<Vec<([f32; 3], f32)>>);
+
+impl DeviceLearns for Heard {
+    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError> {
+        let (mut at, mut values) = (vec![[0.0_f32; 3]; count], vec![0.0_f32; count]);
+        gpu().synchronize()?;
+        // SAFETY: the caller's; the work that wrote them is done.
+        unsafe {
+            cudarc::driver::result::memcpy_dtoh_sync(at.as_flattened_mut(), points).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(&mut values, log_stretch).unwrap();
+        }
+        self.0.borrow_mut().extend(at.into_iter().zip(values));
+        Ok(())
+    }
+}
+
+/// Everything that is traced is learned from where it lies, but for the eighth part that comes back instead.
+#[test]
+#[ignore = "needs a GPU"]
+fn what_stays_on_the_device_is_what_was_traced() {
+    let stage = turbulent();
+    let mut side = Side::new(&stage.gpu);
+    side.renderer = side.renderer.with_look_ahead(LookAhead { camera: 1, shadow: 1 });
+    let heard = Heard(RefCell::default());
+    let how = How { keep: 1 << 21, pupil: Some(&heard), ..GATED };
+    let (_, _, tally, labels) = stage.on_gpu(&mut side, &mut stage.renderer(), 0, 1, &how);
+    let heard = heard.0.into_inner();
+    assert_eq!(heard.len() as u64, tally.traced);
+    let bits = |point: [f32; 3], value: f32| (stage.domain().to_unit(point).map(f32::to_bits), value.to_bits());
+    let mut held_back: Vec<_> =
+        heard.iter().filter(|(point, _)| keeps_label(*point, 3)).map(|&(point, value)| bits(point, value)).collect();
+    let mut back: Vec<_> =
+        labels.points.iter().zip(&labels.log_stretch).map(|(point, value)| (point.map(f32::to_bits), value.to_bits())).collect();
+    held_back.sort_unstable();
+    back.sort_unstable();
+    assert!(back.len() > 100 && back == held_back, "{} came back, {} were held back", back.len(), held_back.len());
 }
 
 #[test]

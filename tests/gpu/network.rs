@@ -14,7 +14,7 @@ use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
     Architecture, Average, Fused, Loss, Model, NetworkSettings, Objective, Pick, PlannedStep, Step, Target, stock_step,
 };
-use ridgewatch::surrogate::{Offload, Predict, SampleRing, Samples, Table};
+use ridgewatch::surrogate::{Brought, Offload, Predict, SampleRing, Samples, Table};
 
 /// Of the cases that the CPU trains, those that the kernels take.
 fn cases() -> Vec<Case> {
@@ -133,7 +133,7 @@ fn gradients_equal_finite_differences_and_burns() {
         let model = settled(&model);
         let mut device = training(&model, &objective);
         let pool = device.upload(&samples, None).unwrap();
-        let loss = device.train_steps(&pool, &[step(SAMPLES, 1e-9)]).unwrap()[0];
+        let loss = device.train_steps(&pool, None, &[step(SAMPLES, 1e-9)]).unwrap()[0];
         let found = gradients(&stored(&device, &model));
         let mut stock = model.clone();
         let stock_loss = stock_step(&mut stock, &objective, &samples, SAMPLES, 1e-9);
@@ -184,7 +184,7 @@ fn parts_of_a_batch_add_up() {
         }
         let mut device = training(&model, &objective);
         let pool = device.upload(&samples, None).unwrap();
-        device.train_steps(&pool, &[step(MANY, 1e-9)]).unwrap();
+        device.train_steps(&pool, None, &[step(MANY, 1e-9)]).unwrap();
         let found = gradients(&stored(&device, &model));
         let mut stock = model.clone();
         stock_step(&mut stock, &objective, &samples, MANY, 1e-9);
@@ -206,7 +206,7 @@ fn adam_is_burns() {
     let mut before = model.clone();
     let adam = AdamConfig::new().with_beta_1(0.9).with_beta_2(0.999).with_epsilon(model.epsilon).build();
     for number in 0..5 {
-        device.train_steps(&pool, &[step(SAMPLES, 1e-2)]).unwrap();
+        device.train_steps(&pool, None, &[step(SAMPLES, 1e-2)]).unwrap();
         let after = stored(&device, &model);
         assert_eq!(after.steps(), number + 1);
         // The gradient that the moments speak of, given to burn's Adam.
@@ -243,9 +243,9 @@ fn lines_without_a_gradient_wait() {
     let mut device = training(&model, &objective);
     let pool = device.upload(&labels(2, 3), None).unwrap();
     let lazy = PlannedStep { lazy: true, ..step(2, 1e-2) };
-    device.train_steps(&pool, &[lazy, lazy]).unwrap();
+    device.train_steps(&pool, None, &[lazy, lazy]).unwrap();
     let others = device.upload(&labels(2, 4), None).unwrap();
-    device.train_steps(&others, &[lazy]).unwrap();
+    device.train_steps(&others, None, &[lazy]).unwrap();
     let (before, after) = (model.tables(), stored(&device, &model).tables());
     let mut moved = 0;
     for (level, lines) in model.shape.levels.iter().map(|l| (l, (l.entries * 2).div_ceil(16))) {
@@ -280,7 +280,7 @@ fn training_learns_what_the_cpu_learns() {
             ..step(count, 1e-2)
         })
         .collect();
-    let found = device.train_steps(&pool, &steps).unwrap();
+    let found = device.train_steps(&pool, None, &steps).unwrap();
     let mut average = Average { tables: model.tables(), layers: model.layers() };
     let mut expected = Vec::new();
     Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
@@ -330,10 +330,10 @@ fn a_table_below_adds_up() {
     let mut device = training(&zero, &Objective { scale: Default::default(), ..objective.clone() });
     let labels = Samples { log_stretch: below.clone(), points, ..Samples::default() };
     let pool = device.upload(&labels, Some(&base)).unwrap();
-    let loss = device.train_steps(&pool, &[step(4000, 1e-3)]).unwrap()[0];
+    let loss = device.train_steps(&pool, None, &[step(4000, 1e-3)]).unwrap()[0];
     assert!(loss < 1e-10, "{loss}");
     let pool = device.upload(&labels, None).unwrap();
-    let loss = device.train_steps(&pool, &[step(4000, 1e-3)]).unwrap()[0];
+    let loss = device.train_steps(&pool, None, &[step(4000, 1e-3)]).unwrap()[0];
     let expected = below[..4000].iter().map(|s| f64::from(s * s)).sum::<f64>() / 4000.0;
     assert!((loss / expected - 1.0).abs() < 0.01, "{loss} {expected}");
 }
@@ -351,10 +351,10 @@ fn held_out_and_broken_samples_are_not_learned_from() {
     let mut device = training(&model, &objective);
     let pool = device.upload(&samples, None).unwrap();
     let drawn = |hold_out| PlannedStep { drawn: Some((1, 0)), hold_out, ..step(5000, 1e-3) };
-    let losses = device.train_steps(&pool, &[drawn(true); 3]).unwrap();
+    let losses = device.train_steps(&pool, None, &[drawn(true); 3]).unwrap();
     assert!(losses.iter().all(|loss| *loss < 1.0), "{losses:?}");
     assert!(stored(&device, &model).tables().iter().all(|x| x.is_finite()));
-    let losses = device.train_steps(&pool, &[drawn(false)]).unwrap();
+    let losses = device.train_steps(&pool, None, &[drawn(false)]).unwrap();
     assert!(losses[0] > 1e3, "the held-out ones are there: {losses:?}");
 }
 
@@ -412,22 +412,27 @@ fn what_is_kept_comes_back() {
         let moments = model.layer_moments.map(|state| state.momentum.moment_2.into_data().to_vec::<f32>().unwrap());
         (model.module.layers.val().into_data().to_vec::<f32>().unwrap(), moments, device.average().unwrap(), device.steps())
     };
-    device.train_steps(&pool, &steps(3)).unwrap();
+    device.train_steps(&pool, None, &steps(3)).unwrap();
     device.keep().unwrap();
     let (kept, points) = (all(&device), uniform_points(3, 100));
     let predicted = predict(&device.frozen().unwrap(), &points);
-    let losses = device.train_steps(&pool, &steps(4)).unwrap();
+    let losses = device.train_steps(&pool, None, &steps(4)).unwrap();
     assert!(all(&device) != kept && predict(&device.frozen().unwrap(), &points) != predicted);
     device.roll_back().unwrap();
     assert!(all(&device) == kept && predict(&device.frozen().unwrap(), &points) == predicted);
     // The rounded tables come back too: the first loss is the same up to the order of sums.
-    let again = device.train_steps(&pool, &steps(1)).unwrap();
+    let again = device.train_steps(&pool, None, &steps(1)).unwrap();
     assert!((again[0] / losses[0] - 1.0).abs() < 1e-5, "{} and {}", again[0], losses[0]);
     device.restart_average().unwrap();
     let (now, ..) = all(&device);
     assert_eq!(device.average().unwrap().layers, now);
     device.set_average(&kept.2).unwrap();
     assert_eq!(device.average().unwrap(), kept.2);
+    let layers = kept.0.len();
+    device.zero_layers(layers - 65..layers).unwrap();
+    let (values, _, mean, _) = all(&device);
+    assert!(values[layers - 65..].iter().chain(&mean.layers[layers - 65..]).all(|v| *v == 0.0));
+    assert!(values[..layers - 65] == now[..layers - 65] && mean.layers[..layers - 65] == kept.2.layers[..layers - 65]);
 }
 
 /// Samples come over from a ring that fills up, goes round, and is moved: a step on all of them has the loss that the CPU has on the ring's.
@@ -441,7 +446,7 @@ fn a_ring_is_followed_wherever_it_writes() {
     let mut device = offload.training(&model, &objective, &average).unwrap();
     let mut ring = SampleRing::new(1000);
     let mut follow = |ring: &SampleRing, broken: usize| {
-        assert_eq!(device.bring(ring, None).unwrap(), ring.len() - broken);
+        assert_eq!(device.bring(ring, None).unwrap(), Brought { usable: ring.len() - broken, dropped: broken });
         let found = device.steps(&[step(ring.len(), 1e-12)]).unwrap()[0];
         let finite: Vec<usize> = (0..ring.len()).filter(|&i| ring.samples().log_stretch[i].is_finite()).collect();
         let samples = Samples {

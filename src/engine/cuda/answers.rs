@@ -3,7 +3,7 @@
 //! What [`crate::engine::Answers`] is to the renderer on the CPU. A surrogate takes part once it predicts on the device
 //! ([`DevicePredict`]); land, the gate, the tracing budget and the labels that come back are the same for all of them.
 
-use super::labels::Labels;
+use super::labels::{HELD_BACK, Labels};
 use super::layout::{ChoiceArgument, LandArgument, ListsArgument, Outputs};
 use super::pinned::Pinned;
 use super::{Buffer, DeviceError, DeviceLand, DeviceTracer, Gpu, launch, threads};
@@ -42,6 +42,16 @@ pub trait DevicePredict {
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError>;
 }
 
+/// A network on the device that learns from what is traced there.
+pub trait DeviceLearns {
+    /// Enqueues on the work stream: takes in `count` points (device address `points`, three f32 each, domain coordinates) and their traced
+    /// log-stretch (f32 each), but for those that the host may keep.
+    ///
+    /// # Safety
+    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError>;
+}
+
 /// Every query traced.
 pub struct Traced<'a>(pub &'a DeviceTracer);
 
@@ -68,6 +78,8 @@ pub struct Panel<'a> {
     pub land: Option<&'a DeviceLand>,
     /// Who answers where the gate trusts it; none: RK4 answers everywhere.
     pub surrogate: Option<&'a dyn DevicePredict>,
+    /// Who learns from what is traced, on the device; none: nobody does.
+    pub pupil: Option<&'a dyn DeviceLearns>,
     /// Where the surrogate is trusted.
     pub gate: &'a Gate,
     /// Device seconds of tracing from which the surrogate answers everywhere.
@@ -173,7 +185,7 @@ impl Division {
             pad: 0,
         };
         Ok(Divided {
-            labels: Labels::new(&gpu, panel.keep)?,
+            labels: Labels::new(&gpu, panel.keep, if panel.pupil.is_some() { HELD_BACK } else { 0 })?,
             split: &self.split,
             join: &self.join,
             memory,
@@ -271,6 +283,10 @@ impl Divided<'_> {
             )?;
         }
         let tracing = gpu.mark()?;
+        if let Some(pupil) = self.panel.pupil {
+            // SAFETY: as above.
+            unsafe { pupil.learn_from(lists.points + 12 * back, lists.values + 4 * back, traced) }?;
+        }
         let (labels, emptied) = self.labels.offer(traced, stored, lists.lengths + 8)?;
         if emptied {
             self.memory.lengths.zero_at(2, 1)?;

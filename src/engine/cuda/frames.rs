@@ -1,7 +1,7 @@
 //! Films of a run, made on the GPU alone where every query can be answered there.
 
 use super::audit::Audits;
-use super::predictor::Predictors;
+use super::predictor::{Predictor, Predictors};
 use super::{CudaTracer, DeviceError, DevicePredict, Division, Gpu, GpuRenderer, Panel, Traced};
 use crate::engine::accelerator::DeviceRenderer;
 use crate::engine::{Answers, AuditFindings, AuditRequest, EngineError, Tally};
@@ -80,6 +80,7 @@ impl DeviceRenderer for CudaFrames {
             domain: tracer.domain(),
             land: tracer.land(),
             surrogate: predictor.as_ref().map(|predictor| predictor as &dyn DevicePredict),
+            pupil: predictor.as_ref().and_then(Predictor::pupil),
             gate: asked.gate,
             trace_budget: asked.trace_budget,
             keep: asked.keep,

@@ -13,6 +13,10 @@ use rayon::prelude::*;
 /// Most labels that one frame keeps (64 MiB).
 const MOST: usize = 1 << 22;
 
+/// Where a network learns on the device, one label of 2^3 may come back to the host, and is not learned from there: what is held out of
+/// training must be held out on both sides.
+pub(super) const HELD_BACK: u32 = 3;
+
 /// A traced point: domain coordinates, log-stretch.
 pub type Label = [f32; 4];
 
@@ -35,11 +39,11 @@ pub struct Labels {
 }
 
 impl Labels {
-    /// Keeps fewer than `keep`; none where that is 1 or 0.
-    pub fn new(gpu: &Gpu, keep: usize) -> Result<Self, DeviceError> {
+    /// Keeps fewer than `keep`, of every 2^shift points one at most; none where `keep` is 1 or 0.
+    pub fn new(gpu: &Gpu, keep: usize, shift: u32) -> Result<Self, DeviceError> {
         let keep = if keep > 1 { keep.min(MOST) } else { 0 };
         let memory = (keep > 0).then(|| gpu.alloc("labels", Self::with_luck(keep))).transpose()?;
-        Ok(Self { keep, shift: 0, offered: 0, back: Vec::new(), memory })
+        Ok(Self { keep, shift, offered: 0, back: Vec::new(), memory })
     }
 
     /// Six standard deviations more than a number that is drawn, and a few.

@@ -38,7 +38,7 @@ mod window;
 
 pub use super::device::Storage;
 pub use accelerator::CudaAccelerator;
-pub use answers::{DeviceAnswers, DevicePredict, Divided, Division, Panel, Traced};
+pub use answers::{DeviceAnswers, DeviceLearns, DevicePredict, Divided, Division, Panel, Traced};
 pub use audit::Audits;
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;

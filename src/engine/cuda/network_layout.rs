@@ -45,12 +45,15 @@ pub struct ReadingArgument {
 #[derive(Debug, Clone, Copy)]
 pub struct DrawArgument {
     pub samples: u64,
+    pub more: u64,
     pub seed: u64,
     pub counter: u64,
     pub count: u32,
+    pub first: u32,
     pub batch: u32,
     pub random: u32,
     pub hold_out: u32,
+    pub pad: u32,
 }
 
 /// `Adam`.
@@ -90,6 +93,6 @@ mod tests {
     fn sizes_are_those_of_cpp() {
         // static_asserts in the kernels' sources hold the other side.
         assert_eq!((size_of::<LevelArgument>(), size_of::<ReadingArgument>()), (56, 48));
-        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (40, 16, 48));
+        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (56, 16, 48));
     }
 }

@@ -19,6 +19,70 @@ const STEPS: usize = 256;
 /// Samples that come over at once: bounds the memory beside the ring.
 const WRITTEN: usize = 1 << 20;
 
+/// Turns traced points on the device into samples of one network.
+#[derive(Debug, Clone)]
+pub(super) struct SampleWriter {
+    kernels: Arc<NetworkKernels>,
+    objective: Objective,
+}
+
+impl SampleWriter {
+    /// Traced points on the device go to the places of `to`. Of every 2^held_back of them one cannot be learned from
+    /// ([`super::keeps_label`]), since the host may keep it; with 0 all can.
+    ///
+    /// # Safety
+    /// As for [`DeviceTraining::append`].
+    unsafe fn place(
+        &self,
+        ring: &DeviceSamples,
+        to: Range<usize>,
+        domain: &Domain,
+        points: u64,
+        log_stretch: u64,
+        base: Option<&DeviceTable>,
+        held_back: u32,
+    ) -> Result<(), DeviceError> {
+        if to.is_empty() {
+            return Ok(());
+        }
+        assert!(to.end <= ring.samples.len(), "a ring of {} for samples {to:?}", ring.samples.len());
+        let (domain, reading) = (unit_box(domain), reading(&self.objective, base, 1.0));
+        let (n, at) = (to.len() as u32, ring.samples.address_of(to.start));
+        let stream = self.kernels.gpu.work();
+        let mut call = stream.launch_builder(&self.kernels.samples);
+        call.arg(&domain).arg(&reading).arg(&points).arg(&log_stretch).arg(&n).arg(&held_back).arg(&at);
+        // SAFETY: the arguments of `network_samples`; the caller's addresses, and as many samples fit behind `at`.
+        unsafe { launch(&mut call, threads(to.len(), 256)) }
+    }
+
+    /// Takes traced points in; of more than the ring holds the last ones.
+    ///
+    /// # Safety
+    /// As for [`DeviceTraining::append`].
+    pub(super) unsafe fn append(
+        &self,
+        ring: &mut DeviceSamples,
+        domain: &Domain,
+        points: u64,
+        log_stretch: u64,
+        count: usize,
+        base: Option<&DeviceTable>,
+        held_back: u32,
+    ) -> Result<(), DeviceError> {
+        let capacity = ring.samples.len();
+        let skipped = count.saturating_sub(capacity);
+        let before_the_end = (count - skipped).min(capacity - ring.next);
+        for (from, part) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
+            let to = ring.next..ring.next + part;
+            // SAFETY: the caller's.
+            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base, held_back) }?;
+            ring.next = (ring.next + part) % capacity;
+        }
+        ring.len = (ring.len + count).min(capacity);
+        Ok(())
+    }
+}
+
 /// Samples to learn from: unit point and target. A ring: the newest take the place of the oldest.
 #[derive(Debug)]
 pub struct DeviceSamples {
@@ -38,9 +102,9 @@ impl DeviceSamples {
         self.len == 0
     }
 
-    /// The same without samples.
-    pub(super) fn emptied(self) -> Self {
-        Self { samples: self.samples, len: 0, next: 0 }
+    /// Forgets all samples.
+    pub(super) fn clear(&mut self) {
+        (self.len, self.next) = (0, 0);
     }
 
     /// Unit point and target of each.
@@ -118,8 +182,7 @@ fn read(buffer: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
 #[derive(Debug)]
 pub struct DeviceTraining {
     gpu: Arc<Gpu>,
-    kernels: Arc<NetworkKernels>,
-    objective: Objective,
+    writer: SampleWriter,
     epsilon: f32,
     /// Steps taken.
     time: usize,
@@ -156,7 +219,6 @@ impl DeviceTraining {
         let [tables, layers] = model.state();
         let training = Self {
             gpu: gpu.clone(),
-            objective: objective.clone(),
             epsilon: model.epsilon,
             time: model.steps(),
             tables: Moments::upload(gpu, "a network's tables", &tables, kernels.padded)?,
@@ -164,15 +226,15 @@ impl DeviceTraining {
             halves: gpu.alloc("a network's rounded tables", kernels.padded)?,
             losses: gpu.alloc("losses", STEPS)?,
             kept: None,
-            kernels,
+            writer: SampleWriter { kernels, objective: objective.clone() },
         };
-        training.kernels.round(&training.tables.parameters, &training.halves)?;
+        training.writer.kernels.round(&training.tables.parameters, &training.halves)?;
         Ok(training)
     }
 
     /// What is stored where.
     pub fn shape(&self) -> &Architecture {
-        &self.kernels.shape
+        &self.writer.kernels.shape
     }
 
     /// Optimizer steps taken so far.
@@ -188,7 +250,7 @@ impl DeviceTraining {
     /// # Panics
     /// When `model` has another shape.
     pub fn store(&self, model: &mut Model) -> Result<(), DeviceError> {
-        assert!(model.shape == self.kernels.shape, "a model of the shape that was brought over");
+        assert!(model.shape == self.writer.kernels.shape, "a model of the shape that was brought over");
         model.set_state([self.tables.read()?, self.layers.read()?], self.time);
         Ok(())
     }
@@ -222,6 +284,17 @@ impl DeviceTraining {
         [&self.tables, &self.layers].into_iter().try_for_each(|moments| copy(&self.gpu, &moments.parameters, &moments.average))
     }
 
+    /// Sets a range of the layers' parameters to 0, and their moments and mean.
+    ///
+    /// # Errors
+    /// What the device says.
+    ///
+    /// # Panics
+    /// When the range goes beyond the layers.
+    pub fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceError> {
+        self.layers.all().into_iter().try_for_each(|values| values.zero_at(range.start, range.len()))
+    }
+
     /// Remembers everything that steps change as what to come back to.
     ///
     /// # Errors
@@ -241,7 +314,7 @@ impl DeviceTraining {
         self.tables.roll_back(&self.gpu, tables)?;
         self.layers.roll_back(&self.gpu, layers)?;
         self.time = *time;
-        self.kernels.round(&self.tables.parameters, &self.halves)
+        self.writer.kernels.round(&self.tables.parameters, &self.halves)
     }
 
     /// What predicts now, for good: the running mean.
@@ -250,7 +323,7 @@ impl DeviceTraining {
     /// Memory that is not there.
     pub fn frozen(&self) -> Result<DeviceNetwork, DeviceError> {
         let layers = copied(&self.gpu, "a network's layers", &self.layers.average)?;
-        DeviceNetwork::of(&self.kernels, &self.objective, &self.tables.average, layers)
+        DeviceNetwork::of(&self.writer.kernels, &self.writer.objective, &self.tables.average, layers)
     }
 
     /// Room for `capacity` samples.
@@ -291,7 +364,7 @@ impl DeviceTraining {
             let points = self.gpu.upload("samples", &samples.points[part.clone()])?;
             let log_stretch = self.gpu.upload("samples", &samples.log_stretch[part.clone()])?;
             // SAFETY: both buffers hold as many entries and are freed in the order of the work stream.
-            unsafe { self.place(ring, part, &unit, points.address(), log_stretch.address(), base) }?;
+            unsafe { self.writer.place(ring, part, &unit, points.address(), log_stretch.address(), base, 0) }?;
         }
         ring.len = ring.len.max(range.end);
         Ok(())
@@ -302,42 +375,19 @@ impl DeviceTraining {
     /// # Errors
     /// What the device says.
     pub fn usable(&self, ring: &DeviceSamples) -> Result<usize, DeviceError> {
+        if ring.is_empty() {
+            return Ok(0);
+        }
         let count = self.gpu.upload("a counter", &[0_u32])?;
         let (samples, n, to) = (ring.samples.address(), ring.len as u32, count.address());
         let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.kernels.usable);
+        let mut call = stream.launch_builder(&self.writer.kernels.usable);
         call.arg(&samples).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_usable`; the ring holds as many samples.
         unsafe { launch(&mut call, threads(ring.len, 256)) }?;
         let mut found = [0];
         count.read(&mut found)?;
         Ok(found[0] as usize)
-    }
-
-    /// Traced points on the device go to the places of `to`.
-    ///
-    /// # Safety
-    /// As for [`Self::append`].
-    unsafe fn place(
-        &self,
-        ring: &DeviceSamples,
-        to: Range<usize>,
-        domain: &Domain,
-        points: u64,
-        log_stretch: u64,
-        base: Option<&DeviceTable>,
-    ) -> Result<(), DeviceError> {
-        if to.is_empty() {
-            return Ok(());
-        }
-        assert!(to.end <= ring.samples.len(), "a ring of {} for samples {to:?}", ring.samples.len());
-        let (domain, reading) = (unit_box(domain), reading(&self.objective, base, 1.0));
-        let (n, at) = (to.len() as u32, ring.samples.address_of(to.start));
-        let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.kernels.samples);
-        call.arg(&domain).arg(&reading).arg(&points).arg(&log_stretch).arg(&n).arg(&at);
-        // SAFETY: the arguments of `network_samples`; the caller's addresses, and as many samples fit behind `at`.
-        unsafe { launch(&mut call, threads(to.len(), 256)) }
     }
 
     /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`) and their log-stretch (f32 each).
@@ -362,15 +412,8 @@ impl DeviceTraining {
     ) -> Result<(), DeviceError> {
         let capacity = ring.samples.len();
         assert!(count <= capacity, "a ring of {capacity} for {count} samples");
-        let before_the_end = count.min(capacity - ring.next);
-        for (from, part) in [(0, before_the_end), (before_the_end, count - before_the_end)] {
-            let to = ring.next..ring.next + part;
-            // SAFETY: the caller's.
-            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base) }?;
-            ring.next = (ring.next + part) % capacity;
-        }
-        ring.len = (ring.len + count).min(capacity);
-        Ok(())
+        // SAFETY: the caller's.
+        unsafe { self.writer.append(ring, domain, points, log_stretch, count, base, 0) }
     }
 
     /// Fills `points` with uniform points of the domain, a function of `seed` and their numbers, `first` and on.
@@ -380,25 +423,35 @@ impl DeviceTraining {
     pub fn draw_points(&self, domain: &Domain, seed: u64, first: u64, points: &mut Buffer<[f32; 3]>) -> Result<(), DeviceError> {
         let (domain, n, to) = (unit_box(domain), points.len() as u32, points.address());
         let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.kernels.points);
+        let mut call = stream.launch_builder(&self.writer.kernels.points);
         call.arg(&domain).arg(&seed).arg(&first).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_points`.
         unsafe { launch(&mut call, threads(points.len(), 256)) }
     }
 
-    /// Takes the steps in order and waits for the last; the loss of each, before it.
+    /// What turns traced points into samples of this network, without the network.
+    pub(super) fn writer(&self) -> SampleWriter {
+        self.writer.clone()
+    }
+
+    /// Takes the steps in order and waits for the last; the loss of each, before it. Steps that draw do so from `samples` and `more` alike.
     ///
     /// # Errors
     /// What the device says; parameters are then lost.
     ///
     /// # Panics
     /// When a step takes more samples in order than there are, or there are none.
-    pub fn train_steps(&mut self, samples: &DeviceSamples, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceError> {
+    pub fn train_steps(
+        &mut self,
+        samples: &DeviceSamples,
+        more: Option<&DeviceSamples>,
+        steps: &[PlannedStep],
+    ) -> Result<Vec<f64>, DeviceError> {
         let mut losses = Vec::with_capacity(steps.len());
         for part in steps.chunks(STEPS) {
             self.losses.zero_front(part.len())?;
             for (number, step) in part.iter().enumerate() {
-                self.enqueue(samples, step, number)?;
+                self.enqueue(samples, more.filter(|more| !more.is_empty()), step, number)?;
             }
             let mut found = vec![0.0; part.len()];
             self.losses.read(&mut found)?;
@@ -407,19 +460,28 @@ impl DeviceTraining {
         Ok(losses)
     }
 
-    fn enqueue(&mut self, samples: &DeviceSamples, step: &PlannedStep, number: usize) -> Result<(), DeviceError> {
+    fn enqueue(
+        &mut self,
+        samples: &DeviceSamples,
+        more: Option<&DeviceSamples>,
+        step: &PlannedStep,
+        number: usize,
+    ) -> Result<(), DeviceError> {
         assert!(!samples.is_empty() && step.count > 0 && (step.drawn.is_some() || step.count <= samples.len()), "samples for a batch");
-        let Self { gpu, kernels, tables, layers, .. } = self;
+        let Self { gpu, writer: SampleWriter { kernels, .. }, tables, layers, .. } = self;
         let stream = gpu.work();
         let (seed, counter) = step.drawn.unwrap_or_default();
         let draw = DrawArgument {
             samples: samples.samples.address(),
+            more: more.map_or(0, |more| more.samples.address()),
             seed,
             counter,
-            count: samples.len as u32,
+            count: (samples.len + more.map_or(0, DeviceSamples::len)) as u32,
+            first: samples.len as u32,
             batch: step.count as u32,
             random: u32::from(step.drawn.is_some()),
             hold_out: if step.hold_out { HELD_OUT as u32 } else { 0 },
+            pad: 0,
         };
         let (halves, loss) = (self.halves.address(), self.losses.address_of(number));
         let [table_parameters, table_first, table_second, table_gradient] =

@@ -1,11 +1,19 @@
 //! Networks that train on the device, for the surrogates that own them: the device's side of [`crate::surrogate::Offload`].
 
+use super::answers::DeviceLearns;
+use super::labels::HELD_BACK;
+use super::network_training::SampleWriter;
 use super::predictor::{TableCopy, predict_from_host};
-use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTraining, Gpu};
+use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep};
-use crate::surrogate::{DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table};
-use std::sync::Arc;
+use crate::surrogate::{Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table};
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+/// Labels that were traced on the device and stay there: so many times the ring's, but at most one part of the memory that is left.
+const TIMES_THE_RING: usize = 4;
+const MEMORY_SHARE: u64 = 8;
 
 /// Trains networks on a GPU.
 #[derive(Debug)]
@@ -30,7 +38,7 @@ impl Offload for CudaOffload {
             training.set_average(average)?;
             Ok(training)
         })?;
-        Some(Box::new(CudaTraining { gpu: gpu.clone(), training, held: None, below: TableCopy::default(), seconds: 0.0 }))
+        Some(Box::new(CudaTraining { gpu: gpu.clone(), training, held: None, pool: None, below: TableCopy::default(), seconds: 0.0 }))
     }
 }
 
@@ -43,6 +51,36 @@ struct Held {
     /// The table that targets are relative to.
     base: Option<u64>,
     usable: usize,
+    /// And of the labels that were traced on the device.
+    more_usable: usize,
+}
+
+/// Labels of the frames since the last slide that were traced on the device and stay there; frames write, training reads, in turns.
+#[derive(Debug)]
+pub(super) struct LabelPool {
+    writer: SampleWriter,
+    samples: Mutex<DeviceSamples>,
+}
+
+impl LabelPool {
+    fn samples(&self) -> MutexGuard<'_, DeviceSamples> {
+        self.samples.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// What learns from the labels of one frame.
+pub(super) struct Pupil<'a> {
+    pool: &'a LabelPool,
+    domain: &'a Domain,
+    base: Option<&'a DeviceTable>,
+}
+
+impl DeviceLearns for Pupil<'_> {
+    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError> {
+        let (writer, mut samples) = (&self.pool.writer, self.pool.samples());
+        // SAFETY: the caller's.
+        unsafe { writer.append(&mut samples, self.domain, points, log_stretch, count, self.base, HELD_BACK) }
+    }
 }
 
 /// A network in training.
@@ -50,6 +88,7 @@ struct CudaTraining {
     gpu: Arc<Gpu>,
     training: DeviceTraining,
     held: Option<Held>,
+    pool: Option<Arc<LabelPool>>,
     below: TableCopy,
     /// Device seconds of steps, not yet asked for.
     seconds: f64,
@@ -63,19 +102,21 @@ impl CudaTraining {
     }
 
     /// The samples on the device are those of the ring.
-    fn follow(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceError> {
+    fn follow(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceError> {
+        let pool = self.pool(ring.capacity())?;
         let stamp = base.map(Table::stamp);
         let held = self.held.take().filter(|held| held.capacity == ring.capacity());
         let known = held.as_ref().filter(|held| held.base == stamp).map(|held| held.mark);
         let ranges = ring.written_since(known);
-        let nothing_new = ranges.iter().all(|range| range.is_empty());
         let mut samples = match held {
-            Some(held) if known.is_some() && nothing_new => return Ok(self.held.insert(held).usable),
-            Some(held) if known.is_some() => held.samples,
-            // All comes over anew; the memory stays.
-            Some(held) => held.samples.emptied(),
+            Some(held) => held.samples,
             None => self.training.ring(ring.capacity())?,
         };
+        if known.is_none() {
+            // All comes over anew, and what was traced here was of another window or another table; the memory stays.
+            samples.clear();
+            pool.samples().clear();
+        }
         // In two dimensions tables have one node along z.
         let domain = match base.map(Table::nodes) {
             Some([.., 1]) => Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)),
@@ -88,24 +129,38 @@ impl CudaTraining {
             self.training.write(&mut samples, range, ring.samples(), below)?;
         }
         let usable = self.training.usable(&samples)?;
-        self.held = Some(Held { samples, capacity: ring.capacity(), mark: ring.mark(), base: stamp, usable });
-        Ok(usable)
+        let more_usable = self.training.usable(&pool.samples())?;
+        self.held = Some(Held { samples, capacity: ring.capacity(), mark: ring.mark(), base: stamp, usable, more_usable });
+        Ok(Brought { usable: usable + more_usable, dropped: ring.len() - usable })
+    }
+
+    /// The labels that stay here.
+    fn pool(&mut self, ring: usize) -> Result<Arc<LabelPool>, DeviceError> {
+        if let Some(pool) = &self.pool {
+            return Ok(pool.clone());
+        }
+        let most = self.gpu.memory_left() / MEMORY_SHARE / size_of::<[f32; 4]>() as u64;
+        // The kernels count samples, those of the ring included, in 32 bits.
+        let capacity = TIMES_THE_RING.saturating_mul(ring).min(most as usize).clamp(1, 1 << 31);
+        let pool = LabelPool { writer: self.training.writer(), samples: Mutex::new(self.training.ring(capacity)?) };
+        Ok(self.pool.insert(Arc::new(pool)).clone())
     }
 }
 
 impl OffloadedTraining for CudaTraining {
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<usize, DeviceLost> {
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
         self.ask(|training| training.follow(ring, base))
     }
 
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
-        self.ask(|Self { gpu, training, held, seconds, .. }| {
-            let Some(Held { samples, usable, .. }) = held else { return Ok(Vec::new()) };
+        self.ask(|Self { gpu, training, held, pool, seconds, .. }| {
+            let (Some(Held { samples, usable, more_usable, .. }), Some(pool)) = (held, pool) else { return Ok(Vec::new()) };
+            let more = pool.samples();
             let begin = gpu.mark()?;
-            let mut losses = training.train_steps(samples, steps)?;
+            let mut losses = training.train_steps(samples, Some(&more), steps)?;
             *seconds += 1e-3 * f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?);
             // Those without a target are drawn too, and count for nothing in the mean over the batch.
-            let drawn = samples.len() as f64 / *usable as f64;
+            let drawn = (samples.len() + more.len()) as f64 / (*usable + *more_usable) as f64;
             losses.iter_mut().for_each(|loss| *loss *= drawn);
             Ok(losses)
         })
@@ -123,9 +178,13 @@ impl OffloadedTraining for CudaTraining {
         self.ask(|this| this.training.restart_average())
     }
 
+    fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost> {
+        self.ask(|this| this.training.zero_layers(range))
+    }
+
     fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {
         let network = self.gpu.health().ask(|| self.training.frozen()).ok_or(DeviceLost)?;
-        Ok(Arc::new(CudaNetwork { gpu: self.gpu.clone(), network }))
+        Ok(Arc::new(CudaNetwork { gpu: self.gpu.clone(), network, pool: self.pool.clone() }))
     }
 
     fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
@@ -147,9 +206,16 @@ impl OffloadedTraining for CudaTraining {
 pub(super) struct CudaNetwork {
     gpu: Arc<Gpu>,
     network: DeviceNetwork,
+    /// Whose training takes labels.
+    pool: Option<Arc<LabelPool>>,
 }
 
 impl CudaNetwork {
+    /// Who learns from what a frame traces, beyond `base`.
+    pub(super) fn pupil<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>) -> Option<Pupil<'a>> {
+        self.pool.as_ref().map(|pool| Pupil { pool, domain, base })
+    }
+
     pub(super) fn network(&self) -> &DeviceNetwork {
         &self.network
     }

@@ -1,7 +1,7 @@
 //! What predicts on the device what a surrogate predicts: tables and networks that are there, and copies of those that are not.
 
-use super::offload::CudaNetwork;
-use super::{CudaTracer, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, Gpu, NetworkAbove};
+use super::offload::{CudaNetwork, Pupil};
+use super::{CudaTracer, DeviceError, DeviceLearns, DeviceNetwork, DevicePredict, DeviceTable, Gpu, NetworkAbove};
 use crate::field::Domain;
 use crate::flow::Tracer;
 use crate::surrogate::{NetworkState, Predict, Table};
@@ -47,7 +47,17 @@ impl TableCopy {
 /// What predicts in one frame.
 pub(super) enum Predictor<'a> {
     Table(&'a DeviceTable),
-    Network(NetworkAbove<'a>),
+    /// And who learns from what is traced, where the network is trained here.
+    Network(NetworkAbove<'a>, Option<Pupil<'a>>),
+}
+
+impl Predictor<'_> {
+    pub(super) fn pupil(&self) -> Option<&dyn DeviceLearns> {
+        match self {
+            Self::Network(_, Some(pupil)) => Some(pupil),
+            _ => None,
+        }
+    }
 }
 
 impl DevicePredict for Predictor<'_> {
@@ -56,7 +66,7 @@ impl DevicePredict for Predictor<'_> {
         unsafe {
             match self {
                 Self::Table(table) => table.predict(points, count, out),
-                Self::Network(network) => network.predict(points, count, out),
+                Self::Network(network, _) => network.predict(points, count, out),
             }
         }
     }
@@ -76,18 +86,23 @@ impl Predictors {
     }
 
     /// What predicts what `surrogate` predicts; none where nothing does.
-    pub(super) fn of<'a>(&'a mut self, surrogate: &'a dyn Predict, tracer: &CudaTracer) -> Result<Option<Predictor<'a>>, DeviceError> {
+    pub(super) fn of<'a>(&'a mut self, surrogate: &'a dyn Predict, tracer: &'a CudaTracer) -> Result<Option<Predictor<'a>>, DeviceError> {
         if let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref()).and_then(DeviceTable::of) {
             return Ok(Some(Predictor::Table(table)));
         }
         let Some(state) = surrogate.network().filter(|state| DeviceNetwork::takes(&self.gpu, state.shape)) else { return Ok(None) };
         let Self { gpu, network, below } = self;
-        let network = match state.on_device.and_then(|there| there.as_any().downcast_ref::<CudaNetwork>()) {
+        let there = state.on_device.and_then(|there| there.as_any().downcast_ref::<CudaNetwork>());
+        let network = match there {
             Some(there) => there.network(),
             None => brought(gpu, network, &state)?,
         };
-        let base = state.base.map(|(table, share)| Ok::<_, DeviceError>((below.of(gpu, tracer.domain(), table)?, share))).transpose()?;
-        Ok(Some(Predictor::Network(network.above(base))))
+        let base = match state.base {
+            Some((table, share)) => Some((below.of(gpu, tracer.domain(), table)?, share)),
+            None => None,
+        };
+        let pupil = there.and_then(|there| there.pupil(tracer.domain(), base.map(|(table, _)| table)));
+        Ok(Some(Predictor::Network(network.above(base), pupil)))
     }
 }
 

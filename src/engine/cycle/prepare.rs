@@ -91,10 +91,12 @@ impl Cycle<'_> {
         Ok(())
     }
 
-    /// Traced samples that a frame keeps, at most: what training can use of them, or what trust can where nothing is trained.
+    /// Traced samples that a frame keeps, at most: what training can use of them, or what trust can where nothing is trained here. (A device
+    /// that trains learns from all that it traces.)
     pub(super) fn keep_a_frame(&self) -> usize {
         let ring = self.plan.scene.training.ring / KEEP_A_FRAME;
-        self.live.as_ref().map_or(0, |live| if live.learns() { ring } else { ring.min(RENDER_RESIDUALS) })
+        let trains_here = |live: &dyn Surrogate| live.learns() && !live.is_offloaded();
+        self.live.as_ref().map_or(0, |live| if trains_here(&**live) { ring } else { ring.min(RENDER_RESIDUALS) })
     }
 
     /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.

@@ -84,7 +84,7 @@ impl Model {
     }
 
     /// Sets the last layer and its moments to 0.
-    pub(crate) fn zero_output(&mut self) {
+    pub fn zero_output(&mut self) {
         let head = &self.shape.layers[self.shape.layers.len() - 1];
         let range = head.weights..head.biases + head.outputs;
         let mut loan = self.lend();
