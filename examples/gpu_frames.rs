@@ -61,7 +61,7 @@ fn main() {
     let shape = [value(2, 600), value(3, 192), value(4, 192)];
 
     let began = Instant::now();
-    let Ok(gpu) = Gpu::open(0, &GpuSettings::default()) else { return println!("no GPU: nothing is measured") };
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
     let mut device = GpuRenderer::new(&gpu).unwrap();
     let opened = began.elapsed().as_secs_f64();
 

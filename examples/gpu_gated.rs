@@ -79,10 +79,7 @@ fn main() {
     let given: Vec<usize> = std::env::args().skip(1).filter_map(|a| a.parse().ok()).collect();
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
-    let gpu = match Gpu::open(0, &GpuSettings::default()) {
-        Ok(gpu) => gpu,
-        Err(why) => return println!("no GPU: nothing is measured ({why})"),
-    };
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
     let device = Device::Gpu { gpu: Arc::new(CudaAccelerator::new(gpu.clone(), Storage::F32)), may_fall_back: false };
     let text = include_str!("../configs/turbulence_easy.toml");
     let mut keys = vec!["flow.steps=22".to_owned()];

@@ -70,7 +70,7 @@ fn main() {
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let (width, height) = (value(0, 1920), value(1, 1080));
     let shape = [value(2, 600), value(3, 192), value(4, 192)];
-    let Ok(gpu) = Gpu::open(0, &GpuSettings::default()) else { return println!("no GPU: nothing is measured") };
+    let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
     println!("<!-- block slides -->");
     println!("{width}x{height} pixels of {shape:?} nodes, 22 steps, one sample; milliseconds, median and largest.\n");
     println!(

@@ -93,15 +93,19 @@ template <class Config> struct Node {
     bool known;
 };
 
+// A mark must not be summed up with weight 0: a missing node moves nothing.
+template <class Config> RW_FN Node<Config> marked(float x, float y, float z, float w) {
+    const bool known = !Config::MARKS || !is_nan(w);
+    return {{x, y, z, known ? w : 0.0f}, known};
+}
 template <class Config> RW_FN Node<Config> halves(uint32_t low, uint32_t high) {
-    return {{from_half(uint16_t(low & 0xffffu)), from_half(uint16_t(low >> 16)), from_half(uint16_t(high & 0xffffu)), from_half(uint16_t(high >> 16))},
-            !Config::MARKS || (high >> 16 & 0x7fffu) <= 0x7c00u};
+    return marked<Config>(from_half(uint16_t(low)), from_half(uint16_t(low >> 16)), from_half(uint16_t(high)), from_half(uint16_t(high >> 16)));
 }
 
 template <class Config> RW_FN Node<Config> node_at(const void* nodes, size_t index) {
     if constexpr (Config::STORAGE == F32) {
         const Four f = load(static_cast<const Four*>(nodes) + index);
-        return {{f.x, f.y, f.z, f.w}, !Config::MARKS || !is_nan(f.w)};
+        return marked<Config>(f.x, f.y, f.z, f.w);
     } else {
 #if RW_DEVICE
         const uint2 w = __ldg(static_cast<const uint2*>(nodes) + index);

@@ -22,13 +22,13 @@ encode_nodes(const float4* __restrict__ nodes, uint64_t n, float factor, uint2* 
     out[i * STRIDE] = encoded(v.x * factor, v.y * factor, v.z * factor, v.w * factor);
 }
 
-// Behind each node its change to the same node of the next snapshot; marked where that is missing. Both as they are held: at the next
-// snapshot's time, what is interpolated is what that snapshot holds.
+// Behind each node its change to the same node of the next snapshot, both as they are held, and rounded once more; marked where that one is
+// missing.
 extern "C" __global__ void __launch_bounds__(256)
 pair_nodes(uint2* __restrict__ nodes, const uint2* __restrict__ next, uint64_t n) {
     const uint64_t i = blockIdx.x * uint64_t(256) + threadIdx.x;
     if (i >= n) return;
     const float4 a = decoded(nodes[i * STRIDE]), b = decoded(next[i * STRIDE]);
-    // The mark of this node alone is no mark of the next one.
-    nodes[i * STRIDE + 1] = encoded(b.x - a.x, b.y - a.y, b.z - a.z, is_nan(a.w) && !is_nan(b.w) ? 0.0f : b.w - a.w);
+    // A mark counts as 0 (see grid.cuh), and is none of the next node's.
+    nodes[i * STRIDE + 1] = encoded(b.x - a.x, b.y - a.y, b.z - a.z, is_nan(a.w) ? b.w : b.w - a.w);
 }

@@ -549,6 +549,32 @@ samples = 2
     );
 }
 
+/// What `--device auto` may do without from the start, and not once it was taken up.
+#[test]
+fn a_device_chosen_by_itself_may_refuse_the_first_window_alone() {
+    let text = "[source]\nkind = \"turbulence\"\nnodes = [16, 8, 8]\nsnapshots = 9\n[time]\ntau = 4\n[flow]\nsteps = 8\n[render]\nwidth = 16\nheight = 8";
+    let scene = SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap();
+    let run = |breaks_at, when_lost| {
+        let device = Breaking::new(breaks_at, How::Refusal, when_lost);
+        let made = made(&scene, Device::Gpu { gpu: device.clone(), may_fall_back: true });
+        (made, device)
+    };
+    let (unbroken, device) = run(usize::MAX, WhenLost::Stop);
+    let calls = device.line.calls.lock().unwrap().clone();
+    let tracers: Vec<usize> = (0..calls.len()).filter(|&i| calls[i] == "making a tracer").collect();
+    assert!(unbroken.error.is_none() && tracers.len() >= 4, "{calls:?}");
+
+    let (first, _) = run(tracers[0], WhenLost::Stop);
+    assert!(first.error.is_none() && first.records.iter().all(|r| r.device == "cpu"), "{:?}", first.error);
+    assert_eq!(first.records.len(), unbroken.records.len());
+
+    let (second, device) = run(tracers[1], WhenLost::Stop);
+    assert_eq!(device.line.broke_in.get(), Some(&"making a tracer"));
+    assert!(matches!(second.error, Some(EngineError::Device(_))) && second.films.len() < unbroken.films.len(), "{:?}", second.error);
+    let (second, _) = run(tracers[1], WhenLost::Cpu);
+    assert!(second.error.is_none() && second.records.iter().map(has_ended).sum::<usize>() == 1, "{:?}", second.error);
+}
+
 /// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
 #[test]
 fn training_of_a_residual_over_a_sliding_window() {

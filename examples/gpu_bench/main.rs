@@ -261,7 +261,7 @@ mod bench {
             block(&format!("{name}-collisions"));
             println!("{} points in the first wave, {} in {waves}; {} x {} pixels.\n", first_wave, points.len(), picture[0], picture[1]);
             let batch = Batch::of(&self.gpu, points)?;
-            self.rows(source, &batch, &KERNELS[..3], &[18, 21, 23])
+            self.rows(source, &batch, &KERNELS, &[18, 21, 23])
         }
 
         /// A line for each kernel and size, a column for each number of steps: millions of samples a second, and the share of the floor.

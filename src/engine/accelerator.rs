@@ -12,6 +12,7 @@ use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, Velocity
 use crate::render::{Film, RenderStats, Renderer};
 use crate::surrogate::{Offload, Predict, Table};
 use std::fmt;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
 
 /// An opened GPU, as the engine sees it.
@@ -79,13 +80,25 @@ pub trait DeviceRenderer: Send + Sync {
 #[derive(Debug, Default)]
 pub struct Health {
     failure: Mutex<Option<DeviceError>>,
+    /// Whether it has taken work.
+    in_use: AtomicBool,
     when_lost: WhenLost,
 }
 
 impl Health {
     /// Works.
     pub fn new(when_lost: WhenLost) -> Self {
-        Self { failure: Mutex::default(), when_lost }
+        Self { when_lost, ..Self::default() }
+    }
+
+    /// It has taken work: what it refuses from here on is a failure.
+    pub fn take_up(&self) {
+        self.in_use.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether it has taken work.
+    pub fn in_use(&self) -> bool {
+        self.in_use.load(Ordering::Relaxed)
     }
 
     /// Remembers the first failure; later work is not tried.

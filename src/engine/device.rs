@@ -263,14 +263,17 @@ impl Device {
         match self {
             #[cfg(feature = "cuda")]
             Self::Gpu { gpu, may_fall_back } if gpu.health().works() => match gpu.tracer(source.clone(), map, t0) {
-                Ok(tracer) => Ok((tracer, None)),
+                Ok(tracer) => {
+                    gpu.health().take_up();
+                    Ok((tracer, None))
+                }
                 Err(CudaTracerError::Flow(error)) => Err(error.into()),
                 Err(CudaTracerError::Device(error)) if error.is_fault() => {
                     gpu.health().fail(error);
                     self.check()?;
                     Ok((cpu_tracer(source, map, t0)?, None))
                 }
-                Err(CudaTracerError::Device(error)) if *may_fall_back => {
+                Err(CudaTracerError::Device(error)) if *may_fall_back && !gpu.health().in_use() => {
                     Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
                 }
                 Err(CudaTracerError::Device(error)) => Err(error.into()),

@@ -113,7 +113,8 @@ impl Gpu {
         if capability < (7, 0) {
             return Err(DeviceError::TooOld { device: ordinal, capability });
         }
-        // SAFETY: every use of a buffer on another stream than the one it was made on is ordered by events here (`after`, `ring`).
+        // SAFETY: every use of a buffer on another stream than the one it was made on is ordered by events here (`DeviceSnapshot::ready`,
+        // `Buffer::read_by`).
         unsafe { context.disable_event_tracking() };
         let stream = || {
             if settings.polite {

@@ -80,7 +80,7 @@ pub enum DeviceError {
     /// The velocity window does not fit.
     #[error(
         "the window of {snapshots} snapshots of {nodes:?} nodes does not fit: {missing} of them are not on the device and need {} MiB in \
-         {storage}; {} MiB are left. Ways out: storage f16 ({} MiB for the whole window), a region of interest, a coarser grid, a shorter \
+         {storage}; {} MiB are left. Ways out: storage f16 ({} MiB for the whole window) where it is another, a region of interest, a coarser grid, a shorter \
          tau (fewer snapshots), or a larger memory cap",
         needed >> 20, left >> 20, needed_f16 >> 20
     )]

@@ -276,7 +276,7 @@ mod tests {
 
     #[test]
     fn sizes_are_those_of_cpp() {
-        // As nvcc and g++ lay them out (static_asserts in tests/kernels_host.cpp hold the other side).
+        // As nvcc and g++ lay them out (static_asserts in kernels/host.cpp hold the other side).
         assert_eq!((size_of::<AxisData<f32>>(), size_of::<AxisData<f64>>()), (64, 80));
         assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (336, 488));
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));

@@ -239,12 +239,13 @@ impl Shared {
                 left,
             });
         }
+        // What comes over from here on is held so, also when not all of it can.
+        state.form = Some((storage, scale));
         for snapshot in &missing {
             let there = self.carry(snapshot, storage, scale)?;
             state.held.push(there);
             state.brought += 1;
         }
-        state.form = Some((storage, scale));
         let doing = DeviceError::driver("ordering the transfer of snapshots");
         let mut snapshots = Vec::with_capacity(wanted.len());
         for snapshot in wanted {
