@@ -13,8 +13,12 @@ use ridgewatch::engine::{
     Accelerator, Answers, AuditFindings, AuditRequest, Backed, Device, DeviceNodes, DeviceRenderer, DeviceTrace, EngineError, Event,
     FrameRecord, Health, RunOptions, Setup, StageSeconds, Tally, WhenLost, audit, run,
 };
+use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::{Domain, Snapshot};
-use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::flow::{
+    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
+    cpu_tracer,
+};
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
 use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
 use ridgewatch::surrogate::{
@@ -551,28 +555,31 @@ samples = 2
 
 /// What `--device auto` may do without from the start, and not once it was taken up.
 #[test]
-fn a_device_chosen_by_itself_may_refuse_the_first_window_alone() {
-    let text = "[source]\nkind = \"turbulence\"\nnodes = [16, 8, 8]\nsnapshots = 9\n[time]\ntau = 4\n[flow]\nsteps = 8\n[render]\nwidth = 16\nheight = 8";
-    let scene = SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap();
-    let run = |breaks_at, when_lost| {
-        let device = Breaking::new(breaks_at, How::Refusal, when_lost);
-        let made = made(&scene, Device::Gpu { gpu: device.clone(), may_fall_back: true });
-        (made, device)
+fn a_device_chosen_by_itself_may_refuse_its_first_work_alone() {
+    let flow = Analytic::Saddle { rate: 1.0 };
+    let source = VelocitySource::Analytic(flow, Domain::slab([-1.0; 2], [1.0; 2], (0.0, 1.0)));
+    let map = FlowMap {
+        tau: 1.0,
+        direction: Direction::Forward,
+        integrator: Integrator::Tangent,
+        precision: Precision::F32,
+        steps: Steps::Fixed(8),
+        gap: 1e-3,
+        boundary: Boundary::Unbounded,
+        normalisation: Normalisation::Tau,
+        interpolation: Interpolation::Linear,
     };
-    let (unbroken, device) = run(usize::MAX, WhenLost::Stop);
-    let calls = device.line.calls.lock().unwrap().clone();
-    let tracers: Vec<usize> = (0..calls.len()).filter(|&i| calls[i] == "making a tracer").collect();
-    assert!(unbroken.error.is_none() && tracers.len() >= 4, "{calls:?}");
+    let tracer = |device: &Device| device.tracer(source.clone(), &map, 0.0).map(|(_, told)| told);
+    let device = |breaks_at| Device::Gpu { gpu: Breaking::new(breaks_at, How::Refusal, WhenLost::Stop), may_fall_back: true };
 
-    let (first, _) = run(tracers[0], WhenLost::Stop);
-    assert!(first.error.is_none() && first.records.iter().all(|r| r.device == "cpu"), "{:?}", first.error);
-    assert_eq!(first.records.len(), unbroken.records.len());
-
-    let (second, device) = run(tracers[1], WhenLost::Stop);
-    assert_eq!(device.line.broke_in.get(), Some(&"making a tracer"));
-    assert!(matches!(second.error, Some(EngineError::Device(_))) && second.films.len() < unbroken.films.len(), "{:?}", second.error);
-    let (second, _) = run(tracers[1], WhenLost::Cpu);
-    assert!(second.error.is_none() && second.records.iter().map(has_ended).sum::<usize>() == 1, "{:?}", second.error);
+    let refusing = device(0);
+    for _ in 0..2 {
+        let told = tracer(&refusing).unwrap().unwrap();
+        assert!(told.contains("on the CPU") && told.contains("broken by the test"), "{told}");
+    }
+    let taken_up = device(1);
+    assert_eq!(tracer(&taken_up).unwrap(), None);
+    assert!(matches!(tracer(&taken_up), Err(EngineError::Device(_))));
 }
 
 /// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
