@@ -185,9 +185,13 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
     child.stdin.take().unwrap().write_all(task.to_string().as_bytes()).unwrap();
     let output = child.wait_with_output().unwrap();
     assert!(output.status.success());
-    let theirs: Vec<Option<f64>> = serde_json::from_slice(&output.stdout).unwrap();
+    let theirs: Vec<serde_json::Value> = serde_json::from_slice(&output.stdout).unwrap();
     let pairs: (Vec<f64>, Vec<f64>) =
-        chosen.iter().zip(theirs).filter_map(|(&i, theirs)| theirs.map(|t| (out.log_stretch_f64[i], t))).unzip();
+        chosen.iter().zip(&theirs).filter_map(|(&i, theirs)| theirs.as_f64().map(|t| (out.log_stretch_f64[i], t))).unzip();
+    println!("{kind}: {} of {} points are left out, for a neighbour stops", theirs.len() - PAIRS, theirs.len());
+    for (&i, theirs) in chosen.iter().zip(&theirs) {
+        assert_ne!(theirs, "seed", "{kind}: {:?} lives here and not there", seeds[i]);
+    }
     assert_eq!(pairs.0.len(), PAIRS);
     pairs
 }
@@ -245,8 +249,8 @@ fn era5_agrees_with_an_independent_integration() {
     let (relative, correlation) = report("ERA5", tau, &pairs);
     // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
     assert!(relative < 2e-5 && correlation > 0.999_999, "{relative} {correlation}");
-    // The rim is seen behind what is transparent.
-    looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.1, tau), 0.01..=0.2);
+    // The rim is seen behind what is transparent; 0.040 was measured.
+    looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.1, tau), 0.03..=0.05);
 }
 
 #[test]
@@ -257,6 +261,6 @@ fn wrf_agrees_with_an_independent_integration() {
     let (relative, correlation) = report("WRF", tau, &pairs);
     // Horizontally the same interpolant; vertically ours has fixed heights, theirs the levels of each column.
     assert!(relative < 0.024 && correlation > 0.9992, "{relative} {correlation}");
-    // Where the nest is not.
-    looks_right("WRF", &replay(&file, tau), &per_second(&pairs.1, tau), 0.01..=0.4);
+    // Where the nest is not; 0.128 was measured.
+    looks_right("WRF", &replay(&file, tau), &per_second(&pairs.1, tau), 0.1..=0.16);
 }

@@ -1,7 +1,9 @@
-//! Damaged classic files: whatever the bytes, an answer or an error, no panic, no hang, no memory beyond the file's size.
+//! Damaged classic files: whatever the bytes, an answer or an error that names the file, no panic, no hang, no memory for what a file only
+//! claims to hold.
 //!
 //! NetCDF-4 is elsewhere (archive_mutation.rs): there the bytes are read by libhdf5, whose C code may crash on a damaged file by itself.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
+#![cfg(target_os = "linux")]
 
 mod netcdf_fixture;
 
@@ -66,7 +68,7 @@ fn mutated_files_are_answered() {
                 }
                 Err(error) => {
                     refused += 1;
-                    assert!(!error.to_string().is_empty());
+                    assert!(error.to_string().contains("mutant.nc"), "names no file: {name}: {error}");
                 }
             }
             if let Ok(inspection) = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None) {
@@ -81,17 +83,14 @@ fn mutated_files_are_answered() {
     }
     let grown = peak() - before;
     println!("{longest:.1?} at most, {} MB more at most than before", grown >> 20);
-    // 2^20 values may be read from any file (see `Container::read`), of three components as f64, f32 and nodes.
-    assert!(grown < 200 << 20, "{grown}");
+    // 7 MB were measured, on 3000 and on 30,000 mutants of files of 7 kB at most: the program's own pages. 2^20 values that a file claims and
+    // does not have would take 8 MB more as f64 alone.
+    assert!(grown < 14 << 20, "{grown}");
 }
 
-/// Bytes that this process had in memory at most.
+/// Bytes that this process had in memory at most. What `getrusage` says would begin at the peak of the process that started this one.
 fn peak() -> u64 {
-    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
-    let usage = unsafe {
-        let mut usage: libc::rusage = std::mem::zeroed();
-        assert_eq!(libc::getrusage(libc::RUSAGE_SELF, &raw mut usage), 0);
-        usage
-    };
-    usage.ru_maxrss as u64 * 1024
+    let status = std::fs::read_to_string("/proc/self/status").unwrap();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();
+    line.trim().strip_suffix(" kB").unwrap().parse::<u64>().unwrap() * 1024
 }

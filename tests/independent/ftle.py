@@ -3,8 +3,8 @@ differenced. The interpolation is written here, straight from what the files hol
 
 Standard input: {"kind": "era5" | "wrf" | "globcurrent", "files": [...], "points": [[x, y, z], ...], "count": how many are wanted,
 "from": seconds, "tau": seconds (signed)}. Coordinates in metres, heights above the sea (ERA5: -7000 ln(p / 1000 hPa)); of GlobCurrent
-longitude and latitude in degrees. Standard output: log-stretches of the points, null where a particle met missing values, up to the one by
-which as many as wanted are known."""
+longitude and latitude in degrees. Standard output: log-stretches of the points, up to the one by which as many as wanted are known; where one
+of a point's neighbours met missing values, "neighbour", and "seed" where the point itself did."""
 
 import json
 import sys
@@ -180,7 +180,7 @@ def main():
     flow = {"era5": Era5, "wrf": Wrf, "globcurrent": GlobCurrent}[task["kind"]](task["files"])
     out = []
     for point in task["points"]:
-        if sum(value is not None for value in out) == task["count"]:
+        if sum(not isinstance(value, str) for value in out) == task["count"]:
             break
         point = np.array(point[: len(flow.gaps)], dtype=float)
         columns, middles = [], []
@@ -195,8 +195,11 @@ def main():
         jacobian = np.stack(columns, axis=1)
         if isinstance(flow, GlobCurrent):
             jacobian = jacobian * flow.metres(np.mean(middles, axis=0))[:, None] / flow.metres(point)[None, :]
-        known = np.isfinite(jacobian).all()
-        out.append(float(np.log(np.linalg.svd(jacobian, compute_uv=False)[0])) if known else None)
+        if np.isfinite(jacobian).all():
+            out.append(float(np.log(np.linalg.svd(jacobian, compute_uv=False)[0])))
+        else:
+            lived = np.isfinite(arrive(flow, point, task["from"], task["tau"])).all()
+            out.append("neighbour" if lived else "seed")
     json.dump(out, sys.stdout)
 
 
