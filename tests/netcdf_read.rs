@@ -414,10 +414,16 @@ fn inspection_says_what_and_why() {
     }
     assert!(serde_json::to_string(&inspection).unwrap().contains("\"role\":\"time\""));
     // A file that is no archive is still shown.
-    let lone = Fixture::new(CLASSIC, &[("y", 2), ("x", 2)]).variable("sst", &["y", "x"], Data::F32(vec![0.0; 4]));
+    let lone = Fixture::new(CLASSIC, &[("lat", 3), ("x", 2)]).axis("lat", "degrees_north", &[30.0, 20.0, 10.0]).variable(
+        "sst",
+        &["lat", "x"],
+        Data::F32(vec![0.0; 6]),
+    );
     let inspection = inspect(&[lone.write(&dir.path().join("lone.nc"))], &ArchiveSettings::default(), None).unwrap();
-    assert!(inspection.problem.unwrap().contains("no velocity found"));
-    assert_eq!(inspection.variables.len(), 1);
+    assert!(inspection.problem.as_ref().unwrap().contains("no velocity found"));
+    assert_eq!((inspection.variables.len(), inspection.axes.len()), (2, 1));
+    let line = "y `lat`: 3 nodes from 10 to 30 degrees_north, every 10; in the file 30 to 10 degrees_north, descending";
+    assert!(inspection.to_string().contains(line), "{inspection}");
 }
 
 #[test]

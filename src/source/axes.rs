@@ -3,6 +3,7 @@
 use super::SourceError;
 use super::cf::coordinate::Kind;
 use super::cf::units::{AXIS_UNITS, Unit};
+use super::container::Variable;
 use crate::field::{Axis, AxisFault};
 use serde::Serialize;
 use std::ops::Range;
@@ -91,7 +92,15 @@ pub(super) struct Coordinates<'a> {
     pub(super) values: Vec<f64>,
 }
 
-impl Coordinates<'_> {
+impl<'a> Coordinates<'a> {
+    /// Those of a coordinate variable, which hold `values` along `kind`.
+    pub(super) fn of(path: &'a Path, variable: &'a Variable, kind: Kind, values: Vec<f64>) -> Self {
+        let positive = variable.text("positive");
+        let positive_down = positive.is_some_and(|p| p.eq_ignore_ascii_case("down"))
+            || (positive.is_none() && variable.text("standard_name") == Some("depth"));
+        Self { path, name: &variable.name, units: variable.units(), positive_down, kind, values }
+    }
+
     fn fault(&self, fault: AxisFault) -> SourceError {
         SourceError::Axis { path: self.path.into(), fault }
     }

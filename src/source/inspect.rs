@@ -1,9 +1,11 @@
 //! What would be read from an archive, and why.
 
 use super::archive::{Archive, Displacement, files_of};
-use super::axes::{InFile, Quantity};
+use super::axes::{AxisPlan, Coordinates, InFile, Quantity};
+use super::cf::coordinate::{Kind, classify};
 use super::cf::velocity;
 use super::container::{Container, Header};
+use super::layout::Planner;
 use super::settings::ArchiveSettings;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
 use crate::setting::Refused;
@@ -25,14 +27,14 @@ pub struct Inspection {
     pub format: String,
     /// All variables of the first file.
     pub variables: Vec<VariableReport>,
-    /// Why it cannot be read as an archive; what follows is empty then.
+    /// Why it cannot be read as an archive; what follows is empty then, but for the axes that can be told.
     pub problem: Option<String>,
     /// The setting at fault, where the problem is one.
     #[serde(skip)]
     pub refused: Option<Refused>,
     /// What would be read.
     pub source: Option<SourceDescription>,
-    /// Axes of the grid.
+    /// Axes of the grid; those that the first file has where it cannot be read.
     pub axes: Vec<AxisReport>,
     /// Times.
     pub time: Option<TimeReport>,
@@ -64,6 +66,8 @@ pub struct VariableReport {
 /// An axis.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct AxisReport {
+    /// `x`, `y` or `z`.
+    pub role: String,
     /// Name in the file.
     pub name: String,
     /// Units (after conversion to degrees, metres or pascal).
@@ -166,9 +170,48 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
     };
     match Archive::open_files(files, settings) {
         Ok(archive) => inspection.fill(archive, settings.steady, tau)?,
-        Err(error) => (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused()),
+        Err(error) => {
+            (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused());
+            inspection.axes = coordinates(&first, settings);
+        }
     }
     Ok(inspection)
+}
+
+/// Axes of a file whose velocity is not understood: for each of x, y and z the first variable in one row that measures it, where its values
+/// make an axis.
+fn coordinates(file: &Container, settings: &ArchiveSettings) -> Vec<AxisReport> {
+    let planner = Planner { file, settings, notes: Vec::new() };
+    let axis = |(role, kinds): (&str, &[Kind])| {
+        (0..file.header.variables.len()).find_map(|i| {
+            let variable = &file.header.variables[i];
+            let kind = classify(variable);
+            let fits = variable.dimensions.len() == 1 && variable.number.is_number() && kinds.contains(&kind);
+            let values = fits.then(|| planner.coordinate_values(i).ok()).flatten()?;
+            let plan = Coordinates::of(&file.path, variable, kind, values).plan(None, true).ok()?;
+            Some(AxisReport::of(&plan, role))
+        })
+    };
+    let roles: [(&str, &[Kind]); 3] = [("x", &[Kind::Longitude, Kind::X]), ("y", &[Kind::Latitude, Kind::Y]), ("z", &[Kind::Level])];
+    roles.into_iter().filter_map(axis).collect()
+}
+
+impl AxisReport {
+    fn of(plan: &AxisPlan, role: &str) -> Self {
+        let steps: Vec<f64> = plan.axis.coordinates().windows(2).map(|w| w[1] - w[0]).collect();
+        Self {
+            role: role.into(),
+            name: plan.axis.name().into(),
+            units: if plan.quantity == Quantity::None { "no unit".into() } else { plan.axis.units().into() },
+            nodes: plan.axis.len(),
+            first: plan.axis.coordinates()[0],
+            last: plan.axis.coordinates()[plan.axis.len() - 1],
+            least_spacing: steps.iter().copied().fold(f64::INFINITY, f64::min),
+            greatest_spacing: steps.iter().copied().fold(0.0, f64::max),
+            in_file: plan.in_file.clone(),
+            period: plan.axis.period(),
+        }
+    }
 }
 
 fn variables(header: &Header) -> Vec<VariableReport> {
@@ -205,18 +248,7 @@ impl Inspection {
         }
         for (plan, role) in archive.axis_plans().iter().zip(["x", "y", "z"]) {
             give(plan.axis.name(), role, format!("coordinates of {role}"));
-            let steps: Vec<f64> = plan.axis.coordinates().windows(2).map(|w| w[1] - w[0]).collect();
-            self.axes.push(AxisReport {
-                name: plan.axis.name().into(),
-                units: if plan.quantity == Quantity::None { "no unit".into() } else { plan.axis.units().into() },
-                nodes: plan.axis.len(),
-                first: plan.axis.coordinates()[0],
-                last: plan.axis.coordinates()[plan.axis.len() - 1],
-                least_spacing: steps.iter().copied().fold(f64::INFINITY, f64::min),
-                greatest_spacing: steps.iter().copied().fold(0.0, f64::max),
-                in_file: plan.in_file.clone(),
-                period: plan.axis.period(),
-            });
+            self.axes.push(AxisReport::of(plan, role));
         }
         let error = archive.resampling_error()?;
         self.resampling =
@@ -293,15 +325,23 @@ impl fmt::Display for Inspection {
             let role = v.role.as_deref().unwrap_or("-");
             writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
         }
-        if let Some(problem) = &self.problem {
-            return writeln!(f, "\ncannot be read as an archive:\n{problem}");
-        }
         if let Some(source) = &self.source {
             writeln!(f, "\nmetric {}", format!("{:?}", source.metric).to_lowercase())?;
         }
-        writeln!(f, "\naxes")?;
-        for (axis, role) in self.axes.iter().zip(["x", "y", "z"]) {
-            write!(f, "  {role} `{}`: {} nodes from {} to {} {}", axis.name, axis.nodes, Short(axis.first), Short(axis.last), axis.units)?;
+        if !self.axes.is_empty() {
+            writeln!(f, "\naxes")?;
+        }
+        for axis in &self.axes {
+            write!(
+                f,
+                "  {} `{}`: {} nodes from {} to {} {}",
+                axis.role,
+                axis.name,
+                axis.nodes,
+                Short(axis.first),
+                Short(axis.last),
+                axis.units
+            )?;
             if axis.greatest_spacing - axis.least_spacing <= 1e-5 * axis.greatest_spacing {
                 write!(f, ", every {}", Short(axis.greatest_spacing))?;
             } else {
@@ -314,6 +354,9 @@ impl fmt::Display for Inspection {
                 }
                 None => writeln!(f, "{period}; made, ascending")?,
             }
+        }
+        if let Some(problem) = &self.problem {
+            return writeln!(f, "\ncannot be read as an archive:\n{problem}");
         }
         if let Some(t) = &self.time {
             if t.snapshots == 1 {

@@ -367,16 +367,7 @@ impl Planner<'_> {
             return Ok(AxisPlan { kind: extent.kind, axis, order: (0..len).collect(), notes, quantity: Quantity::None, in_file: None });
         };
         let variable = &header.variables[coordinate];
-        let coordinates = Coordinates {
-            path: self.path(),
-            name: &variable.name,
-            units: variable.units(),
-            positive_down: variable.text("positive").is_some_and(|p| p.eq_ignore_ascii_case("down"))
-                || (variable.text("positive").is_none() && variable.text("standard_name") == Some("depth")),
-            kind: extent.kind,
-            values: self.coordinate_values(coordinate)?,
-        };
-        coordinates.plan(range, self.goes_round())
+        Coordinates::of(self.path(), variable, extent.kind, self.coordinate_values(coordinate)?).plan(range, self.goes_round())
     }
 
     /// Whether longitudes that go round are to be periodic.
