@@ -5,61 +5,32 @@
 //! prediction are a running mean over the last share of the steps, which does the work of a decaying rate at every moment, and the rate falls
 //! only when the loss has stopped falling.
 
-use super::checkpoint::{Checkpoint, Entry};
 use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step};
 use super::{
-    Brought, CheckpointError, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing,
-    Samples, SurrogateError, Table, fresh_stamp,
+    Brought, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples, SurrogateError,
+    Table, fresh_stamp,
 };
 use crate::field::Domain;
+use progress::Progress;
 use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
+
+mod progress;
+mod restart;
 
 /// Steps between two moves of the average: it changes slowly, and every move reads and writes all parameters.
 const AVERAGE_EVERY: u64 = 8;
 /// Steps between two copies of the last good weights.
 const KEEP_EVERY: u64 = 512;
-/// A loss above this many times the first one (or the first one of this call, where the window has just slid) counts as diverged.
-const DIVERGED: f64 = 10.0;
-/// A window that has slid makes old weights wrong, but not more so than this many times the first loss.
-const HARDEST: f64 = 10.0;
-/// A loss below this is never a divergence: where there is nothing to learn (solid rotation) the first loss may be 0.
-const NEGLIGIBLE: f64 = 1e-3;
 /// Factor on the rate below which more rollbacks make no sense in one call.
 const LEAST_CAUTION: f64 = 1e-6;
-/// Steps between two looks at whether the loss still falls.
-const LOOK_EVERY: u64 = 512;
-/// Fall of the smoothed loss between two looks, below which it counts as stalled.
-const STALLED: f64 = 0.02;
-/// Factor on the rate when stalled, and the least it may come to.
-const STALL_FACTOR: f64 = 0.7;
-/// See [`STALL_FACTOR`].
-const LEAST_FACTOR: f64 = 0.1;
 /// Steps that a device is told at once at most, and before it is known how long one takes.
 const GROUP: [u64; 2] = [64, 8];
 /// Seconds of a run after which what a device has learned comes back, at least: so much is lost with it.
 const FETCH_EVERY: f64 = 60.0;
 /// And so many times the seconds that it takes to come back, so that it costs one hundredth of the time.
 const FETCH_APART: f64 = 100.0;
-
-/// How far training has come; everything besides weights and moments that the next step depends on.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Progress {
-    /// Samples drawn: the generator's counter.
-    drawn: u64,
-    /// Steps since the start or the last slide, which the average is a share of.
-    averaged: u64,
-    /// Factor on the rate for stalled losses.
-    stall: f64,
-    /// Factor on the rate for divergences; never rises again.
-    caution: f64,
-    /// Loss of the very first step; 0 before it.
-    first_loss: f64,
-    /// Smoothed loss, and its value at the last look; 0 before the first.
-    smooth: f64,
-    looked: f64,
-}
 
 /// What to come back to.
 struct Kept {
@@ -507,111 +478,6 @@ impl Trainer {
         match away.training.fetch(&mut model, &mut average) {
             Ok(()) => (Cow::Owned(model), Cow::Owned(average), self.progress),
             Err(DeviceLost) => (Cow::Borrowed(&self.model), Cow::Borrowed(&self.average), away.fetched),
-        }
-    }
-
-    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
-        checkpoint.note("network.shape", self.shape_text());
-        let (model, average, progress) = self.present();
-        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
-        let scale = &self.objective.scale;
-        let numbers = [("stall", stall), ("caution", caution), ("first_loss", first_loss), ("smooth", smooth), ("looked", looked)];
-        for (key, value) in numbers {
-            checkpoint.note(&format!("network.{key}"), value.to_string());
-        }
-        checkpoint.note("network.learning_rate", (self.rate * stall * caution).to_string());
-        checkpoint.note("network.steps", model.steps().to_string());
-        checkpoint.note("network.drawn", drawn.to_string());
-        checkpoint.note("network.averaged", averaged.to_string());
-        checkpoint.note("network.standardised", self.standardised.to_string());
-        for output in 0..3 {
-            checkpoint.note(&format!("network.mean.{output}"), scale.mean[output].to_string());
-            checkpoint.note(&format!("network.deviation.{output}"), scale.deviation[output].to_string());
-        }
-        let (entries, features) = (model.shape.table_entries(), model.shape.features);
-        let [tables, layers] = model.state();
-        let shapes = [vec![entries, features], vec![model.shape.layer_parameters()]];
-        for (name, shape, values) in [("tables", &shapes[0], tables), ("layers", &shapes[1], layers)] {
-            if values[0].is_empty() {
-                continue;
-            }
-            for (part, values) in ["", ".moment_1", ".moment_2"].into_iter().zip(values) {
-                checkpoint.push(Entry::new(&format!("network.{name}{part}"), shape, values));
-            }
-        }
-        let Average { tables, layers } = average.into_owned();
-        if !tables.is_empty() {
-            checkpoint.push(Entry::new("network.tables.average", &shapes[0], tables));
-        }
-        checkpoint.push(Entry::new("network.layers.average", &shapes[1], layers));
-    }
-
-    /// What must agree for a checkpoint to fit.
-    fn shape_text(&self) -> String {
-        let shape = serde_json::to_string(&self.model.shape).unwrap_or_default();
-        format!("{shape} loss {:?} tau {} extent {:?}", self.objective.loss, self.objective.tau, self.objective.extent)
-    }
-
-    /// Reads everything, and only then changes anything.
-    pub(super) fn restored(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
-        checkpoint.expect_note("network.shape", &self.shape_text())?;
-        let progress = Progress {
-            drawn: checkpoint.number("network.drawn")?,
-            averaged: checkpoint.number("network.averaged")?,
-            stall: checkpoint.number("network.stall")?,
-            caution: checkpoint.number("network.caution")?,
-            first_loss: checkpoint.number("network.first_loss")?,
-            smooth: checkpoint.number("network.smooth")?,
-            looked: checkpoint.number("network.looked")?,
-        };
-        let standardised = checkpoint.number("network.standardised")?;
-        let steps = checkpoint.number("network.steps")?;
-        let mut scale = self.objective.scale;
-        for output in 0..3 {
-            scale.mean[output] = checkpoint.number(&format!("network.mean.{output}"))?;
-            scale.deviation[output] = checkpoint.number(&format!("network.deviation.{output}"))?;
-        }
-        let shape = &self.model.shape;
-        let read = |name: &str, len: usize| -> Result<[Vec<f32>; 3], CheckpointError> {
-            if len == 0 {
-                return Ok(Default::default());
-            }
-            let part = |part: &str| checkpoint.values(&format!("network.{name}{part}"), len);
-            Ok([part("")?, part(".moment_1")?, part(".moment_2")?])
-        };
-        let (table_values, layer_values) = (shape.table_entries() * shape.features, shape.layer_parameters());
-        let state = [read("tables", table_values)?, read("layers", layer_values)?];
-        let tables = if table_values == 0 { Vec::new() } else { checkpoint.values("network.tables.average", table_values)? };
-        let layers = checkpoint.values("network.layers.average", layer_values)?;
-        self.model.set_state(state, steps);
-        self.objective.scale = scale;
-        // Where a device trains it, it goes over again with the next step.
-        (self.progress, self.standardised, self.kept, self.away) = (progress, standardised, None, None);
-        self.average = Arc::new(Average { tables, layers });
-        self.pack();
-        Ok(())
-    }
-}
-
-impl Progress {
-    /// Whether a step's loss says that training has diverged, `first` being that of the call's first step.
-    fn diverges(&mut self, loss: f64, first: f64) -> bool {
-        if self.first_loss == 0.0 && loss.is_finite() {
-            self.first_loss = loss;
-        }
-        let hardest = first.min(HARDEST * self.first_loss);
-        let limit = DIVERGED * self.first_loss.max(hardest).max(NEGLIGIBLE);
-        !loss.is_finite() || loss > limit
-    }
-
-    /// Takes a step's loss in, the last of `averaged`, and lowers the rate when the loss has stopped falling.
-    fn observe(&mut self, loss: f64, averaged: u64) {
-        self.smooth = if self.smooth == 0.0 { loss } else { 0.99 * self.smooth + 0.01 * loss };
-        if averaged.is_multiple_of(LOOK_EVERY) {
-            if self.looked > 0.0 && self.smooth > (1.0 - STALLED) * self.looked {
-                self.stall = (self.stall * STALL_FACTOR).max(LEAST_FACTOR);
-            }
-            self.looked = self.smooth;
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Structures that the network's kernels read, laid out as in `kernels/network.cuh` and `kernels/network.cu`.
+//! Structures that the network's kernels read, laid out as in `kernels/network.cuh`, `kernels/network_data.cuh` and `kernels/network.cu`.
 
 use super::layout::TableArgument;
 use cudarc::driver::DeviceRepr;

@@ -209,7 +209,7 @@ impl DeviceTraining {
     /// Brings a model over; the mean of the parameters starts at them.
     ///
     /// # Errors
-    /// What the kernels do not take: several outputs, widths beyond 128, the published penalty on means. Memory that is not there.
+    /// What the kernels do not take: several outputs, the published penalty on means. Memory that is not there.
     pub fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective) -> Result<Self, DeviceError> {
         if has_penalty(objective) {
             let what = "training with the published penalty on the difference of the batch means (network.mean_penalty)".into();
