@@ -1,5 +1,5 @@
 //! A device that is lost in the middle of a frame, for real: a kernel that traps takes the whole context with it, so that this happens in
-//! a process of its own. (`tests/lost_device.rs` breaks a device at every call, without a GPU.)
+//! a process of its own. (`tests/lost_device/` breaks a device at every call, without a GPU.)
 
 use crate::scenes::device;
 use ridgewatch::config::SceneFile;

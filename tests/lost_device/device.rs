@@ -1,0 +1,348 @@
+//! A device that computes on the CPU, and breaks at one of the calls that are made of it.
+
+use burn::backend::Flex;
+use burn::module::{Param, ParamId};
+use burn::tensor::{Tensor, TensorData};
+use ridgewatch::engine::cuda::{CudaTracerError, DeviceError};
+use ridgewatch::engine::{
+    Accelerator, Answers, AuditFindings, AuditRequest, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, EngineError, Health, Tally,
+    WhenLost, audit,
+};
+use ridgewatch::field::{Domain, Snapshot};
+use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
+use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
+use ridgewatch::surrogate::{
+    Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
+};
+use std::ops::Range;
+use std::sync::atomic::AtomicBool;
+use std::sync::{Arc, Mutex, OnceLock};
+
+/// The way to the device, which breaks at one of the calls and stays broken.
+#[derive(Debug)]
+pub struct Line {
+    /// What was asked for, call by call.
+    pub calls: Mutex<Vec<&'static str>>,
+    breaks_at: usize,
+    how: How,
+    pub broke_in: OnceLock<&'static str>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum How {
+    /// A driver call fails.
+    Fault,
+    /// There is no memory left.
+    Refusal,
+}
+
+impl Line {
+    fn call(&self, what: &'static str) -> Result<(), DeviceError> {
+        let mut calls = self.calls.lock().unwrap();
+        calls.push(what);
+        if calls.len() <= self.breaks_at {
+            return Ok(());
+        }
+        self.broke_in.get_or_init(|| what);
+        Err(match self.how {
+            How::Fault => DeviceError::Driver { doing: what, reason: "broken by the test".into() },
+            How::Refusal => {
+                DeviceError::OutOfMemory { what: what.into(), needed: 1 << 20, used: 0, cap: 0, cap_from: "broken by the test" }
+            }
+        })
+    }
+}
+
+#[derive(Debug)]
+pub struct Breaking {
+    pub line: Arc<Line>,
+    health: Arc<Health>,
+}
+
+pub const NAME: &str = "a device that breaks";
+
+impl Breaking {
+    /// Breaks behind so many calls.
+    pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
+        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in: OnceLock::new() };
+        Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
+    }
+}
+
+impl Accelerator for Breaking {
+    fn name(&self) -> String {
+        NAME.into()
+    }
+    fn health(&self) -> &Arc<Health> {
+        &self.health
+    }
+    fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, CudaTracerError> {
+        let host = || cpu_tracer(source.clone(), map, t0);
+        let trace = Trace { line: self.line.clone(), host: host()? };
+        self.line.call("making a tracer")?;
+        Ok(Box::new(Backed::with(trace, host()?, self.health.clone())))
+    }
+    fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError> {
+        self.line.call("making a renderer")?;
+        Ok(Box::new(Render { line: self.line.clone() }))
+    }
+    fn offload(&self) -> Option<Arc<dyn Offload>> {
+        Some(Arc::new(Training { line: self.line.clone(), health: self.health.clone() }))
+    }
+    fn expect(&self, _: &Arc<Snapshot>) {
+        if let Err(error) = self.line.call("bringing a snapshot over") {
+            self.health.fail(error);
+        }
+    }
+}
+
+struct Trace {
+    line: Arc<Line>,
+    host: Box<dyn Tracer>,
+}
+
+impl DeviceTrace for Trace {
+    fn double(&self) -> bool {
+        false
+    }
+    fn trace_nodes(&self, _: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
+        self.line.call("tracing a table")?;
+        Ok(Some(Box::new(Nodes { line: self.line.clone(), table: Table::trace(&*self.host, nodes) })))
+    }
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+        self.line.call("starting a trace")?;
+        // What a device leaves behind that stops half way.
+        out.log_stretch.iter_mut().step_by(2).for_each(|s| *s = 7e7);
+        out.lived.iter_mut().step_by(3).for_each(|s| *s = -1.0);
+        self.line.call("reading a trace back")?;
+        self.host.trace(seeds, extras, out);
+        Ok(())
+    }
+}
+
+/// A table that nobody reaches once the device is broken.
+#[derive(Debug)]
+struct Nodes {
+    line: Arc<Line>,
+    table: Table,
+}
+
+impl DeviceNodes for Nodes {
+    fn not_finite(&self) -> usize {
+        self.table.not_finite()
+    }
+    fn values(&self) -> Result<Vec<f32>, DeviceError> {
+        self.line.call("reading a table back")?;
+        Ok(self.table.values().to_vec())
+    }
+    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
+        self.line.call("looking up in a table")?;
+        self.table.predict(points, out);
+        Ok(())
+    }
+    fn as_any(&self) -> &dyn std::any::Any {
+        self
+    }
+}
+
+/// Trains with the CPU's kernels, on its own copy of network and samples.
+struct Training {
+    line: Arc<Line>,
+    health: Arc<Health>,
+}
+
+impl Training {
+    fn call(&self, what: &'static str) -> Result<(), DeviceLost> {
+        self.health.ask(|| self.line.call(what)).ok_or(DeviceLost)
+    }
+}
+
+impl Offload for Training {
+    fn takes(&self, _: &Architecture, _: &Objective) -> bool {
+        true
+    }
+    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>> {
+        self.call("taking a network over").ok()?;
+        Some(Box::new(Network {
+            there: Training { line: self.line.clone(), health: self.health.clone() },
+            fused: Fused::new(model, objective, BATCH),
+            model: model.clone(),
+            objective: objective.clone(),
+            average: average.clone(),
+            samples: Samples::default(),
+            mark: None,
+            base: None,
+            kept: None,
+        }))
+    }
+}
+
+/// Samples of a batch, and steps a frame, of the scene that it trains in.
+pub const BATCH: usize = 512;
+pub const STEPS: u64 = 20;
+
+struct Network {
+    there: Training,
+    fused: Fused,
+    model: Model,
+    objective: Objective,
+    average: Average,
+    samples: Samples,
+    mark: Option<RingMark>,
+    base: Option<Table>,
+    kept: Option<(Model, Average)>,
+}
+
+impl OffloadedTraining for Network {
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
+        self.there.call("bringing samples over")?;
+        self.samples.points.resize(ring.len(), [f32::NAN; 3]);
+        self.samples.log_stretch.resize(ring.len(), f32::NAN);
+        for range in ring.written_since(self.mark) {
+            self.samples.points[range.clone()].copy_from_slice(&ring.samples().points[range.clone()]);
+            self.samples.log_stretch[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
+        }
+        (self.mark, self.base) = (Some(ring.mark()), base.cloned());
+        let usable = self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len());
+        Ok(Brought { usable, dropped: self.samples.len() - usable })
+    }
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
+        self.there.call("taking steps")?;
+        let Self { fused, model, objective, average, samples, base, .. } = self;
+        let (among, base) = (objective.sieve(samples), base.as_ref().map(|base| base as &dyn Field));
+        let mut losses = Vec::new();
+        fused.steps(model, objective, average, |done, loss| {
+            losses.extend(loss);
+            steps.get(done as usize).map(|step| Step::of(step, samples, among.as_deref(), base))
+        });
+        Ok(losses)
+    }
+    fn keep(&mut self) -> Result<(), DeviceLost> {
+        self.there.call("keeping a network")?;
+        self.kept = Some((self.model.clone(), self.average.clone()));
+        Ok(())
+    }
+    fn roll_back(&mut self) -> Result<(), DeviceLost> {
+        (self.model, self.average) = self.kept.clone().unwrap();
+        Ok(())
+    }
+    fn restart_average(&mut self) -> Result<(), DeviceLost> {
+        self.average = Average { tables: self.model.tables(), layers: self.model.layers() };
+        Ok(())
+    }
+    fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost> {
+        self.there.call("forgetting an output")?;
+        self.model.zero_output();
+        self.average.layers[range].fill(0.0);
+        Ok(())
+    }
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {
+        self.there.call("freezing a network")?;
+        let (mut model, average) = (self.model.clone(), &self.average);
+        let tensor = |values: &Vec<f32>, shape: Vec<usize>| TensorData::new(values.clone(), shape);
+        let tables = vec![model.shape.table_entries(), model.shape.features];
+        model.module.tables =
+            Some(Param::initialized(ParamId::new(), Tensor::from_data(tensor(&average.tables, tables), &Default::default())));
+        let layers = tensor(&average.layers, vec![average.layers.len()]);
+        model.module.layers = Param::initialized(ParamId::new(), Tensor::from_data(layers, &Default::default()));
+        let there = Training { line: self.there.line.clone(), health: self.there.health.clone() };
+        Ok(Arc::new(Frozen { there, model, objective: self.objective.clone() }))
+    }
+    fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
+        self.there.call("fetching a network")?;
+        (*model, *average) = (self.model.clone(), self.average.clone());
+        Ok(())
+    }
+    fn device_seconds(&mut self) -> f64 {
+        0.0
+    }
+}
+
+struct Frozen {
+    there: Training,
+    model: Model,
+    objective: Objective,
+}
+
+impl OffloadedNetwork for Frozen {
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost> {
+        out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
+        self.there.call("asking a network")?;
+        let (shape, scale) = (Arc::new(self.model.shape.clone()), &self.objective.scale);
+        let flat: Vec<f32> = points.iter().flatten().copied().collect();
+        let points = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [points.len(), 3]), &Default::default());
+        let outputs = self.model.module.forward_fused(&shape, points).into_data().to_vec::<f32>().unwrap();
+        out.iter_mut().zip(outputs).for_each(|(out, output)| *out = output * scale.deviation[0] + scale.mean[0]);
+        Ok(())
+    }
+    fn as_any(&self) -> &dyn std::any::Any {
+        self
+    }
+}
+
+struct Render {
+    line: Arc<Line>,
+}
+
+struct ByHost<'a>(&'a dyn Tracer);
+
+impl LogStretch for ByHost<'_> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        let mut out = Traced::default();
+        self.0.trace(points, Extras::default(), &mut out);
+        log_stretch.copy_from_slice(&out.log_stretch);
+        traced.fill(true);
+    }
+}
+
+impl DeviceRenderer for Render {
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: &dyn Predict,
+    ) -> Result<Option<AuditFindings>, DeviceError> {
+        self.line.call("an audit")?;
+        let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
+        let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref::<Table>()) else { return Ok(None) };
+        let nodes = table.on_device().unwrap().as_any().downcast_ref::<Nodes>().unwrap();
+        Ok(Some(audit(request.clone(), &*traces.on_device().host, Some(&nodes.table))))
+    }
+
+    fn render(
+        &mut self,
+        renderer: &mut Renderer,
+        picture: u64,
+        samples: usize,
+        tracer: &dyn Tracer,
+        answers: &mut Answers<'_>,
+        progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
+    ) -> Result<Option<(Film, RenderStats)>, EngineError> {
+        let asked = answers.asked();
+        if asked.surrogate.is_some() || asked.keep > 1 {
+            return Ok(None);
+        }
+        renderer.set_up(picture, 0..samples as u32)?;
+        for wave in 0..3_u8 {
+            self.line.call("a wave of a frame")?;
+            if let Some(progress) = progress {
+                progress(f32::from(wave) / 3.0);
+            }
+        }
+        self.line.call("reading a film back")?;
+        let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
+        let (film, stats) = renderer.render(picture, &mut ByHost(&*traces.on_device().host), samples, progress, stop)?;
+        let tally = Tally {
+            queries: stats.queries,
+            traced: stats.traced,
+            missing: stats.missing,
+            trace_seconds: stats.evaluate_seconds,
+            ..Tally::default()
+        };
+        answers.answered_elsewhere(tally, Samples::default());
+        Ok(Some((film, stats)))
+    }
+}
