@@ -7,6 +7,7 @@
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python. What is missing is installed where apt is (gfortran, openmpi-bin,
 #    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy and pytest go into out/adapters/venv alone
+# make header   writes the C header anew from the library's source; a test holds the two to each other
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes docs/performance.md
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
@@ -27,7 +28,7 @@ ADAPTERS := out/adapters
 PREFIX ?= /usr/local
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean adapters install-adapters adapter-packages test-adapters python-adapter
+.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter
 
 all: build
 
@@ -100,9 +101,12 @@ gpu-check: packages
 	  OUT=out/gpu-check .gpu/check/run && scripts/gpu-check-write out/gpu-check; else \
 	  echo "no GPU here: take .gpu/check to one, start .gpu/check/run there, and give what it leaves to scripts/gpu-check-write"; fi
 
+header:
+	RIDGEWATCH_WRITE_HEADER=1 $(CARGO) test --release -p ridgewatch-adapter --test c_library the_header_is_that_of_the_library
+
 # Rust and a C linker suffice for the library itself.
 adapters:
-	$(CARGO) build --release -p ridgewatch-c
+	$(CARGO) build --release -p ridgewatch-adapter
 	mkdir -p $(ADAPTERS)/lib $(ADAPTERS)/include
 	cp target/release/libridgewatch_adapter.so target/release/libridgewatch_adapter.a $(ADAPTERS)/lib/
 	cp adapters/c/include/ridgewatch.h $(ADAPTERS)/include/
@@ -134,9 +138,13 @@ adapter-packages:
 	  $(SUDO) apt-get update -qq && $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq $$missing >/dev/null || echo "could not install$$missing"; fi
 
 test-adapters: packages python-packages adapter-packages adapters
-	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-c -- --nocapture
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire --test ring -- --ignored; else \
-	  echo "NOT RUN: a ring on a full file system, since mounting a small one needs root"; fi
+	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-adapter
+	@if command -v gfortran >/dev/null; then $(CARGO) test --release -p ridgewatch-adapter --test fortran_module -- --ignored; else \
+	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored; else \
+	  echo "NOT RUN: a ring on a full file system, files of another user, since these tests need root"; fi
+	@$(MAKE) --no-print-directory install-adapters PREFIX=$(CURDIR)/$(ADAPTERS)/installed
+	scripts/adapters-installed $(ADAPTERS)/installed
 	@if ls $(ADAPTERS)/wheel/*.whl >/dev/null 2>&1; then \
 	  $(ADAPTERS)/venv/bin/pip install --quiet --force-reinstall --no-deps $(ADAPTERS)/wheel/*.whl && $(ADAPTERS)/venv/bin/pytest -q adapters/python/tests; else \
 	  echo "NOT RUN: the tests of the Python package, since its wheel was not built"; fi

@@ -235,6 +235,55 @@ fn all_threads_step_back_for_the_simulation() {
     }
 }
 
+/// Cores that this process may use.
+fn cores() -> Vec<usize> {
+    // SAFETY: the set is as long as is said, and all of its bits are a value.
+    let set = unsafe {
+        let mut set: libc::cpu_set_t = std::mem::zeroed();
+        assert_eq!(libc::sched_getaffinity(0, size_of_val(&set), &mut set), 0);
+        set
+    };
+    // SAFETY: reads a bit of that set.
+    (0..libc::CPU_SETSIZE as usize).filter(|core| unsafe { libc::CPU_ISSET(*core, &set) }).collect()
+}
+
+/// Lets a command run on these cores alone, as `taskset` and Slurm do.
+fn bound(command: &mut Command, cores: Vec<usize>) -> &mut Command {
+    use std::os::unix::process::CommandExt;
+    let bind = move || {
+        // SAFETY: a set of this frame, whose bits are those of cores that are there.
+        let done = unsafe {
+            let mut set: libc::cpu_set_t = std::mem::zeroed();
+            cores.iter().for_each(|core| libc::CPU_SET(*core, &mut set));
+            libc::sched_setaffinity(0, size_of_val(&set), &set)
+        };
+        if done == 0 { Ok(()) } else { Err(std::io::Error::last_os_error()) }
+    };
+    // SAFETY: only calls of the system between fork and exec.
+    unsafe { command.pre_exec(bind) }
+}
+
+#[test]
+fn as_many_threads_render_as_the_simulation_leaves_cores() {
+    let place = Place::new("cores");
+    let (archive, live, ring) = (place.archive(), place.live(), text(&place.ring).to_owned());
+    let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
+    let all = cores();
+    // What the cgroup leaves counts too.
+    let most = std::thread::available_parallelism().unwrap().get();
+    for left in [&all[..1], &all] {
+        let run = place.files.join(format!("{}", left.len()));
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ridgewatch"));
+        command.args(["attach", text(&live), &ring, "--device", "cpu", "--out", text(&run)]).env_remove("RIDGEWATCH_RING");
+        let sidecar = start(bound(&mut command, left.to_vec()));
+        until("the first frame", || !records(&run).is_empty());
+        let names = std::fs::read_dir(format!("/proc/{}/task", sidecar.0.id())).unwrap();
+        let names = names.filter_map(|task| std::fs::read_to_string(task.ok()?.path().join("comm")).ok());
+        // The system keeps 15 letters of a name.
+        assert_eq!(names.filter(|name| name.starts_with("ridgewatch-rend")).count(), left.len().min(most));
+    }
+}
+
 #[test]
 fn every_step_is_taken_through_a_relay() {
     let place = Place::new("every");

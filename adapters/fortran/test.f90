@@ -6,7 +6,9 @@ program test
   type(rw_publisher) :: publisher, second
   real(real32) :: u32(4, 3, 2), v32(4, 3, 2), w32(4, 3, 2)
   real(real64) :: u64(0:5, 8, 2), v64(0:5, 8, 2), w64(0:5, 8, 2), plane(4, 3)
+  real(real32) :: east(4, 3)
   character(:), allocatable :: message
+  character(200) :: ring
   integer :: i, j, k, status
 
   call publisher%begin(3)
@@ -53,6 +55,19 @@ program test
   call second%close()
   call publisher%close(status)
   call want(status == rw_ok, 9)
+  ! Longitude and latitude, in a ring of its own that is named.
+  call get_environment_variable("RIDGEWATCH_RING", ring)
+  call publisher%begin(2)
+  call publisher%sphere(6.371d6)
+  call publisher%uniform(1, 0d0, 270d0, 4, period=360d0)
+  call publisher%rectilinear(2, [-60d0, 0d0, 60d0])
+  call publisher%open(status, trim(ring) // "/globe")
+  call want(status == rw_ok, 10)
+  east = reshape([(real(i, real32), i=1, 12)], [4, 3])
+  call publisher%publish(7, 2d0, east, east + 12, status)
+  call want(status == rw_ok, 11)
+  call publisher%close(status)
+  call want(status == rw_ok, 12)
 
 contains
 

@@ -1,6 +1,12 @@
-//! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` says what each function does.
+//! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` is generated from this file (`make header`), its words are the comments here.
 //!
 //! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`].
+//!
+//! What C promises with each pointer that it gives: it is null, or from this library and not yet freed, or points to as many values as the
+//! function's comment says; texts end with a zero. A description and `rw_close` are for one thread at a time.
+
+// The promises of the callers stand above, once for all functions.
+#![allow(clippy::missing_safety_doc)]
 
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, WireError};
 use std::cell::RefCell;
@@ -10,31 +16,34 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// What a call came to; the numbers of `rw_status`.
+/// What a call came to.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
+// In C the names of a type's values stand beside all others.
+#[allow(clippy::enum_variant_names)]
 pub enum Status {
     /// Done.
-    Ok = 0,
+    RwOk = 0,
     /// No handle, or no ring was asked for: nothing was done.
-    Off = 1,
+    RwOff = 1,
     /// A value that cannot be.
-    Argument = 2,
+    RwArgument = 2,
     /// Another producer has this name.
-    InUse = 3,
+    RwInUse = 3,
     /// No room for the ring.
-    NoSpace = 4,
+    RwNoSpace = 4,
     /// The folder or file belongs to somebody else.
-    Foreign = 5,
+    RwForeign = 5,
     /// The system refused.
-    System = 6,
+    RwSystem = 6,
     /// The handle was opened by the parent process.
-    Forked = 7,
+    RwForked = 7,
     /// A fault of this library, which was caught.
-    Internal = 8,
+    RwInternal = 8,
 }
 
-const VERSION: u32 = 2;
+/// Of this version of the header.
+pub const RW_VERSION: u32 = 2;
 const DEFAULT_SLOTS: u32 = 4;
 
 /// A grid as far as it is described.
@@ -83,15 +92,15 @@ impl From<WireError> for Failure {
 impl Failure {
     fn status(&self) -> Status {
         match self {
-            Failure::Off => Status::Off,
-            Failure::Argument(_) => Status::Argument,
+            Failure::Off => Status::RwOff,
+            Failure::Argument(_) => Status::RwArgument,
             Failure::Wire(error) => match error {
-                WireError::InUse { .. } => Status::InUse,
-                WireError::NoSpace { .. } => Status::NoSpace,
-                WireError::Foreign { .. } => Status::Foreign,
-                WireError::Forked { .. } => Status::Forked,
-                WireError::Io { .. } => Status::System,
-                _ => Status::Argument,
+                WireError::InUse { .. } => Status::RwInUse,
+                WireError::NoSpace { .. } => Status::RwNoSpace,
+                WireError::Foreign { .. } => Status::RwForeign,
+                WireError::Forked { .. } => Status::RwForked,
+                WireError::Io { .. } => Status::RwSystem,
+                _ => Status::RwArgument,
             },
         }
     }
@@ -131,7 +140,7 @@ fn guarded(body: impl FnOnce() -> Result<(), Failure>) -> Status {
     match catch_unwind(AssertUnwindSafe(body)) {
         Ok(Ok(())) => {
             tell(format_args!(""));
-            Status::Ok
+            Status::RwOk
         }
         Ok(Err(failure)) => {
             match &failure {
@@ -143,24 +152,25 @@ fn guarded(body: impl FnOnce() -> Result<(), Failure>) -> Status {
         }
         Err(_) => {
             tell(format_args!("an internal fault of the adapter, which was caught"));
-            Status::Internal
+            Status::RwInternal
         }
     }
 }
 
-/// Version of the interface.
+/// The library's version; another number than `RW_VERSION`: another header.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_version() -> u32 {
-    VERSION
+    RW_VERSION
 }
 
-/// Why this thread's last call failed.
+/// Why the last call of this thread failed; empty when none did. Valid until the thread's next call.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_error() -> *const c_char {
     ERROR.try_with(|error| error.as_ptr().cast::<c_char>().cast_const()).unwrap_or(c"".as_ptr())
 }
 
-/// Begins a description.
+/// Begins a description of a grid of 2 or 3 dimensions, whose velocity has as many components. Null when there is no memory or the
+/// dimensions are wrong.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     let mut made = std::ptr::null_mut();
@@ -182,10 +192,7 @@ pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     made
 }
 
-/// Ends a description.
-///
-/// # Safety
-/// `description` is null, or came from [`rw_describe`] and was not freed.
+/// Ends a description; rings that were opened with it do not need it.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
     guarded(|| {
@@ -216,10 +223,7 @@ fn set_axis(description: &mut RwDescription, axis: u32, mut given: AxisDescripti
 /// Longest axis that is accepted.
 const AXIS_NODES: u64 = 1 << 20;
 
-/// A uniform axis.
-///
-/// # Safety
-/// `description` is null or a description that no other thread uses.
+/// An axis (0: x, 1: y, 2: z) of evenly spaced nodes of the global grid. `period`: length after which the axis repeats, 0: it does not.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_uniform(
     description: *mut RwDescription,
@@ -233,10 +237,7 @@ pub unsafe extern "C" fn rw_describe_uniform(
     unsafe { describe(description, |d| set_axis(d, axis, AxisDescription::uniform("", "", first, last, nodes), period)) }
 }
 
-/// An axis with its own coordinates.
-///
-/// # Safety
-/// As [`rw_describe_uniform`]; `coordinates` points to `nodes` numbers.
+/// An axis with its own `nodes` coordinates, strictly ascending.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_rectilinear(
     description: *mut RwDescription,
@@ -257,10 +258,7 @@ pub unsafe extern "C" fn rw_describe_rectilinear(
     unsafe { describe(description, change) }
 }
 
-/// Longitude and latitude on a sphere.
-///
-/// # Safety
-/// As [`rw_describe_uniform`].
+/// Axes 0 and 1 are longitude and latitude in degrees, on a sphere of this radius; velocities are eastward, northward (and upward).
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_sphere(description: *mut RwDescription, radius: f64) -> Status {
     let change = |d: &mut RwDescription| {
@@ -271,10 +269,8 @@ pub unsafe extern "C" fn rw_describe_sphere(description: *mut RwDescription, rad
     unsafe { describe(description, change) }
 }
 
-/// A block of the global grid.
-///
-/// # Safety
-/// As [`rw_describe_uniform`]; `offset` and `extent` point to a number a dimension.
+/// This process has a block of the global grid: nodes [offset, offset + extent) along x, y, z; blocks must not overlap (leave ghost cells
+/// out) and cover the grid together. Block `index` is of `count`. Arrays have one value for each of the dimensions.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_block(
     description: *mut RwDescription,
@@ -304,10 +300,8 @@ pub unsafe extern "C" fn rw_describe_block(
     unsafe { describe(description, change) }
 }
 
-/// The number that the blocks of one start share.
-///
-/// # Safety
-/// As [`rw_describe_uniform`].
+/// A number that all blocks of this start of the simulation name, and those of its next start do not: the clock of one rank, for example,
+/// that it tells the others. Steps of two starts are then never put together, whatever their blocks are. 0 (default): none.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, start: u64) -> Status {
     let change = |d: &mut RwDescription| {
@@ -318,10 +312,7 @@ pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, star
     unsafe { describe(description, change) }
 }
 
-/// Unit of the times.
-///
-/// # Safety
-/// As [`rw_describe_uniform`]; `unit` is null or ends with a zero.
+/// Unit of the times, for people; default "s".
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, unit: *const c_char) -> Status {
     let change = |d: &mut RwDescription| {
@@ -337,10 +328,7 @@ pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, 
     unsafe { describe(description, change) }
 }
 
-/// Steps that the ring holds.
-///
-/// # Safety
-/// As [`rw_describe_uniform`].
+/// Steps that the ring holds; default 4, at least 2. Its memory is that many copies of the block, 4 bytes a value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_slots(description: *mut RwDescription, slots: u32) -> Status {
     let change = |d: &mut RwDescription| {
@@ -351,10 +339,8 @@ pub unsafe extern "C" fn rw_describe_slots(description: *mut RwDescription, slot
     unsafe { describe(description, change) }
 }
 
-/// The waiting policy.
-///
-/// # Safety
-/// As [`rw_describe_uniform`].
+/// When ridgewatch has not taken the step that is to be overwritten: wait for it, so many milliseconds at most, and then not again before
+/// it moves. 0 (default): overwrite, never wait.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milliseconds: u32) -> Status {
     let change = |d: &mut RwDescription| {
@@ -365,10 +351,8 @@ pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milli
     unsafe { describe(description, change) }
 }
 
-/// Opens a ring.
-///
-/// # Safety
-/// `ring` is null or ends with a zero; `description` is null or a description; `field` is null or may be written.
+/// Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, and `RW_OFF` where it is not set. All memory is taken here.
+/// `*field` is null unless `RW_OK` is returned.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
     guarded(|| {
@@ -432,30 +416,23 @@ unsafe fn publish(
     })
 }
 
-/// Packed components, f32.
-///
-/// # Safety
-/// `field` is null or open; each component has a value a node of the block.
+/// Publishes a step whose components are arrays of their own, packed, x fastest. `w` is not read in two dimensions.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_f32(field: *mut RwField, step: u64, time: f64, u: *const f32, v: *const f32, w: *const f32) -> Status {
     // SAFETY: the caller's promise.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, None) }
 }
 
-/// Packed components, f64.
-///
-/// # Safety
-/// As [`rw_publish_f32`].
+/// The same of doubles, which are rounded to floats.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_f64(field: *mut RwField, step: u64, time: f64, u: *const f64, v: *const f64, w: *const f64) -> Status {
     // SAFETY: the caller's promise.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, None) }
 }
 
-/// Any strides, f32.
-///
-/// # Safety
-/// As [`rw_publish_f32`], for the values that the strides speak of; a stride a dimension.
+/// The same with strides, in elements, along x, y, z (two of them in two dimensions): value (i, j, k) of u is
+/// `u[i * strides[0] + j * strides[1] + k * strides[2]]`. Interleaved components: u = a, v = a + 1, w = a + 2,
+/// strides {3, 3 nx, 3 nx ny}.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_strided_f32(
     field: *mut RwField,
@@ -470,10 +447,7 @@ pub unsafe extern "C" fn rw_publish_strided_f32(
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, Some(strides)) }
 }
 
-/// Any strides, f64.
-///
-/// # Safety
-/// As [`rw_publish_strided_f32`].
+/// The same of doubles, which are rounded to floats.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_strided_f64(
     field: *mut RwField,
@@ -488,10 +462,7 @@ pub unsafe extern "C" fn rw_publish_strided_f64(
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, Some(strides)) }
 }
 
-/// Steps published and overwritten.
-///
-/// # Safety
-/// `field` is null or open; the others are null or may be written.
+/// Steps published, and how many of them overwrote one that nobody had taken; either may be null.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u64, overwrote: *mut u64) -> Status {
     guarded(|| {
@@ -507,10 +478,7 @@ pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u6
     })
 }
 
-/// Ends a ring.
-///
-/// # Safety
-/// `field` is null, or open and in no other thread's hands.
+/// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_close(field: *mut RwField) -> Status {
     guarded(|| {

@@ -2,8 +2,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch_wire::{Following, Limits, Read, RingReader};
-use std::collections::BTreeMap;
+use ridgewatch_wire::{Following, Geometry, Limits, Read, RingReader};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -30,112 +29,40 @@ impl Drop for Folder {
     }
 }
 
+/// How a program has the library.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Link {
+    Shared,
+    Static,
+}
+
 /// Compiles a C program against the header and the library.
-fn compile(source: &Path, to: &Path, extra: &[&str]) {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+fn compile(source: &Path, to: &Path, link: Link, extra: &[&str]) {
+    let (root, libraries) = (Path::new(env!("CARGO_MANIFEST_DIR")), library_folder());
     let mut cc = Command::new("cc");
     cc.args(["-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", "-Wall", "-Wextra", "-Werror", "-I"]).arg(root.join("include"));
-    cc.arg(source).arg("-o").arg(to).arg("-L").arg(library_folder()).args(["-lridgewatch_adapter", "-lm"]).args(extra);
-    let out = cc.output().expect("a C compiler");
+    cc.arg(source).arg("-o").arg(to);
+    match link {
+        Link::Shared => cc.arg("-L").arg(libraries).arg("-lridgewatch_adapter"),
+        // As ridgewatch.pc says it under Libs.private.
+        Link::Static => cc.arg(libraries.join("libridgewatch_adapter.a")).args(["-lpthread", "-ldl"]),
+    };
+    let out = cc.arg("-lm").args(extra).output().expect("a C compiler");
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
 }
 
-/// A function as C declares it: its return type and those of its parameters, without blanks at stars.
-type Signature = (String, Vec<String>);
-
-/// Splits `const float *u` into its type and its name.
-fn type_and_name(declared: &str) -> (String, String) {
-    let declared = declared.split_whitespace().collect::<Vec<_>>().join(" ");
-    let begin = declared.rfind(|c: char| !c.is_ascii_alphanumeric() && c != '_').map_or(0, |at| at + 1);
-    (declared[..begin].trim_end().replace(" *", "*"), declared[begin..].to_owned())
-}
-
-/// Functions that a header without comments declares.
-fn declared(header: &str) -> BTreeMap<String, Signature> {
-    let lines: Vec<_> = header.lines().filter(|line| !line.starts_with('#')).collect();
-    let mut found = BTreeMap::new();
-    for statement in lines.join("\n").split(';') {
-        let Some((head, parameters)) = statement.split_once('(') else { continue };
-        let (returned, name) = type_and_name(head.rsplit_once('{').map_or(head, |(_, head)| head));
-        let parameters = parameters.trim_end().strip_suffix(')').unwrap();
-        let parameters = parameters.split(',').filter(|p| p.trim() != "void").map(|p| type_and_name(p).0).collect();
-        assert!(found.insert(name.clone(), (returned, parameters)).is_none(), "{name} twice");
-    }
-    found
-}
-
-/// A type of the library as C writes it.
-fn in_c(rust: &str) -> String {
-    if let Some(pointee) = rust.strip_prefix("*const ") {
-        assert!(!pointee.starts_with('*'), "{rust}");
-        return format!("const {}*", in_c(pointee));
-    }
-    if let Some(pointee) = rust.strip_prefix("*mut ") {
-        return format!("{}*", in_c(pointee));
-    }
-    let c = match rust {
-        "()" => "void",
-        "u32" => "uint32_t",
-        "u64" => "uint64_t",
-        "i64" => "int64_t",
-        "f32" => "float",
-        "f64" => "double",
-        "c_char" => "char",
-        "Status" => "rw_status",
-        "RwDescription" => "rw_description",
-        "RwField" => "rw_field",
-        other => panic!("{other}: a type without a counterpart in C"),
-    };
-    c.to_owned()
-}
-
-/// Functions that the library exports, as C would declare them.
-fn exported(library: &str) -> BTreeMap<String, Signature> {
-    let function = |text: &str| {
-        let (name, rest) = text.split_once('(').unwrap();
-        let (parameters, rest) = rest.split_once(')').unwrap();
-        let returned = rest.split_once('{').unwrap().0.trim().strip_prefix("->").unwrap_or("()");
-        let types = parameters.split(',').filter_map(|p| Some(in_c(p.split_once(':')?.1.trim()))).collect();
-        (name.to_owned(), (in_c(returned.trim()), types))
-    };
-    library.split("extern \"C\" fn ").skip(1).map(function).collect()
-}
-
+/// With `RIDGEWATCH_WRITE_HEADER` set it is written instead: `make header`.
 #[test]
-fn the_header_and_the_library_agree() {
+fn the_header_is_that_of_the_library() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let header = std::fs::read_to_string(root.join("include/ridgewatch.h")).unwrap();
-    let library = std::fs::read_to_string(root.join("src/lib.rs")).unwrap();
-    // Without comments: examples stand there.
-    let mut plain = String::new();
-    let mut rest = header.as_str();
-    while let Some((before, after)) = rest.split_once("/*") {
-        plain.push_str(before);
-        rest = after.split_once("*/").unwrap().1;
+    let config = cbindgen::Config::from_file(root.join("cbindgen.toml")).unwrap();
+    let mut bytes = Vec::new();
+    cbindgen::Builder::new().with_src(root.join("src/lib.rs")).with_config(config).generate().unwrap().write(&mut bytes);
+    let (path, generated) = (root.join("include/ridgewatch.h"), String::from_utf8(bytes).unwrap());
+    if std::env::var_os("RIDGEWATCH_WRITE_HEADER").is_some() {
+        std::fs::write(&path, &generated).unwrap();
     }
-    plain.push_str(rest);
-    let declared = declared(&plain);
-    assert_eq!(declared, exported(&library));
-    assert!(declared.len() >= 17, "{declared:?}");
-    // Status numbers.
-    let number = |text: &str, name: &str| -> Option<u32> {
-        let rest = text.split_once(&format!("{name} = "))?.1;
-        rest.chars().take_while(char::is_ascii_digit).collect::<String>().parse().ok()
-    };
-    for (c, rust) in [
-        ("RW_OK", "    Ok"),
-        ("RW_OFF", "    Off"),
-        ("RW_ARGUMENT", "    Argument"),
-        ("RW_IN_USE", "    InUse"),
-        ("RW_NO_SPACE", "    NoSpace"),
-        ("RW_FOREIGN", "    Foreign"),
-        ("RW_SYSTEM", "    System"),
-        ("RW_FORKED", "    Forked"),
-        ("RW_INTERNAL", "    Internal"),
-    ] {
-        assert!(number(&plain, c).is_some() && number(&plain, c) == number(&library, rust), "{c}");
-    }
-    assert_eq!(plain.split_once("#define RW_VERSION ").unwrap().1.trim_start().split('\n').next(), Some("2"));
+    assert!(std::fs::read_to_string(&path).unwrap() == generated, "include/ridgewatch.h is not what src/lib.rs gives: make header");
 }
 
 #[test]
@@ -143,7 +70,7 @@ fn a_c_solver_is_followed_and_needs_nobody() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let build = tempfile("solver");
     let program = build.0.join("solver");
-    compile(&root.join("examples/solver.c"), &program, &[]);
+    compile(&root.join("examples/solver.c"), &program, Link::Shared, &[]);
     let run = |ring: Option<&Path>, arguments: &[&str]| {
         let mut solver = Command::new(&program);
         solver.args(arguments).env("LD_LIBRARY_PATH", library_folder()).env_remove("RIDGEWATCH_RING");
@@ -184,6 +111,80 @@ fn a_c_solver_is_followed_and_needs_nobody() {
     assert!(good && said.starts_with("0 steps published") && told.contains("not published"), "{said}{told}");
 }
 
+/// Longitude, latitude and height in two blocks, interleaved doubles, from the shared and from the static library.
+#[test]
+fn a_globe_in_blocks_arrives_from_either_library() {
+    let build = tempfile("globe");
+    let source = build.0.join("globe.c");
+    std::fs::write(&source, GLOBE).unwrap();
+    for link in [Link::Shared, Link::Static] {
+        let program = build.0.join(format!("{link:?}"));
+        compile(&source, &program, link, &[]);
+        let ring = Folder::new("globe");
+        let following = Following::begin(&ring.0).unwrap();
+        let mut command = Command::new(&program);
+        command.arg(&ring.0).env_remove("LD_LIBRARY_PATH");
+        if link == Link::Shared {
+            command.env("LD_LIBRARY_PATH", library_folder());
+        }
+        let out = command.output().unwrap();
+        assert!(out.status.success(), "{link:?}: line {:?}: {}", out.status.code(), String::from_utf8_lossy(&out.stderr));
+        for block in 0..2 {
+            let mut reader = RingReader::open(&ring.0, block, &Limits::default()).unwrap();
+            let description = reader.header().description.clone();
+            assert_eq!(description.geometry, Geometry::Sphere { radius: 6.371e6 });
+            assert_eq!((description.shape(), description.start, description.time_unit.as_str()), ([6, 4, 2], 7, "h"));
+            assert_eq!(description.axes[0].coordinates, [0.0, 60.0, 120.0, 180.0, 240.0, 300.0]);
+            assert_eq!((description.axes[0].period, description.axes[1].period), (Some(360.0), None));
+            assert_eq!(description.axes[1].coordinates, [-80.0, -20.0, 10.0, 85.0]);
+            assert_eq!((description.block.offset, description.block.extent), ([3 * u64::from(block), 0, 0], [3, 4, 2]));
+            let mut values = Vec::new();
+            let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step of block {block}") };
+            assert_eq!((info.step, info.time), (5, 1.5));
+            for (n, value) in values.iter().enumerate() {
+                let (c, i, j, k) = (n / 24, n % 3, n / 3 % 4, n % 24 / 12);
+                let longitude = 60.0 * (i + 3 * block as usize) as f32;
+                assert_eq!(*value, longitude + 1000.0 * c as f32 + 10.0 * j as f32 + k as f32, "block {block}, {c} {i} {j} {k}");
+            }
+            assert_eq!(reader.read(&mut values).unwrap(), Read::Ended);
+        }
+        drop(following);
+        assert!(!ring.0.exists(), "nothing stays behind");
+    }
+}
+
+const GLOBE: &str = r#"
+#include <ridgewatch.h>
+#include <stdio.h>
+#define WANT(x) do { if (!(x)) { fprintf(stderr, "%s (%s)\n", #x, rw_error()); return __LINE__; } } while (0)
+
+int main(int argc, char **argv) {
+    WANT(argc == 2 && rw_version() == RW_VERSION);
+    const double latitudes[4] = {-80, -20, 10, 85}, heights[2] = {0, 1e4};
+    rw_description *d = rw_describe(3);
+    WANT(rw_describe_sphere(d, -1) == RW_OK && rw_describe_uniform(d, 0, 0, 300, 6, 360) == RW_OK);
+    WANT(rw_describe_rectilinear(d, 1, latitudes, 4, 0) == RW_OK && rw_describe_rectilinear(d, 2, heights, 2, 0) == RW_OK);
+    WANT(rw_describe_time_unit(d, "h") == RW_OK && rw_describe_start(d, 7) == RW_OK && rw_describe_slots(d, 2) == RW_OK);
+    rw_field *fields[2] = {NULL, NULL};
+    WANT(rw_open(argv[1], d, &fields[0]) == RW_ARGUMENT && !fields[0]);   /* the radius */
+    WANT(rw_describe_sphere(d, 6.371e6) == RW_OK && rw_describe_wait(d, 1) == RW_OK);
+    static double air[6 * 4 * 2][3];
+    for (int n = 0; n < 48; n++)
+        for (int c = 0; c < 3; c++) air[n][c] = 60 * (n % 6) + 1000 * c + 10 * (n / 6 % 4) + n / 24;
+    const int64_t strides[3] = {3, 18, 72};
+    for (uint32_t b = 0; b < 2; b++) {
+        const uint64_t offset[3] = {3 * b, 0, 0}, extent[3] = {3, 4, 2};
+        WANT(rw_describe_block(d, b, 2, offset, extent) == RW_OK);
+        WANT(rw_open(argv[1], d, &fields[b]) == RW_OK);
+        const double *u = air[3 * b];
+        WANT(rw_publish_strided_f64(fields[b], 5, 1.5, u, u + 1, u + 2, strides) == RW_OK);
+    }
+    rw_free_description(d);
+    WANT(rw_close(fields[0]) == RW_OK && rw_close(fields[1]) == RW_OK);
+    return 0;
+}
+"#;
+
 /// Faults that C can make, in one program: each has its status, none ends it.
 #[test]
 fn faults_of_the_caller_are_statuses() {
@@ -191,7 +192,7 @@ fn faults_of_the_caller_are_statuses() {
     let source = build.0.join("faults.c");
     std::fs::write(&source, FAULTS).unwrap();
     let program = build.0.join("faults");
-    compile(&source, &program, &["-std=c11", "-lpthread"]);
+    compile(&source, &program, Link::Shared, &["-std=c11", "-lpthread"]);
     let ring = Folder::new("faults");
     let out = Command::new(&program).arg(&ring.0).env("LD_LIBRARY_PATH", library_folder()).env_remove("RIDGEWATCH_RING").output().unwrap();
     assert!(out.status.success(), "line {:?} failed: {}", out.status.code(), String::from_utf8_lossy(&out.stderr));

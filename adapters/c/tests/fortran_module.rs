@@ -2,20 +2,13 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch_wire::{Following, Limits, Read, RingReader};
+use ridgewatch_wire::{Following, Geometry, Limits, Read, RingReader};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-fn fortran() -> bool {
-    Command::new("gfortran").arg("--version").output().is_ok_and(|out| out.status.success())
-}
-
 #[test]
+#[ignore = "needs gfortran; make test-adapters installs it"]
 fn fortran_arrays_arrive_as_they_are() {
-    if !fortran() {
-        println!("NOT RUN: the Fortran module, since gfortran is not installed");
-        return;
-    }
     let build = std::env::temp_dir().join(format!("rw-fortran-{}", std::process::id()));
     std::fs::create_dir_all(&build).unwrap();
     let ring = PathBuf::from("/dev/shm").join(format!("rw-fortran-{}", std::process::id()));
@@ -33,9 +26,10 @@ fn fortran_arrays_arrive_as_they_are() {
         .arg(&library)
         .arg("-lridgewatch_adapter")
         .output()
-        .unwrap();
+        .expect("gfortran");
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let following = Following::begin(&ring).unwrap();
+    let following_globe = Following::begin(&ring.join("globe")).unwrap();
     let out = Command::new(&program).env("LD_LIBRARY_PATH", &library).env("RIDGEWATCH_RING", &ring).output().unwrap();
     assert!(out.status.success(), "{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
     let mut reader = RingReader::open(&ring, 0, &Limits::default()).unwrap();
@@ -54,7 +48,14 @@ fn fortran_arrays_arrive_as_they_are() {
         }
     }
     assert_eq!(reader.read(&mut values).unwrap(), Read::Ended);
-    drop(following);
+    let globe = ring.join("globe");
+    let mut reader = RingReader::open(&globe, 0, &Limits::default()).unwrap();
+    let description = &reader.header().description;
+    assert_eq!((description.geometry, description.shape()), (Geometry::Sphere { radius: 6.371e6 }, [4, 3, 1]));
+    assert_eq!((description.axes[0].period, description.axes[1].coordinates.as_slice()), (Some(360.0), &[-60.0, 0.0, 60.0][..]));
+    let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step on the globe") };
+    assert_eq!((info.step, info.time, values.as_slice()), (7, 2.0, (1..=24).map(|n| n as f32).collect::<Vec<_>>().as_slice()));
+    drop((following_globe, following));
     std::fs::remove_dir_all(&build).unwrap();
     assert!(!ring.exists());
 }

@@ -5,6 +5,8 @@ use pyo3::exceptions::{PyException, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE};
 use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::Duration;
 
 pyo3::create_exception!(_core, RidgewatchError, PyException, "The ring could not be opened, or a step was refused.");
@@ -13,14 +15,21 @@ fn refused(error: ridgewatch_wire::WireError) -> PyErr {
     RidgewatchError::new_err(error.to_string())
 }
 
-/// Publishes into a ring.
-#[pyclass]
+/// Publishes into a ring. Frozen: while one thread copies a step, others may call anything here.
+#[pyclass(frozen)]
 struct Publisher {
-    producer: Option<Producer>,
+    /// None where publishing is off or closed; the ring ends with the last call that still publishes.
+    producer: Mutex<Option<Arc<Producer>>>,
     dimensions: usize,
     reversed: bool,
-    published: u64,
-    overwrote: u64,
+    published: AtomicU64,
+    overwrote: AtomicU64,
+}
+
+impl Publisher {
+    fn producer(&self) -> MutexGuard<'_, Option<Arc<Producer>>> {
+        self.producer.lock().unwrap_or_else(|broken| broken.into_inner())
+    }
 }
 
 /// One component as it lies in memory.
@@ -128,15 +137,16 @@ impl Publisher {
         let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
         let policy = if wait_ms == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(wait_ms)) };
         let producer = match ring.or_else(named) {
-            Some(ring) => Some(Producer::open(&ring, description, slots, policy).map_err(refused)?),
+            Some(ring) => Some(Arc::new(Producer::open(&ring, description, slots, policy).map_err(refused)?)),
             None => None,
         };
-        Ok(Self { producer, dimensions, reversed, published: 0, overwrote: 0 })
+        let (published, overwrote) = (AtomicU64::new(0), AtomicU64::new(0));
+        Ok(Self { producer: Mutex::new(producer), dimensions, reversed, published, overwrote })
     }
 
     #[pyo3(signature = (step, time, u, v, w=None))]
     fn publish(
-        &mut self,
+        &self,
         py: Python<'_>,
         step: u64,
         time: f64,
@@ -144,7 +154,7 @@ impl Publisher {
         v: &Bound<'_, PyAny>,
         w: Option<&Bound<'_, PyAny>>,
     ) -> PyResult<bool> {
-        let Some(producer) = &self.producer else { return Ok(false) };
+        let Some(producer) = self.producer().clone() else { return Ok(false) };
         let given: Vec<&Bound<'_, PyAny>> = [Some(u), Some(v), w].into_iter().flatten().collect();
         if given.len() != self.dimensions {
             return Err(PyValueError::new_err(format!("{} components; accepted: {}, one an axis", given.len(), self.dimensions)));
@@ -164,31 +174,35 @@ impl Publisher {
         let published = py.detach(|| {
             let components: Vec<*const u8> = addresses.iter().map(|address| *address as *const u8).collect();
             // SAFETY: the buffers' shapes and strides were checked against the block's extent.
-            unsafe { producer.publish(step, time, &Field { components: &components, element, strides }) }
+            let published = unsafe { producer.publish(step, time, &Field { components: &components, element, strides }) };
+            // Where `close` came meanwhile, the ring ends here, with Python's other threads running.
+            drop(producer);
+            published
         });
         let published = published.map_err(refused)?;
-        self.published = published.count;
-        self.overwrote += u64::from(published.overwrote);
+        self.published.fetch_max(published.count, Ordering::Relaxed);
+        self.overwrote.fetch_add(u64::from(published.overwrote), Ordering::Relaxed);
         Ok(true)
     }
 
-    fn close(&mut self) {
-        self.producer = None;
+    fn close(&self) {
+        let producer = self.producer().take();
+        drop(producer);
     }
 
     #[getter]
     fn is_open(&self) -> bool {
-        self.producer.is_some()
+        self.producer().is_some()
     }
 
     #[getter]
     fn published(&self) -> u64 {
-        self.published
+        self.published.load(Ordering::Relaxed)
     }
 
     #[getter]
     fn overwrote(&self) -> u64 {
-        self.overwrote
+        self.overwrote.load(Ordering::Relaxed)
     }
 
     fn __enter__(this: Py<Self>) -> Py<Self> {
@@ -196,7 +210,7 @@ impl Publisher {
     }
 
     #[pyo3(signature = (*_arguments))]
-    fn __exit__(&mut self, _arguments: &Bound<'_, pyo3::types::PyTuple>) {
+    fn __exit__(&self, _arguments: &Bound<'_, pyo3::types::PyTuple>) {
         self.close();
     }
 }

@@ -4,6 +4,8 @@ import os
 import shutil
 import struct
 import tempfile
+import threading
+import time
 
 import numpy as np
 import pytest
@@ -66,6 +68,68 @@ def test_order_xyz(ring):
     with Publisher(np.arange(5.0), np.arange(3.0), order="xyz") as publisher:
         publisher.publish(0, 0.0, field[0], field[1])
         assert np.array_equal(newest(ring, (3, 5))[2], field.transpose(0, 2, 1))
+
+
+def test_longitude_and_latitude(ring):
+    longitude, latitude = np.arange(0.0, 360.0, 90.0), np.array([-60.0, 0.0, 70.0])
+    field = np.random.default_rng(2).random((2, 3, 4))
+    with Publisher(longitude, latitude, periods=[360.0, None], radius=6.371e6, time_unit="h") as publisher:
+        assert publisher.publish(4, 2.5, *field)
+        data = open(os.path.join(ring, "block-00000.ring"), "rb").read()
+        assert struct.unpack_from("<IId", data, 8192) == (1, 2, 6.371e6)
+        # Behind index and count, offset and extent: the time's unit, then the first axis, its name, unit, period, nodes, coordinates.
+        assert data[8192 + 80 : 8192 + 85] == b"\x01\0\0\0h"
+        assert struct.unpack_from("<I1sIdQ4d", data, 8192 + 85) == (1, b"x", 0, 360.0, 4, *longitude)
+        step, time, values = newest(ring, (3, 4))
+        assert (step, time) == (4, 2.5) and np.array_equal(values, field.astype(np.float32))
+    with pytest.raises(RidgewatchError, match="radius"):
+        Publisher(longitude, latitude, radius=-1.0)
+
+
+def test_other_threads_run_and_publish_meanwhile(ring):
+    size, threads, steps = 512, 4, 50
+    x = np.arange(float(size))
+    failed = []
+    with Publisher(x, x, slots=8) as publisher:
+
+        def publish(thread):
+            field = np.full((size, size), thread, np.float32)
+            try:
+                for step in range(steps):
+                    assert publisher.publish(step, float(step), field, field)
+                    assert publisher.is_open and publisher.published > 0 and publisher.overwrote >= 0
+            except BaseException as error:
+                failed.append(error)
+
+        workers = [threading.Thread(target=publish, args=(n,)) for n in range(threads)]
+        for worker in workers:
+            worker.start()
+        for worker in workers:
+            worker.join()
+        assert not failed
+        assert publisher.published == threads * steps
+        values = newest(ring, (size, size))[2]
+        assert values[0, 0, 0] in range(threads) and np.all(values == values[0, 0, 0])
+
+
+def test_closing_while_another_thread_publishes(ring):
+    """A thread that waits for ridgewatch (which never comes) keeps the ring, and `close` does not wait for that thread."""
+    x = np.arange(4.0)
+    good = np.zeros((4, 4), np.float32)
+    publisher = Publisher(x, x, slots=2, wait_ms=2000)
+    answers = []
+    worker = threading.Thread(target=lambda: answers.extend(publisher.publish(n, float(n), good, good) for n in range(4)))
+    worker.start()
+    # Two steps fill the ring; the third waits.
+    while publisher.published < 2:
+        time.sleep(0.01)
+    time.sleep(0.3)
+    publisher.close()
+    assert worker.is_alive() and not publisher.is_open and os.path.exists(ring)
+    worker.join()
+    # The fourth found it closed.
+    assert answers == [True, True, True, False] and not os.path.exists(ring)
+    assert publisher.publish(9, 9.0, good, good) is False
 
 
 def test_refusals(ring):

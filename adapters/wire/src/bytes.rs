@@ -57,6 +57,14 @@ impl<'a> Parser<'a> {
         }
     }
 
+    /// A version, of which one is known.
+    pub fn version(&mut self, known: u32) -> Result<(), WireError> {
+        match self.u32()? {
+            found if found == known => Ok(()),
+            found => Err(WireError::Version { what: self.what, found, known }),
+        }
+    }
+
     /// Nothing may be left.
     pub fn end(&self) -> Result<(), WireError> {
         if self.at == self.bytes.len() {

@@ -48,8 +48,10 @@ pub enum WireError {
         found: [u8; 8],
     },
     /// Written by another version.
-    #[error("version {found}; this is version {known} and knows no other")]
+    #[error("{what} has version {found}; this is version {known} and knows no other")]
     Version {
+        /// What of it.
+        what: &'static str,
         /// What it says.
         found: u32,
         /// What is known.

@@ -90,15 +90,12 @@ impl Header {
 
     /// Length of the description that a fixed part announces.
     pub(crate) fn description_bytes(fixed: &[u8; FIXED]) -> Result<usize, WireError> {
-        let mut input = Parser::new("the header", fixed);
+        let mut input = Parser::new("the ring", fixed);
         let found = input.array()?;
         if found != MAGIC {
             return Err(WireError::NotARing { found });
         }
-        let version = input.u32()?;
-        if version != VERSION {
-            return Err(WireError::Version { found: version, known: VERSION });
-        }
+        input.version(VERSION)?;
         let bytes = input.u32()?;
         if bytes > DESCRIPTION_BYTES {
             return Err(WireError::TooLarge { what: "the description", needed: bytes.into(), limit: DESCRIPTION_BYTES.into() });

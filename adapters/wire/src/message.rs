@@ -117,7 +117,7 @@ impl ConnectionFile {
         };
         let version = value("ridgewatch-connection")?;
         if version != "1" {
-            return Err(WireError::Version { found: version.parse().unwrap_or(0), known: 1 });
+            return Err(WireError::Version { what: "the connection file", found: version.parse().unwrap_or(0), known: 1 });
         }
         let address = value("address")?.to_owned();
         let hex = value("key")?.as_bytes();
@@ -251,10 +251,7 @@ impl Session {
         if magic != ASK_MAGIC {
             return Err(WireError::field("magic", format_args!("{magic:02x?}"), "what a follower asks"));
         }
-        let version = input.u32()?;
-        if version != VERSION {
-            return Err(WireError::Version { found: version, known: VERSION });
-        }
+        input.version(VERSION)?;
         let number = input.u64()?;
         if number <= self.asked {
             return Err(WireError::Replayed { found: number, newest: self.asked });
@@ -356,10 +353,7 @@ impl Session {
         if magic != MAGIC {
             return Err(WireError::field("magic", format_args!("{magic:02x?}"), "a message of a relay"));
         }
-        let version = input.u32()?;
-        if version != VERSION {
-            return Err(WireError::Version { found: version, known: VERSION });
-        }
+        input.version(VERSION)?;
         let number = input.u64()?;
         if number <= self.number {
             return Err(WireError::Replayed { found: number, newest: self.number });
@@ -402,10 +396,7 @@ fn read_greeting(from: &mut impl Read) -> Result<[u8; 32], WireError> {
     if found != GREETING {
         return Err(WireError::field("greeting", format_args!("{found:02x?}"), "that of a ridgewatch relay or follower"));
     }
-    let version = input.u32()?;
-    if version != VERSION {
-        return Err(WireError::Version { found: version, known: VERSION });
-    }
+    input.version(VERSION)?;
     input.array()
 }
 
@@ -415,6 +406,58 @@ mod tests {
     use crate::counting::{HELD, PEAK};
     use crate::{AxisDescription, Geometry};
     use std::io::Cursor;
+
+    /// What a peer says, and what it is told.
+    struct Peer(Cursor<Vec<u8>>, Vec<u8>);
+
+    impl Read for Peer {
+        fn read(&mut self, to: &mut [u8]) -> std::io::Result<usize> {
+            self.0.read(to)
+        }
+    }
+
+    impl Write for Peer {
+        fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
+            self.1.write(from)
+        }
+
+        fn flush(&mut self) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn another_version_is_refused_by_name_in_greeting_message_and_ask() {
+        let key = Key([1; 32]);
+        let session = || Session { key: key.clone(), number: 0, asked: 0 };
+        // Under the session's own signature, so that the version alone is wrong.
+        let older = |mut bytes: Vec<u8>, head: usize| {
+            bytes[4..8].copy_from_slice(&1u32.to_le_bytes());
+            let signature = key.signature(&[&bytes[..head]]);
+            bytes[head..head + SIGNATURE].copy_from_slice(&signature);
+            bytes
+        };
+        let mut greeted = greeting(&[7; 32]);
+        greeted[12..16].copy_from_slice(&1u32.to_le_bytes());
+        let peer = || Peer(Cursor::new(greeted.clone()), Vec::new());
+        let (mut message, mut ask) = (Vec::new(), Vec::new());
+        let facts = Facts { kind: Kind::Pulse, block: 0, generation: 1, step: 2, time: 3.0, published: 4, missed: 0 };
+        session().send(&mut message, &facts, None, &[]).unwrap();
+        session().ask(&mut ask, Ask::Next).unwrap();
+        let message = older(message, HEAD);
+        let ask: [u8; ASK_BYTES] = older(ask, ASK_BYTES - SIGNATURE).try_into().unwrap();
+        let received = session().receive(&mut Cursor::new(message), &Limits::default(), &mut |_, _| None, &mut Vec::new());
+        for (found, what) in [
+            (Session::accept(&mut peer(), &key).err(), "the greeting"),
+            (Session::connect(&mut peer(), &key).err(), "the greeting"),
+            (received.err(), "a message"),
+            (session().check_ask(&ask).err(), "what a follower asks"),
+        ] {
+            let error = found.unwrap();
+            assert!(matches!(error, WireError::Version { what: w, found: 1, known: VERSION } if w == what), "{what}: {error}");
+            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 2 and knows no other"));
+        }
+    }
 
     /// A peer that has the key and lies: heads and descriptions are changed, then hashed and signed as if they were meant so. Memory: that of the
     /// description as announced, which the limit on descriptions bounds, of a step, of the description's parts and of an error's words.

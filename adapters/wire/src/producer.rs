@@ -57,7 +57,7 @@ struct Writer {
 
 /// What followers have taken.
 #[derive(Debug, Clone, Copy)]
-struct Taken {
+struct Progress {
     /// Steps that all of them have.
     steps: u64,
     /// Followers came, and none of them is heard of any more: nobody waits for them. One that never came is waited for.
@@ -172,7 +172,7 @@ impl Producer {
     fn has_room(&self, writer: &mut Writer) -> bool {
         let slots = u64::from(self.header.slots);
         let free = |taken: u64| writer.count < taken.saturating_add(slots);
-        let mut seen = self.taken();
+        let mut seen = self.progress();
         if free(seen.steps) {
             return true;
         }
@@ -185,7 +185,7 @@ impl Producer {
         while !seen.silent && system::monotonic().saturating_sub(begin) < limit {
             std::thread::sleep(nap);
             nap = (nap * 2).min(Duration::from_millis(1));
-            seen = self.taken();
+            seen = self.progress();
             if free(seen.steps) {
                 return true;
             }
@@ -195,7 +195,7 @@ impl Producer {
     }
 
     /// What the followers' marks say: those that fell silent count only where no other is left.
-    fn taken(&self) -> Taken {
+    fn progress(&self) -> Progress {
         let now = system::monotonic();
         let (mut least, mut left) = (None, None);
         for mark in 0..MARKS as usize {
@@ -211,7 +211,7 @@ impl Producer {
                 left = left.max(Some(steps));
             }
         }
-        Taken { steps: least.or(left).unwrap_or(0), silent: least.is_none() && left.is_some() }
+        Progress { steps: least.or(left).unwrap_or(0), silent: least.is_none() && left.is_some() }
     }
 
     /// The word at a multiple of 8.

@@ -150,7 +150,7 @@ fn connection_files_are_private_and_checked() {
     assert_eq!(ConnectionFile::read(&path).unwrap(), file);
     let text = std::fs::read_to_string(&path).unwrap();
     for (changed, expected) in [
-        (text.replace("connection = 1", "connection = 2"), "version 2"),
+        (text.replace("connection = 1", "connection = 2"), "the connection file has version 2; this is version 1"),
         (text.replace("key = ", "key = zz"), "66 characters"),
         (text.replace("address", "adress"), "`address` is missing"),
         (String::new(), "`ridgewatch-connection` is missing"),
@@ -160,6 +160,17 @@ fn connection_files_are_private_and_checked() {
         assert!(error.contains(expected), "{error}");
     }
     std::fs::set_permissions(&path, PermissionsExt::from_mode(0o644)).unwrap();
-    assert!(matches!(ConnectionFile::read(&path), Err(WireError::Foreign { .. })));
+    assert!(matches!(ConnectionFile::read(&path), Err(WireError::Foreign { found, .. }) if found == "has mode 0644"));
     std::fs::remove_dir_all(&folder).unwrap();
+}
+
+#[test]
+#[ignore = "gives a file to another user, which needs root"]
+fn a_connection_file_of_another_user_is_refused() {
+    let path = std::env::temp_dir().join(format!("rw-connection-theirs-{}", std::process::id()));
+    ConnectionFile { address: "127.0.0.1:4711".into(), key: Key::random().unwrap() }.write(&path).unwrap();
+    std::os::unix::fs::chown(&path, Some(12345), None).unwrap();
+    let read = ConnectionFile::read(&path);
+    std::fs::remove_file(&path).unwrap();
+    assert!(matches!(read, Err(WireError::Foreign { found, .. }) if found == "belongs to user 12345"));
 }

@@ -40,9 +40,14 @@ class Publisher:
         """
 
     def publish(self, step: int, time: float, u: Field, v: Field, w: Field | None = None) -> bool:
-        """Copies a step into the ring; False where publishing is off. The arrays have one shape, dtype and strides."""
+        """Copies a step into the ring; False where publishing is off. The arrays have one shape, dtype and strides.
 
-    def close(self) -> None: ...
+        Threads may publish at once, and other threads of Python run meanwhile: let none of them write into the arrays.
+        """
+
+    def close(self) -> None:
+        """Ends the ring, after what other threads are publishing."""
+
     @property
     def is_open(self) -> bool: ...
     @property

@@ -67,7 +67,7 @@ fn two_producers_of_one_name_and_what_a_killed_one_leaves() {
 }
 
 #[test]
-fn rings_of_others_links_and_odd_files_are_refused() {
+fn open_rings_links_and_odd_files_are_refused() {
     let folder = Folder::new("foreign");
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     let path = block_path(&folder.0, 0);
@@ -75,18 +75,6 @@ fn rings_of_others_links_and_odd_files_are_refused() {
     std::fs::set_permissions(&path, PermissionsExt::from_mode(0o640)).unwrap();
     assert!(matches!(open(), WireError::Foreign { found, .. } if found == "has mode 0640"));
     std::fs::set_permissions(&path, PermissionsExt::from_mode(0o600)).unwrap();
-    // SAFETY: a call of the system on a path that lives.
-    if unsafe { libc::geteuid() } == 0 {
-        std::os::unix::fs::chown(&path, Some(12345), None).unwrap();
-        assert!(matches!(open(), WireError::Foreign { found, .. } if found == "belongs to user 12345"));
-        std::os::unix::fs::chown(&path, Some(0), None).unwrap();
-        let theirs = folder.0.join("theirs");
-        std::fs::create_dir(&theirs).unwrap();
-        std::os::unix::fs::chown(&theirs, Some(12345), None).unwrap();
-        let error = Producer::open(&theirs, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
-        assert!(matches!(error, WireError::Foreign { .. }), "{error}");
-        std::fs::remove_dir(&theirs).unwrap();
-    }
     let moved = folder.0.join("moved");
     std::fs::rename(&path, &moved).unwrap();
     std::os::unix::fs::symlink(&moved, &path).unwrap();
@@ -104,6 +92,20 @@ fn rings_of_others_links_and_odd_files_are_refused() {
     assert!(error.contains("others may write into"), "{error}");
     std::fs::remove_dir(&open_to_all).unwrap();
     drop(producer);
+}
+
+#[test]
+#[ignore = "gives a ring to another user, which needs root"]
+fn rings_and_folders_of_another_user_are_refused() {
+    let folder = Folder::new("theirs");
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    let theirs = |error: WireError| matches!(error, WireError::Foreign { found, .. } if found == "belongs to user 12345");
+    std::os::unix::fs::chown(block_path(&folder.0, 0), Some(12345), None).unwrap();
+    assert!(theirs(RingReader::open(&folder.0, 0, &Limits::default()).unwrap_err()));
+    drop(producer);
+    std::fs::create_dir_all(&folder.0).unwrap();
+    std::os::unix::fs::chown(&folder.0, Some(12345), None).unwrap();
+    assert!(theirs(Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err()));
 }
 
 /// A ring that is there whole, then changed.
@@ -128,7 +130,7 @@ fn changed(change: impl Fn(&Path), limits: &Limits) -> WireError {
 fn damaged_rings_have_their_own_errors() {
     let limits = Limits::default();
     assert!(matches!(changed(|p| overwrite(p, 0, b"RIFF"), &limits), WireError::NotARing { .. }));
-    assert!(matches!(changed(|p| overwrite(p, 8, &[1]), &limits), WireError::Version { found: 1, known: 2 }));
+    assert!(matches!(changed(|p| overwrite(p, 8, &[1]), &limits), WireError::Version { what: "the ring", found: 1, known: 2 }));
     assert!(matches!(changed(|p| overwrite(p, 12, &[255; 4]), &limits), WireError::TooLarge { .. }));
     assert!(matches!(changed(|p| overwrite(p, 24, &[3]), &limits), WireError::Checksum { .. }));
     assert!(matches!(changed(|p| overwrite(p, 8200, &[77]), &limits), WireError::Checksum { .. }));
