@@ -173,7 +173,7 @@ fn parts_of_a_batch_add_up() {
     for name in ["wide, tables", "deep, frequency"] {
         let case = cases().into_iter().find(|case| case.name == name).unwrap();
         let (model, objective, _) = prepare(&case);
-        assert!(!is_fused(&model.shape), "{name}");
+        assert!(!is_fused(&model.shape, gpu().shared_memory()), "{name}");
         let (model, samples) = (settled(&model), labels(MANY, 12));
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         let found = predict(&network, &samples.points);
