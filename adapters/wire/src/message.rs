@@ -152,7 +152,7 @@ pub enum Kind {
 pub enum Ask {
     /// The next message, please.
     Next,
-    /// Nothing yet, but the follower lives and will ask again.
+    /// The follower lives. What it asked before stands; where nothing stands it will ask again.
     Hold,
 }
 

@@ -98,7 +98,8 @@ impl Strangers {
         if there.len() > STRANGERS
             && let Some((_, oldest)) = there.pop_front()
         {
-            oldest.shutdown(Shutdown::Both)?;
+            // It may have gone by itself.
+            let _ = oldest.shutdown(Shutdown::Both);
         }
         Ok(())
     }
@@ -388,8 +389,9 @@ impl Receiving {
     fn session(&mut self, stream: &TcpStream, mut session: Session) -> Result<Result<(), WireError>, Left> {
         let mut from = BufReader::with_capacity(1 << 16, stream);
         self.blocks.values_mut().for_each(|known| known.announced = false);
+        let mut ask = Ask::Next;
         while !self.stop.load(Ordering::Relaxed) {
-            if let Err(error) = session.ask(&mut &*stream, Ask::Next) {
+            if let Err(error) = session.ask(&mut &*stream, ask) {
                 return Ok(Err(error));
             }
             let mut values = self.spare.try_recv().unwrap_or_default();
@@ -402,6 +404,8 @@ impl Receiving {
                 Ok(facts) => facts,
                 Err(error) => return Ok(Err(error)),
             };
+            // A pulse is no answer: what was asked stands.
+            ask = if facts.kind == Kind::Pulse { Ask::Hold } else { Ask::Next };
             let Facts { block, generation, step, time, published, missed, .. } = facts;
             // All that is there is announced before the first step.
             if facts.kind != Kind::Opened {
@@ -467,4 +471,43 @@ fn connect(place: &ConnectionFile) -> Result<(TcpStream, Session), WireError> {
     let stream = TcpStream::connect_timeout(&found, PATIENCE).map_err(broken)?;
     let session = greet(&stream, |within| Session::connect(within, &place.key))?;
     Ok((stream, session))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::fd::AsRawFd;
+
+    /// Closes a connection by a reset.
+    fn reset(stream: TcpStream) {
+        let at_once = libc::linger { l_onoff: 1, l_linger: 0 };
+        // SAFETY: an option of a socket that lives, with its own type.
+        let done = unsafe {
+            let (value, length) = ((&raw const at_once).cast(), size_of_val(&at_once) as libc::socklen_t);
+            libc::setsockopt(stream.as_raw_fd(), libc::SOL_SOCKET, libc::SO_LINGER, value, length)
+        };
+        assert_eq!(done, 0);
+    }
+
+    #[test]
+    fn a_stranger_that_resets_its_connection_costs_nobody_else_a_place() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap();
+        let strangers = Strangers::default();
+        let mut there = Vec::new();
+        for n in 0..STRANGERS + 2 {
+            let client = TcpStream::connect(address).unwrap();
+            let (stream, peer) = listener.accept().unwrap();
+            if n == 0 {
+                reset(client);
+                // It has arrived, and nobody has taken the oldest from the list yet.
+                assert!((&stream).read(&mut [0]).is_err());
+                assert!(stream.shutdown(Shutdown::Both).is_err(), "a reset connection cannot be shut down");
+            } else {
+                there.push(client);
+            }
+            strangers.come(peer, &stream).unwrap();
+        }
+        assert_eq!(strangers.0.lock().unwrap().len(), STRANGERS);
+    }
 }

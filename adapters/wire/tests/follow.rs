@@ -2,9 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch_wire::message::{ConnectionFile, Key, Session};
+use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::relay::{RelayCounts, RelayFollower, serve};
 use ridgewatch_wire::{AxisDescription, Description, Element, Event, Field, Geometry, Limits, Policy, Producer, RingFollower, WireError};
+use std::io::Read;
 use std::net::{TcpListener, TcpStream};
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -288,6 +289,38 @@ fn a_follower_that_holds_is_not_cut_off_and_holds_the_solver() {
     assert_eq!(relay.counts.accepted.load(Ordering::Relaxed), 1, "one connection all the while");
     drop(solver.join().unwrap());
     assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+}
+
+#[test]
+fn a_pulse_is_no_answer_and_what_was_asked_is_not_asked_again() {
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let key = Key::random().unwrap();
+    let file = ConnectionFile { address: listener.local_addr().unwrap().to_string(), key: key.clone() };
+    let mut follower = RelayFollower::begin(Box::new(move || Ok(file.clone())), Limits::default(), LONG).unwrap();
+    const SENT: [Kind; 7] = [Kind::Pulse, Kind::Opened, Kind::Pulse, Kind::Pulse, Kind::Step, Kind::Pulse, Kind::Ended];
+    // Says all that a relay may say, and notes what it is asked before each and at last.
+    let relay = std::thread::spawn(move || {
+        let mut stream = listener.accept().unwrap().0;
+        stream.set_read_timeout(Some(Duration::from_secs(5))).unwrap();
+        let mut session = Session::accept(&mut stream, &key).unwrap();
+        let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 1, step: 0, time: 0.0, published: 0, missed: 0 };
+        let mut asked = Vec::new();
+        for answer in SENT.map(Some).into_iter().chain([None]) {
+            let mut bytes = [0; ASK_BYTES];
+            stream.read_exact(&mut bytes).unwrap();
+            asked.push(session.check_ask(&bytes).unwrap());
+            let Some(kind) = answer else { break };
+            let announced = (kind == Kind::Opened).then(|| description(2));
+            let values: &[f32] = if kind == Kind::Step { &[0.0; 8] } else { &[] };
+            session.send(&mut stream, &Facts { kind, ..quiet }, announced.as_ref(), values).unwrap();
+        }
+        asked
+    });
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    assert_eq!(events(&mut poll, "ended"), ["opened 2", "step 0 missed 0", "ended true"]);
+    // The first, then one after each answer; after a pulse that the follower lives.
+    let expected = std::iter::once(Ask::Next).chain(SENT.map(|kind| if kind == Kind::Pulse { Ask::Hold } else { Ask::Next }));
+    assert_eq!(relay.join().unwrap(), expected.collect::<Vec<_>>());
 }
 
 #[test]
