@@ -1,9 +1,14 @@
 //! What runs on a GPU, against the f64 reference on the CPU. Every test needs a device and is ignored elsewhere; `make gpu-check` runs
-//! them where one is. inputs are other ones in every run; fresh device memory and outputs are poisoned.
+//! them where one is. Inputs are other ones in every run; fresh device memory and outputs are poisoned.
 
 #![cfg(feature = "cuda")]
 // Helpers of a test may unwrap, and figures are printed for the record.
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
+
+/// Prints a figure that `gpu-check` puts on its page.
+macro_rules! measured {
+    ($($figure:tt)*) => { println!("measured: {}", format_args!($($figure)*)) };
+}
 
 #[path = "gpu/answers.rs"]
 mod answers;

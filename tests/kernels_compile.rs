@@ -67,8 +67,8 @@ fn variants(source: &str) -> Vec<Vec<String>> {
         ],
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
         "network.cu" => networks(|_| true),
-        "network_fused.cu" => networks(is_fused),
-        "network_batched.cu" => networks(|shape| !is_fused(shape))
+        "network_fused.cu" => networks(|shape| is_fused(shape, usize::MAX)),
+        "network_batched.cu" => networks(|_| true)
             .iter()
             .flat_map(|defines| batched_defines().map(|more| [defines.as_slice(), more.as_slice()].concat()))
             .collect(),

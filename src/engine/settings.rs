@@ -182,8 +182,8 @@ pub struct TrainingSettings {
     /// Share of the threads that train while the others render (at least one thread each; with a single thread they take turns). Where a GPU
     /// trains: of the device's time, in turns with the picture.
     pub share: f64,
-    /// Wall-clock seconds of training that every frame gets at least: the next frame waits for them. None: 1 where the CPU trains; where a
-    /// GPU does, what `share` gives.
+    /// Wall-clock seconds of training that every frame gets: at least, where the CPU trains (the next frame waits for them), and at most while
+    /// a simulation is waited for. None: 1 where the CPU trains; where a GPU does, what `share` gives.
     pub seconds_per_frame: Option<f64>,
     /// Exactly so many optimizer steps a frame instead: slower, but the same on every run.
     pub steps_per_frame: Option<u64>,

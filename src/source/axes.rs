@@ -59,11 +59,6 @@ impl FileOrder {
             () => Self::Unsorted,
         }
     }
-
-    /// In words.
-    pub(super) fn name(self) -> &'static str {
-        ["ascending", "descending", "unsorted"][self as usize]
-    }
 }
 
 impl AxisPlan {

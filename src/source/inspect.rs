@@ -8,7 +8,7 @@ use super::container::{Container, Header};
 use super::layout::Planner;
 use super::settings::ArchiveSettings;
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
-use crate::setting::Refused;
+use crate::setting::{Refused, word};
 use serde::Serialize;
 use std::fmt;
 use std::path::PathBuf;
@@ -350,7 +350,7 @@ impl fmt::Display for Inspection {
             let period = axis.period.map(|p| format!(", periodic with {p}")).unwrap_or_default();
             match &axis.in_file {
                 Some(InFile { first, last, units, order }) => {
-                    writeln!(f, "{period}; in the file {} to {} {units}, {}", Short(*first), Short(*last), order.name())?;
+                    writeln!(f, "{period}; in the file {} to {} {units}, {}", Short(*first), Short(*last), word(order))?;
                 }
                 None => writeln!(f, "{period}; made, ascending")?,
             }

@@ -262,9 +262,7 @@ impl Staggered {
         let mean = |sum: f64| (sum / count.max(1) as f64).sqrt();
         Ok([mean(wrong), mean(size)])
     }
-}
 
-impl Staggered {
     /// What is to be said of a grid that moves.
     fn moves(&self) -> Option<String> {
         let cells = [0, 1].map(|k| self.reach.greatest[k] - self.reach.least[k]);
@@ -485,7 +483,7 @@ fn mean_heights(staggered: &Staggered, full: &[f32]) -> Vec<f64> {
         heights.push(0.5 * (pair[0] + pair[1]));
         heights.push(pair[1]);
     }
-    // Above the highest half level there is no u.
+    // u lies on half levels: the grid ends at the highest of them, where it is lowest.
     let (below, top) = (&full[full.len() - 2 * plane..][..plane], &full[full.len() - plane..]);
     let highest = below.iter().zip(top).map(|(a, b)| 0.5 * (f64::from(*a) + f64::from(*b))).fold(f64::INFINITY, f64::min);
     heights.retain(|&z| z < highest);

@@ -415,7 +415,7 @@ impl Trainer {
         Ok(losses)
     }
 
-    /// After the last step of a call: what predicts is up to date, and every few seconds it comes back from where it is trained.
+    /// After the last step of a call: what predicts is up to date, and every minute or so it comes back from where it is trained.
     fn settle(&mut self) -> Result<(), DeviceLost> {
         let restart = self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY;
         if let Some(away) = &mut self.away {

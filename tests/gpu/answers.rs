@@ -174,10 +174,8 @@ fn pictures_agree(stage: &Stage, how: &How<'_>, name: &str) -> Tally {
         let (expected, cpu_stats, cpu_tally) = stage.on_cpu(&mut cpu, frame, samples, how);
         let (found, stats, tally, _) = stage.on_gpu(&mut side, &mut renderer, frame, samples, how);
         let psnr = compare_films(&found, &expected, stage.scene.settings.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-        println!(
-            "{name}, frame {frame}, {samples} samples: {psnr:.1} dB; CPU {cpu_tally:?}; GPU {tally:?}; {:?}",
-            side.renderer.timeline()
-        );
+        measured!("{name}, {samples} samples: {psnr:.1} dB, {} and {} queries", tally.queries, cpu_tally.queries);
+        println!("CPU {cpu_tally:?}; GPU {tally:?}; {:?}", side.renderer.timeline());
         assert_eq!(stats.paths, cpu_stats.paths);
         near(tally.queries, cpu_tally.queries, "queries");
         near(tally.traced, cpu_tally.traced, "traced");
@@ -376,10 +374,7 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
             let (gpu, cpu) = (&found.record, &expected.record);
-            println!(
-                "{method}: traced share {:.3} and {:.3}, trusted share {:.3} and {:.3}, {:?}",
-                gpu.traced_share, cpu.traced_share, gpu.trusted_share, cpu.trusted_share, gpu.seconds
-            );
+            println!("{method}: trusted share {:.3} and {:.3}, {:?}", gpu.trusted_share, cpu.trusted_share, gpu.seconds);
             assert!(gpu.device.starts_with("cuda:0") && gpu.warnings == cpu.warnings, "{:?}", gpu.warnings);
             // Points ahead of their flights are answered by a GPU that walks, and by nobody else.
             assert!(gpu.traced_ahead > 0 && cpu.traced_ahead == 0);
@@ -387,7 +382,8 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
             // Cells at the edge of the tolerance may fall to either side: other labels are kept.
             assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_share - cpu.trusted_share).abs() < 0.05);
             let psnr = compare_films(&found.film, &expected.film, found.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-            println!("  {psnr:.1} dB; stated {:?} and {:?}", gpu.trusted, cpu.trusted);
+            measured!("a run, `{method}`: {psnr:.1} dB; traced share {:.3} and {:.3}", gpu.traced_share, cpu.traced_share);
+            println!("stated {:?} and {:?}", gpu.trusted, cpu.trusted);
             if let (Some(gpu), Some(cpu)) = (gpu.trusted.filter(|_| method == "surrogate"), cpu.trusted) {
                 // The same points, unless rounding puts one more into a cell.
                 assert!((gpu.optical_rms / cpu.optical_rms - 1.0).abs() < 0.02, "{gpu:?} for {cpu:?}");

@@ -110,7 +110,7 @@ fn predictions_are_the_references() {
             let apart: Vec<f64> = found.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b).collect();
             let worst = apart.iter().fold(0.0, |m: f64, e| if e.is_nan() { f64::INFINITY } else { m.max(e.abs()) });
             let error = norm(&apart) / norm(&expected);
-            println!("{}: {name}: relative {error:.1e}, worst {worst:.1e}", case.name);
+            measured!("{}: predictions off f64 ({name}) by {error:.1e} of their root mean square, {worst:.1e} at most", case.name);
             assert!(error < tolerance, "{}: {name}: {error}", case.name);
             assert!(worst < 20.0 * tolerance * norm(&expected) / (expected.len() as f64).sqrt(), "{}: {name}: {worst}", case.name);
         }
@@ -159,7 +159,7 @@ fn gradients_equal_finite_differences_and_burns() {
             apart.push(found[parameter] - differences[differences.len() - 1]);
         }
         let from_differences = norm(&apart) / norm(&differences);
-        println!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
+        measured!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
         // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
         assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
     }
@@ -173,7 +173,7 @@ fn parts_of_a_batch_add_up() {
     for name in ["wide, tables", "deep, frequency"] {
         let case = cases().into_iter().find(|case| case.name == name).unwrap();
         let (model, objective, _) = prepare(&case);
-        assert!(!is_fused(&model.shape), "{name}");
+        assert!(!is_fused(&model.shape, gpu().shared_memory()), "{name}");
         let (model, samples) = (settled(&model), labels(MANY, 12));
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         let found = predict(&network, &samples.points);
@@ -191,7 +191,7 @@ fn parts_of_a_batch_add_up() {
         let burns = gradients(&stock);
         let apart: Vec<f64> = found.iter().zip(&burns).map(|(a, b)| a - b).collect();
         let from_burn = norm(&apart) / norm(&burns);
-        println!("{name}: gradients of {MANY} samples off burn's by {from_burn:.1e}");
+        measured!("{name}: gradients of {MANY} samples off burn's by {from_burn:.1e}");
         assert!(from_burn < 3e-3, "{name}: {from_burn}");
     }
 }
@@ -291,7 +291,7 @@ fn training_learns_what_the_cpu_learns() {
     // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
     assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "first losses {} and {}", found[0], expected[0]);
     let mean = |losses: &[f64]| losses[losses.len() - 30..].iter().sum::<f64>() / 30.0;
-    println!("losses: device {:.2e} ... {:.3e}, CPU ... {:.3e}", found[0], mean(&found), mean(&expected));
+    measured!("losses of 150 steps on the same batches: GPU {:.2e} to {:.3e}, CPU to {:.3e}", found[0], mean(&found), mean(&expected));
     assert!((mean(&found) / mean(&expected) - 1.0).abs() < 0.15, "last losses {} and {}", mean(&found), mean(&expected));
     assert!(mean(&found) < 0.02 * found[0], "it learns");
     // What predicts is the mean, brought back or not.

@@ -82,8 +82,8 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
     let (cpu_first, cpu_last) = learned(&Device::CPU, None, "cpu");
     let (on_cpu, on_cpu_last) = learned(&Device::CPU, Some("gpu"), "gpu, then cpu");
     let (on_gpu, on_gpu_last) = learned(&gpu, Some("cpu"), "cpu, then gpu");
-    println!(
-        "dB: GPU {gpu_first:.2} to {gpu_last:.2}, then CPU {on_cpu:.2} to {on_cpu_last:.2}; CPU {cpu_first:.2} to {cpu_last:.2}, then GPU {on_gpu:.2} to {on_gpu_last:.2}"
+    measured!(
+        "what a network knows, dB: GPU {gpu_first:.2} to {gpu_last:.2}, then CPU {on_cpu:.2} to {on_cpu_last:.2}; CPU {cpu_first:.2} to {cpu_last:.2}, then GPU {on_gpu:.2} to {on_gpu_last:.2}"
     );
     assert!(gpu_last > gpu_first + 5.0 && cpu_last > cpu_first + 5.0, "both learn");
     assert!((gpu_last - cpu_last).abs() < 1.0, "as much");
@@ -117,8 +117,8 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
         difference_over_noise(&frames, &dealt).0 >= difference
     });
     let larger = larger.count();
-    println!(
-        "squared difference of the means over its variance: {difference:.3} on average over {pixels} pixels; {larger} of {DEALS} deals are as large"
+    measured!(
+        "frames with a network, {SEEDS} seeds each: squared difference of the means over its variance: {difference:.3} on average over {pixels} pixels; {larger} of {DEALS} deals are as large"
     );
     assert!(pixels > 200 && larger > 0, "{difference} over {pixels} pixels: in no deal of {DEALS} as large");
 }

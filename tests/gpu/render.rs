@@ -97,10 +97,17 @@ fn the_same_answers_give_the_cpu_s_picture() {
         // The third frame walks with tight majorants.
         for (frame, samples) in [(0, 0..2), (1, 3..11), (2, 0..64)] {
             let (expected, cpu_stats) = cpu.render_samples(frame, samples.clone(), &mut OnHost, None, &NEVER).unwrap();
-            let (found, stats) = on_gpu(&mut device, &gpu, &mut renderer, frame, samples);
+            let (found, stats) = on_gpu(&mut device, &gpu, &mut renderer, frame, samples.clone());
             assert_eq!((stats.paths, &found.samples), (cpu_stats.paths, &expected.samples));
             let psnr = compare_films(&found, &expected, tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
-            println!("frame {frame}: {psnr:.1} dB, queries {} and {}, {:?}", stats.queries, cpu_stats.queries, device.timeline());
+            let light = if point_light { "point light" } else { "directional light" };
+            measured!(
+                "answers alike, {light}, {} samples: {psnr:.1} dB, {} and {} queries",
+                samples.len(),
+                stats.queries,
+                cpu_stats.queries
+            );
+            println!("{:?}", device.timeline());
             // Rounding moves a collision by some 1e-7 of the box, which turns a decision about once in 1e5.
             assert!(psnr > 55.0, "frame {frame}: {psnr} dB");
             for (found, expected) in [
@@ -147,7 +154,7 @@ impl LogStretch for ByCpu {
 }
 
 /// Traced pictures of the same seed; `psnr` in dB is what they must reach.
-fn traced_pictures_agree(source: VelocitySource, map: &FlowMap, scene: Scene, samples: u32, least: f64) {
+fn traced_pictures_agree(name: &str, source: VelocitySource, map: &FlowMap, scene: Scene, samples: u32, least: f64) {
     let gpu = gpu();
     let host = cpu_tracer(source.clone(), map, 0.0).unwrap();
     let domain = host.domain().clone();
@@ -164,7 +171,7 @@ fn traced_pictures_agree(source: VelocitySource, map: &FlowMap, scene: Scene, sa
             device.render_samples(&mut renderer, frame, samples.clone(), &mut Traced(tracer.device()), None, &NEVER).unwrap();
         let comparison = compare_films(&found, &expected, tone_map).unwrap();
         let psnr = comparison.psnr.unwrap_or(f64::INFINITY);
-        println!("frame {frame}, {} samples: {psnr:.1} dB, queries {} and {}", samples.end, stats.queries, cpu_stats.queries);
+        measured!("traced, {name}, {} samples: {psnr:.1} dB, {} and {} queries", samples.end, stats.queries, cpu_stats.queries);
         assert_eq!((stats.paths, stats.traced), (cpu_stats.paths, stats.queries));
         // Unbiased counts: decisions that rounding turns go either way.
         assert!((stats.queries as f64 / cpu_stats.queries as f64 - 1.0).abs() < 2e-3, "{} for {}", stats.queries, cpu_stats.queries);
@@ -184,7 +191,7 @@ fn the_double_gyre_is_the_cpu_s_picture_to_50_db() {
     let transfer = TransferSettings { low: Some(0.05), high: Some(0.45), extinction: Some(60.0), ..TransferSettings::default() };
     let scene = Scene::assemble(&domain, Some(camera), Some(light), Some(transfer), settings, 3);
     // Answers that differ in their last places turn a decision now and then: more than the 55 dB of equal answers, fewer than 50 allow.
-    traced_pictures_agree(VelocitySource::Analytic(flow, domain), &map(10.0, 100, Boundary::Unbounded), scene, 64, 50.0);
+    traced_pictures_agree("double gyre", VelocitySource::Analytic(flow, domain), &map(10.0, 100, Boundary::Unbounded), scene, 64, 50.0);
 }
 
 #[test]
@@ -196,7 +203,7 @@ fn turbulence_is_the_cpu_s_picture() {
     let transfer = TransferSettings { low: Some(0.1), high: Some(0.3), ..TransferSettings::default() };
     let scene = Scene::assemble(&domain, None, None, Some(transfer), settings, 3);
     // Sums of f32 over 22 steps differ by some 1e-5 of the log-stretch: fewer turned decisions than 50 dB allow.
-    traced_pictures_agree(source, &map(11.0, 22, Boundary::Clamp), scene, 64, 50.0);
+    traced_pictures_agree("turbulence", source, &map(11.0, 22, Boundary::Clamp), scene, 64, 50.0);
 }
 
 #[test]

@@ -160,7 +160,7 @@ fn half_precision_is_as_good_as_its_rounding() {
         };
         let of = |storage, keep, sorted| rms(&on_gpu(&source, &map, 0.0, Tuning { storage, keep, sorted, ..Tuning::default() }, &seeds));
         let half = of(Storage::F16, true, true);
-        println!("half precision, {name}: root mean square error of the log-stretch {half:.1e}");
+        measured!("half precision, {name}: root mean square error of the log-stretch {half:.1e}");
         // Velocities are off by 2^-12 of themselves, their differences between nodes by some 1e-3; errors of single nodes average out along
         // a path. Log-stretches here are about 1.
         assert!(half < 5e-3 && half > 1e-6, "{name}: {half}");

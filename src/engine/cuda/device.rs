@@ -45,6 +45,7 @@ pub struct Gpu {
     name: String,
     capability: (i32, i32),
     multiprocessors: u32,
+    shared_memory: usize,
     driver_version: i32,
     context: Arc<CudaContext>,
     work: Arc<CudaStream>,
@@ -126,13 +127,15 @@ impl Gpu {
         };
         let (work, transfer) = (stream().map_err(&opening)?, stream().map_err(&opening)?);
         let (free, total) = context.mem_get_info().map_err(&opening)?;
-        let multiprocessors =
-            context.attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT).map_err(&opening)? as u32;
+        let attribute = |which| context.attribute(which).map_err(&opening);
+        let multiprocessors = attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)? as u32;
+        let shared_memory = attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN)? as usize;
         let gpu = Self {
             ordinal,
             name: found.name.clone(),
             capability,
             multiprocessors,
+            shared_memory,
             driver_version: driver_version()?,
             work,
             transfer,
@@ -176,6 +179,10 @@ impl Gpu {
     /// Multiprocessors.
     pub fn multiprocessors(&self) -> u32 {
         self.multiprocessors
+    }
+    /// Bytes of shared memory that a block may ask for.
+    pub fn shared_memory(&self) -> usize {
+        self.shared_memory
     }
     /// CUDA version that the driver supports, e.g. `13.0`.
     pub fn driver(&self) -> String {

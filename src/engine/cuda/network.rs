@@ -1,14 +1,15 @@
 //! The network on the device: its kernels, compiled for one architecture, and prediction.
 //!
-//! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads them.
+//! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads
+//! them (fused) or once a call (batched).
 
 use super::layout::TableArgument;
 use super::network_batched::{Batched, GradientTo};
 use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Target};
-use cudarc::driver::sys::{CUdevice_attribute as Device, CUfunction_attribute as Function};
+use crate::surrogate::network::{Architecture, HASH, Loss, Objective, Target};
+use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg, result};
 use std::sync::Arc;
 
@@ -23,11 +24,12 @@ const DEEPEST: usize = 4;
 /// Oldest device with the matrix instruction.
 const OLDEST: (i32, i32) = (8, 0);
 
-/// Whether a warp's registers hold a network of this architecture (`network_fused.cu`); others go through it batch by batch
-/// (`network_batched.cu`).
-pub fn is_fused(shape: &Architecture) -> bool {
+/// Whether a warp's registers hold samples of this architecture, and so many bytes of shared memory its layers (`network_fused.cu`); batches
+/// go through others (`network_batched.cu`).
+pub fn is_fused(shape: &Architecture, shared_memory: usize) -> bool {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
-    hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST
+    let (_, workspace) = shared_bytes(shape);
+    hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST && workspace <= shared_memory
 }
 
 /// The macros that `network*.cu` are compiled with for an architecture; none where it has several outputs.
@@ -70,14 +72,10 @@ struct Resident {
 }
 
 impl Resident {
+    /// `shared` bytes, which the device has.
     fn new(gpu: &Gpu, function: CudaFunction, shared: usize) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("asking for shared memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
-        let most = gpu.context().attribute(Device::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN).map_err(&doing)?;
-        if shared > most as usize {
-            let what = format!("a network whose layers need {shared} bytes of shared memory; there are {most}");
-            return Err(DeviceError::Unsupported { what });
-        }
         function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
         let together = function.occupancy_max_active_blocks_per_multiprocessor(THREADS, shared, None).map_err(&doing)?;
         Ok(Self { function, shared: shared as u32, blocks: together.max(1) * gpu.multiprocessors() })
@@ -135,7 +133,7 @@ impl NetworkKernels {
         let (weights, workspace) = shared_bytes(shape);
         let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, shared);
         Ok(Arc::new(Self {
-            way: match is_fused(shape) {
+            way: match is_fused(shape, gpu.shared_memory()) {
                 true => Way::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? },
                 false => Way::Batched(Box::new(Batched::new(gpu, shape, grid, &defines)?)),
             },
@@ -358,7 +356,21 @@ pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer
     Ok(to)
 }
 
-/// Whether `encoding` has tables.
-pub(super) fn has_tables(shape: &Architecture) -> bool {
-    shape.encoding == Encoding::HashGrid
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::surrogate::network::{Encoding, NetworkSettings};
+
+    #[test]
+    fn what_does_not_fit_into_shared_memory_goes_in_batches() {
+        // Of H200, A100 and the RTX cards since Ampere.
+        let [h200, a100, rtx] = [227, 163, 99].map(|kibibytes| kibibytes << 10);
+        let fused = |settings: NetworkSettings, on: usize| is_fused(&Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap(), on);
+        let small = NetworkSettings::default();
+        assert!([h200, a100, rtx].into_iter().all(|on| fused(small.clone(), on)));
+        let wider = NetworkSettings { width: 128, ..small.clone() };
+        assert!(fused(wider.clone(), h200) && fused(wider.clone(), a100) && !fused(wider, rtx));
+        let published = NetworkSettings { encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..small };
+        assert!(!fused(published, h200));
+    }
 }

@@ -4,7 +4,7 @@
 use super::network_layout::{DrawArgument, GridArgument, ReadingArgument};
 use super::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::surrogate::network::Architecture;
-use cudarc::driver::sys::{CUdevice_attribute as Device, CUfunction_attribute as Function};
+use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -94,9 +94,8 @@ pub(super) struct GradientTo {
 impl Batched {
     pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture, grid: GridArgument, defines: &[String]) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("asking for shared memory");
-        let most = gpu.context().attribute(Device::CU_DEVICE_ATTRIBUTE_MAX_SHARED_MEMORY_PER_BLOCK_OPTIN).map_err(&doing)? as usize;
         let [more, fewer] = batched_defines();
-        let (stages, chosen) = if most >= STAGES * STAGE_BYTES { (STAGES, more) } else { (FEWEST_STAGES, fewer) };
+        let (stages, chosen) = if gpu.shared_memory() >= STAGES * STAGE_BYTES { (STAGES, more) } else { (FEWEST_STAGES, fewer) };
         let product_shared = stages * STAGE_BYTES;
         let defines: Vec<String> = defines.iter().cloned().chain(chosen).collect();
         let kernel = |name| gpu.kernel("network_batched.cu", &defines, name);

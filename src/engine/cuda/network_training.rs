@@ -3,7 +3,7 @@
 //! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
-use super::network::{DeviceNetwork, NetworkKernels, copied, copy, has_tables, reading, unit_box};
+use super::network::{DeviceNetwork, NetworkKernels, copied, copy, reading, unit_box};
 use super::network_batched::GradientTo;
 use super::network_layout::{AdamArgument, DrawArgument};
 use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
@@ -500,7 +500,7 @@ impl DeviceTraining {
             correction: adam.correction,
             gradient: (1.0 / step.count as f64) as f32,
         };
-        if has_tables(&kernels.shape) {
+        if kernels.padded > 0 {
             let (n, lazy) = (kernels.padded as u64, u32::from(step.lazy));
             let mut call = stream.launch_builder(&kernels.adam_tables);
             call.arg(&kernels.grid).arg(&adam).arg(&n).arg(&lazy).arg(&table_gradient);

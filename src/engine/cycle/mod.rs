@@ -1,7 +1,8 @@
 //! The cycle: slide, render with the weights of the cycle before, test, then train.
 //!
-//! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames
-//! before. Where a GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are held against the frozen weights, which have not seen them, before they go to the ring.
+//! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames before. Where a
+//! GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are held against
+//! the frozen weights, which have not seen them, before they go to the ring.
 
 mod assess;
 mod frame;
