@@ -185,8 +185,7 @@ impl std::io::Write for Loop {
 
 #[test]
 fn mutated_messages() {
-    // Signed by somebody who has the key and lies: mutations of the plain parts are signed anew, which needs the session's own `send`; so
-    // the session of one side is a socket pair away, and the mutated bytes are those behind the signature or the signature itself.
+    // Changed on the way, by somebody without the key: no signature is made anew. Those who have the key and lie are in src/message.rs.
     let key = Key::random().unwrap();
     let (mut server, mut client) = sessions(&key);
     let mut known: Option<Description> = None;
