@@ -87,18 +87,19 @@ async fn listen(endpoint: String, until: tokio::sync::watch::Receiver<bool>) -> 
     arrivals
 }
 
-fn beside_a_healthy_one(seconds: u64) -> (PublishStatistics, Duration, usize) {
+/// Frames for so long to a healthy subscriber and beside it to another: what was counted, the healthy one's largest gap, and how many it got.
+fn beside_a_healthy_one(seconds: u64, other: impl FnOnce(&str) -> TcpStream) -> (PublishStatistics, Duration, usize) {
     let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().unwrap();
     let publisher = publisher();
     let (stop, stopped) = tokio::sync::watch::channel(false);
     let healthy = runtime.spawn(listen(publisher.endpoint().to_owned(), stopped));
     std::thread::sleep(Duration::from_millis(500));
-    let stalled = stalled(publisher.endpoint());
+    let other = other(publisher.endpoint());
     publish(&publisher, seconds);
     let end = Instant::now();
     stop.send(true).unwrap();
     let arrivals = runtime.block_on(healthy).unwrap();
-    drop(stalled);
+    drop(other);
     let times: Vec<Instant> = arrivals.iter().map(|a| a.0).chain([end]).collect();
     let gap = times.windows(2).map(|w| w[1].saturating_duration_since(w[0])).max().unwrap();
     (publisher.finish(Duration::from_millis(500)), gap, arrivals.len())
@@ -118,14 +119,34 @@ fn check(statistics: &PublishStatistics, gap: Duration, arrivals: usize, seconds
 
 #[test]
 fn a_stalled_subscriber_is_cut_off_and_the_healthy_one_goes_on() {
-    let (statistics, gap, arrivals) = beside_a_healthy_one(9);
+    let (statistics, gap, arrivals) = beside_a_healthy_one(9, stalled);
     check(&statistics, gap, arrivals, 9);
+}
+
+/// A subscriber that announces a frame of 2^50 bytes: memory for it would end the process.
+fn lying(endpoint: &str) -> TcpStream {
+    let mut stream = stalled(endpoint);
+    stream.write_all(&[&[0x02], (1u64 << 50).to_be_bytes().as_slice()].concat()).unwrap();
+    match stream.read(&mut [0]) {
+        Ok(0) => {}
+        Err(error) if error.kind() == std::io::ErrorKind::ConnectionReset => {}
+        other => panic!("it was not cut off: {other:?}"),
+    }
+    stream
+}
+
+#[test]
+fn a_subscriber_that_lies_about_a_length_is_cut_off_and_nobody_else() {
+    let (statistics, gap, arrivals) = beside_a_healthy_one(5, lying);
+    println!("{statistics:?}\nlargest gap {gap:?}, {arrivals} frames arrived");
+    assert_eq!((statistics.cut_offs, statistics.lost), (0, false));
+    assert!(arrivals >= 25 && gap < Duration::from_secs(1), "{arrivals} frames, {gap:?}");
 }
 
 #[test]
 #[ignore = "takes a minute"]
 fn a_minute_of_stall() {
-    let (statistics, gap, arrivals) = beside_a_healthy_one(60);
+    let (statistics, gap, arrivals) = beside_a_healthy_one(60, stalled);
     check(&statistics, gap, arrivals, 60);
 }
 

@@ -7,6 +7,7 @@ mod compare;
 mod error;
 mod exr;
 mod file_writer;
+mod guard;
 mod mailbox;
 mod message;
 mod output;
