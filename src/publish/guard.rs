@@ -1,11 +1,15 @@
 //! The door in front of the ZeroMQ socket: what subscribers send is looked at before the `zeromq` crate has it.
 //!
 //! The crate takes memory for any length that a peer announces, and its PUB socket reads subscriptions from everybody: nine bytes of a stranger could end
-//! the run. So the socket itself listens in a folder of this user alone, connections over TCP end here, and a peer's bytes are handed on only as far as they
+//! the run. So the socket itself listens where nobody else can reach it, connections over TCP end here, and a peer's bytes are handed on only as far as they
 //! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more is cut off, and nobody else notices. What the socket sends passes
 //! as it is.
 
+use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Result};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::OpenOptionsExt;
+use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -29,8 +33,18 @@ const MORE: u8 = 1;
 const LONG: u8 = 2;
 const COMMAND: u8 = 4;
 
-/// Lets subscribers in, until it is dropped. The socket listens at `socket`.
-pub(super) async fn guard(listener: TcpListener, socket: PathBuf) {
+/// A listener that nobody else can reach, and its place. The folder in which it was made is gone, so that nothing stays behind however this process ends.
+pub(super) fn private_listener() -> Result<(UnixListener, File)> {
+    let folder = tempfile::Builder::new().prefix("ridgewatch-").tempdir()?;
+    let path = folder.path().join("socket");
+    let listener = UnixListener::bind(&path)?;
+    let place = OpenOptions::new().read(true).custom_flags(libc::O_PATH).open(&path)?;
+    Ok((listener, place))
+}
+
+/// Lets subscribers in, until it is dropped. The socket listens at `place`.
+pub(super) async fn guard(listener: TcpListener, place: File) {
+    let socket = PathBuf::from(format!("/proc/self/fd/{}", place.as_raw_fd()));
     let places = Arc::new(Semaphore::new(CONNECTIONS));
     loop {
         let Ok((stream, peer)) = listener.accept().await else {

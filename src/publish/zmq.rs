@@ -6,7 +6,7 @@
 //! held longer than the limit, the runtime is shut down, which closes all its connections and frees all that they held, and a new
 //! one takes over. The listener stays open all the while: healthy subscribers reconnect at once, and nobody can take the port.
 
-use super::guard::guard;
+use super::guard::{guard, private_listener};
 use super::mailbox::{Kind, Mailbox, State};
 use super::message::{FRAME_TOPIC, RECORD_TOPIC, encode_frame};
 use super::{Payload, PublishError, PublishSettings};
@@ -152,27 +152,23 @@ struct Generation {
     next_event: Box<dyn FnMut() -> Option<SocketEvent> + Send>,
     /// Lets subscribers in.
     door: tokio::task::JoinHandle<()>,
-    /// Where the socket listens, for this user alone.
-    _folder: tempfile::TempDir,
 }
 
 impl Generation {
     fn open(listener: &TcpListener, number: u64) -> std::io::Result<Self> {
         let listener = listener.try_clone()?;
         let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).thread_name("ridgewatch-zmq").enable_all().build()?;
-        let folder = tempfile::Builder::new().prefix("ridgewatch-").tempdir()?;
-        let path = folder.path().join("socket");
         let (socket, mut events, door) = runtime.block_on(async {
             let mut socket = PubSocket::new();
             let events = socket.monitor();
-            let inside = std::os::unix::net::UnixListener::bind(&path)?;
+            let (inside, place) = private_listener()?;
             socket.bind_listener(inside).await.map_err(std::io::Error::other)?;
             listener.set_nonblocking(true)?;
-            let door = tokio::spawn(guard(tokio::net::TcpListener::from_std(listener)?, path));
+            let door = tokio::spawn(guard(tokio::net::TcpListener::from_std(listener)?, place));
             std::io::Result::Ok((socket, events, door))
         })?;
         let next_event = Box::new(move || events.try_recv().ok());
-        Ok(Self { number, runtime, socket, subscribers: HashSet::new(), next_event, door, _folder: folder })
+        Ok(Self { number, runtime, socket, subscribers: HashSet::new(), next_event, door })
     }
 
     /// Reads who came and went; returns how many are there.
