@@ -12,7 +12,7 @@ use super::feed::{Feed, Slide};
 use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup};
 use super::stop::{Halt, Interruptible, heed};
-use super::training::Threads;
+use super::training::{Threads, Turns};
 use super::{Device, EngineError, Frame, Settings};
 use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
@@ -118,6 +118,8 @@ struct Cycle<'a> {
     told_of_failure: bool,
     /// What was learned after the last frame had gone out; the next one's record tells of it.
     learned_meanwhile: Option<Learned>,
+    /// What training has of the device beside a simulation.
+    turns: Turns,
     report: &'a mut RunReport,
     /// Set from outside when the run should end.
     stop: &'a AtomicBool,
@@ -254,6 +256,7 @@ impl<'a> Cycle<'a> {
             pictures: 0,
             told_of_failure: false,
             learned_meanwhile: None,
+            turns: Turns::new(scene.training.share),
             report,
             stop,
             peak: f32::NEG_INFINITY,
