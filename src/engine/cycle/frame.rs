@@ -56,6 +56,8 @@ impl Cycle<'_> {
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<Frame, EngineError> {
         let start = Instant::now();
+        self.learn_shorter(slide, tracer)?;
+        let shorter_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
         let gate = match scene.render.method {
             Method::Gated => self.trust.gate(),
@@ -78,7 +80,7 @@ impl Cycle<'_> {
         if let Some(front) = front.as_deref() {
             self.assess(front, tracer, &gate, &work, &mut record);
         }
-        let audit_seconds = work.audit_seconds + auditing.elapsed().as_secs_f64();
+        let audit_seconds = shorter_seconds + work.audit_seconds + auditing.elapsed().as_secs_f64();
         let total = start.elapsed().as_secs_f64();
         if let Some(front) = front.as_deref() {
             // The measurement's time, not the frame's.
