@@ -1,7 +1,8 @@
 #!/usr/bin/env python3
 """Evaluates a checkpoint of `ridgewatch replay --checkpoint` with NumPy alone: evaluate_network.py CHECKPOINT < points > log_stretch
 
-Points are lines of three unit coordinates; the file is safetensors, whose metadata say how its tensors are to be evaluated.
+Points are lines of three unit coordinates and, for a network that is shown them, a start time and a duration in the unit of the flow's time;
+the file is safetensors, whose metadata say how its tensors are to be evaluated.
 """
 import json
 import struct
@@ -9,7 +10,7 @@ import sys
 
 import numpy as np
 
-PRIMES = (1, 2654435761, 805459861)
+PRIMES = (1, 2654435761, 805459861, 3674653429)
 
 
 def read(path):
@@ -57,13 +58,27 @@ def frequencies(points, shape):
     return np.stack([np.sin(angle), np.cos(angle)], -1).reshape(len(points), -1)
 
 
+def inputs_of(points, notes):
+    """What the network is shown, a column an input, all in the unit interval."""
+    names = notes["network.inputs"].split()
+    first, last = map(float, notes.get("network.start_range", "0 1").split())
+    ranges = {"start": (first, last), "duration": (0.0, float(notes["network.tau"]))}
+    columns = dict(zip("xyz", points.T))
+    for name, column in zip([name for name in names if name in ranges], points.T[3:]):
+        columns[name] = (column - ranges[name][0]) / (ranges[name][1] - ranges[name][0])
+    missing = [name for name in names if name not in columns]
+    if missing:
+        sys.exit(f"points lack a column of {missing[0]}: this network wants x y z " + " ".join(name for name in names if name in ranges))
+    return np.clip(np.stack([columns[name] for name in names], 1), 0, 1)
+
+
 def log_stretch(path, points):
-    """Log-stretch at unit points, of networks with the target ftle and the loss mean_square and of such networks on a table."""
+    """Log-stretch at points, of networks with the target ftle and the loss mean_square and of such networks on a table."""
     notes, tensors = read(path)
     shape, rest = json.JSONDecoder().raw_decode(notes["network.shape"])
     if shape["target"] != "ftle" or "MeanSquare" not in notes["network.shape"][rest:]:
         sys.exit(f"{path}: this evaluates the target ftle with the loss mean_square only")
-    inputs = np.clip(points, 0, 1)[:, shape["axes"]]
+    inputs = inputs_of(points, notes)
     values = hash_grid(inputs, shape, tensors["network.tables.average"]) if shape["levels"] else frequencies(inputs, shape)
     flat = tensors["network.layers.average"].astype("f8")
     for number, layer in enumerate(shape["layers"]):

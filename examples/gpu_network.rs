@@ -1,10 +1,11 @@
 //! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
-//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [published] [seconds]`
+//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [double-gyre] [published]
+//! [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
 //! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled) and stands still
 //! while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform points, against f64 with
-//! 220 steps.
+//! 220 steps (1000 for the double gyre, whose points are x, y and the start time).
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
 
@@ -26,6 +27,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             bench::quality(word, field, seconds)?;
         }
     }
+    if asked("double-gyre") {
+        bench::double_gyre(seconds)?;
+    }
     if asked("published") {
         bench::published(seconds)?;
     }
@@ -39,11 +43,12 @@ mod bench {
         Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::Domain;
+    use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
     use ridgewatch::flow::{
         Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
     };
-    use ridgewatch::surrogate::network::{Architecture, Encoding, Model, NetworkSettings, Objective, PlannedStep, Scale};
+    use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale};
     use std::error::Error;
     use std::sync::Arc;
     use std::time::Instant;
@@ -191,16 +196,38 @@ mod bench {
         20.0 * (peak / square.sqrt()).log10()
     }
 
+    /// Points where a field is known.
+    struct KnownPoints {
+        /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
+        seeds: Batch,
+        tested: Batch,
+        truth: Vec<f32>,
+    }
+
+    impl KnownPoints {
+        fn new(gpu: &Arc<Gpu>, domain: &Domain, tracer: &DeviceTracer, exact: &DeviceTracer) -> Outcome<Self> {
+            let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
+            let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
+            let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
+            let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
+            let drawer = DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?;
+            let (mut seeds, mut tested) = (Batch::new(gpu, TESTED)?, Batch::new(gpu, TESTED)?);
+            drawer.draw_points(domain, 99, 0, &mut seeds.points)?;
+            drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
+            seeds.trace(exact)?;
+            let truth = seeds.found()?;
+            seeds.trace(tracer)?;
+            Ok(Self { seeds, tested, truth })
+        }
+    }
+
     /// A field with its tracer, and points where it is known.
     struct Known {
         gpu: Arc<Gpu>,
         tracer: CudaTracer,
         domain: Domain,
         steps: usize,
-        /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
-        seeds: Batch,
-        tested: Batch,
-        truth: Vec<f32>,
+        points: KnownPoints,
     }
 
     impl Known {
@@ -220,18 +247,8 @@ mod bench {
             let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
             let exact = CudaTracer::new(&store, &gpu, source, &map(220, Precision::F64), 0.0, Tuning::default())?;
             let domain = tracer.domain().clone();
-            let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
-            let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
-            let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
-            let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
-            let drawer = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
-            let (mut seeds, mut tested) = (Batch::new(&gpu, TESTED)?, Batch::new(&gpu, TESTED)?);
-            drawer.draw_points(&domain, 99, 0, &mut seeds.points)?;
-            drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
-            seeds.trace(exact.device())?;
-            let truth = seeds.found()?;
-            seeds.trace(tracer.device())?;
-            Ok(Self { gpu, tracer, domain, steps, seeds, tested, truth })
+            let points = KnownPoints::new(&gpu, &domain, tracer.device(), exact.device())?;
+            Ok(Self { gpu, tracer, domain, steps, points })
         }
     }
 
@@ -246,7 +263,7 @@ mod bench {
     pub fn published(seconds: f64) -> Outcome<()> {
         const COUNT: usize = 1 << 18;
         const PACE: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
-        let Known { gpu, tracer, domain, tested, truth, .. } = Known::new(Field::Easy)?;
+        let Known { gpu, tracer, domain, points: KnownPoints { tested, truth, .. }, .. } = Known::new(Field::Easy)?;
         let mut batch = Batch::new(&gpu, COUNT)?;
         let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
         let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
@@ -298,7 +315,7 @@ mod bench {
 
     pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
         const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
-        let Known { gpu, tracer, domain, steps, seeds, tested, truth } = Known::new(field)?;
+        let Known { gpu, tracer, domain, steps, points: KnownPoints { seeds, tested, truth } } = Known::new(field)?;
         println!("<!-- block network-{name} -->");
         println!("Labels, traced with {steps} steps: {:.1} dB. Tables, by their nodes:\n", psnr(&seeds.found()?, &truth));
 
@@ -340,6 +357,57 @@ mod bench {
         Ok(())
     }
 
+    /// The double gyre over x, y and the start time in [0, 10], tau 10: a network with the start as an input, beside tables with an axis of starts.
+    pub fn double_gyre(seconds: f64) -> Outcome<()> {
+        const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
+        const LABEL_STEPS: usize = 100;
+        const STARTS: [f64; 2] = [0.0, 10.0];
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let flow = Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: std::f64::consts::TAU / 10.0 };
+        let plane = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
+        let space_time = Domain::cuboid([0.0, 0.0, STARTS[0]], [2.0, 1.0, STARTS[1]]);
+        let map = |steps, precision| FlowMap { precision, ..FlowMap::tangent(10.0, steps) };
+        let tracer = DeviceTracer::with_starts(&gpu, &flow, &plane, &map(LABEL_STEPS, Precision::F32), LABEL_STEPS)?;
+        let exact = DeviceTracer::with_starts(&gpu, &flow, &plane, &map(1000, Precision::F64), 1000)?;
+        let KnownPoints { seeds, tested, truth } = KnownPoints::new(&gpu, &space_time, &tracer, &exact)?;
+
+        println!("<!-- block network-double-gyre -->");
+        let batch = Batch::new(&gpu, CHUNK)?;
+        let milliseconds = time(&gpu, || batch.trace(&tracer))?;
+        println!(
+            "Labels, traced with {LABEL_STEPS} steps, {:.0} M/s: {:.1} dB. Tables over x, y and start, by their nodes:\n",
+            CHUNK as f64 / milliseconds * 1e-3,
+            psnr(&seeds.found()?, &truth)
+        );
+        println!("| table | MB | traced in, s | PSNR, dB |\n|---|---|---|---|");
+        for nodes in [[272, 136, 136], [384, 192, 192], [512, 256, 256]] {
+            let table = DeviceTable::trace(&tracer, &space_time, nodes)?;
+            let begin = gpu.mark()?;
+            drop(table);
+            let table = DeviceTable::trace(&tracer, &space_time, nodes)?;
+            let traced = f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?) * 1e-3;
+            let megabytes = 4e-6 * nodes.iter().product::<usize>() as f64;
+            println!("| {nodes:?} | {megabytes:.0} | {traced:.3} | {:.1} |", psnr(&tested.predict(&table)?, &truth));
+        }
+        println!();
+        println!("| network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|");
+        let of_start = |settings| NetworkSettings { inputs: vec![Input::Start], start_range: Some(STARTS), ..settings };
+        for (name, settings) in [
+            ("8x2, growth 2, T = 2^19", hash(8, 2, 2.0, 19, 64)),
+            ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
+            ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64)),
+            ("4x4, growth 1.6, base 128, T = 2^24", NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }),
+        ] {
+            let row = learn(&gpu, &space_time, &tracer, None, 0.0, &of_start(settings), PACE, seconds, |network| {
+                Ok(psnr(&tested.predict(network)?, &truth))
+            })?;
+            println!("| {name} {row}");
+        }
+        println!();
+        Ok(())
+    }
+
     /// Trains for some seconds; one row of the table. `before`: seconds that the clock starts at, where there is a table to be traced.
     fn learn(
         gpu: &Arc<Gpu>,
@@ -352,7 +420,9 @@ mod bench {
         seconds: f64,
         measure: impl Fn(&dyn DevicePredict) -> Outcome<f64>,
     ) -> Outcome<String> {
-        let shape = Architecture::new(settings, &[0, 1, 2], domain.extent())?;
+        // The start time takes the third axis' place.
+        let axes = if settings.inputs.is_empty() { &[0, 1, 2][..] } else { &[0, 1] };
+        let shape = Architecture::new(settings, axes, domain.extent())?;
         let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
         let model = Model::new(shape, 1, base.is_some());
         let mut chunk = Batch::new(gpu, CHUNK)?;

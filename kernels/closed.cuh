@@ -93,6 +93,12 @@ template <> struct FormOf<DOUBLE_GYRE> {
             p[1][c] = fma_(w, m[0][c], q * m[1][c]);
         }
     }
+    // Constants of a seed's own start, whose phase has this sine and cosine. Before, k[2] and k[3] are epsilon times sine and cosine of the
+    // phase since the start.
+    template <class R> static RW_FN void start_at(R (&k)[4], R sine, R cosine) {
+        k[2] = fma_(k[2], cosine, k[3] * sine);
+        k[3] = R(1) - (k[2] + k[2]);
+    }
 };
 
 template <> struct FormOf<ABC> {
@@ -137,12 +143,14 @@ template <> struct FormOf<LINEAR> {
 // Edge policies, as flow::Boundary.
 enum Boundary { STOP = 0, CLAMP = 1, PERIODIC = 2, UNBOUNDED = 3, ZERO = 4 };
 
-// The flow and its box. `low` and `high` bound where particles may go on; `box` is the domain.
+// The flow and its box. `low` and `high` bound where particles may go on; `box` is the domain. `rate`: radians of phase a unit of time, where
+// every seed has a start of its own.
 template <class Real> struct ClosedData {
     Real low[3], high[3], box_low[3], box_high[3];
+    double rate;
 };
 
-// Config: FORM, BOUNDARY.
+// Config: FORM, BOUNDARY, STARTS (whether the third coordinate of a seed is its start time).
 template <class Config, class Real> struct ClosedFlow {
     using R = Real;
     using F = FormOf<Config::FORM>;
@@ -155,8 +163,23 @@ template <class Config, class Real> struct ClosedFlow {
     struct Memory {};
     const ClosedData<R>& data;
     const Stage* stages;
+    // Sine and cosine of the phase at which this seed starts.
+    R sine, cosine;
 
-    RW_FN Step step(int n) const { return {stages[2 * n], stages[2 * n + 1], stages[2 * n + 2]}; }
+    RW_FN ClosedFlow(const ClosedData<R>& data, const Stage* stages, const float (&seed)[3]) : data(data), stages(stages), sine(0), cosine(1) {
+        if constexpr (Config::STARTS) {
+            double s, c;
+            sin_cos(data.rate * double(seed[2]), s, c);
+            sine = R(s);
+            cosine = R(c);
+        }
+    }
+
+    RW_FN Step step(int n) const {
+        Step step = {stages[2 * n], stages[2 * n + 1], stages[2 * n + 2]};
+        if constexpr (Config::STARTS) RW_UNROLL for (int i = 0; i < 3; i++) F::start_at(step.stage[i].c, sine, cosine);
+        return step;
+    }
     RW_FN void start(const double (&seed)[3], R (&x)[D]) const { RW_UNROLL for (int k = 0; k < D; k++) x[k] = R(seed[k]); }
     RW_FN void first_tangent(const double (&)[3], R (&m)[D][C]) const {
         RW_UNROLL for (int i = 0; i < D; i++) RW_UNROLL for (int c = 0; c < C; c++) m[i][c] = R(i == c);

@@ -1,4 +1,4 @@
-// The closed-form flow and the integrator that macros pick: RW_REAL, RW_FORM, RW_BOUNDARY, RW_DIFFERENCES.
+// The closed-form flow and the integrator that macros pick: RW_REAL, RW_FORM, RW_BOUNDARY, RW_DIFFERENCES, RW_STARTS.
 #pragma once
 #include "closed.cuh"
 #include "integrate.cuh"
@@ -7,6 +7,7 @@ using namespace rw;
 
 struct Config {
     static constexpr int FORM = RW_FORM, BOUNDARY = RW_BOUNDARY;
+    static constexpr bool STARTS = RW_STARTS;
 };
 using Flow = ClosedFlow<Config, RW_REAL>;
 

@@ -17,14 +17,19 @@ static_assert(sizeof(AxisData<float>) == 64 && sizeof(AxisData<double>) == 80, "
 static_assert(sizeof(GridData<float>) == 336 && sizeof(GridData<double>) == 488, "layout");
 static_assert(sizeof(GridStep<float>) == 64 && sizeof(GridStep<double>) == 72, "layout");
 #else
-static_assert(sizeof(ClosedData<float>) == 48, "layout");
+static_assert(sizeof(ClosedData<float>) == 56 && sizeof(ClosedData<double>) == 104, "layout");
 #endif
 
 extern "C" void host_trace(const Data* data, const Times* times, const RW_REAL* h, double gap, const Verdict* verdict, const float* seeds,
                            uint32_t n, const Outputs* out) {
     for (uint32_t i = 0; i < n; i++) {
         const float seed[3] = {seeds[3 * size_t(i)], seeds[3 * size_t(i) + 1], seeds[3 * size_t(i) + 2]};
-        one(Flow{*data, times}, *h, gap, *verdict, seed, i, *out);
+#if RW_CLOSED
+        const Flow flow(*data, times, seed);
+#else
+        const Flow flow{*data, times};
+#endif
+        one(flow, *h, gap, *verdict, seed, i, *out);
     }
 }
 

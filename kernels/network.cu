@@ -96,6 +96,7 @@ network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ 
     }
     // No place, no target.
     if (!isfinite(point[0] + point[1] + point[2]) || (held_back && keeps_label(point, held_back))) target = not_a_number();
+    place_times(reading, unit);
     samples[i] = {unit[0], unit[1], unit[2], target};
 }
 

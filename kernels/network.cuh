@@ -5,7 +5,8 @@
 // that gathers a pair of features is the one that needs them, and the one that gets their gradient back. Values are half precision, sums
 // single precision.
 //
-// Macros: RW_AXES (axes of the unit point that are inputs), RW_DIMS of them; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH
+// Macros: RW_AXES (places of the unit point that hold an input, where times take those of axes along which the flow does not vary), RW_DIMS
+// of them; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH
 // and RW_HIDDEN, neurons of and number of hidden layers;
 // RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, the shared memory of prediction and of training.
 #pragma once

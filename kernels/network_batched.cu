@@ -247,10 +247,11 @@ RW_FN void encode_two(const Grid& grid, const uint16_t* tables, const float (&un
 
 // Of `n` points (3 floats each, unit coordinates); rows beyond repeat the last one. Launched with THREADS a multiple of what is to do.
 extern "C" __global__ void __launch_bounds__(THREADS)
-batched_encode_points(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const float* __restrict__ points, uint32_t n,
-                      uint16_t* __restrict__ out) {
+batched_encode_points(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const __grid_constant__ Reading reading,
+                      const float* __restrict__ points, uint32_t n, uint16_t* __restrict__ out) {
     const size_t i = blockIdx.x * size_t(THREADS) + threadIdx.x, row = i / (ENCODED_PADDED / 2), at = row < n ? row : n - 1u;
-    const float unit[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
+    float unit[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
+    place_times(reading, unit);
     encode_two(grid, tables, unit, i, out);
 }
 

@@ -11,10 +11,14 @@ struct Reading {
     float mean, deviation, tau;
     int published;  // 0: output * deviation + mean; 1: tau * sign(output) (exp|output| - 1)
     float share;    // of the network, above `base`
-    int pad;
+    float times[3]; // what a point has at places that hold a time (RW_AXES); NaN: what it brings along
     Table base;     // without values: none
 };
-static_assert(sizeof(Reading) == 48, "layout");
+static_assert(sizeof(Reading) == 56, "layout");
+
+RW_FN void place_times(const Reading& reading, float (&unit)[3]) {
+    RW_UNROLL for (int k = 0; k < 3; ++k) unit[k] = is_nan(reading.times[k]) ? unit[k] : reading.times[k];
+}
 
 RW_FN float read_output(const Reading& reading, float output, const float (&unit)[3]) {
     const float value = reading.published ? reading.tau * copysignf(expm1f(fabsf(output)), output) : fma_(output, reading.deviation, reading.mean);

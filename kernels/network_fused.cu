@@ -23,6 +23,7 @@ network_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ 
         RW_UNROLL for (int row = 0; row < 2; ++row) {
             const uint32_t sample = tile * 16u + g + 8u * row, at = sample < n ? sample : n - 1u;
             RW_UNROLL for (int k = 0; k < 3; ++k) units[row][k] = points[3 * size_t(at) + k];
+            place_times(reading, units[row]);
             inputs(rows[row], units[row]);
         }
         Rows<ENCODED_BLOCKS> encoded;

@@ -6,7 +6,7 @@
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
 use ridgewatch::engine::cuda::{batched_defines, is_fused, network_defines};
-use ridgewatch::surrogate::network::{Architecture, Encoding, NetworkSettings};
+use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings};
 
 /// Macros in which the gridded kernel is compiled here.
 fn grid(changes: &[(&str, &str)]) -> Vec<String> {
@@ -38,7 +38,8 @@ fn networks(which: impl Fn(&Architecture) -> bool) -> Vec<Vec<String>> {
         (NetworkSettings { levels: 16, features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, width: 512, hidden_layers: 16, ..usual.clone() }, &[0, 1, 2]),
-        (NetworkSettings { width: 200, hidden_layers: 5, ..usual }, &[0, 1]),
+        (NetworkSettings { width: 200, hidden_layers: 5, ..usual.clone() }, &[0, 1]),
+        (NetworkSettings { inputs: vec![Input::Start], ..usual }, &[0, 1]),
     ];
     let shapes = settings.iter().map(|(settings, axes)| Architecture::new(settings, axes, [1.0; 3]).unwrap());
     shapes.filter(which).map(|shape| network_defines(&shape).unwrap()).collect()
@@ -46,10 +47,9 @@ fn networks(which: impl Fn(&Architecture) -> bool) -> Vec<Vec<String>> {
 
 fn variants(source: &str) -> Vec<Vec<String>> {
     match source {
-        "trace_closed.cu" => ["0", "1", "2"]
-            .iter()
-            .zip(["float", "double", "float"])
-            .map(|(form, real)| [("REAL", real), ("FORM", *form), ("BOUNDARY", "1"), ("DIFFERENCES", "0")])
+        "trace_closed.cu" => [("0", "float", "0"), ("1", "double", "0"), ("2", "float", "0"), ("0", "float", "1"), ("0", "double", "1")]
+            .map(|(form, real, starts)| [("REAL", real), ("FORM", form), ("BOUNDARY", "1"), ("DIFFERENCES", "0"), ("STARTS", starts)])
+            .into_iter()
             .map(|defines| defines.map(|(name, value)| format!("RW_{name}={value}")).to_vec())
             .collect(),
         "trace_grid.cu" => vec![

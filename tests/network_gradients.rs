@@ -8,7 +8,7 @@ use network_support::reference::{Reference, labels, norm};
 use network_support::{Case, cases, uniform_points};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Model, Objective, Pick, Step, autodiff_gradient, operation_step, stock_step,
+    Architecture, Average, Fused, Model, Objective, Pick, Row, Step, autodiff_gradient, operation_step, row, stock_step,
 };
 
 fn prepare(case: &Case) -> (Model, Objective, Samples) {
@@ -167,17 +167,18 @@ fn predictions_of_all_ways_agree() {
         // Not a multiple of any tile, with the corners of the domain.
         let mut points = uniform_points(8, 1237);
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]]);
-        let flat: Vec<f32> = points.iter().flat_map(|p| case.axes.iter().map(|&a| p[a])).collect();
-        let tensor = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [points.len(), case.axes.len()]), &Default::default());
+        let rows: Vec<Row> = points.iter().map(|&[x, y, z]| row([x, y, z], [z, x])).collect();
+        let flat: Vec<f32> = rows.iter().flat_map(|row| shape.axes.iter().map(|&a| row[a])).collect();
+        let tensor = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [rows.len(), shape.inputs()]), &Default::default());
         let stock = model.module.forward(&shape, tensor.clone()).into_data().to_vec::<f32>().unwrap();
         let fused = model.module.forward_fused(&shape, tensor).into_data().to_vec::<f32>().unwrap();
         let reference = Reference::new(&model);
-        for (i, &point) in points.iter().enumerate() {
-            for (o, expected) in reference.outputs(point)[0].iter().enumerate() {
+        for (i, &row) in rows.iter().enumerate() {
+            for (o, expected) in reference.outputs(row)[0].iter().enumerate() {
                 let at = i * model.shape.outputs() + o;
                 // Frequencies up to 2^3 pi/2 and weights of order 1 lose two digits of f32.
-                assert!((f64::from(stock[at]) - expected).abs() < 2e-5 * expected.abs().max(1.0), "{}: stock {point:?}", case.name);
-                assert!((f64::from(fused[at]) - expected).abs() < 2e-5 * expected.abs().max(1.0), "{}: fused {point:?}", case.name);
+                assert!((f64::from(stock[at]) - expected).abs() < 2e-5 * expected.abs().max(1.0), "{}: stock {row:?}", case.name);
+                assert!((f64::from(fused[at]) - expected).abs() < 2e-5 * expected.abs().max(1.0), "{}: fused {row:?}", case.name);
             }
         }
     }

@@ -6,17 +6,17 @@ mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
-use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
+use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Times};
 use ridgewatch::surrogate::{Kind, SampleRing, SurrogateSettings, build};
 use std::io::Write;
 use std::process::{Command, Stdio};
 
 /// The example's answers at unit points.
-fn evaluated(checkpoint: &std::path::Path, points: &[[f32; 3]]) -> Vec<f32> {
+fn evaluated(checkpoint: &std::path::Path, points: &[[f32; 3]], times: &str) -> Vec<f32> {
     let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/evaluate_network.py");
     let mut child = Command::new(python).args([script.as_ref(), checkpoint]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
-    let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z}\n")).collect();
+    let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z} {times}\n")).collect();
     // The script reads everything before it writes anything.
     child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
     let output = child.wait_with_output().unwrap();
@@ -29,22 +29,40 @@ fn evaluated(checkpoint: &std::path::Path, points: &[[f32; 3]]) -> Vec<f32> {
 fn numpy_reproduces_predictions_from_a_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
     let tracer = DoubleGyre::new(0.0, 3.0, 30);
+    let later = DoubleGyre::new(3.0, 2.0, 30);
     let samples = traced(&tracer, uniform_points(3, 4000), false);
+    let other = traced(&later, uniform_points(4, 4000), false);
     let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 3, width: 24, octaves: 4, batch: 1024, ..hash.clone() };
-    for (name, kind, network) in
-        [("hash", Kind::Network, &hash), ("frequency", Kind::Network, &frequency), ("residual", Kind::Residual, &hash)]
-    {
+    let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
+    let both = NetworkSettings { inputs: vec![Input::Duration, Input::Start], ..start.clone() };
+    let of_both = NetworkSettings { inputs: both.inputs.clone(), start_range: both.start_range, ..frequency.clone() };
+    for (name, kind, network, times) in [
+        ("hash", Kind::Network, &hash, ""),
+        ("frequency", Kind::Network, &frequency, ""),
+        ("residual", Kind::Residual, &hash, ""),
+        ("start", Kind::Network, &start, "2.5"),
+        ("start and duration", Kind::Network, &both, "2.5 1.2"),
+        ("start and duration, frequency", Kind::Network, &of_both, "2.5 1.2"),
+    ] {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 200);
+        let mut ring = SampleRing::new(2 * samples.len());
+        for (window, samples) in [(&tracer, &samples), (&later, &other)] {
+            ring.set_now(Times::new(network, tracer.tau).unit(window.start, window.tau));
+            ring.push(samples);
+        }
+        surrogate.learn(&ring, f64::INFINITY, 200);
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]]);
+        if !times.is_empty() {
+            surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30));
+        }
         let mut expected = vec![0.0; points.len()];
         surrogate.predict(&points, &mut expected);
-        let found = evaluated(&path, &points);
+        let found = evaluated(&path, &points, times);
         assert_eq!(found.len(), expected.len());
         for ((point, found), expected) in points.iter().zip(&found).zip(&expected) {
             // f64 there, f32 here.

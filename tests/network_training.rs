@@ -6,7 +6,7 @@ mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
-use ridgewatch::surrogate::network::{Encoding, Loss, NetworkSettings, Target};
+use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
 use ridgewatch::surrogate::{CheckpointError, Kind, Predict, Residual, SampleRing, Samples, Surrogate, SurrogateSettings, Table, build};
 
 fn small() -> NetworkSettings {
@@ -159,10 +159,19 @@ fn a_resumed_run_goes_on_bit_for_bit() {
     let folder = tempfile::tempdir().unwrap();
     let flow_map = NetworkSettings { target: Target::FlowMap, ..small() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, octaves: 4, ..small() };
-    for (kind, network) in
-        [(Kind::Network, small()), (Kind::Residual, small()), (Kind::Network, flow_map), (Kind::Network, frequency), (Kind::Table, small())]
+    let of_start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([0.0, 3.0]), ..small() };
+    for (number, (kind, network)) in [
+        (Kind::Network, small()),
+        (Kind::Residual, small()),
+        (Kind::Network, flow_map),
+        (Kind::Network, frequency),
+        (Kind::Network, of_start.clone()),
+        (Kind::Table, small()),
+    ]
+    .into_iter()
+    .enumerate()
     {
-        let path = folder.path().join(format!("{kind:?}"));
+        let path = folder.path().join(number.to_string());
         let mut first = surrogate(kind, &network, &tracer);
         first.learn(&SampleRing::holding(&samples), 60.0, 37);
         first.save(&path).unwrap();
@@ -181,7 +190,11 @@ fn a_resumed_run_goes_on_bit_for_bit() {
         assert_eq!(std::fs::read(&again[0]).unwrap(), std::fs::read(&again[1]).unwrap(), "{kind:?}");
     }
     // Nothing but the checkpoints is left in the folder.
-    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 5);
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 8);
+    // The range of an input is part of what must fit.
+    let other = NetworkSettings { start_range: Some([0.0, 4.0]), ..of_start };
+    let fault = surrogate(Kind::Network, &other, &tracer).load(&folder.path().join("4")).unwrap_err().to_string();
+    assert!(fault.contains("starts 0 to 3") && fault.contains("starts 0 to 4"), "{fault}");
 }
 
 #[test]

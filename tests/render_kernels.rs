@@ -273,6 +273,9 @@ impl Tracer for Plane {
     fn domain(&self) -> &Domain {
         &self.0
     }
+    fn start(&self) -> f64 {
+        0.0
+    }
     fn tau(&self) -> f64 {
         1.0
     }

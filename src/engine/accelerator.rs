@@ -242,6 +242,9 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
     fn domain(&self) -> &Domain {
         self.host.domain()
     }
+    fn start(&self) -> f64 {
+        self.host.start()
+    }
     fn tau(&self) -> f64 {
         self.host.tau()
     }

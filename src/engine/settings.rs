@@ -211,11 +211,6 @@ impl TrainingSettings {
         (self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
     }
 
-    /// Seconds that a device rests after it has trained for so long, so that training takes `share` of its time where nothing else is to be done.
-    pub fn rest(&self, trained: f64) -> f64 {
-        (1.0 - self.share) / self.share * trained
-    }
-
     /// Checks ranges.
     pub fn check(&self) -> Result<(), Refused> {
         let t = self;
@@ -241,11 +236,6 @@ mod tests {
             let turn = with(share, None).turn(0.03);
             assert!((turn / (turn + 0.03) - share).abs() < 1e-12, "{share}: {turn}");
         }
-        for share in [0.25, 0.5, 0.9] {
-            let rest = with(share, None).rest(0.05);
-            assert!((0.05 / (0.05 + rest) - share).abs() < 1e-12, "{share}: {rest}");
-        }
-        assert!(with(0.0, None).rest(0.05).is_infinite(), "for good");
         assert_eq!((with(0.5, Some(2.0)).turn(0.03), with(0.5, Some(0.0)).turn(0.03)), (2.0, 0.03), "seconds are the least");
         assert_eq!((with(0.5, None).seconds(), with(0.5, Some(0.2)).seconds()), (1.0, 0.2));
     }

@@ -9,6 +9,7 @@ use crate::setting::{Refused, require, shown};
 use crate::source::live::Live;
 use crate::source::{Metric, SnapshotSource, SourceKind, Steady, VelocityUnit};
 use crate::surrogate::Kind;
+use crate::surrogate::network::Input;
 
 /// A scene whose open questions (tau, direction, boundary, domain) are answered.
 #[derive(Debug, Clone)]
@@ -53,7 +54,7 @@ impl Setup {
         Self::settle(scene, None, Some(live))
     }
 
-    fn settle(scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
+    fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
@@ -137,8 +138,41 @@ impl Setup {
             None => Feed::open(&scene, snapshots, tau, direction)?,
         };
         let slides = feed.expected_slides(times.as_deref(), tau);
+        notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
     }
+}
+
+/// Settles over which seed times the network's input runs, where it has one and they are left open: those that the source can be asked for. Says
+/// so where there is but one, and the input does nothing.
+fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, direction: Direction) -> Result<Option<String>, Refused> {
+    if !scene.network.inputs.contains(&Input::Start) || scene.network.start_range.is_some() {
+        return Ok(None);
+    }
+    let ends = match (times, scene.source.kind) {
+        (_, SourceKind::Live) => {
+            let found = "is missing, and a running simulation does not say when it will end";
+            return Err(Refused::new("network.start_range", found, "two times, ascending").beside(&["network.inputs"]));
+        }
+        (Some(times), _) => {
+            let (first, last) = (times.first().copied().unwrap_or(0.0), times.last().copied().unwrap_or(0.0));
+            match direction {
+                Direction::Forward => [first, last - tau],
+                Direction::Backward => [first + tau, last],
+            }
+        }
+        (None, _) => {
+            let TimeSettings { start, step, slides, .. } = scene.time;
+            let last = start + step * slides.unwrap_or(1).saturating_sub(1) as f64;
+            [start.min(last), start.max(last)]
+        }
+    };
+    if ends[0] < ends[1] {
+        scene.network.start_range = Some(ends);
+        return Ok(None);
+    }
+    scene.network.inputs.retain(|input| *input != Input::Start);
+    Ok(Some(format!("network.inputs: \"start\" is left out, since all frames are of one start time, {}", ends[0])))
 }
 
 /// Refuses times so far from 0 that adding tau to them is lost in their last place: nothing would move, and the FTLE would be 0.

@@ -66,6 +66,10 @@ impl Tracer for Interruptible<'_> {
         self.tracer.domain()
     }
 
+    fn start(&self) -> f64 {
+        self.tracer.start()
+    }
+
     fn tau(&self) -> f64 {
         self.tracer.tau()
     }
@@ -130,6 +134,9 @@ mod tests {
     impl Tracer for Counting<'_> {
         fn domain(&self) -> &Domain {
             &self.domain
+        }
+        fn start(&self) -> f64 {
+            0.0
         }
         fn tau(&self) -> f64 {
             1.0

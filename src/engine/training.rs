@@ -51,6 +51,39 @@ impl Threads {
     }
 }
 
+/// What training has of a device's time where a simulation is followed: so much of every second is due to it, and what it took is taken off.
+#[derive(Debug)]
+pub(super) struct Turns {
+    share: f64,
+    /// Seconds that are due, and when they were counted.
+    due: f64,
+    counted: f64,
+}
+
+impl Turns {
+    /// Most seconds that may become due: what was missed while nobody trained is not made up for.
+    const MOST: f64 = 1.0;
+    /// Fewer seconds are not worth a turn.
+    const LEAST: f64 = 0.01;
+
+    /// `share` of the time, from now on.
+    pub(super) fn new(share: f64) -> Self {
+        Self { share, due: 0.0, counted: 0.0 }
+    }
+
+    /// Seconds that are due `now` (seconds since the beginning); none where they are not worth a turn yet.
+    pub(super) fn due(&mut self, now: f64) -> Option<f64> {
+        self.due = (self.due + self.share * (now - self.counted)).min(Self::MOST);
+        self.counted = now;
+        (self.due >= Self::LEAST).then_some(self.due)
+    }
+
+    /// Training took so many seconds of the device.
+    pub(super) fn took(&mut self, seconds: f64) {
+        self.due -= seconds;
+    }
+}
+
 /// When a share of a frame's training ends, unless the number of steps is given.
 #[derive(Clone, Copy)]
 pub(super) enum Until<'a> {
@@ -107,4 +140,31 @@ pub(super) fn train(
     sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
     sum.seconds = start.elapsed().as_secs_f64();
     sum
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Turns;
+
+    /// However long frames take and however late a turn ends, training gets its share of the time.
+    #[test]
+    fn turns_are_a_share_of_the_time() {
+        for (share, frame, longer) in [(0.25, 0.007, 1.0), (0.25, 0.2, 1.0), (0.75, 0.03, 1.5), (0.5, 0.4, 0.3)] {
+            let (mut turns, mut now, mut trained) = (Turns::new(share), 0.0, 0.0);
+            for _ in 0..20_000 {
+                now += frame;
+                while let Some(due) = turns.due(now) {
+                    let took = longer * f64::min(due, 0.05);
+                    turns.took(took);
+                    now += took;
+                    trained += took;
+                }
+            }
+            assert!((trained / now - share).abs() < 0.01, "{share} of frames of {frame} s: {}", trained / now);
+        }
+        let mut none = Turns::new(0.0);
+        assert_eq!(none.due(1e6), None);
+        let mut late = Turns::new(0.5);
+        assert_eq!(late.due(1e6), Some(Turns::MOST), "what was missed is not made up for");
+    }
 }

@@ -79,6 +79,21 @@ pub struct DoubleGyre {
     omega: f64,
 }
 
+impl DoubleGyre {
+    /// Radians of phase a unit of time: the flow depends on time by its phase alone.
+    pub(crate) fn rate(&self) -> f64 {
+        self.omega
+    }
+
+    /// What the constants at `time` after a start are made of, with the sine and cosine of the phase at the start
+    /// (sin(a + b) = sin a cos b + cos a sin b): the first two, and epsilon times sine and cosine of the phase since.
+    pub(crate) fn constants_since(&self, time: f64) -> Constants<f64> {
+        let [scale, scale_pi, ..] = self.constants(time);
+        let (sine, cosine) = (self.omega * time).sin_cos();
+        [scale, scale_pi, self.epsilon * sine, self.epsilon * cosine]
+    }
+}
+
 impl ClosedForm<2> for DoubleGyre {
     fn constants(&self, time: f64) -> Constants<f64> {
         let a = self.epsilon * (self.omega * time).sin();

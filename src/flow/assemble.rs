@@ -207,6 +207,7 @@ impl<'a> Assembly<'a> {
             field,
             kernel,
             domain: self.domain.clone(),
+            start: self.from,
             tau: self.map.tau,
             boundary: self.map.boundary,
             normalisation: self.map.normalisation,

@@ -229,6 +229,8 @@ impl Traced {
 pub trait Tracer: Send + Sync {
     /// Where seeds may lie.
     fn domain(&self) -> &Domain;
+    /// Seed time.
+    fn start(&self) -> f64;
     /// |tau|.
     fn tau(&self) -> f64;
     /// Runge-Kutta steps a path gets.

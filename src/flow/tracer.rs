@@ -94,6 +94,8 @@ pub struct CpuTracer<K, V, L, const D: usize, const C: usize> {
     pub kernel: K,
     /// Where seeds may lie.
     pub domain: Domain,
+    /// Seed time.
+    pub start: f64,
     /// |tau|.
     pub tau: f64,
     /// Edge policy.
@@ -195,6 +197,10 @@ where
 {
     fn domain(&self) -> &Domain {
         &self.domain
+    }
+
+    fn start(&self) -> f64 {
+        self.start
     }
 
     fn tau(&self) -> f64 {

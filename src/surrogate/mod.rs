@@ -43,6 +43,8 @@ pub struct Samples {
     pub arrival: Vec<[f32; 3]>,
     /// d arrival / d point in unit coordinates, row-major; empty unless the target is the flow map.
     pub jacobian: Vec<[f32; 9]>,
+    /// Start time and duration of each in unit intervals ([`network::Times`]); empty where that of all is the same.
+    pub times: Vec<[f32; 2]>,
 }
 
 impl Samples {
@@ -54,6 +56,16 @@ impl Samples {
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
+    }
+
+    /// What a network may be shown of sample `index`.
+    pub(crate) fn row(&self, index: usize) -> network::Row {
+        network::row(self.points[index], self.times_of(index))
+    }
+
+    /// Unit times of sample `index`.
+    pub(crate) fn times_of(&self, index: usize) -> [f32; 2] {
+        self.times.get(index).copied().unwrap_or(network::UNTIMED)
     }
 }
 
@@ -130,6 +142,8 @@ pub struct NetworkState<'a> {
     pub tables: &'a [f32],
     /// Weights and biases of all layers.
     pub layers: &'a [f32],
+    /// Start time and duration that it is asked for, in unit intervals.
+    pub times: [f32; 2],
     /// The same network where a device trains it; the numbers here are then those that came back last.
     pub on_device: Option<&'a dyn OffloadedNetwork>,
     /// A table below, and the factor on the network above it.
@@ -150,7 +164,8 @@ pub trait Surrogate: Predict {
     fn is_offloaded(&self) -> bool {
         false
     }
-    /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over.
+    /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over; a network with the start time as an input
+    /// goes on learning as before, and predicts for the new start.
     fn window_slid(&mut self, tracer: &dyn Tracer);
     /// Writes everything needed to go on (weights, optimizer state, base table) into the file.
     fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError>;
@@ -246,6 +261,13 @@ impl SurrogateSettings {
             // No flow varies along fewer than two axes; the third is looked at when the domain is known.
             self.check_nodes(2)?;
         }
+        if !network.inputs.is_empty() && self.kind != Kind::Network {
+            return Err(SurrogateError::Setting {
+                key: "network.inputs".into(),
+                found: crate::setting::shown(&network.inputs),
+                accepted: "none, or surrogate.kind = \"network\": a table knows one window and one duration".into(),
+            });
+        }
         if self.kind == Kind::Residual { Residual::check(network) } else { Ok(()) }
     }
 
@@ -299,7 +321,7 @@ pub fn build(
 ) -> Result<Box<dyn Surrogate>, SurrogateError> {
     Ok(match settings.kind {
         Kind::Table => Box::new(Table::trace(tracer, settings.nodes(domain)?)),
-        Kind::Network => Box::new(Network { trainer: Trainer::new(network, domain, tracer.tau(), seed, false)? }),
+        Kind::Network => Box::new(Network { trainer: Trainer::new(network, tracer, seed, false)? }),
         Kind::Residual => Box::new(Residual::new(network, settings.nodes(domain)?, seed, tracer)?),
     })
 }
@@ -344,8 +366,8 @@ impl Surrogate for Network {
         self.trainer.is_offloaded()
     }
 
-    fn window_slid(&mut self, _: &dyn Tracer) {
-        self.trainer.window_slid();
+    fn window_slid(&mut self, tracer: &dyn Tracer) {
+        self.trainer.window_slid(tracer);
     }
 
     fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {

@@ -65,11 +65,11 @@ pub trait OffloadedTraining: Send + Sync {
 
 /// A network on a device that does not change.
 pub trait OffloadedNetwork: Send + Sync {
-    /// Writes the log-stretch (or the residual's part of it) at each unit point.
+    /// Writes the log-stretch (or the residual's part of it) at each unit point, at these unit times.
     ///
     /// # Errors
     /// When the device is lost; `out` then holds anything.
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost>;
+    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost>;
 
     /// Itself, for the engine whose device it is on.
     fn as_any(&self) -> &dyn Any;

@@ -31,7 +31,7 @@ impl Residual {
     /// Traces the table with `nodes` along x, y, z. The network must have the target `ftle` and the mean-square loss: nothing else adds up.
     pub fn new(network: &NetworkSettings, nodes: [usize; 3], seed: u64, tracer: &dyn Tracer) -> Result<Self, SurrogateError> {
         Self::check(network)?;
-        let trainer = Trainer::new(network, tracer.domain(), tracer.tau(), seed, true)?;
+        let trainer = Trainer::new(network, tracer, seed, true)?;
         Ok(Self { table: Table::trace(tracer, nodes), trainer, shrinkage: 0.0, slid: false })
     }
 
@@ -160,7 +160,7 @@ impl Surrogate for Residual {
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.table.retrace(tracer);
-        self.trainer.window_slid();
+        self.trainer.window_slid(tracer);
         (self.slid, self.shrinkage) = (true, 0.0);
     }
 

@@ -30,13 +30,24 @@ pub struct SampleRing {
     dropped_stale: u64,
     /// Another number whenever samples were moved, which no other ring has.
     epoch: u64,
+    /// Times of samples that say nothing of time; none where nobody asks for times.
+    now: Option<[f32; 2]>,
 }
 
 impl SampleRing {
     /// An empty ring of at least one sample.
     pub fn new(capacity: usize) -> Self {
         let empty = Samples::default();
-        Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, dropped_stale: 0, epoch: fresh_stamp() }
+        Self {
+            capacity: capacity.max(1),
+            fresh: empty.clone(),
+            next: 0,
+            stale: empty,
+            pushed: 0,
+            dropped_stale: 0,
+            epoch: fresh_stamp(),
+            now: None,
+        }
     }
 
     /// A full ring of these samples.
@@ -44,6 +55,11 @@ impl SampleRing {
         let mut ring = Self::new(samples.len());
         ring.push(samples);
         ring
+    }
+
+    /// Samples that say nothing of time are of these unit times from now on, and every sample is kept with its own.
+    pub fn set_now(&mut self, times: [f32; 2]) {
+        self.now = Some(times);
     }
 
     /// Where the ring stands now.
@@ -113,9 +129,9 @@ impl SampleRing {
         let first = samples.len().saturating_sub(self.capacity);
         for index in first..samples.len() {
             if self.fresh.len() < self.capacity {
-                append(&mut self.fresh, samples, index);
+                append(&mut self.fresh, samples, index, self.now);
             } else {
-                overwrite(&mut self.fresh, self.next, samples, index);
+                overwrite(&mut self.fresh, self.next, samples, index, self.now);
                 self.next = (self.next + 1) % self.capacity;
             }
         }
@@ -124,6 +140,7 @@ impl SampleRing {
         self.stale.log_stretch.truncate(room);
         self.stale.arrival.truncate(room);
         self.stale.jacobian.truncate(room);
+        self.stale.times.truncate(room);
     }
 
     /// The window slid: all labels are set aside. What had been set aside before is dropped.
@@ -154,7 +171,7 @@ impl SampleRing {
         }
         let room = (self.capacity - self.fresh.len()).min(stale.len());
         for index in 0..room {
-            append(&mut self.fresh, &stale, index);
+            append(&mut self.fresh, &stale, index, None);
         }
         self.epoch = fresh_stamp();
         self.dropped_stale += (stale.len() - room) as u64;
@@ -168,7 +185,7 @@ impl SampleRing {
             return batch;
         }
         for i in 0..count {
-            append(&mut batch, &self.fresh, draw(seed, counter + i as u64, self.fresh.len()));
+            append(&mut batch, &self.fresh, draw(seed, counter + i as u64, self.fresh.len()), None);
         }
         batch
     }
@@ -182,20 +199,24 @@ fn shape(samples: &Samples) -> [bool; 2] {
     [samples.arrival.len() == samples.len(), samples.jacobian.len() == samples.len()]
 }
 
-fn append(to: &mut Samples, from: &Samples, index: usize) {
+fn append(to: &mut Samples, from: &Samples, index: usize, now: Option<[f32; 2]>) {
     to.points.push(from.points[index]);
     to.log_stretch.push(from.log_stretch.get(index).copied().unwrap_or(f32::NAN));
     to.arrival.extend(from.arrival.get(index));
     to.jacobian.extend(from.jacobian.get(index));
+    to.times.extend(from.times.get(index).copied().or(now));
 }
 
-fn overwrite(to: &mut Samples, at: usize, from: &Samples, index: usize) {
+fn overwrite(to: &mut Samples, at: usize, from: &Samples, index: usize, now: Option<[f32; 2]>) {
     to.points[at] = from.points[index];
     to.log_stretch[at] = from.log_stretch.get(index).copied().unwrap_or(f32::NAN);
     if let (Some(to), Some(&from)) = (to.arrival.get_mut(at), from.arrival.get(index)) {
         *to = from;
     }
     if let (Some(to), Some(&from)) = (to.jacobian.get_mut(at), from.jacobian.get(index)) {
+        *to = from;
+    }
+    if let (Some(to), Some(from)) = (to.times.get_mut(at), from.times.get(index).copied().or(now)) {
         *to = from;
     }
 }

@@ -242,6 +242,9 @@ mod tests {
         fn domain(&self) -> &Domain {
             &self.0
         }
+        fn start(&self) -> f64 {
+            0.0
+        }
         fn tau(&self) -> f64 {
             1.0
         }

@@ -5,12 +5,14 @@
 //! prediction are a running mean over the last share of the steps, which does the work of a decaying rate at every moment, and the rate falls
 //! only when the loss has stopped falling.
 
-use super::network::{Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step};
+use super::network::{
+    Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step, Times,
+};
 use super::{
     Brought, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples, SurrogateError,
     Table, fresh_stamp,
 };
-use crate::field::Domain;
+use crate::flow::Tracer;
 use progress::Progress;
 use std::borrow::Cow;
 use std::sync::{Arc, OnceLock};
@@ -85,6 +87,9 @@ pub(super) struct Trainer {
     settings: NetworkSettings,
     rate: f64,
     seed: u64,
+    /// Ranges of the times that are inputs, and the times that are predicted for, in them.
+    times: Times,
+    asked: [f32; 2],
     standardised: bool,
     fused: Option<Fused>,
     kept: Option<Kept>,
@@ -100,6 +105,7 @@ pub(super) struct FrozenNetwork {
     average: Arc<Average>,
     predictor: Arc<Predictor>,
     on_device: Option<Arc<dyn OffloadedNetwork>>,
+    asked: [f32; 2],
     stamp: u64,
 }
 
@@ -108,10 +114,11 @@ fn predict(
     on_device: Option<&dyn OffloadedNetwork>,
     (shape, objective, average, predictor): (&Architecture, &Objective, &Average, &Predictor),
     points: &[[f32; 3]],
+    times: [f32; 2],
     out: &mut [f32],
 ) {
-    if on_device.is_none_or(|network| network.predict(points, out).is_err()) {
-        predictor.log_stretch(shape, objective, &average.tables, points, out);
+    if on_device.is_none_or(|network| network.predict(points, times, out).is_err()) {
+        predictor.log_stretch(shape, objective, &average.tables, points, times, out);
     }
 }
 
@@ -121,7 +128,7 @@ impl Predict for FrozenNetwork {
     }
 
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        predict(self.on_device.as_deref(), (&self.shape, &self.objective, &self.average, &self.predictor), points, out);
+        predict(self.on_device.as_deref(), (&self.shape, &self.objective, &self.average, &self.predictor), points, self.asked, out);
     }
 
     fn bytes(&self) -> usize {
@@ -129,14 +136,16 @@ impl Predict for FrozenNetwork {
     }
 
     fn network(&self) -> Option<NetworkState<'_>> {
-        let Self { shape, objective, average, stamp, .. } = self;
-        let on_device = self.on_device.as_deref();
-        Some(NetworkState { stamp: *stamp, shape, objective, tables: &average.tables, layers: &average.layers, on_device, base: None })
+        let Self { shape, objective, average, stamp, asked, .. } = self;
+        let (on_device, tables, layers) = (self.on_device.as_deref(), &average.tables, &average.layers);
+        Some(NetworkState { stamp: *stamp, shape, objective, tables, layers, times: *asked, on_device, base: None })
     }
 }
 
 impl Trainer {
-    pub(super) fn new(settings: &NetworkSettings, domain: &Domain, tau: f64, seed: u64, centred: bool) -> Result<Self, SurrogateError> {
+    /// For what `tracer` traces; `centred`: the output layer starts at 0.
+    pub(super) fn new(settings: &NetworkSettings, tracer: &dyn Tracer, seed: u64, centred: bool) -> Result<Self, SurrogateError> {
+        let (domain, tau) = (tracer.domain(), tracer.tau());
         let axes: Vec<usize> = (0..domain.dimensions.clamp(1, 3)).collect();
         let shape = Architecture::new(settings, &axes, domain.extent())?;
         let objective = Objective::new(settings, &shape, domain.extent(), tau);
@@ -150,6 +159,7 @@ impl Trainer {
         };
         let progress = Progress { drawn: 0, averaged: 0, stall: 1.0, caution: 1.0, first_loss: 0.0, smooth: 0.0, looked: 0.0 };
         let rate = f64::from(settings.learning_rate.unwrap_or(default));
+        let times = Times::new(settings, tau);
         Ok(Self {
             model,
             objective,
@@ -159,6 +169,8 @@ impl Trainer {
             settings: settings.clone(),
             rate,
             seed,
+            times,
+            asked: times.unit(tracer.start(), tau),
             standardised: false,
             fused: None,
             kept: None,
@@ -185,7 +197,7 @@ impl Trainer {
     /// Writes the log-stretch (or the residual's part of it) at each point.
     pub(super) fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         let frozen = self.away.as_ref().and_then(Away::frozen);
-        predict(frozen.as_deref(), (&self.model.shape, &self.objective, &self.average, &self.predictor), points, out);
+        predict(frozen.as_deref(), (&self.model.shape, &self.objective, &self.average, &self.predictor), points, self.asked, out);
     }
 
     /// What predicts now, for good.
@@ -196,6 +208,7 @@ impl Trainer {
             average: self.average.clone(),
             predictor: self.predictor.clone(),
             on_device: self.away.as_ref().and_then(Away::frozen),
+            asked: self.asked,
             stamp: fresh_stamp(),
         }
     }
@@ -205,8 +218,13 @@ impl Trainer {
         self.model.shape.parameters() * size_of::<f32>()
     }
 
-    /// The window slid: weights carry over, but the average forgets what it has seen, and the rate is the first one again.
-    pub(super) fn window_slid(&mut self) {
+    /// The window slid: weights carry over, but the average forgets what it has seen, and the rate is the first one again. Where the start
+    /// time is an input, all that was learned stays right, and training goes on as it was.
+    pub(super) fn window_slid(&mut self, tracer: &dyn Tracer) {
+        self.asked = self.times.unit(tracer.start(), tracer.tau());
+        if self.times.tells(tracer.start()) {
+            return;
+        }
         self.kept = None;
         self.progress.averaged = 0;
         self.progress.stall = 1.0;

@@ -12,13 +12,15 @@ use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePr
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Loss, Model, NetworkSettings, Objective, Pick, PlannedStep, Step, Target, stock_step,
+    Architecture, Average, Fused, Input, Loss, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, Target, row, stock_step,
 };
 use ridgewatch::surrogate::{Brought, Offload, Predict, SampleRing, Samples, Table};
 
 /// Of the cases that the CPU trains, those that the kernels take.
 fn cases() -> Vec<Case> {
-    let taken = |case: &Case| case.settings.target == Target::Ftle;
+    // A sample has room for three inputs.
+    let inputs = |case: &Case| case.axes.len() + case.settings.inputs.len();
+    let taken = |case: &Case| case.settings.target == Target::Ftle && inputs(case) <= 3;
     let without_penalty = |case: Case| Case { settings: NetworkSettings { mean_penalty: 0.0, ..case.settings }, ..case };
     network_support::cases().into_iter().filter(taken).map(without_penalty).collect()
 }
@@ -81,6 +83,12 @@ fn predict(network: &dyn DevicePredict, points: &[[f32; 3]]) -> Vec<f32> {
     found
 }
 
+/// What the kernels take a point of three numbers for: a time stands where the network is shown no axis.
+fn row_of(shape: &Architecture, point: [f32; 3]) -> Row {
+    let free = (0..3).find(|axis| !shape.space().contains(axis)).map_or(0.0, |axis| point[axis]);
+    row(point, [free; 2])
+}
+
 /// Log-stretch from the reference's output.
 fn read(objective: &Objective, output: f64) -> f64 {
     match objective.loss {
@@ -106,7 +114,8 @@ fn predictions_are_the_references() {
             // Halves carry 11 bits.
             ("exact", Reference::new(&model), 2e-3),
         ] {
-            let expected: Vec<f64> = points.iter().map(|p| read(&objective, reference.outputs(inside(p))[0][0])).collect();
+            let expected: Vec<f64> =
+                points.iter().map(|p| read(&objective, reference.outputs(row_of(&model.shape, inside(p)))[0][0])).collect();
             let apart: Vec<f64> = found.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b).collect();
             let worst = apart.iter().fold(0.0, |m: f64, e| if e.is_nan() { f64::INFINITY } else { m.max(e.abs()) });
             let error = norm(&apart) / norm(&expected);
@@ -179,7 +188,7 @@ fn parts_of_a_batch_add_up() {
         let found = predict(&network, &samples.points);
         let reference = Reference::in_halves(&model);
         for i in (0..MANY).step_by(97).chain([MANY - 1]) {
-            let expected = read(&objective, reference.outputs(samples.points[i])[0][0]);
+            let expected = read(&objective, reference.outputs(row(samples.points[i], samples.times[i]))[0][0]);
             assert!((f64::from(found[i]) - expected).abs() < 1e-2, "{name}, {i}: {} and {expected}", found[i]);
         }
         let mut device = training(&model, &objective);
@@ -373,6 +382,24 @@ fn what_the_kernels_do_not_take_is_refused() {
     ] {
         assert!(matches!(refused(&settings), DeviceError::Unsupported { .. }), "{settings:?}");
     }
+}
+
+/// Points that bring no times along are answered for those that the network is asked for, on the device and from the host.
+#[test]
+#[ignore = "needs a GPU"]
+fn times_stand_where_no_axis_does() {
+    for case in cases().into_iter().filter(|case| !case.settings.inputs.is_empty()) {
+        let (model, objective, _) = prepare(&case);
+        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
+        let free = (0..3).find(|axis| !case.axes.contains(axis)).unwrap();
+        let points = uniform_points(4, 700);
+        let brought: Vec<[f32; 3]> = points.iter().map(|&point| std::array::from_fn(|k| if k == free { 0.3 } else { point[k] })).collect();
+        let times = if case.settings.inputs == [Input::Start] { [0.3, 0.9] } else { [0.9, 0.3] };
+        assert_eq!(predict(&network.above(None).at(times), &points), predict(&network, &brought), "{}", case.name);
+    }
+    let settings = NetworkSettings { inputs: vec![Input::Start], ..NetworkSettings::default() };
+    let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
+    assert!(!DeviceNetwork::takes(&gpu(), &shape), "four inputs");
 }
 
 #[test]

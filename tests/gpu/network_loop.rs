@@ -91,6 +91,66 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
     assert!(on_cpu > gpu_last - 0.5 && on_gpu > cpu_last - 0.5 && on_cpu_last > on_cpu - 0.5 && on_gpu_last > on_gpu - 0.5, "and go on");
 }
 
+/// A double gyre whose start is an input of the network, over slides: what the device learns is worth what the CPU learns, and labels outlive
+/// slides on both.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_network_with_the_start_time_slides_on_the_device() {
+    const GYRE: &str = "
+[source]
+kind = \"double_gyre\"
+[domain]
+min = [0, 0, 0]
+max = [2, 1, 0.2]
+[time]
+tau = 5
+step = 0.5
+slides = 4
+frames_per_slide = 4
+[flow]
+steps = 25
+[surrogate]
+kind = \"network\"
+[network]
+inputs = [\"start\"]
+log2_table = 16
+width = 32
+batch = 4096
+[training]
+steps_per_frame = 200
+[render]
+width = 48
+height = 24
+samples = 4
+";
+    let scene = SceneFile::parse(Path::new("a test"), GYRE, &[]).unwrap();
+    let made = |device: &Device| -> Vec<Frame> {
+        let mut frames = Vec::new();
+        let mut sink = |event: Event| {
+            if let Event::Frame(frame) = event {
+                frames.push(frame);
+            }
+        };
+        let options = RunOptions { device: device.clone(), ..RunOptions::default() };
+        run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).unwrap();
+        frames
+    };
+    let (found, expected) = (made(&device(GpuSettings::default())), made(&Device::CPU));
+    let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
+    println!("dB: GPU {:.1?}, CPU {:.1?}", psnr(&found), psnr(&expected));
+    for (frames, learns_there) in [(&found, true), (&expected, false)] {
+        for pair in frames.windows(2) {
+            let [before, after] = [&pair[0].record, &pair[1].record];
+            assert!(after.ring > before.ring, "frame {}: {} samples, then {}", after.frame, before.ring, after.ring);
+            assert!(after.warnings.is_empty(), "{:?}", after.warnings);
+            assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
+        }
+        assert!(psnr(frames)[15] > psnr(frames)[0] + 5.0, "it learns");
+    }
+    // A device learns from all that it traces, the CPU from what is kept.
+    assert!(psnr(&found)[15] > psnr(&expected)[15] - 1.0, "as much");
+}
+
 /// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
 /// networks, which are trained on other samples.
 #[test]

@@ -1,7 +1,7 @@
 //! Tracing kernels against the CPU in f64.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{Storage, Tuning};
+use ridgewatch::engine::cuda::{DeviceTracer, Outputs, Storage, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource};
@@ -60,6 +60,38 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         );
         assert!(ours < 3.0 * theirs + 2e-6, "{name}: single precision is off by {ours:e}, the CPU's by {theirs:e}");
     }
+}
+
+/// Each seed at a start of its own, against the CPU's tracer at that start.
+#[test]
+#[ignore = "needs a GPU"]
+fn seeds_with_starts_of_their_own() {
+    let VelocitySource::Analytic(flow, plane) = gyre([0.0, 0.0], [2.0, 1.0]) else { panic!("a closed form") };
+    let seeds = fresh(&Domain::cuboid([0.0, 0.0, -3.0], [2.0, 1.0, 10.0]), 500);
+    for (precision, tolerance) in [(Precision::F64, 2e-9), (Precision::F32, 2e-3)] {
+        let map = FlowMap { precision, ..map(10.0, 40) };
+        let tracer = DeviceTracer::with_starts(&gpu(), &flow, &plane, &map, 40).unwrap();
+        let found = traced_there(&tracer, &seeds);
+        for (seed, found) in seeds.iter().zip(&found) {
+            let exact = on_cpu(&gyre([0.0, 0.0], [2.0, 1.0]), &super::scenes::map(10.0, 40), f64::from(seed[2]), &[*seed]);
+            let exact = exact.log_stretch_f64[0];
+            assert!((found - exact).abs() < tolerance * exact.abs().max(1.0), "{precision:?} {seed:?}: {found} for {exact}");
+        }
+    }
+    let saddle = Analytic::Saddle { rate: 1.0 };
+    assert!(DeviceTracer::with_starts(&gpu(), &saddle, &plane, &map(10.0, 40), 40).is_err());
+}
+
+fn traced_there(tracer: &DeviceTracer, seeds: &[[f32; 3]]) -> Vec<f64> {
+    let points = gpu().upload("seeds", seeds).unwrap();
+    let single = gpu().upload("values", &vec![f32::NAN; seeds.len()]).unwrap();
+    let double = gpu().upload("values", &vec![f64::NAN; seeds.len()]).unwrap();
+    let out = Outputs { log_stretch: single.address(), log_stretch_f64: double.address(), ..Outputs::default() };
+    // SAFETY: all buffers hold as many entries, and reading waits for the stream.
+    unsafe { tracer.trace(points.address(), seeds.len(), &out) }.unwrap();
+    let mut found = vec![f64::NAN; seeds.len()];
+    double.read(&mut found).unwrap();
+    found
 }
 
 #[test]

@@ -267,7 +267,7 @@ struct Frozen {
 }
 
 impl OffloadedNetwork for Frozen {
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost> {
+    fn predict(&self, points: &[[f32; 3]], _: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost> {
         out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
         self.there.call("asking a network")?;
         let (shape, scale) = (Arc::new(self.model.shape.clone()), &self.objective.scale);

@@ -6,7 +6,7 @@ pub mod reference;
 use rayon::prelude::*;
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Extras, Traced, Tracer};
-use ridgewatch::surrogate::network::{Encoding, Loss, NetworkSettings, Target};
+use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
 use std::f64::consts::PI;
 
 /// A = 0.1, eps = 0.25, omega = 2 pi / 10, forward from `start` over `tau`.
@@ -57,6 +57,9 @@ impl Tracer for DoubleGyre {
     fn domain(&self) -> &Domain {
         &self.domain
     }
+    fn start(&self) -> f64 {
+        self.start
+    }
     fn tau(&self) -> f64 {
         self.tau
     }
@@ -105,6 +108,7 @@ pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> rid
         log_stretch: out.log_stretch,
         arrival: out.arrival.iter().map(unit).collect(),
         jacobian: out.jacobian.iter().map(scaled).collect(),
+        times: Vec::new(),
     }
 }
 
@@ -147,6 +151,15 @@ pub fn cases() -> Vec<Case> {
         case("frequency, 4 layers of 40", plane, |s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 4, 40)),
         case("wide, tables", space, |s| s.width = 130),
         case("deep, frequency", plane, |s| (s.encoding, s.hidden_layers, s.width) = (Encoding::Frequency, 6, 25)),
+        case("2 axes and start", plane, |s| s.inputs = vec![Input::Start]),
+        case("x, z and duration, wide", &[0, 2], |s| (s.width, s.inputs) = (130, vec![Input::Duration])),
+        case("3 axes and start", space, |s| s.inputs = vec![Input::Start]),
+        case("frequency, 3 axes, start and duration", space, |s| {
+            (s.encoding, s.inputs) = (Encoding::Frequency, vec![Input::Duration, Input::Start]);
+        }),
+        case("flow map, 2 axes and start", plane, |s| {
+            (s.target, s.jacobian_weight, s.inputs) = (Target::FlowMap, 0.3, vec![Input::Start]);
+        }),
         case("published loss", plane, |s| (s.loss, s.mean_penalty) = (Loss::Published, 0.7)),
         case("flow map, 2 axes", plane, flow_map),
         case("flow map, 3 axes", space, flow_map),

@@ -2,7 +2,7 @@
 
 use super::uniform_points;
 use ridgewatch::surrogate::Samples;
-use ridgewatch::surrogate::network::{Architecture, Encoding, Loss, Model, Objective, Target};
+use ridgewatch::surrogate::network::{Architecture, Encoding, Loss, Model, Objective, Row, Target, row};
 
 /// Rounded to half precision (11 bits, 2^-24 at least apart), ties to even.
 fn half(x: f64) -> f64 {
@@ -37,10 +37,10 @@ impl<'a> Reference<'a> {
         halves
     }
 
-    /// Outputs and their derivatives along the axes: `[1 + axes][outputs]`.
-    pub fn outputs(&self, point: [f32; 3]) -> Vec<Vec<f64>> {
+    /// Outputs and their derivatives along the inputs: `[1 + inputs][outputs]`.
+    pub fn outputs(&self, row: Row) -> Vec<Vec<f64>> {
         let shape = self.shape;
-        let x: Vec<f32> = shape.axes.iter().map(|&a| point[a]).collect();
+        let x: Vec<f32> = shape.axes.iter().map(|&a| row[a]).collect();
         let d = x.len();
         let mut rows = vec![Vec::new(); 1 + d];
         match shape.encoding {
@@ -61,7 +61,7 @@ impl<'a> Reference<'a> {
                                 let side = |a: usize| (corner >> a) & 1;
                                 let node: Vec<u32> = (0..d).map(|a| cell[a] + side(a)).collect();
                                 let index = if level.hashed {
-                                    let primes = [1_u32, 2_654_435_761, 805_459_861];
+                                    let primes = [1_u32, 2_654_435_761, 805_459_861, 3_674_653_429];
                                     let hash = (0..d).fold(0, |h, a| h ^ node[a].wrapping_mul(primes[a]));
                                     hash as usize % level.entries
                                 } else {
@@ -122,7 +122,7 @@ impl<'a> Reference<'a> {
         let outputs = self.shape.outputs();
         let (mut loss, mut linear) = (0.0, 0.0);
         for i in 0..samples.len() {
-            let rows = self.outputs(samples.points[i]);
+            let rows = self.outputs(row(samples.points[i], samples.times[i]));
             if objective.target == Target::Ftle {
                 let y = f64::from(samples.log_stretch[i]);
                 let target = match objective.loss {
@@ -135,15 +135,16 @@ impl<'a> Reference<'a> {
                 };
                 loss += (rows[0][0] - target).powi(2) / count;
             } else {
-                for (o, &axis) in self.shape.axes.iter().enumerate() {
+                let axes = self.shape.space();
+                for (o, &axis) in axes.iter().enumerate() {
                     let deviation = f64::from(objective.scale.deviation[o]);
                     let moved = f64::from(samples.arrival[i][axis] - samples.points[i][axis]);
                     let target = (moved - f64::from(objective.scale.mean[o])) / deviation;
                     loss += (rows[0][o] - target).powi(2) / (count * outputs as f64);
-                    for (a, &along) in self.shape.axes.iter().enumerate() {
+                    for (a, &along) in axes.iter().enumerate() {
                         let identity = if axis == along { 1.0 } else { 0.0 };
                         let target = (f64::from(samples.jacobian[i][3 * axis + along]) - identity) / deviation;
-                        let weight = f64::from(objective.jacobian_weight) / self.shape.axes.len() as f64;
+                        let weight = f64::from(objective.jacobian_weight) / axes.len() as f64;
                         loss += weight * (rows[1 + a][o] - target).powi(2) / (count * outputs as f64);
                     }
                 }
@@ -166,6 +167,7 @@ pub fn labels(count: usize, seed: u64) -> Samples {
         log_stretch: points.iter().map(value).collect(),
         arrival: points.iter().map(arrival).collect(),
         jacobian: points.iter().map(jacobian).collect(),
+        times: uniform_points(seed + 1000, count).into_iter().map(|[start, duration, _]| [start, duration]).collect(),
         points,
     }
 }

@@ -1,8 +1,8 @@
 //! The kernels' numerics, compiled as host C++ with the very macros and arguments of a launch, against the Rust reference in f64. No GPU.
 
 use super::grid::{GridArguments, Nodes};
-use super::layout::{DeviceReal, Outputs, Verdict, words};
-use super::trace::{closed_data, closed_defines, closed_stages, verdict};
+use super::layout::{DeviceReal, Outputs, Verdict};
+use super::trace::{ClosedArguments, verdict};
 use super::{DeviceError, Storage};
 use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
@@ -32,16 +32,18 @@ fn library(folder: &Path, defines: &[String]) -> libloading::Library {
     unsafe { libloading::Library::new(&out) }.unwrap()
 }
 
-/// Runs the kernel's code on the host. Outputs are poisoned before.
-fn host(source: &VelocitySource, map: &FlowMap, t0: f64, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+/// Runs the kernel's code on the host. Outputs are poisoned before. `t0`: none where every seed has its own.
+fn host(source: &VelocitySource, map: &FlowMap, t0: impl Into<Option<f64>>, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+    let t0 = t0.into();
     match map.precision {
         Precision::F32 => host_in::<f32>(source, map, t0, storage, seeds),
         Precision::F64 => host_in::<f64>(source, map, t0, storage, seeds),
     }
 }
 
-fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
+fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<f64>, storage: Storage, seeds: &[[f32; 3]]) -> Traced {
     let Steps::Fixed(steps) = map.steps else { panic!("fixed steps") };
+    let t0 = start.unwrap_or(0.0);
     let to = t0 + map.direction.sign() * map.tau;
     // Memory that stays where it is until the end; eight-byte words, so that it is aligned.
     let mut memory: Vec<Box<[u64]>> = Vec::new();
@@ -55,10 +57,9 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, t0: f64, stora
     let folder = tempfile::tempdir().unwrap();
     let (data, times, mut defines) = match source {
         VelocitySource::Analytic(flow, domain) => {
-            let (stages, form) = closed_stages::<R>(flow, t0, to, steps);
-            let mut defines = closed_defines::<R>(map, form);
+            let ClosedArguments { data, stages, mut defines } = ClosedArguments::new::<R>(flow, domain, map, start, steps);
             defines.push("RW_CLOSED=1".into());
-            (words(&closed_data::<R>(domain, map.boundary)), put(&stages).unwrap(), defines)
+            (data, put(&stages).unwrap(), defines)
         }
         VelocitySource::Window(window) => {
             let grid = window.grid().unwrap().clone();
@@ -246,6 +247,35 @@ fn closed_forms() {
     check("ABC", &abc, &FlowMap { boundary: Boundary::Unbounded, ..map(2.0, 30) }, 0.0);
     for flow in [Analytic::Saddle { rate: 0.7 }, Analytic::Rotation { omega: 0.7 }, Analytic::Shear { rate: 0.7 }] {
         check("linear", &VelocitySource::Analytic(flow, plane.clone()), &map(4.0, 20), 0.0);
+    }
+}
+
+/// Seeds with starts of their own, each against the CPU's tracer at that start.
+#[test]
+fn closed_forms_with_starts() {
+    let plane = Domain::slab([0.0, 0.0], [2.0, 1.0], (0.0, 1.0));
+    let gyre = VelocitySource::Analytic(Analytic::DoubleGyre { amplitude: 0.1, epsilon: 0.25, omega: 0.6 }, plane);
+    let seeds = fresh(&Domain::cuboid([0.0, 0.0, -3.0], [2.0, 1.0, 10.0]), 150);
+    for (direction, integrator, tolerance) in [
+        (Direction::Forward, Integrator::Tangent, 2e-9),
+        (Direction::Backward, Integrator::Tangent, 2e-9),
+        // Rounding over the gap.
+        (Direction::Forward, Integrator::Differences, 1e-6),
+    ] {
+        let map = FlowMap { direction, integrator, ..map(10.0, 40) };
+        let found = host(&gyre, &map, None, Storage::F32, &seeds);
+        let single = host(&gyre, &FlowMap { precision: Precision::F32, ..map.clone() }, None, Storage::F32, &seeds);
+        for (i, &seed) in seeds.iter().enumerate() {
+            let exact = cpu(&gyre, &map, f64::from(seed[2]), &[seed]);
+            let (a, b) = (exact.log_stretch_f64[0], found.log_stretch_f64[i]);
+            assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{direction:?} {integrator:?} {seed:?}: {a} {b}");
+            // Single precision: differences lose what the gap of 1e-4 leaves of seven digits.
+            let tolerance = if integrator == Integrator::Tangent { 2e-3 } else { 0.1 };
+            assert!(
+                (f64::from(single.log_stretch[i]) - a).abs() < tolerance,
+                "{direction:?} {integrator:?} {seed:?}: {a} in single precision"
+            );
+        }
     }
 }
 
@@ -437,7 +467,7 @@ fn round_to_half(x: f32) -> f32 {
 #[test]
 fn halves_round_to_nearest() {
     let folder = tempfile::tempdir().unwrap();
-    let defines = ["RW_CLOSED=1", "RW_REAL=float", "RW_FORM=0", "RW_BOUNDARY=3", "RW_DIFFERENCES=0"].map(String::from);
+    let defines = ["RW_CLOSED=1", "RW_REAL=float", "RW_FORM=0", "RW_BOUNDARY=3", "RW_DIFFERENCES=0", "RW_STARTS=0"].map(String::from);
     let library = library(folder.path(), &defines);
     // SAFETY: the function has this signature.
     let half: libloading::Symbol<unsafe extern "C" fn(f32) -> f32> = unsafe { library.get(b"host_half") }.unwrap();

@@ -70,6 +70,7 @@ pub struct ClosedData<R> {
     pub high: [R; 3],
     pub box_low: [R; 3],
     pub box_high: [R; 3],
+    pub rate: f64,
 }
 
 /// `Verdict`.
@@ -280,7 +281,7 @@ mod tests {
         assert_eq!((size_of::<AxisData<f32>>(), size_of::<AxisData<f64>>()), (64, 80));
         assert_eq!((size_of::<GridData<f32>>(), size_of::<GridData<f64>>()), (336, 488));
         assert_eq!((size_of::<GridStep<f32>>(), size_of::<GridStep<f64>>()), (64, 72));
-        assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (48, 40, 12));
+        assert_eq!((size_of::<ClosedData<f32>>(), size_of::<Outputs>(), size_of::<Verdict>()), (56, 40, 12));
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
         // static_asserts in the kernels' sources hold the other side of these.
         assert_eq!((size_of::<TableArgument>(), size_of::<LandArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));

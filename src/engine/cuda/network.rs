@@ -8,7 +8,7 @@ use super::network_batched::{Batched, GradientTo};
 use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, HASH, Loss, Objective, Target};
+use crate::surrogate::network::{Architecture, HASH, Loss, Objective, Target, row};
 use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg, result};
 use std::sync::Arc;
@@ -32,17 +32,17 @@ pub fn is_fused(shape: &Architecture, shared_memory: usize) -> bool {
     hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST && workspace <= shared_memory
 }
 
-/// The macros that `network*.cu` are compiled with for an architecture; none where it has several outputs.
+/// The macros that `network*.cu` are compiled with for an architecture; none where it has several outputs, or more than three inputs.
 pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
     if shape.target != Target::Ftle || hidden == 0 {
         return None;
     }
-    let axes: Vec<String> = shape.axes.iter().map(usize::to_string).collect();
+    let axes: Vec<String> = places(shape)?.iter().map(usize::to_string).collect();
     let (weights, workspace) = shared_bytes(shape);
     Some(vec![
         format!("RW_AXES={}", axes.join(",")),
-        format!("RW_DIMS={}", shape.dimensions()),
+        format!("RW_DIMS={}", shape.inputs()),
         format!("RW_LEVELS={}", shape.levels.len()),
         format!("RW_FEATURES={}", shape.features),
         format!("RW_OCTAVES={}", shape.octaves),
@@ -51,6 +51,25 @@ pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
         format!("RW_WEIGHTS_BYTES={weights}"),
         format!("RW_WORKSPACE_BYTES={workspace}"),
     ])
+}
+
+/// Which of the three numbers of a unit point holds each input: axes have their own, times those of axes that the network is not shown. None
+/// where there are too many.
+fn places(shape: &Architecture) -> Option<Vec<usize>> {
+    let mut free = (0..3).filter(|place| !shape.space().contains(place));
+    let times = shape.times().iter().map(|_| free.next());
+    shape.space().iter().map(|&axis| Some(axis)).chain(times).collect()
+}
+
+/// Unit times at those places; NaN at the others, and everywhere where there are none, for what a point brings along.
+pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> [f32; 3] {
+    let mut placed = [f32::NAN; 3];
+    let (Some(times), Some(places)) = (times, places(shape)) else { return placed };
+    let row = row([f32::NAN; 3], times);
+    for (place, &column) in places.into_iter().zip(&shape.axes) {
+        placed[place] = row[column];
+    }
+    placed
 }
 
 /// Sizes of `Weights` in `network.cuh` and `Workspace` in `network_fused.cu`, which asserts them.
@@ -123,8 +142,9 @@ impl NetworkKernels {
         }
         let Some(defines) = network_defines(shape) else {
             return refuse(format!(
-                "a network of {} hidden layers for the target {:?}; the device takes the target ftle with at least one",
+                "a network of {} hidden layers and the inputs {} for the target {:?}; the device takes the target ftle with at least one layer and at most three inputs",
                 shape.layers.len() - 1,
+                shape.input_names().join(", "),
                 shape.target
             ));
         };
@@ -219,9 +239,10 @@ fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
             stride = stride.wrapping_mul(level.cells[axis] + 1);
             if level.hashed { HASH[axis] } else { dense }
         });
+        let [x, y, z, _] = level.cells;
         *argument = LevelArgument {
-            cells: level.cells.map(|n| n as f32),
-            last_cell: level.cells.map(|n| n - 1),
+            cells: [x, y, z].map(|n| n as f32),
+            last_cell: [x, y, z].map(|n| n - 1),
             factor,
             mask: (level.entries - 1) as u32,
             hashed: u32::from(level.hashed),
@@ -237,8 +258,8 @@ fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
     Ok((grid, offset * shape.features))
 }
 
-/// How outputs become log-stretch, above `base` by `share` of them where there is one.
-pub(super) fn reading(objective: &Objective, base: Option<&DeviceTable>, share: f32) -> ReadingArgument {
+/// How outputs become log-stretch, above `base` by `share` of them where there is one, and the times that points have ([`placed_times`]).
+pub(super) fn reading(objective: &Objective, times: [f32; 3], base: Option<&DeviceTable>, share: f32) -> ReadingArgument {
     let table = base.map_or(TableArgument { nodes: [0; 3], dimensions: 0, values: 0 }, |base| {
         let nodes = base.nodes().map(|n| n as i32);
         TableArgument { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: base.address() }
@@ -249,7 +270,7 @@ pub(super) fn reading(objective: &Objective, base: Option<&DeviceTable>, share: 
         tau: objective.tau,
         published: i32::from(objective.loss == Loss::Published),
         share,
-        pad: 0,
+        times,
         base: table,
     }
 }
@@ -273,6 +294,7 @@ pub struct DeviceNetwork {
 pub struct NetworkAbove<'a> {
     network: &'a DeviceNetwork,
     base: Option<(&'a DeviceTable, f32)>,
+    times: Option<[f32; 2]>,
 }
 
 impl DeviceNetwork {
@@ -315,9 +337,16 @@ impl DeviceNetwork {
         2 * self.kernels.padded + 4 * self.layers.len()
     }
 
-    /// Above a table, by a share of the network.
+    /// Above a table, by a share of the network. Where times are inputs, points bring them along, at the places of axes that are none.
     pub fn above<'a>(&'a self, base: Option<(&'a DeviceTable, f32)>) -> NetworkAbove<'a> {
-        NetworkAbove { network: self, base }
+        NetworkAbove { network: self, base, times: None }
+    }
+}
+
+impl NetworkAbove<'_> {
+    /// For these unit times, whatever points bring along.
+    pub fn at(self, times: [f32; 2]) -> Self {
+        Self { times: Some(times), ..self }
     }
 }
 
@@ -334,7 +363,8 @@ impl DevicePredict for NetworkAbove<'_> {
             return Ok(());
         }
         let DeviceNetwork { kernels, halves, layers, objective } = self.network;
-        let reading = reading(objective, self.base.map(|(table, _)| table), self.base.map_or(1.0, |(_, share)| share));
+        let times = placed_times(&kernels.shape, self.times);
+        let reading = reading(objective, times, self.base.map(|(table, _)| table), self.base.map_or(1.0, |(_, share)| share));
         // SAFETY: the caller's; the parameters are of these kernels' architecture.
         unsafe { kernels.predict(halves.address(), layers.address(), &reading, points, count, out) }
     }

@@ -213,7 +213,7 @@ impl Batched {
             let (n, at, to) = (part as u32, points + 12 * first as u64, out + 4 * first as u64);
             let encoded = encoded.address();
             let mut call = stream.launch_builder(&self.encode_points);
-            call.arg(&self.grid).arg(&halves).arg(&at).arg(&n).arg(&encoded);
+            call.arg(&self.grid).arg(&halves).arg(reading).arg(&at).arg(&n).arg(&encoded);
             // SAFETY: the arguments of `batched_encode_points`, a thread two columns.
             unsafe { launch(&mut call, threads(rows * self.encoded / 2, THREADS)) }?;
             let mut from = encoded;

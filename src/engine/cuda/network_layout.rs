@@ -36,7 +36,7 @@ pub struct ReadingArgument {
     pub tau: f32,
     pub published: i32,
     pub share: f32,
-    pub pad: i32,
+    pub times: [f32; 3],
     pub base: TableArgument,
 }
 
@@ -92,7 +92,7 @@ mod tests {
     #[test]
     fn sizes_are_those_of_cpp() {
         // static_asserts in the kernels' sources hold the other side.
-        assert_eq!((size_of::<LevelArgument>(), size_of::<ReadingArgument>()), (56, 48));
+        assert_eq!((size_of::<LevelArgument>(), size_of::<ReadingArgument>()), (56, 56));
         assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (56, 16, 48));
     }
 }

@@ -3,7 +3,7 @@
 //! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
-use super::network::{DeviceNetwork, NetworkKernels, copied, copy, reading, unit_box};
+use super::network::{DeviceNetwork, NetworkKernels, copied, copy, placed_times, reading, unit_box};
 use super::network_batched::GradientTo;
 use super::network_layout::{AdamArgument, DrawArgument};
 use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
@@ -11,6 +11,7 @@ use crate::field::Domain;
 use crate::surrogate::Samples;
 use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Loss, Model, Objective, PlannedStep};
 use cudarc::driver::PushKernelArg;
+use std::borrow::Cow;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -27,8 +28,21 @@ pub(super) struct SampleWriter {
 }
 
 impl SampleWriter {
+    /// Points of samples on the host, with their times where the network is shown them.
+    fn placed<'a>(&self, samples: &'a Samples, range: Range<usize>) -> Cow<'a, [[f32; 3]]> {
+        let shape = &self.kernels.shape;
+        if shape.times().is_empty() {
+            return Cow::Borrowed(&samples.points[range]);
+        }
+        let with_times = |index: usize| {
+            let times = placed_times(shape, Some(samples.times_of(index)));
+            std::array::from_fn(|k| if times[k].is_nan() { samples.points[index][k] } else { times[k] })
+        };
+        range.map(with_times).collect()
+    }
+
     /// Traced points on the device go to the places of `to`. Of every 2^held_back of them one cannot be learned from
-    /// ([`super::keeps_label`]), since the host may keep it; with 0 all can.
+    /// ([`super::keeps_label`]), since the host may keep it; with 0 all can. They are of the unit times, or bring theirs along.
     ///
     /// # Safety
     /// As for [`DeviceTraining::append`].
@@ -40,13 +54,15 @@ impl SampleWriter {
         points: u64,
         log_stretch: u64,
         base: Option<&DeviceTable>,
+        times: Option<[f32; 2]>,
         held_back: u32,
     ) -> Result<(), DeviceError> {
         if to.is_empty() {
             return Ok(());
         }
         assert!(to.end <= ring.samples.len(), "a ring of {} for samples {to:?}", ring.samples.len());
-        let (domain, reading) = (unit_box(domain), reading(&self.objective, base, 1.0));
+        let (domain, times) = (unit_box(domain), placed_times(&self.kernels.shape, times));
+        let reading = reading(&self.objective, times, base, 1.0);
         let (n, at) = (to.len() as u32, ring.samples.address_of(to.start));
         let stream = self.kernels.gpu.work();
         let mut call = stream.launch_builder(&self.kernels.samples);
@@ -67,6 +83,7 @@ impl SampleWriter {
         log_stretch: u64,
         count: usize,
         base: Option<&DeviceTable>,
+        times: Option<[f32; 2]>,
         held_back: u32,
     ) -> Result<(), DeviceError> {
         let capacity = ring.samples.len();
@@ -75,7 +92,7 @@ impl SampleWriter {
         for (from, part) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
             let to = ring.next..ring.next + part;
             // SAFETY: the caller's.
-            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base, held_back) }?;
+            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base, times, held_back) }?;
             ring.next = (ring.next + part) % capacity;
         }
         ring.len = (ring.len + count).min(capacity);
@@ -361,10 +378,10 @@ impl DeviceTraining {
         let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
         for from in range.clone().step_by(WRITTEN) {
             let part = from..(from + WRITTEN).min(range.end);
-            let points = self.gpu.upload("samples", &samples.points[part.clone()])?;
+            let points = self.gpu.upload("samples", &self.writer.placed(samples, part.clone()))?;
             let log_stretch = self.gpu.upload("samples", &samples.log_stretch[part.clone()])?;
             // SAFETY: both buffers hold as many entries and are freed in the order of the work stream.
-            unsafe { self.writer.place(ring, part, &unit, points.address(), log_stretch.address(), base, 0) }?;
+            unsafe { self.writer.place(ring, part, &unit, points.address(), log_stretch.address(), base, None, 0) }?;
         }
         ring.len = ring.len.max(range.end);
         Ok(())
@@ -390,7 +407,8 @@ impl DeviceTraining {
         Ok(found[0] as usize)
     }
 
-    /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`) and their log-stretch (f32 each).
+    /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`, times at the places of axes that are no
+    /// inputs) and their log-stretch (f32 each).
     /// What is not finite is never learned from.
     ///
     /// # Errors
@@ -413,7 +431,7 @@ impl DeviceTraining {
         let capacity = ring.samples.len();
         assert!(count <= capacity, "a ring of {capacity} for {count} samples");
         // SAFETY: the caller's.
-        unsafe { self.writer.append(ring, domain, points, log_stretch, count, base, 0) }
+        unsafe { self.writer.append(ring, domain, points, log_stretch, count, base, None, 0) }
     }
 
     /// Fills `points` with uniform points of the domain, a function of `seed` and their numbers, `first` and on.

@@ -55,7 +55,7 @@ struct Held {
     more_usable: usize,
 }
 
-/// Labels of the frames since the last slide that were traced on the device and stay there; frames write, training reads, in turns.
+/// Labels of the frames that were traced on the device and stay there, since the last slide that made them wrong; frames write, training reads, in turns.
 #[derive(Debug)]
 pub(super) struct LabelPool {
     writer: SampleWriter,
@@ -73,13 +73,14 @@ pub(super) struct Pupil<'a> {
     pool: &'a LabelPool,
     domain: &'a Domain,
     base: Option<&'a DeviceTable>,
+    times: [f32; 2],
 }
 
 impl DeviceLearns for Pupil<'_> {
     unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError> {
         let (writer, mut samples) = (&self.pool.writer, self.pool.samples());
         // SAFETY: the caller's.
-        unsafe { writer.append(&mut samples, self.domain, points, log_stretch, count, self.base, HELD_BACK) }
+        unsafe { writer.append(&mut samples, self.domain, points, log_stretch, count, self.base, Some(self.times), HELD_BACK) }
     }
 }
 
@@ -211,9 +212,9 @@ pub(super) struct CudaNetwork {
 }
 
 impl CudaNetwork {
-    /// Who learns from what a frame traces, beyond `base`.
-    pub(super) fn pupil<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>) -> Option<Pupil<'a>> {
-        self.pool.as_ref().map(|pool| Pupil { pool, domain, base })
+    /// Who learns from what a frame traces at these unit times, beyond `base`.
+    pub(super) fn pupil<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>, times: [f32; 2]) -> Option<Pupil<'a>> {
+        self.pool.as_ref().map(|pool| Pupil { pool, domain, base, times })
     }
 
     pub(super) fn network(&self) -> &DeviceNetwork {
@@ -222,8 +223,9 @@ impl CudaNetwork {
 }
 
 impl OffloadedNetwork for CudaNetwork {
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceLost> {
-        self.gpu.health().ask(|| predict_from_host(&self.gpu, &self.network, points, out)).ok_or(DeviceLost)
+    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost> {
+        let network = self.network.above(None).at(times);
+        self.gpu.health().ask(|| predict_from_host(&self.gpu, &network, points, out)).ok_or(DeviceLost)
     }
 
     fn as_any(&self) -> &dyn std::any::Any {

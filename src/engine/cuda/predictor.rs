@@ -101,8 +101,8 @@ impl Predictors {
             Some((table, share)) => Some((below.of(gpu, tracer.domain(), table)?, share)),
             None => None,
         };
-        let pupil = there.and_then(|there| there.pupil(tracer.domain(), base.map(|(table, _)| table)));
-        Ok(Some(Predictor::Network(network.above(base), pupil)))
+        let pupil = there.and_then(|there| there.pupil(tracer.domain(), base.map(|(table, _)| table), state.times));
+        Ok(Some(Predictor::Network(network.above(base).at(state.times), pupil)))
     }
 }
 

@@ -5,7 +5,7 @@ use super::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
 use super::sort::{MOST, SortCells, Sorter};
 use super::window::DeviceWindow;
 use super::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
-use crate::field::analytic::{Analytic, ClosedForm, Form};
+use crate::field::analytic::{Analytic, ClosedForm, Constants, Form};
 use crate::field::{Domain, Geometry};
 use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
 use crate::simd::Real;
@@ -79,6 +79,51 @@ impl DeviceTracer {
         }
     }
 
+    /// For seeds with start times of their own: x, y and start. Only a closed form of two dimensions that depends on time by a phase, the double
+    /// gyre, can be traced so.
+    ///
+    /// # Errors
+    /// Other flows, the adaptive integrator; kernels that do not compile.
+    pub fn with_starts(gpu: &Arc<Gpu>, flow: &Analytic, domain: &Domain, map: &FlowMap, steps: usize) -> Result<Self, DeviceError> {
+        if !matches!(flow.form(), Form::DoubleGyre(_)) || map.integrator == Integrator::DormandPrince {
+            let what = format!("start times of each seed's own with {:?} and the flow {flow:?}", map.integrator);
+            return Err(DeviceError::Unsupported { what });
+        }
+        match map.precision {
+            Precision::F32 => Self::of_closed::<f32>(gpu, flow, domain, map, None, steps),
+            Precision::F64 => Self::of_closed::<f64>(gpu, flow, domain, map, None, steps),
+        }
+    }
+
+    /// `t0`: none where every seed has its own.
+    fn of_closed<R: DeviceReal>(
+        gpu: &Arc<Gpu>,
+        flow: &Analytic,
+        domain: &Domain,
+        map: &FlowMap,
+        t0: Option<f64>,
+        steps: usize,
+    ) -> Result<Self, DeviceError> {
+        let ClosedArguments { data, stages, defines } = ClosedArguments::new::<R>(flow, domain, map, t0, steps);
+        let stages = gpu.upload("the stages of a closed form", &stages)?;
+        Ok(Self {
+            plain: gpu.kernel("trace_closed.cu", &defines, "trace")?,
+            sorted: gpu.kernel("trace_closed.cu", &defines, "trace_sorted")?,
+            seeds_a_warp: 32,
+            block: 256,
+            data,
+            times: stages.address(),
+            step: step_word::<R>(map, steps),
+            gap: map.gap,
+            verdict: verdict(map, steps),
+            cells: None,
+            sorter: Mutex::new(None),
+            _window: None,
+            _memory: vec![stages],
+            gpu: gpu.clone(),
+        })
+    }
+
     fn of_real<R: DeviceReal>(
         store: &SnapshotStore,
         gpu: &Arc<Gpu>,
@@ -89,31 +134,8 @@ impl DeviceTracer {
         tuning: Tuning,
     ) -> Result<Self, DeviceError> {
         let to = t0 + map.direction.sign() * map.tau;
-        let verdict = verdict(map, steps);
-        let mut step = [0u64; 1];
-        step[0] = words(&R::from_f64((to - t0) / steps as f64))[0];
         match source {
-            VelocitySource::Analytic(flow, domain) => {
-                let (stages, form) = closed_stages::<R>(flow, t0, to, steps);
-                let defines = closed_defines::<R>(map, form);
-                let stages = gpu.upload("the stages of a closed form", &stages)?;
-                Ok(Self {
-                    plain: gpu.kernel("trace_closed.cu", &defines, "trace")?,
-                    sorted: gpu.kernel("trace_closed.cu", &defines, "trace_sorted")?,
-                    seeds_a_warp: 32,
-                    block: 256,
-                    data: words(&closed_data::<R>(domain, map.boundary)),
-                    times: stages.address(),
-                    step,
-                    gap: map.gap,
-                    verdict,
-                    cells: None,
-                    sorter: Mutex::new(None),
-                    _window: None,
-                    _memory: vec![stages],
-                    gpu: gpu.clone(),
-                })
-            }
+            VelocitySource::Analytic(flow, domain) => Self::of_closed::<R>(gpu, flow, domain, map, Some(t0), steps),
             VelocitySource::Window(window) => {
                 let grid = window.grid().ok_or_else(|| DeviceError::Unsupported { what: "an empty window".into() })?.clone();
                 let held = store.window(window, tuning.storage)?;
@@ -139,9 +161,9 @@ impl DeviceTracer {
                     block: 128,
                     data: arguments.data,
                     times: arguments.steps,
-                    step,
+                    step: step_word::<R>(map, steps),
                     gap: map.gap,
-                    verdict,
+                    verdict: verdict(map, steps),
                     cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
                     sorter: Mutex::new(None),
                     _window: Some(held),
@@ -243,13 +265,43 @@ fn shifted(out: &Outputs, first: usize) -> Outputs {
     }
 }
 
+/// The length of a step, with its sign, as the kernels take it.
+fn step_word<R: DeviceReal>(map: &FlowMap, steps: usize) -> [u64; 1] {
+    [words(&R::from_f64(map.direction.sign() * map.tau / steps as f64))[0]]
+}
+
+/// What `trace_closed.cu` is compiled with and launched with.
+pub(super) struct ClosedArguments {
+    pub(super) data: Words,
+    /// Constants of every stage, as bytes.
+    pub(super) stages: Vec<u8>,
+    pub(super) defines: Vec<String>,
+}
+
+impl ClosedArguments {
+    /// `t0`: none where every seed of a double gyre has its own.
+    pub(super) fn new<R: DeviceReal>(flow: &Analytic, domain: &Domain, map: &FlowMap, t0: Option<f64>, steps: usize) -> Self {
+        let from = t0.unwrap_or(0.0);
+        let to = from + map.direction.sign() * map.tau;
+        let (stages, form, rate) = match (flow.form(), t0) {
+            (Form::DoubleGyre(form), None) => (stages::<R>(|time| form.constants_since(time), from, to, steps), 0, form.rate()),
+            (Form::DoubleGyre(form), _) => (stages::<R>(|time| form.constants(time), from, to, steps), 0, 0.0),
+            (Form::Abc(form), _) => (stages::<R>(|time| form.constants(time), from, to, steps), 1, 0.0),
+            (Form::Linear(form), _) => (stages::<R>(|time| form.constants(time), from, to, steps), 2, 0.0),
+        };
+        let defines = closed_defines::<R>(map, form, t0.is_none());
+        Self { data: words(&closed_data::<R>(domain, map.boundary, rate)), stages, defines }
+    }
+}
+
 /// Macros of `trace_closed.cu`.
-pub(super) fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8) -> Vec<String> {
+fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<String> {
     vec![
         format!("RW_REAL={}", R::NAME),
         format!("RW_FORM={form}"),
         format!("RW_BOUNDARY={}", boundary_number(map.boundary)),
         format!("RW_DIFFERENCES={}", u8::from(map.integrator == Integrator::Differences)),
+        format!("RW_STARTS={}", u8::from(starts)),
     ]
 }
 
@@ -273,31 +325,24 @@ fn boundary_number(boundary: Boundary) -> u8 {
     }
 }
 
-pub(super) fn closed_data<R: Real>(domain: &Domain, boundary: Boundary) -> ClosedData<R> {
+fn closed_data<R: Real>(domain: &Domain, boundary: Boundary, rate: f64) -> ClosedData<R> {
     let (low, high) = (domain.min.map(R::from_f64), domain.max.map(R::from_f64));
     let (inner_low, inner_high) = match boundary {
         Boundary::Zero => (low.map(R::above), high.map(R::below)),
         _ => (low, high),
     };
-    ClosedData { low: inner_low, high: inner_high, box_low: low, box_high: high }
+    ClosedData { low: inner_low, high: inner_high, box_low: low, box_high: high, rate }
 }
 
-/// Constants of every stage as bytes, and the number of the form in `closed.cuh`.
-pub(super) fn closed_stages<R: Real>(flow: &Analytic, from: f64, to: f64, steps: usize) -> (Vec<u8>, u8) {
-    fn of<R: Real, F: ClosedForm<D>, const D: usize>(form: F, from: f64, to: f64, steps: usize) -> Vec<u8> {
-        let halves = 2 * steps;
-        let mut bytes = Vec::new();
-        for i in 0..=halves {
-            for constant in form.constants(from + (to - from) * (i as f64 / halves as f64)) {
-                let constant = R::from_f64(constant);
-                bytes.extend_from_slice(&words(&constant)[0].to_le_bytes()[..size_of::<R>()]);
-            }
+/// Constants of every stage as bytes.
+fn stages<R: Real>(constants: impl Fn(f64) -> Constants<f64>, from: f64, to: f64, steps: usize) -> Vec<u8> {
+    let halves = 2 * steps;
+    let mut bytes = Vec::new();
+    for i in 0..=halves {
+        for constant in constants(from + (to - from) * (i as f64 / halves as f64)) {
+            let constant = R::from_f64(constant);
+            bytes.extend_from_slice(&words(&constant)[0].to_le_bytes()[..size_of::<R>()]);
         }
-        bytes
     }
-    match flow.form() {
-        Form::DoubleGyre(form) => (of::<R, _, 2>(form, from, to, steps), 0),
-        Form::Abc(form) => (of::<R, _, 3>(form, from, to, steps), 1),
-        Form::Linear(form) => (of::<R, _, 2>(form, from, to, steps), 2),
-    }
+    bytes
 }

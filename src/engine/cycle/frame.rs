@@ -19,8 +19,8 @@ const WARMUP_PICTURES: u64 = 1 << 40;
 
 /// Seconds of training after which the next window is looked for.
 const MEANWHILE: f64 = 0.05;
-/// Seconds between two looks for it while a device rests.
-const GLANCE: f64 = 0.002;
+/// Between two looks for it while a device rests.
+const GLANCE: Duration = Duration::from_millis(2);
 
 /// What the rendering threads hand back.
 pub(super) struct Rendered {
@@ -56,6 +56,8 @@ impl Cycle<'_> {
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<Frame, EngineError> {
         let start = Instant::now();
+        self.learn_shorter(slide, tracer)?;
+        let shorter_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
         let gate = match scene.render.method {
             Method::Gated => self.trust.gate(),
@@ -78,7 +80,7 @@ impl Cycle<'_> {
         if let Some(front) = front.as_deref() {
             self.assess(front, tracer, &gate, &work, &mut record);
         }
-        let audit_seconds = work.audit_seconds + auditing.elapsed().as_secs_f64();
+        let audit_seconds = shorter_seconds + work.audit_seconds + auditing.elapsed().as_secs_f64();
         let total = start.elapsed().as_secs_f64();
         if let Some(front) = front.as_deref() {
             // The measurement's time, not the frame's.
@@ -226,34 +228,40 @@ impl Cycle<'_> {
     }
 
     /// What is left of a frame's training where a simulation is followed, after the frame has gone out: until the next window is there, but at
-    /// least `training.share` of the `seconds` that the frame took, so that a fast simulation does not end all learning. Where a device trains, it
-    /// rests between slices, since a solver may be on the same device.
+    /// least `training.share` of the `seconds` that the frame took, so that a fast simulation does not end all learning. A device trains for
+    /// `training.share` of the time and no longer, since a solver may be on it.
     pub(super) fn train_meanwhile(&mut self, feed: &Feed, seconds: f64) {
         let settings = &self.plan.scene.training;
         let Feed::Live { window, .. } = feed else { return };
         let Some(live) = self.live.as_mut().filter(|live| live.learns() && !self.ring.is_empty()) else { return };
-        if settings.steps_per_frame.is_some() || (live.is_offloaded() && settings.share == 0.0) {
+        if settings.steps_per_frame.is_some() {
             return;
         }
         let pool = self.threads.all();
         let (ring, stop, begin) = (&self.ring, self.stop, Instant::now());
-        let mut rested = 0.0;
-        loop {
-            let gone = begin.elapsed().as_secs_f64();
-            let least = settings.share * seconds;
-            if gone >= settings.seconds() || stop.load(Ordering::Relaxed) || (gone >= least && !window.is_waited_for()) {
+        let mut trained = 0.0;
+        while trained < settings.seconds() && !stop.load(Ordering::Relaxed) {
+            let mut slice = (settings.seconds() - trained).min(MEANWHILE);
+            if live.is_offloaded() {
+                match self.turns.due(self.began.elapsed().as_secs_f64()) {
+                    Some(due) => slice = slice.min(due),
+                    None if window.is_waited_for() => {
+                        std::thread::sleep(GLANCE);
+                        continue;
+                    }
+                    None => return,
+                }
+            } else if begin.elapsed().as_secs_f64() >= settings.share * seconds && !window.is_waited_for() {
                 return;
             }
-            if gone < rested {
-                std::thread::sleep(Duration::from_secs_f64((rested - gone).min(GLANCE)));
-                continue;
-            }
-            let slice = (settings.seconds() - gone).min(MEANWHILE);
             let learned = pool.install(|| train(&mut **live, ring, settings, Until::Seconds(slice), stop));
-            if live.is_offloaded() {
-                rested = begin.elapsed().as_secs_f64() + settings.rest(learned.device_seconds.unwrap_or(slice));
-            }
+            let nothing = learned.steps == 0;
+            trained += learned.seconds;
+            self.turns.took(learned.device_seconds.unwrap_or(learned.seconds));
             self.learned_meanwhile = Some(self.learned_meanwhile.take().unwrap_or_default().and(learned));
+            if nothing {
+                return;
+            }
         }
     }
 

@@ -12,11 +12,11 @@ use super::feed::{Feed, Slide};
 use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup};
 use super::stop::{Halt, Interruptible, heed};
-use super::training::Threads;
+use super::training::{Threads, Turns};
 use super::{Device, EngineError, Frame, Settings};
 use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
-use crate::surrogate::network::Size;
+use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{Learned, Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
 use crate::trust::TrustMap;
 use std::path::PathBuf;
@@ -102,6 +102,9 @@ struct Cycle<'a> {
     renderer: Renderer,
     trust: TrustMap,
     ring: SampleRing,
+    /// The times that are inputs of the network, and whether it tells the window of the ring's labels from others.
+    times: Times,
+    told: bool,
     live: Option<Box<dyn Surrogate>>,
     /// What it is built from, with the data's own nodes.
     surrogate: SurrogateSettings,
@@ -118,6 +121,8 @@ struct Cycle<'a> {
     told_of_failure: bool,
     /// What was learned after the last frame had gone out; the next one's record tells of it.
     learned_meanwhile: Option<Learned>,
+    /// What training has of the device beside a simulation.
+    turns: Turns,
     report: &'a mut RunReport,
     /// Set from outside when the run should end.
     stop: &'a AtomicBool,
@@ -235,6 +240,11 @@ impl<'a> Cycle<'a> {
             threads.render().install(|| surrogate.window_slid(tracer));
             heed(stop)?;
         }
+        let times = Times::new(&scene.network, tracer.tau());
+        let mut ring = SampleRing::new(scene.training.ring);
+        if !scene.network.inputs.is_empty() {
+            ring.set_now(times.unit(tracer.start(), tracer.tau()));
+        }
         report.integration_steps = fixed_steps(tracer);
         report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
         Ok(Self {
@@ -244,7 +254,9 @@ impl<'a> Cycle<'a> {
             frames: frame_renderer(&options.device),
             renderer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
-            ring: SampleRing::new(scene.training.ring),
+            ring,
+            times,
+            told: times.tells(tracer.start()),
             surrogate,
             sizing,
             resize: None,
@@ -254,6 +266,7 @@ impl<'a> Cycle<'a> {
             pictures: 0,
             told_of_failure: false,
             learned_meanwhile: None,
+            turns: Turns::new(scene.training.share),
             report,
             stop,
             peak: f32::NEG_INFINITY,
@@ -287,6 +300,14 @@ impl<'a> Cycle<'a> {
             }
             self.report.time_resolution = Some(resolution);
         }
+        let offered = self.options.device.offload().is_some();
+        if offered && self.live.as_ref().is_some_and(|live| live.learns() && !live.is_offloaded()) {
+            let inputs = self.plan.domain.dimensions + self.plan.scene.network.inputs.len();
+            slide.warnings.push(format!(
+                "the network is trained on the CPU: a GPU takes the target ftle, no penalty on means, and at most 3 inputs (here {inputs})"
+            ));
+        }
+        slide.warnings.extend(self.beyond_the_range(slide.time));
         self.pilot(tracer)?;
         self.probe(tracer, slide.index)?;
         self.frames(tracer, slide, begun, sink)
@@ -305,6 +326,7 @@ impl<'a> Cycle<'a> {
             let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time)?;
             slide.warnings.extend(told);
             self.slid(&*tracer)?;
+            slide.warnings.extend(self.beyond_the_range(slide.time));
             self.probe(&*tracer, slide.index)?;
             self.frames(&*tracer, &mut slide, begun, sink)?;
         }

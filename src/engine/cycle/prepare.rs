@@ -7,15 +7,17 @@ use crate::engine::feed::Slide;
 use crate::engine::setup::{Plan, assemble};
 use crate::engine::stop::{Halt, Interruptible, heed};
 use crate::engine::{Device, EngineError};
-use crate::flow::{Extras, Traced, Tracer};
+use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
 use crate::render::Scene;
-use crate::surrogate::network::Target;
+use crate::surrogate::network::{Input, Target, uniform};
 use crate::surrogate::{Kind, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
 use crate::trust::{Audited, Gate, Strata};
 use rayon::prelude::*;
 
 /// Random stream of the first probe, apart from those of audit points.
 const PROBE_STREAM: u64 = 1 << 62;
+/// Random streams of points at which shorter durations are traced.
+const SHORTER_STREAM: u64 = 1 << 61;
 /// Number of the pilot's picture.
 const PILOT_PICTURE: u64 = 1 << 41;
 
@@ -33,8 +35,8 @@ impl Cycle<'_> {
         Ok(true)
     }
 
-    /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold, trust must be earned
-    /// again.
+    /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold (unless the network knows of
+    /// which window they are), trust must be earned again.
     pub(super) fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let tracer = Interruptible::new(tracer, self.stop);
         self.peak = f32::NEG_INFINITY;
@@ -45,14 +47,28 @@ impl Cycle<'_> {
                 heed(self.stop)?;
             }
             self.trust.window_slid();
-            self.ring.mark_stale();
-            let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
-            heed(self.stop)?;
-            self.ring.revalidate(holding);
+            let told = self.times.tells(tracer.start());
+            if !(std::mem::replace(&mut self.told, told) && told) {
+                self.ring.mark_stale();
+                let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
+                heed(self.stop)?;
+                self.ring.revalidate(holding);
+            }
+            if !self.plan.scene.network.inputs.is_empty() {
+                self.ring.set_now(self.times.unit(tracer.start(), tracer.tau()));
+            }
         }
         let renderer = &mut self.renderer;
         self.threads.render().install(|| renderer.window_slid());
         Ok(())
+    }
+
+    /// What should be told of a window's start time.
+    pub(super) fn beyond_the_range(&self, start: f64) -> Option<String> {
+        let [first, last] = self.times.starts.filter(|_| self.live.is_some() && !self.times.tells(start))?;
+        Some(format!(
+            "start time {start} lies beyond network.start_range, {first} to {last}: the network takes it for the nearer end, and labels of other windows are not kept"
+        ))
     }
 
     /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and held against the surrogate they earn
@@ -123,11 +139,43 @@ impl Cycle<'_> {
         self.plan.scene.network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table
     }
 
+    /// Labels of durations below tau, where those are an input of the network: one from each of some even parts of (0, tau], drawn anew for every
+    /// frame, at a point of each cell.
+    /// They come before the frame, so that the first optimizer step, by whose loss later ones are judged, has seen some.
+    pub(super) fn learn_shorter(&mut self, slide: &Slide, tracer: &dyn Tracer) -> Result<(), EngineError> {
+        const DURATIONS: u64 = 16;
+        if !self.learns() || !self.plan.scene.network.inputs.contains(&Input::Duration) {
+            return Ok(());
+        }
+        let (tau, seed) = (tracer.tau(), self.plan.scene.seed);
+        let strata = Strata::even(self.trust.shape(), 1);
+        for part in 0..DURATIONS {
+            let draw = DURATIONS * self.frame + part;
+            let duration = tau * ((part + 1) as f64 - f64::from(uniform(seed, draw))) / DURATIONS as f64;
+            let steps = match tracer.steps() {
+                0 => self.plan.map.steps,
+                steps => Steps::Fixed((steps as f64 * duration / tau).ceil() as usize),
+            };
+            let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
+            let unit = audit::stratified_points(&strata, seed, SHORTER_STREAM + draw);
+            let flow_map = self.wants_flow_map();
+            let (shorter, _) = self.threads.render().install(|| self.options.device.tracer(slide.velocity.clone(), &map, slide.time))?;
+            let interruptible = Interruptible::new(&*shorter, self.stop);
+            let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, flow_map));
+            found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];
+            self.probed += found.drawn as u64;
+            self.ring.push(&found.samples);
+        }
+        Ok(())
+    }
+
     /// Traces some of the old labels anew: the share whose ramp is within the tolerance of what the label says.
     pub(super) fn share_of_labels_that_hold(&self, tracer: &dyn Tracer) -> f64 {
         const PROBES: usize = 2048;
         let stale = self.ring.stale();
-        let chosen = self.ring.probe(PROBES, self.plan.scene.seed, self.frame);
+        let mut chosen = self.ring.probe(PROBES, self.plan.scene.seed, self.frame);
+        // Those of shorter durations are not what this tracer finds; they hold as long as these do.
+        chosen.retain(|&i| stale.times_of(i)[1] == 1.0);
         let points: Vec<[f32; 3]> = chosen.iter().map(|&i| tracer.domain().from_unit(stale.points[i])).collect();
         let mut traced = Traced::default();
         tracer.trace(&points, Extras::default(), &mut traced);

@@ -1,19 +1,23 @@
 //! The shape of a network, resolved from its settings and the scene: what is stored where.
 
-use super::{Encoding, NetworkSettings, Target};
+use super::times::{COLUMNS, FIRST_TIME};
+use super::{Encoding, Input, NetworkSettings, Target};
 use crate::surrogate::SurrogateError;
 use serde::{Deserialize, Serialize};
 
 /// Lanes that weight rows are padded to: two AVX registers of f32.
 pub(super) const PANEL: usize = 16;
-/// Multipliers of the spatial hash for the second and third axis (Teschner et al. 2003, as in Müller et al. 2022).
-pub(crate) const HASH: [u32; 3] = [1, 2_654_435_761, 805_459_861];
+/// Most inputs of a hash grid: a cell has twice the corners with each.
+pub(crate) const GRID_INPUTS: usize = 4;
+/// Multipliers of the spatial hash for each input (the first three: Teschner et al. 2003, as in Müller et al. 2022; the fourth is theirs
+/// too, in tiny-cuda-nn).
+pub(crate) const HASH: [u32; GRID_INPUTS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
 /// One level of the hash grid.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Level {
-    /// Cells along each active axis (1 along unused ones).
-    pub cells: [u32; 3],
+    /// Cells along each input (1 where there are fewer).
+    pub cells: [u32; GRID_INPUTS],
     /// First entry of this level in the tables.
     pub offset: usize,
     /// Entries of this level.
@@ -38,7 +42,7 @@ pub struct Layer {
 /// Everything that fixes the number and the order of the parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Architecture {
-    /// Axes of the unit domain that are inputs, ascending.
+    /// Columns of a [`super::Row`] that are inputs, ascending: axes of the unit domain, then times.
     pub axes: Vec<usize>,
     /// Encoding of the position.
     pub encoding: Encoding,
@@ -62,7 +66,8 @@ fn check<T: PartialOrd + std::fmt::Display>(key: &str, value: T, low: T, high: T
 }
 
 impl Architecture {
-    /// Resolves `settings` for inputs along `axes`; `extent` are the edge lengths of the domain along x, y and z.
+    /// Resolves `settings` for inputs along `axes` of the domain and the times of the settings; `extent` are the edge lengths of the domain
+    /// along x, y and z.
     pub fn new(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Result<Self, SurrogateError> {
         settings.validate()?;
         if axes.is_empty() || axes.len() > 3 || axes.windows(2).any(|w| w[0] >= w[1]) || axes.iter().any(|&a| a > 2) {
@@ -76,8 +81,18 @@ impl Architecture {
             Target::Ftle => 1,
             Target::FlowMap => axes.len(),
         };
+        let mut further: Vec<usize> = settings.inputs.iter().map(|input| input.column()).collect();
+        further.sort_unstable();
+        let axes = [axes, &further].concat();
+        if settings.encoding == Encoding::HashGrid && axes.len() > GRID_INPUTS {
+            return Err(SurrogateError::Setting {
+                key: "network.inputs".into(),
+                found: format!("{} further ones for a flow that varies along {} axes", further.len(), axes.len() - further.len()),
+                accepted: format!("{GRID_INPUTS} inputs in all with encoding = \"hash_grid\"; any with \"frequency\""),
+            });
+        }
         let (levels, encoded) = match settings.encoding {
-            Encoding::HashGrid => (levels(settings, axes, extent), settings.levels * settings.features),
+            Encoding::HashGrid => (levels(settings, &axes, extent), settings.levels * settings.features),
             Encoding::Frequency => (Vec::new(), 2 * settings.octaves * axes.len()),
         };
         let mut layers = Vec::new();
@@ -89,7 +104,7 @@ impl Architecture {
             inputs = outputs;
         }
         Ok(Self {
-            axes: axes.to_vec(),
+            axes,
             encoding: settings.encoding,
             levels,
             features: settings.features,
@@ -99,12 +114,33 @@ impl Architecture {
         })
     }
 
-    /// Number of input axes.
+    /// Axes of the domain that are inputs; times come behind them.
+    pub fn space(&self) -> &[usize] {
+        &self.axes[..self.axes.partition_point(|&axis| axis < FIRST_TIME)]
+    }
+
+    /// Columns of times that are inputs.
+    pub fn times(&self) -> &[usize] {
+        &self.axes[self.dimensions()..]
+    }
+
+    /// Number of axes of the domain that are inputs.
     pub fn dimensions(&self) -> usize {
+        self.space().len()
+    }
+
+    /// Names of the inputs, in their order.
+    pub fn input_names(&self) -> Vec<&'static str> {
+        const NAMES: [&str; COLUMNS] = ["x", "y", "z", "start", "duration"];
+        self.axes.iter().map(|&axis| NAMES[axis]).collect()
+    }
+
+    /// Number of inputs.
+    pub fn inputs(&self) -> usize {
         self.axes.len()
     }
 
-    /// Width of the encoded position.
+    /// Width of the encoded inputs.
     pub fn encoded(&self) -> usize {
         self.layers[0].inputs
     }
@@ -147,18 +183,21 @@ pub(super) fn row_stride(width: usize) -> usize {
     (lines + (lines + 1) % 2) * PANEL
 }
 
-/// Cells of level `l`: base * growth^l along the longest axis; shorter axes get fewer in proportion, down to an eighth, so that
-/// cells are about as wide as high. A level whose nodes fit into the table is stored densely.
+/// Cells of level `l`: base * growth^l along the longest axis and along times; shorter axes get fewer in proportion, down to an eighth, so
+/// that cells are about as wide as high. A level whose nodes fit into the table is stored densely.
 fn levels(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Vec<Level> {
-    let longest = axes.iter().map(|&a| extent[a]).fold(0.0, f64::max);
+    let longest = axes.iter().filter_map(|&axis| extent.get(axis)).copied().fold(0.0, f64::max);
     let capacity = 1_usize << settings.log2_table;
     let mut offset = 0;
     (0..settings.levels)
         .map(|l| {
             let resolution = settings.base_resolution as f64 * f64::from(settings.growth).powi(l as i32);
-            let mut cells = [1_u32; 3];
+            let mut cells = [1_u32; GRID_INPUTS];
             for (slot, &axis) in axes.iter().enumerate() {
-                let share = if settings.follow_aspect && longest > 0.0 { (extent[axis] / longest).clamp(0.125, 1.0) } else { 1.0 };
+                let share = match extent.get(axis) {
+                    Some(edge) if settings.follow_aspect && longest > 0.0 => (edge / longest).clamp(0.125, 1.0),
+                    _ => 1.0,
+                };
                 // 2^20 cells are finer than f32 can place a point.
                 cells[slot] = (resolution * share).round().clamp(1.0, 1_048_576.0) as u32;
             }
@@ -175,13 +214,23 @@ fn levels(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Vec<L
 impl NetworkSettings {
     /// Checks every value that has a range.
     pub fn validate(&self) -> Result<(), SurrogateError> {
+        let refuse = |key: &str, found: String, accepted: &str| {
+            Err(SurrogateError::Setting { key: format!("network.{key}"), found, accepted: accepted.into() })
+        };
+        if (1..self.inputs.len()).any(|i| self.inputs[i..].contains(&self.inputs[i - 1])) {
+            return refuse("inputs", crate::setting::shown(&self.inputs), "each of \"start\" and \"duration\" once at most");
+        }
+        if let Some([first, last]) = self.start_range {
+            if !(first.is_finite() && last.is_finite() && first < last) {
+                return refuse("start_range", format!("[{first}, {last}]"), "two finite numbers, ascending");
+            }
+            if !self.inputs.contains(&Input::Start) {
+                return refuse("start_range", format!("[{first}, {last}]"), "with \"start\" among network.inputs");
+            }
+        }
         check("levels", self.levels, 1, 32)?;
         if ![1, 2, 4, 8].contains(&self.features) {
-            return Err(SurrogateError::Setting {
-                key: "network.features".into(),
-                found: self.features.to_string(),
-                accepted: "1, 2, 4 or 8".into(),
-            });
+            return refuse("features", self.features.to_string(), "1, 2, 4 or 8");
         }
         check("log2_table", self.log2_table, 4, 24)?;
         check("base_resolution", self.base_resolution, 1, 65_536)?;

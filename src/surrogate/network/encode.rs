@@ -8,7 +8,7 @@ use wide::{f32x8, i32x8};
 /// Values of a table that share one mark of having received a gradient: a cache line.
 pub(super) const LINE: usize = 16;
 
-/// The corners of the cell around each sample of a tile, for one level. Arrays are `[corner][lane]`, slopes `[axis][corner][lane]`.
+/// The corners of the cell around each sample of a tile, for one level. Arrays are `[corner][lane]`, slopes `[input][corner][lane]`.
 pub(super) struct Corners {
     lanes: usize,
     index: Vec<u32>,
@@ -17,10 +17,11 @@ pub(super) struct Corners {
 }
 
 impl Corners {
-    /// Room for `samples` samples (rounded up to vectors).
-    pub(super) fn new(samples: usize) -> Self {
+    /// Room for `samples` samples (rounded up to vectors); none for the frequency encoding, which has no cells.
+    pub(super) fn new(shape: &Architecture, samples: usize) -> Self {
         let lanes = samples.next_multiple_of(8);
-        Self { lanes, index: vec![0; 8 * lanes], weight: vec![0.0; 8 * lanes], slope: vec![0.0; 24 * lanes] }
+        let values = if shape.levels.is_empty() { 0 } else { lanes << shape.inputs() };
+        Self { lanes, index: vec![0; values], weight: vec![0.0; values], slope: vec![0.0; shape.inputs() * values] }
     }
 
     /// Finds cells and multilinear weights of the first `count` samples; `coordinates` holds one run of `run` unit coordinates an axis, and
@@ -68,7 +69,7 @@ impl Corners {
                         for other in (0..D).filter(|&other| other != axis) {
                             slope *= share[other][side(other)];
                         }
-                        let at = (axis * 8 + corner) * lanes_held + first;
+                        let at = ((axis << D) + corner) * lanes_held + first;
                         self.slope[at..at + 8].copy_from_slice(&slope.to_array());
                     }
                 }
@@ -91,7 +92,7 @@ impl Corners {
             let mut sum = [0.0_f32; F];
             for corner in 0..1 << D {
                 let at = corner * self.lanes + sample;
-                // SAFETY: at < 8 * lanes, the length of both arrays; `locate` keeps every index below the level's entries, and the caller
+                // SAFETY: at < 2^D * lanes, the length of both arrays; `locate` keeps every index below the level's entries, and the caller
                 // passes that level's table of entries * F values.
                 unsafe {
                     let entry = *self.index.get_unchecked(at) as usize * F;
@@ -138,7 +139,7 @@ impl Corners {
     }
 }
 
-/// Chooses the instance for the number of axes and features.
+/// Chooses the instance for the number of inputs and features.
 macro_rules! dispatch {
     ($d:expr, $f:expr, $call:ident) => {
         match ($d, $f) {
@@ -150,10 +151,14 @@ macro_rules! dispatch {
             (2, 2) => $call!(2, 2),
             (2, 4) => $call!(2, 4),
             (2, _) => $call!(2, 8),
-            (_, 1) => $call!(3, 1),
-            (_, 2) => $call!(3, 2),
-            (_, 4) => $call!(3, 4),
-            (_, _) => $call!(3, 8),
+            (3, 1) => $call!(3, 1),
+            (3, 2) => $call!(3, 2),
+            (3, 4) => $call!(3, 4),
+            (3, _) => $call!(3, 8),
+            (_, 1) => $call!(4, 1),
+            (_, 2) => $call!(4, 2),
+            (_, 4) => $call!(4, 4),
+            (_, _) => $call!(4, 8),
         }
     };
 }
@@ -183,12 +188,12 @@ pub(super) fn encode(
                 corners.locate::<$d>(level, coordinates, run, count, groups > 1);
                 corners.gather::<$d, $f>(&corners.weight, table, out, stride, column, count);
                 for axis in 0..groups - 1 {
-                    let slopes = &corners.slope[axis * 8 * corners.lanes..];
+                    let slopes = &corners.slope[(axis << $d) * corners.lanes..];
                     corners.gather::<$d, $f>(slopes, table, &mut out[(axis + 1) * group * stride..], stride, column, count);
                 }
             }};
         }
-        dispatch!(shape.dimensions(), shape.features, level);
+        dispatch!(shape.inputs(), shape.features, level);
     }
 }
 
@@ -216,12 +221,12 @@ pub(super) fn scatter_level(
             corners.locate::<$d>(level, coordinates, run, count, groups > 1);
             corners.scatter::<$d, $f>(&corners.weight, gradient, stride, column, table, touched, count);
             for axis in 0..groups - 1 {
-                let slopes = &corners.slope[axis * 8 * corners.lanes..];
+                let slopes = &corners.slope[(axis << $d) * corners.lanes..];
                 corners.scatter::<$d, $f>(slopes, &gradient[(axis + 1) * group * stride..], stride, column, table, touched, count);
             }
         }};
     }
-    dispatch!(shape.dimensions(), shape.features, level);
+    dispatch!(shape.inputs(), shape.features, level);
 }
 
 /// sin and cos of 2^l (pi/2) p with p = 2x - 1 in [-1, 1], ordered axis, octave, (sin, cos).
@@ -235,11 +240,11 @@ fn frequencies(
     out: &mut [f32],
     stride: usize,
 ) {
-    let (dimensions, octaves) = (shape.dimensions(), shape.octaves);
-    assert!(stride >= 2 * dimensions * octaves);
+    let (inputs, octaves) = (shape.inputs(), shape.octaves);
+    assert!(stride >= 2 * inputs * octaves);
     for first in (0..count).step_by(8) {
         let take = (count - first).min(8);
-        for axis in 0..dimensions {
+        for axis in 0..inputs {
             let x = lanes(&coordinates[axis * run + first..]).fast_max(f32x8::splat(0.0)).fast_min(f32x8::splat(1.0));
             let position = x + x - f32x8::splat(1.0);
             for octave in 0..octaves {

@@ -19,6 +19,7 @@ mod objective;
 mod operation;
 mod predictor;
 mod tile;
+mod times;
 mod train;
 
 #[cfg(feature = "cuda")]
@@ -28,12 +29,11 @@ pub(crate) use architecture::HASH;
 pub use architecture::{Architecture, Layer, Level};
 pub use model::Model;
 pub use module::Network;
-pub(crate) use module::mix;
-#[cfg(test)]
-pub(crate) use module::uniform;
+pub(crate) use module::{mix, uniform};
 pub use objective::{Objective, Scale, signed_exp, signed_log};
 pub use operation::FusedNetwork;
 pub(crate) use predictor::Predictor;
+pub use times::{Row, Times, UNTIMED, row};
 pub use train::{Average, Field, Fused, HELD_OUT, Pick, PlannedStep, Step, autodiff_gradient, operation_step, stock_step};
 
 /// How a position is shown to the MLP.
@@ -44,6 +44,16 @@ pub enum Encoding {
     HashGrid,
     /// sin and cos of 2^0 .. 2^(L-1) (Mildenhall et al. 2020).
     Frequency,
+}
+
+/// What the network is shown beside the position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Input {
+    /// The seed time, so that one network answers for many windows.
+    Start,
+    /// |tau| up to the scene's.
+    Duration,
 }
 
 /// What the network outputs.
@@ -82,7 +92,11 @@ pub enum Size {
 pub struct NetworkSettings {
     /// Whether `width`, `log2_table` and the nodes of a table are taken as they are, or found by the error that is measured.
     pub size: Size,
-    /// Encoding of the position.
+    /// Further inputs beside the position.
+    pub inputs: Vec<Input>,
+    /// Seed times that become 0 and 1 of the input `start`; None: the first and the last that the run asks for.
+    pub start_range: Option<[f64; 2]>,
+    /// Encoding of the inputs.
     pub encoding: Encoding,
     /// Hash-grid levels.
     pub levels: usize,
@@ -123,6 +137,8 @@ impl Default for NetworkSettings {
     fn default() -> Self {
         Self {
             size: Size::Fixed,
+            inputs: Vec::new(),
+            start_range: None,
             encoding: Encoding::HashGrid,
             levels: 6,
             features: 4,

@@ -98,14 +98,14 @@ fn parameter<B: Backend, const D: usize>(tensor: Tensor<B, D>) -> Param<Tensor<B
 /// Multilinear interpolation of table entries, all levels at once: indices and weights are `[samples, levels]`.
 fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Tensor<B, 2>, derivatives: bool) -> Vec<Tensor<B, 2>> {
     let device = points.device();
-    let (samples, levels, dimensions) = (points.dims()[0], shape.levels.len(), shape.dimensions());
+    let (samples, levels, inputs) = (points.dims()[0], shape.levels.len(), shape.inputs());
     let row = |value: &dyn Fn(usize) -> i64| -> Tensor<B, 2, Int> {
         let values: Vec<i64> = (0..levels).map(value).collect();
         Tensor::from_data(TensorData::new(values, [1, levels]), &device)
     };
     let dense = shape.levels.iter().filter(|level| !level.hashed).count();
     let (mut cell, mut share, mut scale) = (Vec::new(), Vec::new(), Vec::new());
-    for axis in 0..dimensions {
+    for axis in 0..inputs {
         let cells = row(&|l| i64::from(shape.levels[l].cells[axis]));
         let position = points.clone().slice([0..samples, axis..axis + 1]) * cells.clone().float();
         let lower = position.clone().floor().min_pair((cells.clone() - 1).float());
@@ -115,14 +115,14 @@ fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Ten
         scale.push(cells.float());
     }
     let offset = row(&|l| shape.levels[l].offset as i64);
-    let mut sums: Vec<Option<Tensor<B, 2>>> = vec![None; if derivatives { 1 + dimensions } else { 1 }];
-    for corner in 0..1_usize << dimensions {
+    let mut sums: Vec<Option<Tensor<B, 2>>> = vec![None; if derivatives { 1 + shape.dimensions() } else { 1 }];
+    for corner in 0..1_usize << inputs {
         let side = |axis: usize| (corner >> axis) & 1;
         let node = |axis: usize| cell[axis].clone() + side(axis) as i32;
         let mut parts = Vec::new();
         if dense > 0 {
             let mut index = node(0);
-            for axis in 1..dimensions {
+            for axis in 1..inputs {
                 let stride =
                     row(&|l| shape.levels[l].cells[..axis].iter().map(|&c| i64::from(c) + 1).fold(1, i64::wrapping_mul) & 0x3fff_ffff);
                 index = index + node(axis) * stride;
@@ -133,7 +133,7 @@ fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Ten
             // Only the low bits of the hash are kept, so the multipliers may be reduced first; this keeps the products inside 32 bits.
             let low = (shape.levels[levels - 1].entries - 1) as i64;
             let mut index = node(0);
-            for axis in 1..dimensions {
+            for axis in 1..inputs {
                 index = index.bitwise_xor(node(axis) * row(&|_| i64::from(HASH[axis]) & low));
             }
             let mask = row(&|_| low).expand([samples, levels]);
@@ -143,7 +143,7 @@ fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Ten
         let entries = tables.clone().select(0, index);
         for (group, sum) in sums.iter_mut().enumerate() {
             let mut weight = Tensor::<B, 2>::ones([samples, levels], &device);
-            for axis in 0..dimensions {
+            for axis in 0..inputs {
                 weight = if group == axis + 1 {
                     weight * (scale[axis].clone() * if side(axis) == 1 { 1.0 } else { -1.0 })
                 } else {
@@ -163,18 +163,18 @@ fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Ten
 /// sin and cos of 2^l (pi/2) (2x - 1), ordered axis, octave, (sin, cos).
 fn frequencies<B: Backend>(shape: &Architecture, points: Tensor<B, 2>, derivatives: bool) -> Vec<Tensor<B, 2>> {
     let device = points.device();
-    let (samples, dimensions, octaves) = (points.dims()[0], shape.dimensions(), shape.octaves);
+    let (samples, inputs, octaves) = (points.dims()[0], shape.inputs(), shape.octaves);
     let frequencies: Vec<f32> = (0..octaves).map(|octave| FRAC_PI_2 * (1_u32 << octave) as f32).collect();
     let frequencies = Tensor::<B, 1>::from_data(TensorData::new(frequencies, [octaves]), &device).reshape([1, 1, octaves]);
-    let angle = (points * 2.0 - 1.0).reshape([samples, dimensions, 1]) * frequencies.clone();
+    let angle = (points * 2.0 - 1.0).reshape([samples, inputs, 1]) * frequencies.clone();
     let (sin, cos) = (angle.clone().sin(), angle.cos());
     let pairs = |sin: Tensor<B, 3>, cos: Tensor<B, 3>| -> Tensor<B, 2> {
-        Tensor::stack::<4>(vec![sin, cos], 3).reshape([samples, 2 * dimensions * octaves])
+        Tensor::stack::<4>(vec![sin, cos], 3).reshape([samples, 2 * inputs * octaves])
     };
     let mut rows = vec![pairs(sin.clone(), cos.clone())];
-    for axis in 0..if derivatives { dimensions } else { 0 } {
-        let along: Vec<f32> = (0..dimensions).map(|other| if other == axis { 2.0 } else { 0.0 }).collect();
-        let along = Tensor::<B, 1>::from_data(TensorData::new(along, [dimensions]), &device).reshape([1, dimensions, 1]);
+    for axis in 0..if derivatives { shape.dimensions() } else { 0 } {
+        let along: Vec<f32> = (0..inputs).map(|other| if other == axis { 2.0 } else { 0.0 }).collect();
+        let along = Tensor::<B, 1>::from_data(TensorData::new(along, [inputs]), &device).reshape([1, inputs, 1]);
         let slope = frequencies.clone() * along;
         rows.push(pairs(cos.clone() * slope.clone(), sin.clone() * slope.neg()));
     }

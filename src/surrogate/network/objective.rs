@@ -53,7 +53,7 @@ impl Objective {
     /// From the settings; `extent` along x, y, z.
     pub fn new(settings: &NetworkSettings, shape: &Architecture, extent: [f64; 3], tau: f64) -> Self {
         let mut active = [1.0; 3];
-        for (slot, &axis) in shape.axes.iter().enumerate() {
+        for (slot, &axis) in shape.space().iter().enumerate() {
             active[slot] = extent[axis] as f32;
         }
         Self {
@@ -98,7 +98,7 @@ impl Objective {
             (Target::Ftle, Loss::MeanSquare) => values[0] = samples.log_stretch[index],
             (Target::Ftle, Loss::Published) => values[0] = signed_log(samples.log_stretch[index] / self.tau),
             (Target::FlowMap, _) => {
-                for (slot, &axis) in shape.axes.iter().enumerate() {
+                for (slot, &axis) in shape.space().iter().enumerate() {
                     values[slot] = samples.arrival[index][axis] - samples.points[index][axis];
                 }
             }
@@ -149,7 +149,7 @@ impl Objective {
             }
         } else {
             let along = shape.axes[group - 1];
-            for (output, &axis) in shape.axes.iter().enumerate() {
+            for (output, &axis) in shape.space().iter().enumerate() {
                 let identity = if axis == along { 1.0 } else { 0.0 };
                 targets[output] = (samples.jacobian[index][3 * axis + along] - identity) / self.scale.deviation[output];
             }

@@ -19,6 +19,7 @@ use super::architecture::Architecture;
 use super::encode::LINE;
 use super::module::Network;
 use super::tile::{self, Batch, OUT, Weights};
+use super::times::Row;
 use burn::backend::autodiff::{
     Autodiff,
     checkpoint::{base::Checkpointer, strategy::CheckpointStrategy},
@@ -31,7 +32,7 @@ use std::sync::Arc;
 
 /// A backend with the fused network.
 pub trait FusedNetwork: Backend {
-    /// Outputs `[samples, outputs]` at `points` `[samples, axes]`. `tables` is `[entries, features]` (any one value for the frequency
+    /// Outputs `[samples, outputs]` at `points` `[samples, inputs]`. `tables` is `[entries, features]` (any one value for the frequency
     /// encoding), `layers` the flat vector. The points get no gradient: they are data.
     fn network(
         points: FloatTensor<Self>,
@@ -71,11 +72,11 @@ fn values(tensor: &FlexTensor) -> std::borrow::Cow<'_, [f32]> {
     }
 }
 
-fn unpack(points: &[f32], shape: &Architecture) -> Vec<[f32; 3]> {
+fn unpack(points: &[f32], shape: &Architecture) -> Vec<Row> {
     points
-        .chunks_exact(shape.dimensions())
+        .chunks_exact(shape.inputs())
         .map(|row| {
-            let mut point = [0.0; 3];
+            let mut point = Row::default();
             for (&axis, &value) in shape.axes.iter().zip(row) {
                 point[axis] = value;
             }
@@ -95,8 +96,9 @@ impl FusedNetwork for Flex {
         let weights = Weights::new(shape, &layers, false);
         let width = shape.outputs();
         let mut out = vec![0.0; points.len() * width];
-        tile::predict(shape, &weights, tables_of(&tables, shape), &points, false, width, &mut out, |points, scratch, out| {
-            for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out.chunks_exact_mut(width)).take(points.len()) {
+        let row = |sample: usize| points[sample];
+        tile::predict(shape, &weights, tables_of(&tables, shape), points.len(), row, false, width, &mut out, |count, scratch, out| {
+            for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out.chunks_exact_mut(width)).take(count) {
                 out.copy_from_slice(&row[..width]);
             }
         });
@@ -126,7 +128,7 @@ impl FusedNetwork for Flex {
         let mut d_layers = vec![0.0; layers.len()];
         batch.layer_gradient(shape, &mut d_layers);
         let mut d_tables = vec![0.0; tables.len()];
-        let mut corners = batch.corners();
+        let mut corners = batch.corners(shape);
         for (number, level) in shape.levels.iter().enumerate() {
             let table = &mut d_tables[level.offset * shape.features..][..level.entries * shape.features];
             let mut touched = vec![0; table.len().div_ceil(LINE)];

@@ -5,6 +5,7 @@ use super::architecture::{Architecture, Level, padded, row_stride};
 use super::dense::{self, BLOCK, Packed, packed_len};
 use super::encode::{self, Corners};
 use super::lanes::{Aligned, lanes};
+use super::times::Row;
 use rayon::prelude::*;
 use wide::f32x8;
 
@@ -115,8 +116,8 @@ impl Scratch {
         Self {
             samples,
             groups,
-            coordinates: vec![0.0; shape.dimensions() * samples.next_multiple_of(8)],
-            corners: Corners::new(samples),
+            coordinates: vec![0.0; shape.inputs() * samples.next_multiple_of(8)],
+            corners: Corners::new(shape, samples),
             encoded: Aligned::zeros(rows * row_stride(shape.encoded())),
             activations: (0..if training { hidden } else { hidden.min(2) })
                 .map(|layer| Aligned::zeros(rows * if training { row_stride(shape.layers[layer].outputs) } else { shape.widest() }))
@@ -132,28 +133,21 @@ impl Scratch {
         self.samples.next_multiple_of(8)
     }
 
-    /// Takes the active axes of `count` points.
-    fn place(&mut self, shape: &Architecture, count: usize, point: impl Fn(usize) -> [f32; 3]) {
+    /// Takes the inputs of `count` rows.
+    fn place(&mut self, shape: &Architecture, count: usize, row: impl Fn(usize) -> Row) {
         let run = self.run();
         for sample in 0..count {
-            let point = point(sample);
+            let row = row(sample);
             for (slot, &axis) in shape.axes.iter().enumerate() {
-                self.coordinates[slot * run + sample] = point[axis];
+                self.coordinates[slot * run + sample] = row[axis];
             }
         }
     }
 
-    /// Positions to outputs.
-    pub(super) fn forward(
-        &mut self,
-        shape: &Architecture,
-        weights: &Weights,
-        tables: &[f32],
-        count: usize,
-        point: impl Fn(usize) -> [f32; 3],
-    ) {
+    /// Inputs to outputs.
+    pub(super) fn forward(&mut self, shape: &Architecture, weights: &Weights, tables: &[f32], count: usize, row: impl Fn(usize) -> Row) {
         assert!(count <= self.samples);
-        self.place(shape, count, point);
+        self.place(shape, count, row);
         let (run, stride) = (self.run(), row_stride(shape.encoded()));
         if count < self.samples {
             // Rows behind the last sample go through the products with weight 0; what an earlier tile left there could be NaN.
@@ -296,7 +290,7 @@ impl Batch {
         let chunks = (0..chunks)
             .map(|_| Chunk {
                 scratch: Scratch::new(shape, derivatives, true),
-                coordinates: vec![0.0; tiles * tile.next_multiple_of(8) * shape.dimensions()],
+                coordinates: vec![0.0; tiles * tile.next_multiple_of(8) * shape.inputs()],
                 d_encoded: Aligned::zeros(encoded),
                 gradient: Aligned::zeros(layout.len),
                 loss: 0.0,
@@ -306,7 +300,7 @@ impl Batch {
         Self { chunks, layout, groups, tiles }
     }
 
-    /// Forward and backward over `count` samples. `announce` is called for every sample one tile before `point` is. `loss` sees the first sample's number, the number of samples, the distance of two groups in
+    /// Forward and backward over `count` samples. `announce` is called for every sample one tile before `row` is. `loss` sees the first sample's number, the number of samples, the distance of two groups in
     /// rows, the outputs and the gradient to write (rows of [`OUT`]); it returns the tile's share of the loss. The sum of all shares comes back.
     pub(super) fn accumulate(
         &mut self,
@@ -315,7 +309,7 @@ impl Batch {
         tables: &[f32],
         count: usize,
         announce: impl Fn(usize) + Sync,
-        point: impl Fn(usize) -> [f32; 3] + Sync,
+        row: impl Fn(usize) -> Row + Sync,
         loss: impl Fn(usize, usize, usize, &[f32], &mut [f32]) -> f64 + Sync,
     ) -> f64 {
         let share = count.div_ceil(self.chunks.len());
@@ -334,7 +328,7 @@ impl Batch {
                 let take = (chunk.count - first).min(scratch.samples);
                 let next = begin + first + scratch.samples;
                 (next..end.min(next + scratch.samples)).for_each(&announce);
-                scratch.forward(shape, weights, tables, take, |sample| point(begin + first + sample));
+                scratch.forward(shape, weights, tables, take, |sample| row(begin + first + sample));
                 chunk.loss += loss(begin + first, take, scratch.samples, &scratch.outputs, &mut scratch.d_outputs);
                 let number = first / scratch.samples;
                 let d_encoded = if shape.levels.is_empty() {
@@ -403,32 +397,34 @@ impl Batch {
     }
 
     /// Room for the corners of a tile.
-    pub(super) fn corners(&self) -> Corners {
-        Corners::new(self.chunks[0].scratch.samples)
+    pub(super) fn corners(&self, shape: &Architecture) -> Corners {
+        Corners::new(shape, self.chunks[0].scratch.samples)
     }
 }
 
-/// Runs `take(first sample, count, scratch)` for every tile of a prediction, on all cores. `out` holds `width` values a sample.
+/// Runs `take(count, scratch, its part of out)` for every tile of a prediction, on all cores. `out` holds `width` values a sample.
 pub(super) fn predict(
     shape: &Architecture,
     weights: &Weights,
     tables: &[f32],
-    points: &[[f32; 3]],
+    rows: usize,
+    row: impl Fn(usize) -> Row + Sync,
     derivatives: bool,
     width: usize,
     out: &mut [f32],
-    take: impl Fn(&[[f32; 3]], &Scratch, &mut [f32]) + Sync,
+    take: impl Fn(usize, &Scratch, &mut [f32]) + Sync,
 ) {
-    assert!(out.len() == points.len() * width);
+    assert!(out.len() == rows * width);
     let tile = Scratch::new(shape, derivatives, false).samples;
     // Sixteen tiles a task: large enough to hide the scheduling, small enough to share out a frame's batch.
     let share = 16 * tile;
-    points.par_chunks(share).zip(out.par_chunks_mut(share * width)).for_each_init(
+    out.par_chunks_mut(share * width).enumerate().for_each_init(
         || Scratch::new(shape, derivatives, false),
-        |scratch, (points, out)| {
-            for (points, out) in points.chunks(tile).zip(out.chunks_mut(tile * width)) {
-                scratch.forward(shape, weights, tables, points.len(), |sample| points[sample]);
-                take(points, scratch, out);
+        |scratch, (task, out)| {
+            for (number, out) in out.chunks_mut(tile * width).enumerate() {
+                let (first, count) = (task * share + number * tile, out.len() / width);
+                scratch.forward(shape, weights, tables, count, |sample| row(first + sample));
+                take(count, scratch, out);
             }
         },
     );

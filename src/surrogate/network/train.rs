@@ -211,12 +211,13 @@ impl Fused {
         // Drawn samples lie anywhere in a pool far larger than the caches: each would be waited for.
         let announce = |position: usize| {
             prefetch(&samples.points, index(position));
+            prefetch(&samples.times, index(position));
             prefetch(&samples.log_stretch, index(position));
             prefetch(&samples.arrival, index(position));
             prefetch(&samples.jacobian, index(position));
         };
-        let point = |position: usize| samples.points[index(position)];
-        penalty + self.batch.accumulate(shape, &self.weights, tables, count, announce, point, loss)
+        let row = |position: usize| samples.row(index(position));
+        penalty + self.batch.accumulate(shape, &self.weights, tables, count, announce, row, loss)
     }
 
     /// Scatters the gradient into the tables, level by level (each level belongs to one task, so nothing is shared), and applies Adam.
@@ -251,7 +252,7 @@ impl Fused {
             // The largest levels first, so that the small ones fill the gaps at the end.
             work.reverse();
             work.into_par_iter().with_max_len(1).for_each_init(
-                || batch.corners(),
+                || batch.corners(shape),
                 |corners, (number, touched, gradient, parameters, [first, second], average)| {
                     batch.table_gradient(shape, number, &shape.levels[number], corners, gradient, touched);
                     if lazy {
@@ -292,10 +293,10 @@ fn mean_penalty(
         return (0.0, 0.0);
     }
     let drawn: Vec<usize> = (0..count).map(index).collect();
-    let points: Vec<[f32; 3]> = drawn.iter().map(|&i| samples.points[i]).collect();
     let mut outputs = vec![0.0; count];
-    tile::predict(shape, weights, tables, &points, false, 1, &mut outputs, |points, scratch, out| {
-        for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out).take(points.len()) {
+    let rows = |position: usize| samples.row(drawn[position]);
+    tile::predict(shape, weights, tables, count, rows, false, 1, &mut outputs, |count, scratch, out| {
+        for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out).take(count) {
             *out = row[0];
         }
     });
@@ -334,9 +335,8 @@ pub fn autodiff_gradient(
         layers: track(model.module.layers.id, model.module.layers.val()),
     };
     let device = Default::default();
-    let dimensions = shape.dimensions();
-    let points = (0..count).flat_map(|i| shape.axes.iter().map(move |&axis| samples.points[i][axis])).collect::<Vec<_>>();
-    let points = Tensor::from_data(TensorData::new(points, [count, dimensions]), &device);
+    let points = (0..count).flat_map(|i| shape.axes.iter().map(move |&axis| samples.row(i)[axis])).collect::<Vec<_>>();
+    let points = Tensor::from_data(TensorData::new(points, [count, shape.inputs()]), &device);
     let rows = forward(&network, &shape, points, objective.derivatives());
     let outputs = shape.outputs();
     let mut loss = Tensor::<Differentiable, 1>::zeros([1], &device);

@@ -9,6 +9,11 @@ use std::sync::Arc;
 impl Trainer {
     pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
         checkpoint.note("network.shape", self.shape_text());
+        checkpoint.note("network.inputs", self.model.shape.input_names().join(" "));
+        if let Some([first, last]) = self.times.starts {
+            checkpoint.note("network.start_range", format!("{first} {last}"));
+        }
+        checkpoint.note("network.tau", self.times.tau.to_string());
         let (model, average, progress) = self.present();
         let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
         let scale = &self.objective.scale;
@@ -46,7 +51,8 @@ impl Trainer {
     /// What must agree for a checkpoint to fit.
     fn shape_text(&self) -> String {
         let shape = serde_json::to_string(&self.model.shape).unwrap_or_default();
-        format!("{shape} loss {:?} tau {} extent {:?}", self.objective.loss, self.objective.tau, self.objective.extent)
+        let starts = self.times.starts.map_or_else(String::new, |[first, last]| format!(" starts {first} to {last}"));
+        format!("{shape} loss {:?} tau {} extent {:?}{starts}", self.objective.loss, self.objective.tau, self.objective.extent)
     }
 
     /// Reads everything, and only then changes anything.
