@@ -1,6 +1,6 @@
 //! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
-//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [double-gyre] [published]
-//! [seconds]`
+//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [double-gyre]
+//! [published-speed] [published] [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
 //! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled) and stands still
@@ -29,6 +29,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     }
     if asked("double-gyre") {
         bench::double_gyre(seconds)?;
+    }
+    if asked("published-speed") {
+        bench::published_speed()?;
     }
     if asked("published") {
         bench::published(seconds)?;
@@ -259,7 +262,69 @@ mod bench {
         rate: f64,
     }
 
-    /// The published networks: what they do in a second and know after some, beside tracing the same number of samples.
+    /// The published networks.
+    fn published_settings() -> impl Iterator<Item = (String, NetworkSettings)> {
+        [(8, 256), (8, 512), (16, 256), (16, 512)].into_iter().map(|(hidden_layers, width)| {
+            let settings = NetworkSettings { encoding: Encoding::Frequency, hidden_layers, width, ..NetworkSettings::default() };
+            (format!("{hidden_layers}x{width}"), settings)
+        })
+    }
+
+    /// What the published networks do in a second; with the operations of their products alone.
+    pub fn published_speed() -> Outcome<()> {
+        const COUNT: usize = 1 << 18;
+        const MANY: usize = 1 << 22;
+        let gpu = Gpu::open(0, &GpuSettings::default())?;
+        let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
+        println!("<!-- block network-published-speed -->");
+        println!(
+            "| network | 2^18 predicted, ms | 2^22 predicted, G/s | TFLOP/s | trained, M/s, batch 2^18 | TFLOP/s | batch 2^16 | 2^14 |"
+        );
+        println!("|---|---|---|---|---|---|---|---|");
+        for (name, settings) in published_settings() {
+            let shape = Architecture::new(&settings, &[0, 1, 2], cube.extent())?;
+            let objective = Objective::new(&settings, &shape, cube.extent(), 1.0);
+            let products: usize = shape.layers.iter().map(|layer| layer.inputs * layer.outputs).sum();
+            // Training: forward, backward but for the first layer, and the gradients of the weights.
+            let (forward, all) =
+                (2e-12 * products as f64, 2e-12 * (3 * products - shape.layers[0].inputs * shape.layers[0].outputs) as f64);
+            let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
+            let mut points = gpu.alloc("points", MANY)?;
+            training.draw_points(&cube, 3, 0, &mut points)?;
+            let values = gpu.upload("values", &vec![0.5f32; MANY])?;
+            let network = training.frozen()?;
+            // SAFETY: both buffers hold `MANY` entries.
+            let predicted = |count| time(&gpu, || unsafe { network.predict(points.address(), count, values.address()) });
+            let (few, many) = (predicted(COUNT)?, predicted(MANY)?);
+            let mut pool = training.ring(MANY)?;
+            // SAFETY: as above.
+            unsafe { training.append(&mut pool, &cube, points.address(), values.address(), MANY, None)? };
+            let mut drawn = 0;
+            let mut trained = |batch: usize| -> Result<f64, DeviceError> {
+                const STEPS: u64 = 4;
+                let milliseconds = time(&gpu, || {
+                    let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-3)).collect();
+                    drawn += STEPS * batch as u64;
+                    training.train_steps(&pool, None, &steps).map(|_| ())
+                })?;
+                Ok(STEPS as f64 * batch as f64 / milliseconds * 1e3)
+            };
+            let (predicted, trained) = (MANY as f64 / many * 1e3, [trained(COUNT)?, trained(1 << 16)?, trained(1 << 14)?]);
+            println!(
+                "| {name} | {few:.2} | {:.3} | {:.0} | {:.1} | {:.0} | {:.1} | {:.1} |",
+                predicted * 1e-9,
+                predicted * forward,
+                trained[0] * 1e-6,
+                trained[0] * all,
+                trained[1] * 1e-6,
+                trained[2] * 1e-6
+            );
+        }
+        println!();
+        Ok(())
+    }
+
+    /// What the published networks know after some seconds, beside tracing 2^18 samples.
     pub fn published(seconds: f64) -> Outcome<()> {
         const COUNT: usize = 1 << 18;
         const PACE: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
@@ -274,40 +339,13 @@ mod bench {
         let ours = time(&gpu, || batch.trace(tracer.device()))?;
         let megabytes = 12e-6 * (SHAPE.iter().product::<usize>() * SNAPSHOTS) as f64;
         println!("Velocities: {megabytes:.0} MB. 2^18 samples traced, 22 steps: {ours:.2} ms.\n");
-        println!("| network | MB | 2^18 predicted, ms | G/s, 2^22 | trained, M/s | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
-        println!("|---|---|---|---|---|---|---|---|---|---|---|");
-        for (hidden_layers, width) in [(8, 256), (8, 512), (16, 256), (16, 512)] {
-            let settings = NetworkSettings { encoding: Encoding::Frequency, hidden_layers, width, ..NetworkSettings::default() };
-            let shape = Architecture::new(&settings, &[0, 1, 2], domain.extent())?;
-            let objective = Objective::new(&settings, &shape, domain.extent(), 1.0);
-            let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
-            let mut points = gpu.alloc("points", 1 << 22)?;
-            training.draw_points(&Domain::cuboid([0.0; 3], [1.0; 3]), 3, 0, &mut points)?;
-            let values = gpu.upload("values", &vec![0.5f32; 1 << 22])?;
-            let network = training.frozen()?;
-            let predicted = [COUNT, 1 << 22].map(|count| {
-                // SAFETY: both buffers hold 2^22 entries.
-                time(&gpu, || unsafe { network.predict(points.address(), count, values.address()) })
-            });
-            let [few, many] = predicted;
-            let mut pool = training.ring(1 << 22)?;
-            // SAFETY: as above.
-            unsafe { training.append(&mut pool, &domain, points.address(), values.address(), 1 << 22, None)? };
-            let mut drawn = 0;
-            let trained = time(&gpu, || {
-                drawn += 1;
-                training.train_steps(&pool, None, &[step(COUNT, drawn * COUNT as u64, PACE.rate)]).map(|_| ())
-            })?;
+        println!("| network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
+        println!("|---|---|---|---|---|---|---|---|");
+        for (name, settings) in published_settings() {
             let row = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, PACE, seconds, |network| {
                 Ok(psnr(&tested.predict(network)?, &truth))
             })?;
-            let (megabytes, row) = row.trim_start_matches("| ").split_once(' ').unwrap_or_default();
-            println!(
-                "| {hidden_layers}x{width} | {megabytes} | {:.2} | {:.3} | {:.1} {row}",
-                few?,
-                (1 << 22) as f64 / many? * 1e-6,
-                COUNT as f64 / trained * 1e-3
-            );
+            println!("| {name} {row}");
         }
         println!();
         Ok(())

@@ -1,258 +1,363 @@
-// Networks too wide or too deep for a warp's registers: a batch goes through them layer by layer, one product of matrices each. Values and
-// weights are in half precision, sums in single precision, as in network_fused.cu.
+// Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers. Their values stay in its shared
+// memory while slices of the layers come in from the cache; training leaves each layer's values and gradients behind, whose products over all
+// samples are the gradients of the weights. Values and weights are in half precision, sums in single precision, as in network_fused.cu.
 //
-// Rows of values are as long as PADDED says (ENCODED_PADDED before the first layer) and there are whole tiles of them; what is beyond the
-// network is 0 in the weights, so that it never counts.
+// Macros beside those of network.cuh: RW_ROWS, samples of a tile; RW_STAGES, slices in shared memory or on the way; RW_TILE_BYTES and
+// RW_PRODUCT_BYTES, the shared memory of a tile and of a product. What is beyond the network is 0 in the slices, so that it never counts.
 #include "network_data.cuh"
 
 using namespace rw;
 
-// Outputs of a block of a product: TILE x TILE, summed up in steps of DEPTH (whole lines of the cache), STAGES of which are in shared memory
-// or on the way.
-constexpr int THREADS = 256, TILE = 128, DEPTH = 64, STAGES = RW_STAGES;
-constexpr uint32_t PADDED = (WIDTH + TILE - 1) / TILE * TILE, ENCODED_PADDED = (ENCODED + TILE - 1) / TILE * TILE;
+constexpr int WARPS = 8, THREADS = 32 * WARPS, ROWS = RW_ROWS, STAGES = RW_STAGES, DEPTH = 32;
+// As many neurons at a time as the registers hold sums of, whole pairs of blocks of 8 for each of four warps; the others in further passes.
+constexpr int PASSES = (WIDTH + 255) / 256, PADDED = (WIDTH + 64 * PASSES - 1) / (64 * PASSES) * (64 * PASSES), COLUMNS = PADDED / PASSES;
+constexpr int ENCODED_PADDED = (ENCODED + DEPTH - 1) / DEPTH * DEPTH, ENCODED_PASSES = (ENCODED + COLUMNS - 1) / COLUMNS;
+constexpr int ROW = (ENCODED_PASSES > PASSES ? ENCODED_PASSES : PASSES) * COLUMNS + SKEW;
+// A warp's sums: M blocks of 16 rows, N of 8 columns; of a product of all samples, four blocks of its PANEL inputs.
+constexpr int M = ROWS / 32, N = COLUMNS / 32, PANEL = 128;
 
-// TILE rows or columns of a matrix, DEPTH of the other kind. DOWN: what is summed up goes down the rows.
-template <bool DOWN> struct Panel {
-    static constexpr int ROWS = DOWN ? DEPTH : TILE, COLUMNS = DOWN ? TILE : DEPTH, ROW = COLUMNS + SKEW;
-    uint16_t values[ROWS][ROW];
+RW_FN int warp_row(int blocks) { return threadIdx.x / 128 * 16 * blocks; }
+RW_FN int warp_column() { return threadIdx.x / 32 % 4 * 8 * N; }
+// First of this lane's rows (the other is 8 below) and columns (the other is beside it) in block (m, n) of `blocks` times N.
+RW_FN int lane_row(int blocks, int m) { return warp_row(blocks) + 16 * m + int(lane() >> 2); }
+RW_FN int lane_column(int n) { return warp_column() + 8 * n + 2 * int(lane() & 3u); }
 
-    // The panel of `from` (rows of `stride` values) that begins at `first` of the outputs and at `k` of what is summed up; without waiting.
-    RW_FN void bring(const uint16_t* from, size_t stride, uint32_t first, uint32_t k) {
-        from += DOWN ? k * stride + first : first * stride + k;
-        constexpr int A_ROW = COLUMNS / 8;
-        RW_UNROLL for (int i = 0; i < TILE * DEPTH / 8 / THREADS; ++i) {
-            const uint32_t part = threadIdx.x + THREADS * i, row = part / A_ROW, column = part % A_ROW * 8;
-            asm volatile("cp.async.cg.shared.global [%0], [%1], 16;" ::"r"(uint32_t(__cvta_generic_to_shared(&values[row][column]))),
-                         "l"(from + row * stride + column)
-                         : "memory");
-        }
-    }
+// 16 bytes to shared memory without waiting; zeros where there are none.
+RW_FN void bring(uint16_t* to, const uint16_t* from, bool there = true) {
+    asm volatile("cp.async.cg.shared.global [%0], [%1], 16, %2;" ::"r"(uint32_t(__cvta_generic_to_shared(to))), "l"(from), "r"(there ? 16 : 0)
+                 : "memory");
+}
+// What was brought so far belongs together; an empty group counts too.
+RW_FN void close_group() { asm volatile("cp.async.commit_group;" ::: "memory"); }
+// All groups but the last STAGES - 2 are there, for the whole block, which is done with all but the oldest stage.
+RW_FN void wait_for_group() {
+    asm volatile("cp.async.wait_group %0;" ::"n"(STAGES - 2) : "memory");
+    __syncthreads();
+}
+
+// DEPTH rows of what is multiplied with, COLUMNS of its columns.
+struct Slice {
+    uint16_t values[DEPTH][COLUMNS + SKEW];
 };
 
-// A block's product: a warp has 64 rows and 32 columns of it.
-template <bool A_DOWN, bool B_DOWN> struct Product {
-    struct Shared {
-        Panel<A_DOWN> a[STAGES];
-        Panel<B_DOWN> b[STAGES];
-    };
-    float sums[4][4][4];
-
-    // First row and column of this lane's part of tile (m, n) of the warp's, in the whole product.
-    static RW_FN uint32_t row(int m) { return blockIdx.y * TILE + threadIdx.x / 128u * 64u + 16u * m + (lane() >> 2); }
-    static RW_FN uint32_t column(int n) { return blockIdx.x * TILE + threadIdx.x / 32u % 4u * 32u + 8u * n + 2u * (lane() & 3u); }
-
-    // Over [from, to) of what is summed up, a multiple of DEPTH.
-    RW_FN void run(const uint16_t* a, size_t a_stride, const uint16_t* b, size_t b_stride, uint32_t from, uint32_t to) {
-        extern __shared__ __align__(16) unsigned char memory[];
-        Shared& shared = *reinterpret_cast<Shared*>(memory);
-        RW_UNROLL for (int m = 0; m < 4; ++m) {
-            RW_UNROLL for (int n = 0; n < 4; ++n) {
-                RW_UNROLL for (int k = 0; k < 4; ++k) sums[m][n][k] = 0.0f;
-            }
-        }
-        const uint32_t steps = (to - from) / DEPTH;
-        auto bring = [&](uint32_t step) {
-            if (step < steps) {
-                shared.a[step % STAGES].bring(a, a_stride, blockIdx.y * TILE, from + step * DEPTH);
-                shared.b[step % STAGES].bring(b, b_stride, blockIdx.x * TILE, from + step * DEPTH);
-            }
-            // An empty group counts too.
-            asm volatile("cp.async.commit_group;" ::: "memory");
-        };
-        RW_UNROLL for (int step = 0; step < STAGES - 1; ++step) bring(step);
-        for (uint32_t step = 0; step < steps; ++step) {
-            asm volatile("cp.async.wait_group %0;" ::"n"(STAGES - 2) : "memory");
-            __syncthreads();
-            // Into the stage that all have done with.
-            bring(step + STAGES - 1);
-            add(shared.a[step % STAGES], shared.b[step % STAGES]);
-        }
+// DEPTH rows of LENGTH values, `stride` apart.
+template <int LENGTH> RW_FN void bring_rows(uint16_t (&to)[DEPTH][LENGTH + SKEW], const uint16_t* from, size_t stride, bool there = true) {
+    constexpr int CHUNKS = LENGTH / 8;
+    RW_UNROLL for (int i = 0; i < DEPTH * CHUNKS / THREADS; ++i) {
+        const int part = threadIdx.x + THREADS * i, row = part / CHUNKS, column = part % CHUNKS * 8;
+        bring(&to[row][column], from + row * stride + column, there);
     }
+}
 
-    RW_FN void add(const Panel<A_DOWN>& a, const Panel<B_DOWN>& b) {
-        const uint32_t l = lane(), low = l & 7u, middle = (l >> 3 & 1u) * 8u, high = (l >> 4) * 8u;
-        const uint32_t first_row = threadIdx.x / 128u * 64u, first_column = threadIdx.x / 32u % 4u * 32u;
-        RW_UNROLL for (int k = 0; k < DEPTH; k += 16) {
-            uint32_t left[4][4], right[2][4];
-            RW_UNROLL for (int m = 0; m < 4; ++m) {
-                if constexpr (A_DOWN) read_turned(left[m], &a.values[k + high + low][first_row + 16 * m + middle]);
-                else read_blocks(left[m], &a.values[first_row + 16 * m + middle + low][k + high]);
-            }
-            RW_UNROLL for (int n = 0; n < 2; ++n) {
-                if constexpr (B_DOWN) read_turned(right[n], &b.values[k + middle + low][first_column + 16 * n + high]);
-                else read_blocks(right[n], &b.values[first_column + 16 * n + high + low][k + middle]);
-            }
-            RW_UNROLL for (int m = 0; m < 4; ++m) {
-                RW_UNROLL for (int n = 0; n < 4; ++n) multiply(sums[m][n], left[m], right[n / 2][n % 2 * 2], right[n / 2][n % 2 * 2 + 1]);
+// Of both operands, this lane's addresses for 16 of what is summed up.
+struct Operands {
+    const uint16_t *left, *right;
+};
+
+// A product's sums, and blocks of its operands: those to come are read while others are multiplied, in the same registers. The sums of four
+// quarters take turns such that a quarter's time or two lie between.
+template <class Left, int BLOCKS> struct Product {
+    static constexpr int HALF_BLOCKS = (BLOCKS + 1) / 2, PAIRS = N / 2, HALF_PAIRS = (PAIRS + 1) / 2;
+    float (&sums)[BLOCKS][N][4];
+    uint32_t a[BLOCKS][4], b[PAIRS][4];
+
+    RW_FN explicit Product(float (&sums)[BLOCKS][N][4]) : sums(sums) {}
+    RW_FN void read_left(const Operands& from, int half) {
+        RW_UNROLL for (int m = half * HALF_BLOCKS; m < (half ? BLOCKS : HALF_BLOCKS); ++m) Left::read(a[m], from.left, m);
+    }
+    RW_FN void read_right(const Operands& from, int half) {
+        RW_UNROLL for (int n = half * HALF_PAIRS; n < (half ? PAIRS : HALF_PAIRS); ++n) read_turned(b[n], from.right + 16 * n);
+    }
+    RW_FN void multiply_quarter(int left, int right) {
+        RW_UNROLL for (int m = left * HALF_BLOCKS; m < (left ? BLOCKS : HALF_BLOCKS); ++m) {
+            RW_UNROLL for (int n = right * HALF_PAIRS; n < (right ? PAIRS : HALF_PAIRS); ++n) {
+                multiply(sums[m][2 * n], a[m], b[n][0], b[n][1]);
+                multiply(sums[m][2 * n + 1], a[m], b[n][2], b[n][3]);
             }
         }
     }
+    // Multiplies what was read, from the half `first` of the right operand on, and reads what `next()` says.
+    template <class Next> RW_FN void multiply_block(int first, Next next) {
+        multiply_quarter(0, first);
+        const Operands to_come = next();
+        multiply_quarter(0, 1 - first);
+        read_left(to_come, 0);
+        multiply_quarter(1, 1 - first);
+        read_right(to_come, 1 - first);
+        multiply_quarter(1, first);
+        read_left(to_come, 1);
+        read_right(to_come, first);
+    }
+    // Adds `steps` times DEPTH; `take()` has the next operands, for the first 16 of it.
+    template <class Take> RW_FN void add(int steps, Take take) {
+        static_assert(DEPTH == 32, "two blocks a step");
+        Operands now = take();
+        auto second = [&] { return Operands{now.left + Left::SECOND, now.right + 16 * (COLUMNS + SKEW)}; };
+        RW_UNROLL for (int half = 0; half < 2; ++half) {
+            read_left(now, half);
+            read_right(now, half);
+        }
+#pragma unroll 1
+        for (int step = 1; step < steps; ++step) {
+            multiply_block(0, second);
+            multiply_block(1, [&] { return now = take(); });
+        }
+        multiply_block(0, second);
+        RW_UNROLL for (int quarter = 0; quarter < 4; ++quarter) multiply_quarter(quarter / 2, quarter % 2);
+    }
+};
+// Rows and columns of a lane's addresses in blocks of the right operand.
+RW_FN int right_row() { return (lane() >> 3 & 1u) * 8u + (lane() & 7u); }
+RW_FN int right_column() { return warp_column() + (lane() >> 4) * 8u; }
+
+template <int BLOCKS> RW_FN void clear(float (&sums)[BLOCKS][N][4]) {
+    RW_UNROLL for (int m = 0; m < BLOCKS; ++m) {
+        RW_UNROLL for (int n = 0; n < N; ++n) {
+            RW_UNROLL for (int k = 0; k < 4; ++k) sums[m][n][k] = 0.0f;
+        }
+    }
+}
+
+// The slices of the layers, in the order in which a tile takes them: each layer pass by pass, first to last, its rows the inputs; then,
+// for training, the transposed ones, last to second, and the first where there are tables.
+constexpr int DEEP = PADDED / DEPTH, ENCODED_DEEP = ENCODED_PADDED / DEPTH;
+constexpr uint32_t FIRST_SLICES = PASSES * ENCODED_DEEP, HIDDEN_SLICES = PASSES * DEEP;
+constexpr uint32_t FORWARD_SLICES = FIRST_SLICES + (HIDDEN - 1) * HIDDEN_SLICES, BACK_SLICES = FORWARD_SLICES + (HIDDEN - 1) * HIDDEN_SLICES;
+constexpr uint32_t ALL_SLICES = BACK_SLICES + (LEVELS > 0 ? ENCODED_PASSES * DEEP : 0), SLICE = DEPTH * COLUMNS;
+
+// Rounds the layers into the first `n` values of their slices, and pads biases to PADDED. A thread a value.
+extern "C" __global__ void __launch_bounds__(THREADS)
+batched_slices(const float* __restrict__ layers, uint32_t n, uint16_t* __restrict__ slices, float* __restrict__ biases) {
+    const uint32_t i = blockIdx.x * uint32_t(THREADS) + threadIdx.x;
+    if (i >= n) return;
+    const uint32_t slice = i / SLICE, row = i % SLICE / COLUMNS, column = i % COLUMNS;
+    const bool first = slice < FIRST_SLICES || slice >= BACK_SLICES, back = slice >= FORWARD_SLICES;
+    const uint32_t start = slice < FIRST_SLICES ? 0 : slice < FORWARD_SLICES ? FIRST_SLICES : slice < BACK_SLICES ? FORWARD_SLICES : BACK_SLICES;
+    const uint32_t inside = slice - start, number = first ? 0 : inside / HIDDEN_SLICES, deep = first && !back ? ENCODED_DEEP : DEEP;
+    const uint32_t layer = first ? 0 : back ? HIDDEN - 1 - number : 1 + number, part = inside - number * HIDDEN_SLICES;
+    const uint32_t summed = part % deep * DEPTH + row, other = part / deep * COLUMNS + column;
+    const uint32_t input = back ? other : summed, neuron = back ? summed : other, inputs = layer == 0 ? ENCODED : WIDTH;
+    slices[i] = to_half(input < inputs && neuron < WIDTH ? layers[layer_start(layer) + input * size_t(WIDTH) + neuron] : 0.0f);
+    if (i < HIDDEN * PADDED) {
+        const uint32_t of = i / PADDED, at = i % PADDED;
+        biases[i] = at < WIDTH ? layers[layer_start(of) + (of == 0 ? ENCODED : WIDTH) * size_t(WIDTH) + at] : 0.0f;
+    }
+}
+
+struct alignas(16) Tile {
+    uint16_t values[ROWS][ROW];
+    Slice stages[STAGES];
+    Four samples[ROWS];
+    float slopes[ROWS];
+    Level levels[LEVELS > 0 ? LEVELS : 1];
 };
 // What launches ask for.
-static_assert(sizeof(Product<false, true>::Shared) <= RW_PRODUCT_BYTES && sizeof(Product<false, false>::Shared) <= RW_PRODUCT_BYTES &&
-                  sizeof(Product<true, true>::Shared) <= RW_PRODUCT_BYTES,
-              "shared memory");
+static_assert(sizeof(Tile) <= RW_TILE_BYTES, "shared memory");
 
-// A block's results in half precision, in place of its panels: they go out in whole lines.
-struct Results {
-    static constexpr int CHUNKS = TILE / 8, ROWS = THREADS / CHUNKS;
-    uint16_t values[TILE][TILE + SKEW];
+extern __shared__ __align__(16) unsigned char memory[];
 
-    static RW_FN Results& of_block() {
-        extern __shared__ __align__(16) unsigned char memory[];
-        return *reinterpret_cast<Results*>(memory);
+// `count` slices, over and over, ahead of what is multiplied with them.
+struct Stream {
+    const uint16_t* slices;
+    Slice* stages;
+    uint32_t count, next, stage;
+
+    RW_FN Stream(const uint16_t* from, Slice* to, uint32_t count) : slices(from), stages(to), count(count), next(0), stage(0) {
+        RW_UNROLL for (int i = 0; i < STAGES - 1; ++i) bring_next(i);
     }
-    // Eight columns, and the first row of several ROWS apart, that a thread takes.
-    static RW_FN uint32_t chunk() { return threadIdx.x % CHUNKS * 8u; }
-    static RW_FN uint32_t row() { return threadIdx.x / CHUNKS; }
-    RW_FN Words4& at(uint32_t row) { return *reinterpret_cast<Words4*>(&values[row][chunk()]); }
+    RW_FN void bring_next(uint32_t to) {
+        bring_rows<COLUMNS>(stages[to].values, slices + next * size_t(SLICE), COLUMNS);
+        close_group();
+        next = next + 1 < count ? next + 1 : 0;
+    }
+    // The next one, until it is called again. By the whole block, whose writes to shared memory are then there for all of it.
+    RW_FN const Slice& take() {
+        wait_for_group();
+        bring_next(stage == 0 ? STAGES - 1 : stage - 1);
+        const Slice& taken = stages[stage];
+        stage = stage + 1 < STAGES ? stage + 1 : 0;
+        return taken;
+    }
 };
-static_assert(sizeof(Results) <= RW_PRODUCT_BYTES, "shared memory");
 
-// By the whole block: each pair of sums, with its column in the product, through `change`, as halves into shared memory.
-template <class P, class Change> RW_FN Results& gather(const P& product, Change change) {
-    Results& results = Results::of_block();
+// Rows of a tile, as a left operand.
+struct TileRows {
+    static constexpr int SECOND = 16;
+    static RW_FN void read(uint32_t (&to)[4], const uint16_t* from, int m) { read_blocks(to, from + 16 * m * ROW); }
+};
+
+// The tile's values times PARTS * COLUMNS columns of `depth` rows of the slices to come take the values' place: `begin(sums, part)` says where
+// a part's sums start, `end(sums, part, pairs)` turns them into pairs of halves. By the whole block.
+template <int PARTS, class Begin, class End> RW_FN void multiply_tile(Tile& tile, Stream& stream, int depth, Begin begin, End end) {
+    const uint32_t l = lane();
+    const uint16_t* left = &tile.values[warp_row(M) + (l >> 3 & 1u) * 8u + (l & 7u)][(l >> 4) * 8u];
+    uint32_t pairs[PARTS][M][N][2];
+    RW_UNROLL for (int part = 0; part < PARTS; ++part) {
+        float sums[M][N][4];
+        begin(sums, part);
+        const uint16_t* at = left;
+        Product<TileRows, M>(sums).add(depth / DEPTH, [&] {
+            const Operands taken = {at, &stream.take().values[right_row()][right_column()]};
+            at += DEPTH;
+            return taken;
+        });
+        end(sums, part, pairs[part]);
+    }
+    // All have read what goes in.
     __syncthreads();
-    RW_UNROLL for (int n = 0; n < 4; ++n) {
-        const uint32_t column = product.column(n), inside = column - blockIdx.x * TILE;
-        RW_UNROLL for (int m = 0; m < 4; ++m) {
-            RW_UNROLL for (int half = 0; half < 2; ++half) {
-                const float2 pair = change(make_float2(product.sums[m][n][2 * half], product.sums[m][n][2 * half + 1]), n);
-                const uint32_t row = product.row(m) + 8 * half - blockIdx.y * TILE;
-                *reinterpret_cast<uint32_t*>(&results.values[row][inside]) = pack(pair.x, pair.y);
+    RW_UNROLL for (int part = 0; part < PARTS; ++part) {
+        RW_UNROLL for (int m = 0; m < M; ++m) {
+            RW_UNROLL for (int n = 0; n < N; ++n) {
+                RW_UNROLL for (int half = 0; half < 2; ++half)
+                    *reinterpret_cast<uint32_t*>(&tile.values[lane_row(M, m) + 8 * half][part * COLUMNS + lane_column(n)]) = pairs[part][m][n][half];
             }
         }
     }
     __syncthreads();
-    return results;
 }
 
-// A layer's values from those before it. Grid: tiles of columns, tiles of rows.
-extern "C" __global__ void __launch_bounds__(THREADS, 2)
-batched_forward(const uint16_t* __restrict__ in, uint32_t in_stride, uint32_t depth, const uint16_t* __restrict__ weights,
-                const float* __restrict__ biases, uint16_t* __restrict__ out) {
-    Product<false, true> product;
-    product.run(in, in_stride, weights, PADDED, 0, depth);
-    float2 bias[4];
-    RW_UNROLL for (int n = 0; n < 4; ++n) {
-        const uint32_t column = product.column(n);
-        bias[n] = make_float2(column < WIDTH ? biases[column] : 0.0f, column + 1 < WIDTH ? biases[column + 1] : 0.0f);
-    }
-    Results& results = gather(product, [&](float2 pair, int n) { return make_float2(rectify(pair.x + bias[n].x), rectify(pair.y + bias[n].y)); });
-    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
-        uint16_t* to = out + (blockIdx.y * TILE + row) * size_t(PADDED) + blockIdx.x * TILE + Results::chunk();
-        *reinterpret_cast<Words4*>(to) = results.at(row);
-    }
+// Halves of two sums where they are positive, else 0.
+RW_FN uint32_t pack_positive(float low, float high) {
+    uint32_t both;
+    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+    return both;
 }
 
-// Of two halves side by side, those that the activation passed.
-RW_FN uint32_t pass(uint32_t values, uint32_t active) {
-    return (active & 0x00007fffu ? values & 0x0000ffffu : 0u) | (active & 0x7fff0000u ? values & 0xffff0000u : 0u);
+// The bit of a block's word that says whether the lower of a pair of values is not 0; that of the upper is 16 above it.
+RW_FN constexpr int passed_bit(int n, int half) { return 16 - 2 * N + 2 * n + half; }
+
+// A layer's values from those before it, and, where `passed` is there, which of them are not 0: a word for each of a thread's M blocks, threads
+// side by side.
+RW_FN void forward_tile(Tile& tile, Stream& stream, int depth, const float* __restrict__ biases, uint32_t* passed) {
+    auto begin = [&](float (&sums)[M][N][4], int pass) {
+        RW_UNROLL for (int n = 0; n < N; ++n) {
+            const float2 bias = __ldg(reinterpret_cast<const float2*>(biases + pass * COLUMNS + lane_column(n)));
+            RW_UNROLL for (int m = 0; m < M; ++m) {
+                sums[m][n][0] = sums[m][n][2] = bias.x;
+                sums[m][n][1] = sums[m][n][3] = bias.y;
+            }
+        }
+    };
+    multiply_tile<PASSES>(tile, stream, depth, begin, [&](const float (&sums)[M][N][4], int pass, uint32_t (&pairs)[M][N][2]) {
+        RW_UNROLL for (int m = 0; m < M; ++m) {
+            uint32_t bits = 0;
+            RW_UNROLL for (int n = 0; n < N; ++n) {
+                RW_UNROLL for (int half = 0; half < 2; ++half) {
+                    const uint32_t pair = pairs[m][n][half] = pack_positive(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+                    // Halves of positive sums and 0 carry into the sign's place unless they are 0.
+                    bits = bits >> 1 | (pair + 0x7fff7fffu & 0x80008000u);
+                }
+            }
+            if (passed) passed[(pass * M + m) * THREADS + threadIdx.x] = bits;
+        }
+    });
+}
+
+// Adds to two neighbouring neurons' gradients: at once where they are aligned, which in an even width all are.
+RW_FN void add_pair(float* row, int column, float x, float y) {
+    if (column >= WIDTH) return;
+    if constexpr (WIDTH % 2 == 0) {
+        add(row + column, x, y);
+    } else {
+        atomicAdd(row + column, x);
+        if (column + 1 < WIDTH) atomicAdd(row + column + 1, y);
+    }
 }
 
 // Gradient with respect to a hidden layer's sums, from that of the layer above; adds up its biases' gradient.
-extern "C" __global__ void __launch_bounds__(THREADS, 2)
-batched_backward(const uint16_t* __restrict__ delta, const uint16_t* __restrict__ weights, const uint16_t* __restrict__ passed,
-                 uint16_t* __restrict__ out, float* __restrict__ bias_gradient) {
-    Product<false, false> product;
-    product.run(delta, PADDED, weights, PADDED, 0, PADDED);
-    Results& results = gather(product, [](float2 pair, int) { return pair; });
-    __shared__ float biases[TILE];
-    if (threadIdx.x < TILE) biases[threadIdx.x] = 0.0f;
-    __syncthreads();
-    float sums[8] = {};
-    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
-        const size_t at = (blockIdx.y * TILE + row) * size_t(PADDED) + blockIdx.x * TILE + Results::chunk();
-        const Words4 values = results.at(row), active = *reinterpret_cast<const Words4*>(passed + at);
-        const Words4 kept = {pass(values.x, active.x), pass(values.y, active.y), pass(values.z, active.z), pass(values.w, active.w)};
-        *reinterpret_cast<Words4*>(out + at) = kept;
-        const uint32_t words[4] = {kept.x, kept.y, kept.z, kept.w};
-        RW_UNROLL for (int k = 0; k < 4; ++k) {
-            const float2 pair = unpack(words[k]);
-            sums[2 * k] += pair.x;
-            sums[2 * k + 1] += pair.y;
-        }
-    }
-    RW_UNROLL for (int k = 0; k < 8; ++k) {
-        // Lanes l and l + 16 have the same columns.
-        sums[k] += __shfl_xor_sync(0xffffffffu, sums[k], 16);
-        if (lane() < 16u) atomicAdd(biases + Results::chunk() + k, sums[k]);
-    }
-    __syncthreads();
-    const uint32_t column = blockIdx.x * TILE + threadIdx.x;
-    if (threadIdx.x < TILE && column < WIDTH) atomicAdd(bias_gradient + column, biases[threadIdx.x]);
-}
-
-// Gradient with respect to the encoded points.
-extern "C" __global__ void __launch_bounds__(THREADS, 2)
-batched_backward_encoded(const uint16_t* __restrict__ delta, const uint16_t* __restrict__ weights, uint16_t* __restrict__ out) {
-    Product<false, false> product;
-    product.run(delta, PADDED, weights, PADDED, 0, PADDED);
-    Results& results = gather(product, [](float2 pair, int) { return pair; });
-    for (uint32_t row = Results::row(); row < TILE; row += Results::ROWS) {
-        uint16_t* to = out + (blockIdx.y * TILE + row) * size_t(ENCODED_PADDED) + blockIdx.x * TILE + Results::chunk();
-        *reinterpret_cast<Words4*>(to) = results.at(row);
-    }
-}
-
-// Adds a layer's gradient over `rows` samples, of which blocks take `share` each (along z): inputs turned, times gradients of sums.
-extern "C" __global__ void __launch_bounds__(THREADS, 2)
-batched_products(const uint16_t* __restrict__ in, uint32_t in_stride, const uint16_t* __restrict__ delta, uint32_t rows, uint32_t share,
-                 uint32_t inputs, float* __restrict__ gradient) {
-    Product<true, true> product;
-    const uint32_t from = blockIdx.z * share;
-    if (from >= rows) return;
-    product.run(in, in_stride, delta, PADDED, from, from + share < rows ? from + share : rows);
-    RW_UNROLL for (int m = 0; m < 4; ++m) {
-        RW_UNROLL for (int n = 0; n < 4; ++n) {
-            RW_UNROLL for (int half = 0; half < 2; ++half) {
-                const uint32_t row = product.row(m) + 8 * half, column = product.column(n);
-                float* to = gradient + row * size_t(WIDTH) + column;
-                if (row >= inputs || column >= WIDTH) continue;
-                // Two at once where they are side by side and aligned: in an even width all are.
-                if constexpr (WIDTH % 2 == 0) {
-                    add(to, product.sums[m][n][2 * half], product.sums[m][n][2 * half + 1]);
-                } else {
-                    atomicAdd(to, product.sums[m][n][2 * half]);
-                    if (column + 1 < WIDTH) atomicAdd(to + 1, product.sums[m][n][2 * half + 1]);
+RW_FN void backward_tile(Tile& tile, Stream& stream, const uint32_t* passed, float* bias_gradient) {
+    auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
+    multiply_tile<PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int pass, uint32_t (&pairs)[M][N][2]) {
+        uint32_t bits[M];
+        RW_UNROLL for (int m = 0; m < M; ++m) bits[m] = passed[(pass * M + m) * THREADS + threadIdx.x];
+        RW_UNROLL for (int n = 0; n < N; ++n) {
+            float2 bias = make_float2(0.0f, 0.0f);
+            RW_UNROLL for (int m = 0; m < M; ++m) {
+                RW_UNROLL for (int half = 0; half < 2; ++half) {
+                    const uint32_t bit = 1u << passed_bit(n, half);
+                    const float x = bits[m] & bit ? sums[m][n][2 * half] : 0.0f, y = bits[m] & bit << 16 ? sums[m][n][2 * half + 1] : 0.0f;
+                    bias.x += x;
+                    bias.y += y;
+                    pairs[m][n][half] = pack(x, y);
                 }
             }
+            RW_UNROLL for (int apart = 4; apart < 32; apart *= 2) {
+                bias.x += __shfl_xor_sync(0xffffffffu, bias.x, apart);
+                bias.y += __shfl_xor_sync(0xffffffffu, bias.y, apart);
+            }
+            if (lane() < 4u) add_pair(bias_gradient, pass * COLUMNS + lane_column(n), bias.x, bias.y);
+        }
+    });
+}
+
+// Encodes the tile's samples.
+RW_FN void encode_tile(Tile& tile, const uint16_t* tables) {
+    for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
+        const int row = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
+        const Four sample = tile.samples[row];
+        const float unit[3] = {sample.x, sample.y, sample.z};
+        float point[DIMS];
+        inputs(point, unit);
+        const float2 pair = encode(tile.levels, {tables}, point, column);
+        *reinterpret_cast<uint32_t*>(&tile.values[row][column]) = pack(pair.x, pair.y);
+    }
+}
+
+// Outputs of the OWN rows that a warp has of a tile, in all its lanes. `head` are the weights of the last layer and its bias.
+constexpr int OWN = ROWS / WARPS;
+RW_FN int own_row() { return threadIdx.x / 32 * OWN; }
+RW_FN void outputs_of(float (&outputs)[OWN], const Tile& tile, const float* __restrict__ head) {
+    RW_UNROLL for (int row = 0; row < OWN; ++row) outputs[row] = 0.0f;
+    for (int column = 2 * lane(); column < WIDTH; column += 64) {
+        const float x = from_half(to_half(head[column])), y = column + 1 < WIDTH ? from_half(to_half(head[column + 1])) : 0.0f;
+        RW_UNROLL for (int row = 0; row < OWN; ++row) {
+            const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[own_row() + row][column]));
+            outputs[row] = fma_(pair.y, y, fma_(pair.x, x, outputs[row]));
+        }
+    }
+    RW_UNROLL for (int row = 0; row < OWN; ++row) {
+        for (int apart = 16; apart > 0; apart /= 2) outputs[row] += __shfl_xor_sync(0xffffffffu, outputs[row], apart);
+        outputs[row] += head[WIDTH];
+    }
+}
+
+// Log-stretch at `n` points (3 floats each, unit coordinates). `slices` and `biases` as `batched_slices` leaves them.
+extern "C" __global__ void __launch_bounds__(THREADS, 1)
+batched_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
+                const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Reading reading,
+                const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
+    Tile& tile = *reinterpret_cast<Tile*>(memory);
+    read_levels(tile.levels, grid);
+    Stream stream(slices, tile.stages, FORWARD_SLICES);
+    for (uint32_t first = blockIdx.x * ROWS; first < n; first += gridDim.x * ROWS) {
+        __syncthreads();
+        if (threadIdx.x < ROWS) {
+            // Rows beyond repeat the last one.
+            const size_t at = first + threadIdx.x < n ? first + threadIdx.x : n - 1u;
+            float unit[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
+            place_times(reading, unit);
+            tile.samples[threadIdx.x] = {unit[0], unit[1], unit[2], 0.0f};
+        }
+        __syncthreads();
+        encode_tile(tile, tables);
+        forward_tile(tile, stream, ENCODED_PADDED, biases, nullptr);
+#pragma unroll 1
+        for (int layer = 1; layer < HIDDEN; ++layer) forward_tile(tile, stream, PADDED, biases + layer * PADDED, nullptr);
+        float outputs[OWN], output = 0.0f;
+        outputs_of(outputs, tile, head);
+        RW_UNROLL for (int row = 0; row < OWN; ++row) output = int(lane()) == row ? outputs[row] : output;
+        const int row = own_row() + int(lane());
+        if (int(lane()) < OWN && first + row < n) {
+            const float unit[3] = {tile.samples[row].x, tile.samples[row].y, tile.samples[row].z};
+            out[first + row] = read_output(reading, output, unit);
         }
     }
 }
 
-// The layers in half precision, padded: the first has ENCODED_PADDED rows, the others PADDED. A thread a value.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_weights(const float* __restrict__ layers, uint64_t n, uint16_t* __restrict__ out) {
-    const size_t i = blockIdx.x * size_t(THREADS) + threadIdx.x;
-    if (i >= n) return;
-    constexpr size_t FIRST = size_t(ENCODED_PADDED) * PADDED, OTHER = size_t(PADDED) * PADDED;
-    const int layer = i < FIRST ? 0 : 1 + int((i - FIRST) / OTHER);
-    const size_t inside = i < FIRST ? i : (i - FIRST) % OTHER;
-    const uint32_t row = uint32_t(inside / PADDED), column = uint32_t(inside % PADDED), inputs = layer == 0 ? ENCODED : WIDTH;
-    out[i] = to_half(row < inputs && column < WIDTH ? layers[size_t(layer_start(layer)) + row * size_t(WIDTH) + column] : 0.0f);
-}
-
-// Encoded points: a thread two neighbouring columns.
-RW_FN void encode_two(const Grid& grid, const uint16_t* tables, const float (&unit)[3], size_t i, uint16_t* out) {
-    __shared__ Level levels[LEVELS > 0 ? LEVELS : 1];
-    read_levels(levels, grid);
-    __syncthreads();
-    float point[DIMS];
-    inputs(point, unit);
-    const float2 pair = encode(levels, {tables}, point, int(i % (ENCODED_PADDED / 2)) * 2);
-    reinterpret_cast<uint32_t*>(out)[i] = pack(pair.x, pair.y);
-}
-
-// Of `n` points (3 floats each, unit coordinates); rows beyond repeat the last one. Launched with THREADS a multiple of what is to do.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_encode_points(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const __grid_constant__ Reading reading,
-                      const float* __restrict__ points, uint32_t n, uint16_t* __restrict__ out) {
-    const size_t i = blockIdx.x * size_t(THREADS) + threadIdx.x, row = i / (ENCODED_PADDED / 2), at = row < n ? row : n - 1u;
-    float unit[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
-    place_times(reading, unit);
-    encode_two(grid, tables, unit, i, out);
+// The tile's values go out in whole lines, rows of LENGTH.
+template <int LENGTH> RW_FN void leave(const Tile& tile, uint16_t* __restrict__ to) {
+    for (int i = threadIdx.x; i < ROWS * LENGTH / 8; i += THREADS)
+        reinterpret_cast<Words4*>(to)[i] = *reinterpret_cast<const Words4*>(&tile.values[i / (LENGTH / 8)][i % (LENGTH / 8) * 8]);
 }
 
 // Sample number `position` of a batch; without a target beyond it.
@@ -261,60 +366,21 @@ RW_FN Four sample_at(const Draw& draw, uint32_t position) {
     return drawn_sample(draw, position);
 }
 
-// Of the samples of a batch from number `first` on, and their targets.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_encode_samples(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const Draw draw, uint32_t first,
-                       uint16_t* __restrict__ out, float* __restrict__ targets) {
-    const size_t i = blockIdx.x * size_t(THREADS) + threadIdx.x, row = i / (ENCODED_PADDED / 2);
-    const Four sample = sample_at(draw, first + uint32_t(row));
-    if (i % (ENCODED_PADDED / 2) == 0) targets[row] = sample.w;
-    const float unit[3] = {sample.x, sample.y, sample.z};
-    encode_two(grid, tables, unit, i, out);
-}
-
-// The output of a row, in all lanes of its warp. `head` are the weights of the last layer and its bias.
-RW_FN float output_of(const uint16_t* row, const float* head) {
-    float sum = 0.0f;
-    for (uint32_t column = 2 * lane(); column < WIDTH; column += 64u) {
-        const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(row + column));
-        sum = fma_(pair.x, from_half(to_half(head[column])), sum);
-        if (column + 1 < WIDTH) sum = fma_(pair.y, from_half(to_half(head[column + 1])), sum);
-    }
-    for (int apart = 16; apart > 0; apart /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, apart);
-    return sum + head[WIDTH];
-}
-
-// Log-stretch of `n` rows; a warp a row.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_answer(const uint16_t* __restrict__ values, const float* __restrict__ head, const __grid_constant__ Reading reading,
-               const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
-    const size_t row = blockIdx.x * size_t(THREADS / 32) + threadIdx.x / 32u;
-    if (row >= n) return;
-    const float output = output_of(values + row * PADDED, head);
-    const float unit[3] = {points[3 * row], points[3 * row + 1], points[3 * row + 2]};
-    if (lane() == 0u) out[row] = read_output(reading, output, unit);
-}
-
-// Rows that a block of batched_head takes.
-constexpr int HEAD_ROWS = 64;
-
-// Gradients of the head, and with respect to the sums of the last hidden layer, whose biases' gradient it adds up; the squared error of each
-// sample, over the batch, is added to the loss. A sample whose target is not finite counts for nothing.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_head(const uint16_t* __restrict__ values, const float* __restrict__ head, const float* __restrict__ targets, uint32_t batch,
-             uint16_t* __restrict__ delta, float* __restrict__ head_gradient, float* __restrict__ bias_gradient, double* __restrict__ loss) {
-    __shared__ float slopes[HEAD_ROWS];
-    const size_t first = blockIdx.x * size_t(HEAD_ROWS);
-    for (int row = threadIdx.x / 32u; row < HEAD_ROWS; row += THREADS / 32) {
-        const float target = targets[first + row], output = output_of(values + (first + row) * PADDED, head);
-        if (lane() == 0u) slopes[row] = isfinite(target) ? 2.0f * (output - target) : 0.0f;
+// Gradients of the head, and, in place of the values of the last hidden layer, with respect to its sums, whose biases' gradient is added up;
+// the squared error of each sample, over the batch, is added to the loss. A sample whose target is not finite counts for nothing.
+RW_FN void head_tile(Tile& tile, const float* __restrict__ head, uint32_t batch, float* head_gradient, float* bias_gradient, double* loss) {
+    float outputs[OWN];
+    outputs_of(outputs, tile, head);
+    RW_UNROLL for (int row = 0; row < OWN; ++row) {
+        const float target = tile.samples[own_row() + row].w;
+        if (int(lane()) == row) tile.slopes[own_row() + row] = isfinite(target) ? 2.0f * (outputs[row] - target) : 0.0f;
     }
     __syncthreads();
     if (threadIdx.x < 32u) {
         float squares = 0.0f, sum = 0.0f;
-        for (int row = lane(); row < HEAD_ROWS; row += 32) {
-            squares = fma_(0.25f * slopes[row], slopes[row], squares);
-            sum += slopes[row];
+        for (int row = lane(); row < ROWS; row += 32) {
+            squares = fma_(0.25f * tile.slopes[row], tile.slopes[row], squares);
+            sum += tile.slopes[row];
         }
         for (int apart = 16; apart > 0; apart /= 2) {
             squares += __shfl_xor_sync(0xffffffffu, squares, apart);
@@ -325,41 +391,152 @@ batched_head(const uint16_t* __restrict__ values, const float* __restrict__ head
             atomicAdd(head_gradient + WIDTH, sum);
         }
     }
-    for (uint32_t column = 2 * threadIdx.x; column < PADDED; column += 2 * THREADS) {
+    // Two columns a thread; of narrow layers several threads share the rows.
+    constexpr int PAIRS = PADDED / 2, SHARES = PAIRS < THREADS ? THREADS / PAIRS : 1, SHARE = ROWS / SHARES;
+    for (int i = threadIdx.x; i < PAIRS * SHARES; i += THREADS) {
+        const int column = 2 * (i % PAIRS), first = i / PAIRS * SHARE;
         const float x = column < WIDTH ? from_half(to_half(head[column])) : 0.0f, y = column + 1 < WIDTH ? from_half(to_half(head[column + 1])) : 0.0f;
-        float weights[2] = {0.0f, 0.0f}, biases[2] = {0.0f, 0.0f};
-        for (int row = 0; row < HEAD_ROWS; ++row) {
-            const uint32_t active = *reinterpret_cast<const uint32_t*>(values + (first + row) * PADDED + column);
+        float2 weights = make_float2(0.0f, 0.0f), bias = make_float2(0.0f, 0.0f);
+        for (int row = first; row < first + SHARE; ++row) {
+            uint32_t& at = *reinterpret_cast<uint32_t*>(&tile.values[row][column]);
+            const uint32_t active = at;
             const float2 pair = unpack(active);
-            const float low = active & 0x00007fffu ? slopes[row] * x : 0.0f, high = active & 0x7fff0000u ? slopes[row] * y : 0.0f;
-            weights[0] = fma_(pair.x, slopes[row], weights[0]);
-            weights[1] = fma_(pair.y, slopes[row], weights[1]);
-            biases[0] += low;
-            biases[1] += high;
-            *reinterpret_cast<uint32_t*>(delta + (first + row) * PADDED + column) = pack(low, high);
+            const float slope = tile.slopes[row], low = active & 0x00007fffu ? slope * x : 0.0f, high = active & 0x7fff0000u ? slope * y : 0.0f;
+            weights.x = fma_(pair.x, slope, weights.x);
+            weights.y = fma_(pair.y, slope, weights.y);
+            bias.x += low;
+            bias.y += high;
+            at = pack(low, high);
         }
-        RW_UNROLL for (int k = 0; k < 2; ++k) {
-            if (column + k >= WIDTH) continue;
-            atomicAdd(head_gradient + column + k, weights[k]);
-            atomicAdd(bias_gradient + column + k, biases[k]);
+        add_pair(head_gradient, column, weights.x, weights.y);
+        add_pair(bias_gradient, column, bias.x, bias.y);
+    }
+    __syncthreads();
+}
+
+// First bias of a hidden layer of the flat vector.
+RW_FN constexpr int bias_start(int layer) { return layer_start(layer) + (layer == 0 ? ENCODED : WIDTH) * WIDTH; }
+
+// Of the samples of a batch from number `first` on, `rows` of them in whole tiles: adds the gradients of the tables (`table_gradient`, padded),
+// of the biases and the head (`layer_gradient`, flat) and the loss; leaves encoded points (rows of ENCODED_PADDED), values of and gradients
+// with respect to the sums of each hidden layer (rows of PADDED, `held` of them a layer). `passed`: HIDDEN - 1 times PASSES * M * THREADS a block.
+extern "C" __global__ void __launch_bounds__(THREADS, 1)
+batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
+                 const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Draw draw, uint32_t first, uint32_t rows,
+                 uint32_t held, uint16_t* __restrict__ encoded, uint16_t* __restrict__ values, uint16_t* __restrict__ deltas, uint32_t* passed,
+                 float* __restrict__ table_gradient, float* __restrict__ layer_gradient, double* __restrict__ loss) {
+    constexpr int PASSED = PASSES * M * THREADS;
+    Tile& tile = *reinterpret_cast<Tile*>(memory);
+    read_levels(tile.levels, grid);
+    passed += blockIdx.x * size_t((HIDDEN - 1) * PASSED);
+    Stream stream(slices, tile.stages, ALL_SLICES);
+    for (uint32_t row = blockIdx.x * ROWS; row < rows; row += gridDim.x * ROWS) {
+        auto of = [&](uint16_t* all, int layer) { return all + (layer * size_t(held) + row) * PADDED; };
+        __syncthreads();
+        if (threadIdx.x < ROWS) tile.samples[threadIdx.x] = sample_at(draw, first + row + threadIdx.x);
+        __syncthreads();
+        encode_tile(tile, tables);
+        __syncthreads();
+        leave<ENCODED_PADDED>(tile, encoded + row * size_t(ENCODED_PADDED));
+        forward_tile(tile, stream, ENCODED_PADDED, biases, HIDDEN > 1 ? passed : nullptr);
+        leave<PADDED>(tile, of(values, 0));
+#pragma unroll 1
+        for (int layer = 1; layer < HIDDEN; ++layer) {
+            // The last one's gradient looks at its values.
+            forward_tile(tile, stream, PADDED, biases + layer * PADDED, layer < HIDDEN - 1 ? passed + layer * PASSED : nullptr);
+            leave<PADDED>(tile, of(values, layer));
         }
+        __syncthreads();
+        head_tile(tile, head, draw.batch, layer_gradient + layer_start(HIDDEN), layer_gradient + bias_start(HIDDEN - 1), loss);
+        leave<PADDED>(tile, of(deltas, HIDDEN - 1));
+#pragma unroll 1
+        for (int layer = HIDDEN - 2; layer >= 0; --layer) {
+            backward_tile(tile, stream, passed + layer * PASSED, layer_gradient + bias_start(layer));
+            leave<PADDED>(tile, of(deltas, layer));
+        }
+#if RW_LEVELS > 0
+        // Gradient with respect to the encoded points, in halves; it goes to the tables.
+        auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
+        multiply_tile<ENCODED_PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int, uint32_t (&pairs)[M][N][2]) {
+            RW_UNROLL for (int m = 0; m < M; ++m) {
+                RW_UNROLL for (int n = 0; n < N; ++n) {
+                    RW_UNROLL for (int half = 0; half < 2; ++half) pairs[m][n][half] = pack(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+                }
+            }
+        });
+        for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
+            const int at = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
+            const Four sample = tile.samples[at];
+            // What has no target would only add zeros.
+            if (!isfinite(sample.w)) continue;
+            const float unit[3] = {sample.x, sample.y, sample.z};
+            float point[DIMS];
+            inputs(point, unit);
+            const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[at][column]));
+            scatter(tile.levels, point, column, pair.x, pair.y, table_gradient);
+        }
+#endif
     }
 }
 
-#if RW_LEVELS > 0
-// The gradient with respect to encoded samples goes to the tables: a thread two neighbouring columns.
-extern "C" __global__ void __launch_bounds__(THREADS)
-batched_scatter(const __grid_constant__ Grid grid, const Draw draw, uint32_t first, const uint16_t* __restrict__ delta, float* __restrict__ gradient) {
-    __shared__ Level levels[LEVELS];
-    read_levels(levels, grid);
-    __syncthreads();
-    const size_t i = blockIdx.x * size_t(THREADS) + threadIdx.x, row = i / (ENCODED_PADDED / 2);
-    const Four sample = sample_at(draw, first + uint32_t(row));
-    if (!isfinite(sample.w)) return;
-    const float unit[3] = {sample.x, sample.y, sample.z};
-    float point[DIMS];
-    inputs(point, unit);
-    const float2 pair = unpack(reinterpret_cast<const uint32_t*>(delta)[i]);
-    scatter(levels, point, int(i % (ENCODED_PADDED / 2)) * 2, pair.x, pair.y, gradient);
+// Stages of a product: DEPTH samples of PANEL inputs and of COLUMNS neurons.
+struct Panels {
+    uint16_t inputs[DEPTH][PANEL + SKEW];
+    Slice deltas;
+};
+static_assert(STAGES * sizeof(Panels) <= RW_PRODUCT_BYTES, "shared memory");
+// Their inputs, as a left operand.
+struct PanelColumns {
+    static constexpr int SECOND = 16 * (PANEL + SKEW);
+    static RW_FN void read(uint32_t (&to)[4], const uint16_t* from, int m) { read_turned(to, from + 16 * m); }
+};
+
+// Adds the weights' gradients over `rows` samples, of which blocks take `share` each (grid's y): what `batched_gradient` left of a layer's
+// inputs, transposed, times its gradients. Grid's x: PANEL times COLUMNS weights at a time, layer by layer.
+extern "C" __global__ void __launch_bounds__(THREADS, 1)
+batched_products(const uint16_t* __restrict__ encoded, const uint16_t* __restrict__ values, const uint16_t* __restrict__ deltas, uint32_t rows,
+                 uint32_t held, uint32_t share, float* __restrict__ layer_gradient) {
+    constexpr int FIRST = (ENCODED + PANEL - 1) / PANEL * PASSES, OTHERS = (WIDTH + PANEL - 1) / PANEL * PASSES;
+    Panels* stages = reinterpret_cast<Panels*>(memory);
+    const int number = blockIdx.x, layer = number < FIRST ? 0 : 1 + (number - FIRST) / OTHERS;
+    const int inside = layer == 0 ? number : (number - FIRST) % OTHERS;
+    const int first_input = inside / PASSES * PANEL, first_neuron = inside % PASSES * COLUMNS, inputs = layer == 0 ? ENCODED : WIDTH;
+    const int stride = layer == 0 ? ENCODED_PADDED : PADDED;
+    const uint32_t from = blockIdx.y * share, steps = from < rows ? ((from + share < rows ? share : rows - from) / DEPTH) : 0;
+    const uint16_t* left = (layer == 0 ? encoded : values + (layer - 1) * size_t(held) * PADDED) + from * size_t(stride) + first_input;
+    const uint16_t* right = deltas + (layer * size_t(held) + from) * PADDED + first_neuron;
+    if (steps == 0) return;
+    float sums[4][N][4];
+    clear(sums);
+    // Inputs beyond the row count as 0, and so does what is beyond the last step.
+    const bool there = first_input + int(threadIdx.x) % (PANEL / 8) * 8 < stride;
+    uint32_t brought = 0;
+    auto bring_step = [&] {
+        Panels& to = stages[brought % STAGES];
+        bring_rows<PANEL>(to.inputs, left, stride, there && brought < steps);
+        bring_rows<COLUMNS>(to.deltas.values, right, PADDED, brought < steps);
+        close_group();
+        left += DEPTH * stride;
+        right += DEPTH * PADDED;
+        ++brought;
+    };
+    RW_UNROLL for (int i = 0; i < STAGES - 1; ++i) bring_step();
+    const uint32_t l = lane(), row = (l >> 4) * 8u + (l & 7u), column = warp_row(4) + (l >> 3 & 1u) * 8u;
+    uint32_t taken = 0;
+    Product<PanelColumns, 4>(sums).add(steps, [&] {
+        wait_for_group();
+        bring_step();
+        const Panels& panels = stages[taken++ % STAGES];
+        return Operands{&panels.inputs[row][column], &panels.deltas.values[right_row()][right_column()]};
+    });
+    float* gradient = layer_gradient + layer_start(layer);
+    RW_UNROLL for (int m = 0; m < 4; ++m) {
+        RW_UNROLL for (int n = 0; n < N; ++n) {
+            RW_UNROLL for (int half = 0; half < 2; ++half) {
+                const int input = first_input + lane_row(4, m) + 8 * half;
+                if (input < inputs)
+                    add_pair(gradient + input * size_t(WIDTH), first_neuron + lane_column(n), sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+            }
+        }
+    }
 }
-#endif

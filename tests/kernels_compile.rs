@@ -5,7 +5,7 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
-use ridgewatch::engine::cuda::{batched_defines, is_fused, network_defines};
+use ridgewatch::engine::cuda::{Tiling, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings};
 
 /// Macros in which the gridded kernel is compiled here.
@@ -29,7 +29,7 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
 }
 
 /// Encodings, widths and depths: what fills the registers, and what has no second feature or no tables.
-fn networks(which: impl Fn(&Architecture) -> bool) -> Vec<Vec<String>> {
+fn networks() -> Vec<Architecture> {
     let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
     let settings = [
         (usual.clone(), &[0, 1, 2][..]),
@@ -38,11 +38,11 @@ fn networks(which: impl Fn(&Architecture) -> bool) -> Vec<Vec<String>> {
         (NetworkSettings { levels: 16, features: 8, hidden_layers: 4, ..usual.clone() }, &[0, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, width: 512, hidden_layers: 16, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { width: 200, hidden_layers: 5, ..usual.clone() }, &[0, 1]),
         (NetworkSettings { inputs: vec![Input::Start], ..usual }, &[0, 1]),
     ];
-    let shapes = settings.iter().map(|(settings, axes)| Architecture::new(settings, axes, [1.0; 3]).unwrap());
-    shapes.filter(which).map(|shape| network_defines(&shape).unwrap()).collect()
+    settings.iter().map(|(settings, axes)| Architecture::new(settings, axes, [1.0; 3]).unwrap()).collect()
 }
 
 fn variants(source: &str) -> Vec<Vec<String>> {
@@ -66,11 +66,18 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
-        "network.cu" => networks(|_| true),
-        "network_fused.cu" => networks(|shape| is_fused(shape, usize::MAX)),
-        "network_batched.cu" => networks(|_| true)
+        "network.cu" => networks().iter().map(|shape| network_defines(shape).unwrap()).collect(),
+        "network_fused.cu" => {
+            networks().iter().filter(|shape| is_fused(shape, usize::MAX)).map(|shape| network_defines(shape).unwrap()).collect()
+        }
+        // All shapes, for no device has room for all of them at once; with the shared memory of H200, A100 and the RTX cards since Ampere.
+        "network_batched.cu" => networks()
             .iter()
-            .flat_map(|defines| batched_defines().map(|more| [defines.as_slice(), more.as_slice()].concat()))
+            .flat_map(|shape| {
+                let mut tilings: Vec<Tiling> = [227, 163, 99].map(|kibibytes| Tiling::of(shape, kibibytes << 10).unwrap()).into();
+                tilings.dedup();
+                tilings.into_iter().map(|tiling| network_defines(shape).unwrap().into_iter().chain(tiling.defines()).collect())
+            })
             .collect(),
         _ => vec![Vec::new()],
     }

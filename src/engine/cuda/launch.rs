@@ -1,7 +1,8 @@
 //! Launching kernels.
 
-use super::DeviceError;
-use cudarc::driver::{LaunchArgs, LaunchConfig};
+use super::{DeviceError, Gpu};
+use cudarc::driver::sys::CUfunction_attribute as Function;
+use cudarc::driver::{CudaFunction, LaunchArgs, LaunchConfig};
 
 /// Enough blocks of `block` threads for `count` threads.
 pub fn threads(count: usize, block: u32) -> LaunchConfig {
@@ -16,4 +17,31 @@ pub fn threads(count: usize, block: u32) -> LaunchConfig {
 pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Result<(), DeviceError> {
     // SAFETY: the caller's.
     unsafe { arguments.launch(config) }.map(|_| ()).map_err(DeviceError::driver("launching a kernel"))
+}
+
+/// A kernel whose blocks stay and take one tile after another, with shared memory beyond what every block may have.
+#[derive(Debug)]
+pub(super) struct Resident {
+    pub(super) function: CudaFunction,
+    threads: u32,
+    shared: u32,
+    /// That the device holds at once.
+    pub(super) blocks: u32,
+}
+
+impl Resident {
+    /// Blocks of `threads` threads and `shared` bytes, which the device has.
+    pub(super) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
+        let doing = DeviceError::driver("asking for shared memory");
+        gpu.context().bind_to_thread().map_err(&doing)?;
+        function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
+        let together = function.occupancy_max_active_blocks_per_multiprocessor(threads, shared, None).map_err(&doing)?;
+        Ok(Self { function, threads, shared: shared as u32, blocks: together.max(1) * gpu.multiprocessors() })
+    }
+
+    /// As many blocks as stay, or as there are tiles.
+    pub(super) fn config(&self, tiles: usize) -> LaunchConfig {
+        let blocks = tiles.clamp(1, self.blocks as usize) as u32;
+        LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (self.threads, 1, 1), shared_mem_bytes: self.shared }
+    }
 }

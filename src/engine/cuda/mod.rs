@@ -48,7 +48,7 @@ pub use launch::{launch, threads};
 pub use layout::Outputs;
 pub use memory::{Budget, Buffer};
 pub use network::{DeviceNetwork, NetworkAbove, is_fused, network_defines};
-pub use network_batched::batched_defines;
+pub use network_batched::Tiling;
 pub use network_training::{DeviceSamples, DeviceTraining};
 pub use offload::CudaOffload;
 pub use render::{GpuRenderer, LookAhead, Timeline};

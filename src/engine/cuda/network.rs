@@ -3,14 +3,14 @@
 //! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads
 //! them (fused) or once a call (batched).
 
+use super::launch::Resident;
 use super::layout::TableArgument;
-use super::network_batched::{Batched, GradientTo};
+use super::network_batched::{Batched, GradientTo, Tiling};
 use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, HASH, Loss, Objective, Target, row};
-use cudarc::driver::sys::CUfunction_attribute as Function;
-use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg, result};
+use cudarc::driver::{CudaFunction, PushKernelArg, result};
 use std::sync::Arc;
 
 /// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
@@ -82,31 +82,6 @@ fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     (weights, weights + 2 * TILE * (encoded.max(width) + 8 + row))
 }
 
-/// A kernel that keeps its layers in shared memory, and the blocks that the device holds at once.
-#[derive(Debug)]
-struct Resident {
-    function: CudaFunction,
-    shared: u32,
-    blocks: u32,
-}
-
-impl Resident {
-    /// `shared` bytes, which the device has.
-    fn new(gpu: &Gpu, function: CudaFunction, shared: usize) -> Result<Self, DeviceError> {
-        let doing = DeviceError::driver("asking for shared memory");
-        gpu.context().bind_to_thread().map_err(&doing)?;
-        function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
-        let together = function.occupancy_max_active_blocks_per_multiprocessor(THREADS, shared, None).map_err(&doing)?;
-        Ok(Self { function, shared: shared as u32, blocks: together.max(1) * gpu.multiprocessors() })
-    }
-
-    /// As many blocks as stay, or as `count` samples keep busy.
-    fn config(&self, count: usize) -> LaunchConfig {
-        let tiles = count.div_ceil(TILE).clamp(1, self.blocks as usize) as u32;
-        LaunchConfig { grid_dim: (tiles, 1, 1), block_dim: (THREADS, 1, 1), shared_mem_bytes: self.shared }
-    }
-}
-
 /// How samples go through the network.
 #[derive(Debug)]
 enum Way {
@@ -151,12 +126,17 @@ impl NetworkKernels {
         let (grid, padded) = grid(shape)?;
         let kernel = |name| gpu.kernel("network.cu", &defines, name);
         let (weights, workspace) = shared_bytes(shape);
-        let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, shared);
+        let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, THREADS, shared);
+        let way = if is_fused(shape, gpu.shared_memory()) {
+            Way::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? }
+        } else if let Some(tiling) = Tiling::of(shape, gpu.shared_memory()) {
+            Way::Batched(Box::new(Batched::new(gpu, shape, grid, &defines, tiling)?))
+        } else {
+            let (width, most) = (shape.layers[0].outputs, gpu.shared_memory());
+            return refuse(format!("a network of layers of {width}, whose values {most} bytes of shared memory do not hold"));
+        };
         Ok(Arc::new(Self {
-            way: match is_fused(shape, gpu.shared_memory()) {
-                true => Way::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? },
-                false => Way::Batched(Box::new(Batched::new(gpu, shape, grid, &defines)?)),
-            },
+            way,
             adam_tables: kernel("network_adam_tables")?,
             adam_layers: kernel("network_adam_layers")?,
             average: kernel("network_average")?,
@@ -192,7 +172,7 @@ impl NetworkKernels {
                 let mut call = self.gpu.work().launch_builder(&predict.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(reading).arg(&points).arg(&n).arg(&out);
                 // SAFETY: the caller's, and the arguments are those of `network_predict`.
-                unsafe { launch(&mut call, predict.config(count)) }
+                unsafe { launch(&mut call, predict.config(count.div_ceil(TILE))) }
             }
         }
     }
@@ -209,7 +189,7 @@ impl NetworkKernels {
                 let mut call = self.gpu.work().launch_builder(&gradient.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&to.tables).arg(&to.layers).arg(&to.loss);
                 // SAFETY: the caller's, and the arguments are those of `network_gradient`.
-                unsafe { launch(&mut call, gradient.config(draw.batch as usize)) }
+                unsafe { launch(&mut call, gradient.config((draw.batch as usize).div_ceil(TILE))) }
             }
         }
     }
@@ -300,7 +280,8 @@ pub struct NetworkAbove<'a> {
 impl DeviceNetwork {
     /// Whether the kernels take networks of this architecture on this device.
     pub fn takes(gpu: &Gpu, shape: &Architecture) -> bool {
-        gpu.capability() >= OLDEST && network_defines(shape).is_some()
+        let most = gpu.shared_memory();
+        gpu.capability() >= OLDEST && network_defines(shape).is_some() && (is_fused(shape, most) || Tiling::of(shape, most).is_some())
     }
 
     /// Brings parameters over, as burn's tensors hold them.
