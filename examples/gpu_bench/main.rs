@@ -163,38 +163,52 @@ mod bench {
         copy: f64,
     }
 
+    /// Points where the log-stretch is known: traced in f64 with 880 steps.
+    struct Truth {
+        points: Vec<[f32; 3]>,
+        batch: Batch,
+        log_stretch: Vec<f64>,
+        peak: f64,
+    }
+
+    impl Truth {
+        fn psnr(&self, found: &[f32]) -> f64 {
+            let squares: f64 = found.iter().zip(&self.log_stretch).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum();
+            10.0 * (self.peak * self.peak / (squares / found.len() as f64)).log10()
+        }
+
+        /// Of what a tracer finds there.
+        fn psnr_of(&self, tracer: &DeviceTracer) -> Outcome<f64> {
+            self.batch.trace(tracer, self.points.len())?;
+            Ok(self.psnr(&self.batch.stretches()?))
+        }
+    }
+
     impl Bench {
         fn tracer(&self, source: &VelocitySource, map: &FlowMap, tuning: Tuning) -> Outcome<DeviceTracer> {
             let Steps::Fixed(steps) = map.steps else { return Err("a number of steps".into()) };
             Ok(DeviceTracer::new(&self.store, &self.gpu, source, map, 0.0, steps, tuning)?)
         }
 
-        fn tables(&self, name: &str, source: &VelocitySource, domain: &Domain) -> Outcome<()> {
-            let fine = CudaTracer::new(
-                &self.store,
-                &self.gpu,
-                source.clone(),
-                &FlowMap { precision: Precision::F64, ..turbulent(880) },
-                0.0,
-                Tuning::default(),
-            )?;
+        fn truth(&self, source: &VelocitySource, domain: &Domain) -> Outcome<Truth> {
+            let fine = FlowMap { precision: Precision::F64, ..turbulent(880) };
+            let fine = CudaTracer::new(&self.store, &self.gpu, source.clone(), &fine, 0.0, Tuning::default())?;
             let points = scattered(domain, 1 << 18, 77);
             let mut truth = Traced::default();
             fine.trace(&points, Extras::default(), &mut truth);
             let peak = truth.log_stretch_f64.iter().copied().fold(0.0, f64::max);
-            let psnr = |found: &[f32]| {
-                let squares: f64 = found.iter().zip(&truth.log_stretch_f64).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum();
-                10.0 * (peak * peak / (squares / found.len() as f64)).log10()
-            };
+            Ok(Truth { batch: Batch::new(&self.gpu, &points)?, points, log_stretch: truth.log_stretch_f64, peak })
+        }
+
+        fn tables(&self, name: &str, source: &VelocitySource, domain: &Domain, truth: &Truth) -> Outcome<()> {
+            let points = &truth.points;
             block(&format!("{name}-steps"));
             println!("| steps | storage | PSNR, dB |\n|---|---|---|");
-            let held = Batch::new(&self.gpu, &points)?;
             let f16 =
                 [(6, Storage::F16Pairs), (11, Storage::F16Pairs), (22, Storage::F16), (22, Storage::F16Pairs), (110, Storage::F16Pairs)];
             for (steps, storage) in STEPS.map(|steps| (steps, Storage::F32)).into_iter().chain(f16) {
                 let tracer = self.tracer(source, &turbulent(steps), Tuning { storage, ..Tuning::default() })?;
-                held.time(&tracer, points.len())?;
-                println!("| {steps} | {} | {:.1} |", storage.name(), psnr(&held.stretches()?));
+                println!("| {steps} | {} | {:.1} |", storage.name(), truth.psnr_of(&tracer)?);
             }
             block(&format!("{name}-tables"));
             println!(
@@ -246,7 +260,7 @@ mod bench {
                     "| {nodes:?} | {:.4} | {:.0} | {:.1} | {:.1} | {:.1} |",
                     seconds[1],
                     all / seconds[1] / M,
-                    psnr(&found),
+                    truth.psnr(&found),
                     rate(&random)?,
                     rate(&coherent)?
                 );
@@ -336,9 +350,10 @@ mod bench {
                 batch.mean_lived(1 << 20)?
             );
 
+            let truth = self.truth(&source, &domain)?;
             block(&format!("{name}-differences"));
             println!(
-                "| integrator | precision | gap, cells | window | M samples/s | tangent in f32 is faster by |\n|---|---|---|---|---|---|"
+                "| integrator | precision | gap, cells | window | M samples/s | tangent in f32 is faster by | PSNR, dB |\n|---|---|---|---|---|---|---|"
             );
             let (count, gap) = (1 << 23, 1e-4);
             // Integrator, precision, gap, cell kept, a lane each.
@@ -353,12 +368,15 @@ mod bench {
             ];
             for storage in [Storage::F32, Storage::F16Pairs] {
                 let held = Tuning { storage, ..Tuning::default() };
-                let tangent = batch.time(&self.tracer(&source, &turbulent(22), held)?, count)?;
-                println!("| tangent | f32 | - | {} | {:.0} | 1 |", storage.name(), count as f64 / tangent / 1e3);
+                let tracer = self.tracer(&source, &turbulent(22), held)?;
+                let tangent = batch.time(&tracer, count)?;
+                let (rate, psnr) = (count as f64 / tangent / 1e3, truth.psnr_of(&tracer)?);
+                println!("| tangent | f32 | - | {} | {rate:.0} | 1 | {psnr:.1} |", storage.name());
                 // In pairs only the best of them.
                 for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
                     let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
-                    let ms = batch.time(&self.tracer(&source, &changed, Tuning { keep, spread, ..held })?, count)?;
+                    let tracer = self.tracer(&source, &changed, Tuning { keep, spread, ..held })?;
+                    let ms = batch.time(&tracer, count)?;
                     let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
                     let how = match (integrator, spread) {
                         (Integrator::Tangent, _) => "",
@@ -369,20 +387,23 @@ mod bench {
                     let precision = if precision == Precision::F32 { "f32" } else { "f64" };
                     let gap = if gap > 0.0 { gap.to_string() } else { "-".into() };
                     println!(
-                        "| {what}{how}{kept} | {precision} | {gap} | {} | {:.0} | {:.2} |",
+                        "| {what}{how}{kept} | {precision} | {gap} | {} | {:.0} | {:.2} | {:.1} |",
                         storage.name(),
                         count as f64 / ms / 1e3,
-                        ms / tangent
+                        ms / tangent,
+                        truth.psnr_of(&tracer)?
                     );
                 }
             }
             let random = KERNELS[2].1;
             let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
             let count = 1 << 18;
-            let slow = batch.time(&self.tracer(&source, &published, random)?, count)? / count as f64;
+            let published = self.tracer(&source, &published, random)?;
+            let slow = batch.time(&published, count)? / count as f64;
             println!(
-                "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, gap of 1e-6 cells) traces {:.2} M/s.",
-                1e-3 / slow
+                "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, gap of 1e-6 cells) traces {:.2} M/s at {:.1} dB.",
+                1e-3 / slow,
+                truth.psnr_of(&published)?
             );
             for (what, tuning) in [
                 ("f32", Tuning::default()),
@@ -399,7 +420,7 @@ mod bench {
             if rows == Rows::All {
                 self.collisions(name, &source)?;
             }
-            self.tables(name, &source, &domain)
+            self.tables(name, &source, &domain, &truth)
         }
 
         /// The whole sphere at one degree with 37 levels, a degree as long as the distance between levels.

@@ -216,7 +216,7 @@ fn a_budget_ends_tracing_in_the_course_of_a_frame() {
     let mut renderer = stage.renderer();
     let (.., tally, _) = stage.on_gpu(&mut side, &mut renderer, 0, 8, &half);
     assert!(tally.traced > 0 && tally.over_budget > 0, "{tally:?}, without a budget {whole:?}");
-    assert!(tally.traced < whole.traced && tally.trace_seconds < whole.trace_seconds, "{tally:?}, without a budget {whole:?}");
+    assert!(tally.traced < whole.traced, "{tally:?}, without a budget {whole:?}");
 }
 
 #[test]

@@ -20,8 +20,10 @@ fn kernels_are_kept_and_damaged_ones_compiled_again() {
     let files: Vec<_> = std::fs::read_dir(folder.path()).unwrap().map(|f| f.unwrap().path()).collect();
     assert_eq!(files.len(), 1);
     let whole = std::fs::read(&files[0]).unwrap();
+    let written = || std::fs::metadata(&files[0]).unwrap().modified().unwrap();
+    let first = written();
     load();
-    assert_eq!(std::fs::read(&files[0]).unwrap(), whole);
+    assert_eq!((std::fs::read(&files[0]).unwrap(), written()), (whole.clone(), first), "read, not compiled again");
     std::fs::write(&files[0], &whole[..whole.len() / 2]).unwrap();
     load();
     assert_eq!(std::fs::read(&files[0]).unwrap().len(), whole.len(), "compiled and kept again");
