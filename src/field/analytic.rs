@@ -81,12 +81,14 @@ pub struct DoubleGyre {
 
 impl DoubleGyre {
     /// Radians of phase a unit of time: the flow depends on time by its phase alone.
+    #[cfg(feature = "cuda")]
     pub(crate) fn rate(&self) -> f64 {
         self.omega
     }
 
     /// What the constants at `time` after a start are made of, with the sine and cosine of the phase at the start
     /// (sin(a + b) = sin a cos b + cos a sin b): the first two, and epsilon times sine and cosine of the phase since.
+    #[cfg(feature = "cuda")]
     pub(crate) fn constants_since(&self, time: f64) -> Constants<f64> {
         let [scale, scale_pi, ..] = self.constants(time);
         let (sine, cosine) = (self.omega * time).sin_cos();
