@@ -239,7 +239,7 @@ impl Cycle<'_> {
         }
         let pool = self.threads.all();
         let (ring, stop, begin) = (&self.ring, self.stop, Instant::now());
-        let mut trained = 0.0;
+        let (mut trained, mut empty) = (0.0, false);
         while trained < settings.seconds() && !stop.load(Ordering::Relaxed) {
             let mut slice = (settings.seconds() - trained).min(MEANWHILE);
             if live.is_offloaded() {
@@ -255,11 +255,12 @@ impl Cycle<'_> {
                 return;
             }
             let learned = pool.install(|| train(&mut **live, ring, settings, Until::Seconds(slice), stop));
-            let nothing = learned.steps == 0;
+            let before = std::mem::replace(&mut empty, learned.steps == 0);
             trained += learned.seconds;
             self.turns.took(learned.device_seconds.unwrap_or(learned.seconds));
             self.learned_meanwhile = Some(self.learned_meanwhile.take().unwrap_or_default().and(learned));
-            if nothing {
+            // One turn may go into bringing over what there is to be learned from; after two there is nothing.
+            if before && empty {
                 return;
             }
         }
