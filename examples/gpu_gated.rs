@@ -1,14 +1,16 @@
 //! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table, or a network that is trained
 //! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
 //! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
-//! traced share, with the device's memory over a thousand frames. Prints; needs a GPU.
+//! traced share, with the device's memory over a thousand frames, and what checkpoints cost their length. Prints; needs a GPU.
 //! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [table.key=value]`, where keys are those of a scene.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaAccelerator, Gpu, GpuSettings};
-use ridgewatch::engine::{Device, Event, FrameRecord, RunOptions, Settings, Setup, Storage, run, stratified_points, trace};
+use ridgewatch::engine::{
+    CheckpointRecord, Device, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, Storage, run, stratified_points, trace,
+};
 use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
@@ -25,10 +27,15 @@ const WARM_UP: usize = 8;
 const NETWORKS: usize = 3;
 /// In which a network is trained up.
 const LEARNING: usize = 240;
-const SLIDES: usize = 4;
-const FRAMES_A_SLIDE: usize = 190;
+/// The first is where all that is ever taken is; the others have a thousand frames.
+const SLIDES: usize = 6;
+const FRAMES_A_SLIDE: usize = 200;
+/// Most that free memory may change by over them, as the driver sees it: two of the chunks in which its pool grows.
+const FLAT: usize = 64 << 20;
+/// Seconds between two checkpoints; a run beside a simulation has 30.
+const CHECKPOINT_SECONDS: f64 = 5.0;
 /// Frames of a slide whose traced share is shown, from 0.
-const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 189];
+const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 199];
 /// A network of 71 MB: few levels, the finest as dense as its table can hold; and batches that keep the device busy.
 const NETWORK: [&str; 6] = [
     "network.levels=3",
@@ -78,6 +85,38 @@ fn median(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64) -> f64 {
 /// Median and, in brackets, the largest.
 fn median_and_most(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64 + Copy) -> String {
     format!("{:.1} ({:.1})", median(records, value), records.iter().map(value).fold(f64::NEG_INFINITY, f64::max))
+}
+
+/// Milliseconds of each frame but the first, from record to record: with what happens between frames, without slides and waiting for them.
+fn lengths(records: &[&FrameRecord]) -> Vec<f64> {
+    let between =
+        |pair: &[&FrameRecord]| pair[1].seconds.elapsed - pair[0].seconds.elapsed - pair[1].seconds.slide - pair[1].seconds.waiting;
+    records.windows(2).map(|pair| 1e3 * between(pair)).collect()
+}
+
+/// What checkpoints cost: the frames during which one was under way beside the others.
+fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
+    let lengths = lengths(records);
+    let frames = || lengths.iter().zip(&records[1..]);
+    let of = |under_way: bool| {
+        let mut some: Vec<f64> = frames().filter(|(_, r)| r.checkpoint.is_some() == under_way).map(|(length, _)| *length).collect();
+        some.sort_by(f64::total_cmp);
+        assert!(!some.is_empty(), "frames with and without a checkpoint under way");
+        format!("{} frames, median {:.1} ms, longest {:.1} ms", some.len(), some[some.len() / 2], some[some.len() - 1])
+    };
+    let ended: Vec<&CheckpointRecord> = records.iter().filter_map(|r| r.checkpoint.as_ref()).filter(|c| c.bytes.is_some()).collect();
+    let waited_for = ended.iter().filter(|c| !c.behind).count();
+    let most = |value: fn(&CheckpointRecord) -> f64| ended.iter().map(|c| value(c)).fold(0.0, f64::max);
+    format!(
+        "{} checkpoints of {:.0} MB, {waited_for} of them waited for, {} postponed: the loop stood still for {:.1} ms at most, written after {:.2} s at most; with one under way: {}; others: {}",
+        ended.len(),
+        most(|c| c.bytes.unwrap_or(0) as f64 * 1e-6),
+        report.checkpoints.as_ref().map_or(0, |c| c.postponed),
+        1e3 * most(|c| c.copy_seconds),
+        most(|c| c.seconds),
+        of(true),
+        of(false)
+    )
 }
 
 fn main() {
@@ -191,7 +230,9 @@ fn main() {
     scene.time.frames_per_slide = FRAMES_A_SLIDE;
     scene.time.slides = Some(SLIDES);
     scene.source.snapshots = Some(12 + SLIDES - 1);
-    let mut memory = Vec::new();
+    let mut lines = Vec::new();
+    let mut runs = Vec::new();
+    let folder = tempfile::tempdir().unwrap();
     for (name, surrogate) in &rows[NETWORKS..] {
         let Some((kind, nodes)) = *surrogate else { continue };
         (scene.surrogate.kind, scene.surrogate.table_nodes) = (kind, Some(nodes));
@@ -201,8 +242,13 @@ fn main() {
                 seen.push(((*frame.record).clone(), gpu.memory().0, gpu.context().mem_get_info().unwrap().0));
             }
         };
-        let options = RunOptions { device: device.clone(), ..RunOptions::default() };
-        run(Setup::new(scene.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
+        let options = RunOptions {
+            device: device.clone(),
+            checkpoint: Some(folder.path().join("weights")),
+            checkpoint_seconds: Some(CHECKPOINT_SECONDS),
+            ..RunOptions::default()
+        };
+        let report = run(Setup::new(scene.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
         let seen = seen.split_off(LEARNING);
         for (slide, frames) in seen.chunks(FRAMES_A_SLIDE).enumerate() {
             let shown = SHOWN.map(|n| format!("{:.1} %, {:.0}", 100.0 * frames[n].0.traced_share, 1e3 * frames[n].0.seconds.total));
@@ -210,16 +256,31 @@ fn main() {
         }
         // From the second slide on, everything that is ever taken has been.
         let settled = &seen[FRAMES_A_SLIDE..];
-        let (least, most) = (settled.iter().map(|s| s.1).min().unwrap_or(0), settled.iter().map(|s| s.1).max().unwrap_or(0));
-        let (begin, end) = (settled[0].2, settled[settled.len() - 1].2);
-        memory.push(format!(
-            "{name}: {} frames, {} to {} MiB taken from the second slide on; free at its begin {} MiB, at the end {} MiB.",
-            seen.len() + LEARNING,
+        let taken = || settled.iter().map(|s| s.1 >> 20);
+        let free = || settled.iter().map(|s| s.2);
+        let (least, most) = (free().min().unwrap(), free().max().unwrap());
+        lines.push(format!(
+            "{name}, memory over the {} frames from the second slide on: {} to {} MiB taken; of the device {} to {} MiB free.",
+            settled.len(),
+            taken().min().unwrap(),
+            taken().max().unwrap(),
             least >> 20,
-            most >> 20,
-            begin >> 20,
-            end >> 20
+            most >> 20
+        ));
+        runs.push((settled.len(), most - least, report.checkpoints.clone().unwrap()));
+        let records: Vec<&FrameRecord> = seen.iter().map(|s| &s.0).collect();
+        lines.push(format!("{name}: {}.", checkpoints(&records, &report)));
+        let (length, record) = lengths(&records).into_iter().zip(&records[1..]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
+        lines.push(format!(
+            "{name}, longest of all {} frames after the warm-up, from record to record, slides apart: {length:.1} ms (frame {} of slide {}).",
+            records.len(),
+            record.frame,
+            record.slide + 1
         ));
     }
-    println!("\n{}", memory.join("\n"));
+    println!("\n{}", lines.join("\n\n"));
+    for (frames, change, checkpoints) in runs {
+        assert!(frames >= 1000 && change <= FLAT, "free memory changed by {change} bytes over {frames} frames");
+        assert!(checkpoints.written >= 3 && checkpoints.failed == 0, "{checkpoints:?}");
+    }
 }

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::engine::{FrameRecord, StageSeconds};
+use ridgewatch::engine::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::Learned;
 use ridgewatch::trust::TrustedError;
@@ -33,5 +33,6 @@ fn the_page_names_every_key_of_a_record_and_no_other() {
         quoted(text.strip_prefix(start).unwrap(), false)
     };
     assert_eq!(paragraph("`training`:"), keys(&Learned::default()));
+    assert_eq!(paragraph("`checkpoint`:"), keys(&CheckpointRecord::default()));
     assert_eq!(paragraph("`seconds`:"), keys(&StageSeconds::default()));
 }

@@ -239,6 +239,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "surrogate_bytes": report.surrogate_bytes,
         "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
+        "checkpoints": report.checkpoints,
         "time_resolution": report.time_resolution,
     }) else {
         unreachable!("an object literal")

@@ -6,6 +6,7 @@
 mod accelerator;
 mod answers;
 mod audit;
+mod checkpoints;
 #[cfg(feature = "cuda")]
 pub mod cuda;
 mod cycle;
@@ -24,11 +25,12 @@ pub use crate::trust::TrustedError;
 pub use accelerator::{Accelerator, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, Health};
 pub use answers::{Answers, Asked, Tally};
 pub use audit::{Audit, AuditFindings, AuditRequest, audit, residuals, stratified_points, trace, trusted_error};
+pub use checkpoints::CheckpointTotals;
 pub use cycle::{Event, RunOptions, RunReport, run};
 pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;
 pub use feed::{Feed, Slide, open_snapshots};
-pub use record::{FrameRecord, StageSeconds};
+pub use record::{CheckpointRecord, FrameRecord, StageSeconds};
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
 

@@ -74,10 +74,32 @@ pub struct FrameRecord {
     /// Points that a GPU traced ahead of flights that ended before them: work, but no queries, and not among `traced`.
     #[serde(default)]
     pub traced_ahead: u64,
+    /// The checkpoint that was under way since the last frame; none when there was none.
+    #[serde(default)]
+    pub checkpoint: Option<CheckpointRecord>,
     /// Wall-clock seconds of each stage.
     pub seconds: StageSeconds,
     /// Warnings that arose since the last frame, in words.
     pub warnings: Vec<String>,
+}
+
+/// One checkpoint. It stands in the record of every frame during which it was under way, the last time with its end.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+pub struct CheckpointRecord {
+    /// The frame after which it was copied, with what was learned until then; none before the first.
+    pub frame: Option<u64>,
+    /// Seconds that the loop stood still for the copy.
+    pub copy_seconds: f64,
+    /// Whether the numbers were brought together behind the loop's back; otherwise it waited for all of them.
+    pub behind: bool,
+    /// Seconds since the copy began: until it was written, or so far.
+    pub seconds: f64,
+    /// Bytes of the file; none where it is not written yet, or was not.
+    pub bytes: Option<u64>,
+    /// Why it was not written; what was there before stays.
+    pub failed: Option<String>,
+    /// Others that fell due meanwhile, and were left for the next time.
+    pub postponed: u64,
 }
 
 /// Where a frame's time went.
@@ -101,7 +123,10 @@ pub struct StageSeconds {
     /// [`crate::surrogate::Learned::device_seconds`].
     #[serde(default)]
     pub device: f64,
-    /// The frame, without `waiting` and `slide`.
+    /// The loop standing still for a checkpoint's copy before the frame.
+    #[serde(default)]
+    pub checkpoint: f64,
+    /// The frame, without `waiting` and `slide`, with `checkpoint`.
     pub total: f64,
     /// Since the run began, reading and preparing included.
     #[serde(default)]

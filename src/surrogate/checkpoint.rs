@@ -61,8 +61,8 @@ impl<'a> Checkpoint<'a> {
         self.entries.push(entry);
     }
 
-    /// Writes the file, atomically.
-    pub(super) fn write(&mut self, path: &Path) -> Result<(), CheckpointError> {
+    /// Writes the file, atomically, and gives its size in bytes.
+    pub(super) fn write(&mut self, path: &Path) -> Result<u64, CheckpointError> {
         let checksum = checksum(self.entries.iter().flat_map(|entry| entry.values.iter().map(|value| value.to_bits())));
         self.note("checksum", format!("{checksum:016x}"));
         let mut header = Map::new();
@@ -95,7 +95,7 @@ impl<'a> Checkpoint<'a> {
         write().map_err(io)?;
         drop(out);
         file.persist(path).map_err(|fault| io(fault.error))?;
-        Ok(())
+        Ok((8 + header.len() + offset) as u64)
     }
 
     /// Reads a checkpoint of this kind.

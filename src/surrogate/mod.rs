@@ -12,6 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use trainer::Trainer;
 
 mod checkpoint;
+mod draft;
 pub mod network;
 mod offload;
 mod residual;
@@ -20,7 +21,8 @@ mod sizing;
 mod table;
 mod trainer;
 
-pub use offload::{Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining};
+pub use draft::Draft;
+pub use offload::{Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
 pub use residual::Residual;
 pub use ring::{KEEP_STALE, RingMark, SampleRing};
 pub use sizing::{Resize, Sizing};
@@ -167,9 +169,18 @@ pub trait Surrogate: Predict {
     /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over; a network with the start time as an input
     /// goes on learning as before, and predicts for the new start.
     fn window_slid(&mut self, tracer: &dyn Tracer);
-    /// Writes everything needed to go on (weights, optimizer state, base table) into the file.
-    fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError>;
-    /// Restores what [`Surrogate::save`] wrote; a checkpoint of another shape is an error and changes nothing.
+    /// Everything needed to go on (weights, optimizer state, base table) as it is now. Where a device trains, its numbers are waited for.
+    fn draft(&self) -> Draft;
+    /// The same without waiting, to be written by another thread: where a device trains, it copies its numbers, which come back as they are
+    /// written. None while an earlier copy is still on its way. Where it has no room for a copy, its numbers are waited for, and the draft says so.
+    fn draft_behind(&mut self) -> Option<Draft> {
+        Some(self.draft())
+    }
+    /// Writes [`Surrogate::draft`] into the file.
+    fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {
+        self.draft().write(path).map(drop)
+    }
+    /// Restores what was written; a checkpoint of another shape is an error and changes nothing.
     fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError>;
 }
 
@@ -215,6 +226,30 @@ pub enum CheckpointError {
         found: String,
         /// What is accepted.
         expected: String,
+    },
+    /// Nothing was written.
+    #[error("checkpoint {path}: {source} before its copy had come back")]
+    Lost {
+        /// The file.
+        path: std::path::PathBuf,
+        /// What trained.
+        source: DeviceLost,
+    },
+    /// The disk did not take it in time; what was there before stays.
+    #[error("checkpoint {path}: not written within {seconds} seconds")]
+    Hangs {
+        /// The file.
+        path: std::path::PathBuf,
+        /// How long it was waited for.
+        seconds: u64,
+    },
+    /// What writes it has ended without a result.
+    #[error("checkpoint {path}: {why}")]
+    Writer {
+        /// The file.
+        path: std::path::PathBuf,
+        /// In words.
+        why: String,
     },
 }
 
@@ -370,10 +405,13 @@ impl Surrogate for Network {
         self.trainer.window_slid(tracer);
     }
 
-    fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {
-        let mut checkpoint = checkpoint::Checkpoint::new("network");
-        self.trainer.entries(&mut checkpoint);
-        checkpoint.write(path)
+    fn draft(&self) -> Draft {
+        Draft::new(self.name(), None, Some(self.trainer.draft()))
+    }
+
+    fn draft_behind(&mut self) -> Option<Draft> {
+        let (network, waited_for) = self.trainer.draft_behind()?;
+        Some(Draft::new(self.name(), None, Some(network)).waited_for(waited_for))
     }
 
     fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError> {

@@ -1,7 +1,7 @@
 //! The seam for engines that train networks on a device: what is asked of one.
 //!
-//! burn's module stays on the host. It goes over when training begins, comes back for a checkpoint and every minute or so, and training goes on
-//! from what came back last when the device is lost.
+//! burn's module stays on the host. It goes over when training begins; for a checkpoint and every minute or so a copy comes back while training
+//! goes on, and when the device is lost, training goes on here from what came back last.
 
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::{SampleRing, Table};
@@ -56,11 +56,32 @@ pub trait OffloadedTraining: Send + Sync {
     /// What the running mean predicts, for good.
     fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost>;
 
-    /// Brings parameters, moments and mean back.
+    /// Brings parameters, moments and mean back, and waits for them.
     fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost>;
+
+    /// Copies parameters, moments and mean where they are, to be brought back by another thread while training goes on. Not asked for while the
+    /// copy before is still there.
+    fn copy(&mut self) -> Result<Copied, DeviceLost>;
 
     /// Seconds of device time that steps have taken since this was last asked.
     fn device_seconds(&mut self) -> f64;
+}
+
+/// What [`OffloadedTraining::copy`] came to.
+pub enum Copied {
+    /// A copy.
+    There(Box<dyn OffloadedCopy>),
+    /// There is no memory for one; why, in words.
+    NoRoom(String),
+}
+
+/// A copy on a device of a network in training.
+pub trait OffloadedCopy: Send {
+    /// Brings parameters, moments and mean back, into what has the same shape, and gives the copy up.
+    ///
+    /// # Errors
+    /// When the device is lost; `model` and `average` then hold anything.
+    fn read(self: Box<Self>, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost>;
 }
 
 /// A network on a device that does not change.

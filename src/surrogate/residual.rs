@@ -5,9 +5,9 @@
 
 use super::checkpoint::Checkpoint;
 use super::network::HELD_OUT;
-use super::trainer::{FrozenNetwork, Trainer};
+use super::trainer::{FrozenNetwork, NetworkDraft, Trainer};
 use super::{
-    CheckpointError, Learned, NetworkSettings, NetworkState, Offload, Predict, SampleRing, Samples, Surrogate, SurrogateError, Table,
+    CheckpointError, Draft, Learned, NetworkSettings, NetworkState, Offload, Predict, SampleRing, Samples, Surrogate, SurrogateError, Table,
 };
 use crate::flow::Tracer;
 use std::path::Path;
@@ -57,6 +57,11 @@ impl Residual {
     /// Factor on the network's output.
     pub fn shrinkage(&self) -> f32 {
         self.shrinkage
+    }
+
+    fn drafted(&self, network: NetworkDraft) -> Draft {
+        let draft = Draft::new(self.name(), Some(self.table.clone()), Some(network));
+        draft.noting("slid", self.slid.to_string()).noting("shrinkage", self.shrinkage.to_string())
     }
 
     /// The factor that fits the held-out samples best. Training noise is independent of them, so what it adds is weighed down.
@@ -164,13 +169,13 @@ impl Surrogate for Residual {
         (self.slid, self.shrinkage) = (true, 0.0);
     }
 
-    fn save(&self, path: &Path) -> Result<(), CheckpointError> {
-        let mut checkpoint = Checkpoint::new("residual");
-        checkpoint.note("slid", self.slid.to_string());
-        checkpoint.note("shrinkage", self.shrinkage.to_string());
-        self.table.entries(&mut checkpoint);
-        self.trainer.entries(&mut checkpoint);
-        checkpoint.write(path)
+    fn draft(&self) -> Draft {
+        self.drafted(self.trainer.draft())
+    }
+
+    fn draft_behind(&mut self) -> Option<Draft> {
+        let (network, waited_for) = self.trainer.draft_behind()?;
+        Some(self.drafted(network).waited_for(waited_for))
     }
 
     fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {

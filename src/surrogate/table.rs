@@ -2,7 +2,7 @@
 
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
-use super::{CheckpointError, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
+use super::{CheckpointError, Draft, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
 use crate::flow::{Extras, Traced, TracedNodes, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
@@ -217,10 +217,8 @@ impl Surrogate for Table {
         self.retrace(tracer);
     }
 
-    fn save(&self, path: &Path) -> Result<(), CheckpointError> {
-        let mut checkpoint = Checkpoint::new("table");
-        self.entries(&mut checkpoint);
-        checkpoint.write(path)
+    fn draft(&self) -> Draft {
+        Draft::new(self.name(), Some(self.clone()), None)
     }
 
     fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {

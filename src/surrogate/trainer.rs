@@ -9,17 +9,21 @@ use super::network::{
     Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step, Times,
 };
 use super::{
-    Brought, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples, SurrogateError,
-    Table, fresh_stamp,
+    Brought, Copied, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples,
+    SurrogateError, Table, fresh_stamp,
 };
 use crate::flow::Tracer;
 use progress::Progress;
-use std::borrow::Cow;
+use returning::{Numbers, Returning};
 use std::sync::{Arc, OnceLock};
-use std::time::Instant;
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
 
 mod progress;
 mod restart;
+mod returning;
+
+pub(super) use restart::NetworkDraft;
 
 /// Steps between two moves of the average: it changes slowly, and every move reads and writes all parameters.
 const AVERAGE_EVERY: u64 = 8;
@@ -31,8 +35,10 @@ const LEAST_CAUTION: f64 = 1e-6;
 const GROUP: [u64; 2] = [64, 8];
 /// Seconds of a run after which what a device has learned comes back, at least: so much is lost with it.
 const FETCH_EVERY: f64 = 60.0;
-/// And so many times the seconds that it takes to come back, so that it costs one hundredth of the time.
+/// And so many times the seconds that training waits for it, so that it costs one hundredth of the time.
 const FETCH_APART: f64 = 100.0;
+/// Longest that the end of training waits for what is still coming back.
+const FETCH_LIMIT: Duration = Duration::from_secs(5);
 
 /// What to come back to.
 struct Kept {
@@ -47,15 +53,37 @@ struct Away {
     training: Box<dyn OffloadedTraining>,
     /// Optimizer steps taken so far, those before it went there included.
     steps: usize,
-    /// How far it was when it last came back, and when that was.
+    /// How far it was when it last came back.
     fetched: Progress,
+    /// When it was last sent for, and the seconds that training waited then; 0 before the first time.
     fetched_at: Instant,
-    /// Seconds that it took; 0 before the first time.
     fetch_seconds: f64,
+    /// On its way back, for the thread here, or for a checkpoint.
+    returning: Option<Arc<Returning>>,
+    brings: Option<JoinHandle<()>>,
     /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
     step_seconds: f64,
     /// What it predicts since the latest step.
     frozen: OnceLock<Arc<dyn OffloadedNetwork>>,
+}
+
+impl Drop for Away {
+    /// The device had better not be closed under a copy; but one that hangs is not waited for.
+    fn drop(&mut self) {
+        let begin = Instant::now();
+        while self.brings.as_ref().is_some_and(|thread| !thread.is_finished()) && begin.elapsed() < FETCH_LIMIT {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// What sending for a network came to.
+enum Sent {
+    For(Arc<Returning>),
+    /// What was sent for before is still on its way.
+    Before,
+    /// The device has no memory for a copy; why.
+    NoRoom(String),
 }
 
 impl Away {
@@ -358,6 +386,8 @@ impl Trainer {
             fetched: self.progress,
             fetched_at: Instant::now(),
             fetch_seconds: 0.0,
+            returning: None,
+            brings: None,
             step_seconds: 0.0,
             frozen: OnceLock::new(),
         });
@@ -367,19 +397,64 @@ impl Trainer {
     fn lose_device(&mut self) {
         self.offload = None;
         self.kept = None;
+        self.take_in();
         if let Some(away) = self.away.take() {
             self.progress = Progress { drawn: self.progress.drawn, ..away.fetched };
         }
     }
 
-    /// Brings back what a device has learned; it goes on there.
+    /// Brings back what a device has learned, behind the back of training; where there is no memory for that, training waits.
     fn fetch(&mut self) -> Result<(), DeviceLost> {
-        let Some(away) = &mut self.away else { return Ok(()) };
         let begin = Instant::now();
-        away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
-        (away.fetched, away.fetched_at, away.fetch_seconds) = (self.progress, Instant::now(), begin.elapsed().as_secs_f64());
-        self.pack();
+        let sent = self.send_for()?;
+        let Some(away) = &mut self.away else { return Ok(()) };
+        match sent {
+            Sent::For(returning) => {
+                let name = "ridgewatch-fetch".to_owned();
+                // What fails there is told where it happens. Without a thread nothing comes back this time.
+                away.brings = std::thread::Builder::new().name(name).spawn(move || drop(returning.bring().cloned())).ok();
+            }
+            Sent::Before => return Ok(()),
+            Sent::NoRoom(_) => {
+                away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
+                away.fetched = self.progress;
+                self.predictor = Arc::new(Predictor::new(&self.model.shape, &self.average.layers));
+            }
+        }
+        (away.fetched_at, away.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
         Ok(())
+    }
+
+    /// Has the device copy what it has learned.
+    fn send_for(&mut self) -> Result<Sent, DeviceLost> {
+        self.take_in();
+        let Some(away) = self.away.as_mut().filter(|away| away.returning.is_none()) else { return Ok(Sent::Before) };
+        Ok(match away.training.copy()? {
+            Copied::NoRoom(why) => Sent::NoRoom(why),
+            Copied::There(copy) => {
+                let returning = Returning::new(copy, self.model.clone(), self.progress);
+                Sent::For(away.returning.insert(returning).clone())
+            }
+        })
+    }
+
+    /// Takes in what has come back.
+    fn take_in(&mut self) {
+        let Some(away) = &mut self.away else { return };
+        let Some(returning) = away.returning.take() else { return };
+        match returning.arrived() {
+            Some(Ok(numbers)) => {
+                let Numbers { model, average, predictor } = numbers.clone();
+                let stale = (std::mem::replace(&mut self.model, model), std::mem::replace(&mut self.average, average));
+                (self.predictor, away.fetched) = (predictor, returning.progress);
+                // To give hundreds of megabytes back to the system takes as long as a frame.
+                drop(std::thread::Builder::new().spawn(move || drop(stale)));
+            }
+            Some(Err(DeviceLost)) => {}
+            // Somebody brings it, or is about to.
+            None if Arc::strong_count(&returning) > 1 => away.returning = Some(returning),
+            None => {}
+        }
     }
 
     /// Packs the layers of the mean for prediction here.
@@ -440,6 +515,8 @@ impl Trainer {
             if restart {
                 away.training.restart_average()?;
             }
+            self.take_in();
+            let Some(away) = &self.away else { return Ok(()) };
             let due = away.fetched_at.elapsed().as_secs_f64() >= FETCH_EVERY.max(FETCH_APART * away.fetch_seconds);
             return if due { self.fetch() } else { Ok(()) };
         }
@@ -490,12 +567,14 @@ impl Trainer {
     }
 
     /// The network as it is now, wherever it is; as it last came back, where the device is lost.
-    fn present(&self) -> (Cow<'_, Model>, Cow<'_, Average>, Progress) {
-        let Some(away) = &self.away else { return (Cow::Borrowed(&self.model), Cow::Borrowed(&self.average), self.progress) };
-        let (mut model, mut average) = (self.model.clone(), Average::clone(&self.average));
-        match away.training.fetch(&mut model, &mut average) {
-            Ok(()) => (Cow::Owned(model), Cow::Owned(average), self.progress),
-            Err(DeviceLost) => (Cow::Borrowed(&self.model), Cow::Borrowed(&self.average), away.fetched),
+    fn present(&self) -> (Model, Arc<Average>, Progress) {
+        let (mut model, last) = (self.model.clone(), self.average.clone());
+        let Some(away) = &self.away else { return (model, last, self.progress) };
+        let mut average = Average::clone(&last);
+        match (away.training.fetch(&mut model, &mut average), away.returning.as_ref().and_then(|r| Some((r.progress, r.arrived()?)))) {
+            (Ok(()), _) => (model, Arc::new(average), self.progress),
+            (Err(DeviceLost), Some((progress, Ok(numbers)))) => (numbers.model.clone(), numbers.average.clone(), progress),
+            (Err(DeviceLost), _) => (self.model.clone(), last, away.fetched),
         }
     }
 }

@@ -1,11 +1,15 @@
 //! Runs whose network is trained on the device, against the same runs on the CPU.
 
-use super::network_support::uniform_points;
+use super::network_support::{DoubleGyre, traced, uniform_points};
 use super::scenes::*;
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::GpuSettings;
+use ridgewatch::engine::cuda::{CudaOffload, GpuSettings};
 use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::flow::Tracer;
+use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
+use ridgewatch::surrogate::{Kind, Offload, SampleRing, SurrogateSettings, build};
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 /// A small run that trains a fixed number of steps a frame.
@@ -212,4 +216,60 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
         }
     }
     (sum / count as f64, count)
+}
+
+/// A checkpoint that is written while training goes on is, byte for byte, the one that training would have waited for; its room on the device is
+/// taken once; where there is none, training waits and the draft says why.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_checkpoint_is_of_its_moment_though_training_went_on() {
+    let gpu = opened(GpuSettings { memory_cap: Some(2 << 30), ..GpuSettings::default() });
+    let offload: Arc<dyn Offload> = Arc::new(CudaOffload::new(&gpu));
+    let tracer = DoubleGyre::new(0.0, 10.0, 40);
+    // 60 MB on the device, in several pieces and a rest.
+    let network = NetworkSettings { levels: 8, log2_table: 18, batch: 1 << 16, ..NetworkSettings::default() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: 1 << 14, ..NetworkSettings::default() };
+    let ring = SampleRing::holding(&traced(&tracer, uniform_points(1, 20_000), false));
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    let bytes = |name: &str| std::fs::read(file(name)).unwrap();
+    for (kind, network) in [(Kind::Network, &network), (Kind::Residual, &network), (Kind::Network, &frequency)] {
+        let settings = SurrogateSettings { kind, table_nodes: Some([257, 129, 2]) };
+        let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
+        surrogate.offload(&offload);
+        surrogate.learn(&ring, f64::INFINITY, 200);
+        let before = gpu.memory().0;
+        let mut room = None;
+        for round in 0..3 {
+            surrogate.save(&file("waited for")).unwrap();
+            let draft = surrogate.draft_behind().unwrap();
+            assert_eq!(draft.not_behind(), None);
+            assert!(surrogate.draft_behind().is_none(), "one at a time");
+            std::thread::scope(|scope| {
+                let learning = scope.spawn(|| surrogate.learn(&ring, f64::INFINITY, 1000));
+                draft.write(&file("behind")).unwrap();
+                assert_eq!(learning.join().unwrap().steps, 1000);
+            });
+            assert!(bytes("behind") == bytes("waited for"), "{kind:?}, round {round}");
+            surrogate.save(&file("later")).unwrap();
+            assert!(bytes("later") != bytes("behind"), "training went on");
+            let taken = gpu.memory().0 - before;
+            assert_eq!(*room.get_or_insert(taken), taken, "taken once");
+        }
+        println!("{kind:?}: {} bytes of room, {} bytes a file", room.unwrap(), bytes("behind").len());
+        drop(surrogate);
+        // What others have leaves no room.
+        let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
+        surrogate.offload(&offload);
+        surrogate.learn(&ring, f64::INFINITY, 20);
+        let others = gpu.alloc::<u8>("what others have", (gpu.memory_left() - (1 << 16)) as usize).unwrap();
+        surrogate.save(&file("waited for")).unwrap();
+        let draft = surrogate.draft_behind().unwrap();
+        assert!(draft.not_behind().is_some_and(|why| why.contains("left")), "{:?}", draft.not_behind());
+        draft.write(&file("behind")).unwrap();
+        assert!(bytes("behind") == bytes("waited for"));
+        drop(others);
+        assert_eq!(surrogate.draft_behind().unwrap().not_behind(), None, "there is room again");
+    }
+    assert_eq!(gpu.health().failure(), None);
 }

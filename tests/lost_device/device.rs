@@ -13,11 +13,12 @@ use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_trac
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
 use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
 use ridgewatch::surrogate::{
-    Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
+    Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
 };
 use std::ops::Range;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
+use std::time::Duration;
 
 /// The way to the device, which breaks at one of the calls and stays broken.
 #[derive(Debug)]
@@ -27,6 +28,9 @@ pub struct Line {
     breaks_at: usize,
     how: How,
     pub broke_in: OnceLock<&'static str>,
+    /// How long a copied network takes to come back, and whether there is room for a copy.
+    pub slowness: Mutex<Duration>,
+    pub room: AtomicBool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -65,7 +69,8 @@ pub const NAME: &str = "a device that breaks";
 impl Breaking {
     /// Breaks behind so many calls.
     pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
-        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in: OnceLock::new() };
+        let (broke_in, slowness, room) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true));
+        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in, slowness, room };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -255,8 +260,31 @@ impl OffloadedTraining for Network {
         (*model, *average) = (self.model.clone(), self.average.clone());
         Ok(())
     }
+    fn copy(&mut self) -> Result<Copied, DeviceLost> {
+        self.there.call("copying a network")?;
+        if !self.there.line.room.load(Ordering::Relaxed) {
+            return Ok(Copied::NoRoom("refused by the test".into()));
+        }
+        let there = Training { line: self.there.line.clone(), health: self.there.health.clone() };
+        Ok(Copied::There(Box::new(Copy { there, model: self.model.clone(), average: self.average.clone() })))
+    }
     fn device_seconds(&mut self) -> f64 {
         0.0
+    }
+}
+
+struct Copy {
+    there: Training,
+    model: Model,
+    average: Average,
+}
+
+impl OffloadedCopy for Copy {
+    fn read(self: Box<Self>, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
+        std::thread::sleep(*self.there.line.slowness.lock().unwrap());
+        self.there.call("reading a copy")?;
+        (*model, *average) = (self.model, self.average);
+        Ok(())
     }
 }
 

@@ -16,7 +16,8 @@ use ridgewatch::surrogate::Learned;
 use std::collections::BTreeSet;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
 
 /// A run's frames: records without what differs from run to run, and the films' bits.
 #[derive(Default)]
@@ -31,6 +32,11 @@ fn made(scene: &SceneFile, device: Device) -> Made {
 }
 
 fn made_with(scene: &SceneFile, options: RunOptions) -> Made {
+    made_behind(scene, options, &mut |_| ())
+}
+
+/// The same; `behind` is called behind each frame.
+fn made_behind(scene: &SceneFile, options: RunOptions, behind: &mut (dyn FnMut(u64) + Send)) -> Made {
     let mut made = Made::default();
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
@@ -39,6 +45,7 @@ fn made_with(scene: &SceneFile, options: RunOptions) -> Made {
             let rest = [&film.ftle_mean, &film.traced, &film.variance, &film.samples, &film.missing, &film.queries];
             made.films.push(rgba.chain(rest.into_iter().flatten()).map(|v| v.to_bits()).collect());
             made.records.push((*frame.record).clone());
+            behind(frame.record.frame);
         }
     };
     made.error = run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).err();
@@ -243,10 +250,9 @@ fn a_device_chosen_by_itself_may_refuse_its_first_work_alone() {
     assert!(matches!(tracer(&taken_up), Err(EngineError::Device(_))));
 }
 
-/// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
-#[test]
-fn training_of_a_residual_over_a_sliding_window() {
-    let scene = SceneFile::parse(
+/// A residual over a sliding window.
+fn residual(keys: &[String]) -> SceneFile {
+    SceneFile::parse(
         Path::new("scene.toml"),
         &format!(
             "
@@ -275,9 +281,15 @@ height = 8
 samples = 2
 "
         ),
-        &[],
+        keys,
     )
-    .unwrap();
+    .unwrap()
+}
+
+/// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
+#[test]
+fn training_of_a_residual_over_a_sliding_window() {
+    let scene = residual(&[]);
     let expected = made(&scene, Device::CPU);
     let folder = tempfile::tempdir().unwrap();
     let run = |device: &Arc<Breaking>| {
@@ -333,5 +345,64 @@ samples = 2
                 assert!(values.filter(|value| !value.is_nan()).all(|value| value.abs() < 1e6), "{case}: nothing of a broken answer");
             }
         }
+    }
+}
+
+/// Checkpoints of a network that a device trains: a copy that takes long to come back does not hold the frames up, and what it comes back with is
+/// what it was copied from; without room for a copy frames wait and a record says so; a copy that is lost costs one checkpoint.
+#[test]
+fn checkpoints_while_a_device_trains() {
+    const SLOW: Duration = Duration::from_secs(1);
+    let scene = residual(&["time.frames_per_slide=5".into()]);
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("checkpoint");
+    let run = |device: &Arc<Breaking>, checkpoint_seconds| {
+        drop(std::fs::remove_file(&path));
+        let (device, checkpoint) = (Device::Gpu { gpu: device.clone(), may_fall_back: false }, Some(path.clone()));
+        let options = RunOptions { device, threads: 2, checkpoint, checkpoint_seconds, ..RunOptions::default() };
+        // The first checkpoint is made here, before the network goes to the device; the disk has its time for it.
+        let written = || checkpoint_seconds.is_none() || path.exists();
+        let found = made_behind(&scene, options, &mut |frame| {
+            let begin = Instant::now();
+            while frame > 0 && !written() && begin.elapsed() < Duration::from_secs(60) {
+                std::thread::sleep(Duration::from_millis(1));
+            }
+        });
+        assert!(found.error.is_none(), "{:?}", found.error);
+        (found, std::fs::read(&path).unwrap())
+    };
+    let whole = || Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
+    let (expected, last) = run(&whole(), None);
+    assert!(expected.records.iter().all(|record| record.checkpoint.is_none()));
+
+    let slow = whole();
+    *slow.line.slowness.lock().unwrap() = SLOW;
+    let (found, with_others_before) = run(&slow, Some(0.0));
+    assert!(found.films == expected.films && with_others_before == last, "checkpoints change nothing");
+    let behind = |record: &&FrameRecord| record.checkpoint.as_ref().is_some_and(|checkpoint| checkpoint.frame > Some(0));
+    let under_way: Vec<&FrameRecord> = found.records.iter().filter(behind).collect();
+    assert!(under_way.len() >= 3);
+    for record in &under_way {
+        assert!(record.checkpoint.as_ref().unwrap().behind && record.seconds.total < 0.5 * SLOW.as_secs_f64(), "{record:?}");
+    }
+    assert!(under_way[2].checkpoint.as_ref().unwrap().postponed >= 1, "one at a time: {:?}", under_way[2].checkpoint);
+
+    let full = whole();
+    full.line.room.store(false, Ordering::Relaxed);
+    let (found, without_room) = run(&full, Some(0.0));
+    assert!(found.films == expected.films && without_room == last);
+    let told = found.records.iter().flat_map(|record| &record.warnings).filter(|warning| warning.contains("refused by the test")).count();
+    assert!(told >= 1, "a record says that frames waited");
+    let not_there = found.records.iter().filter_map(|record| record.checkpoint.as_ref()).filter(|checkpoint| checkpoint.frame > Some(0));
+    assert!(not_there.map(|checkpoint| checkpoint.behind).all(|behind| !behind));
+
+    let asked = slow.line.calls.lock().unwrap().clone();
+    for kind in ["copying a network", "reading a copy"] {
+        let device = Breaking::new(asked.iter().position(|call| *call == kind).unwrap(), How::Fault, WhenLost::Cpu);
+        let (found, _) = run(&device, Some(0.0));
+        assert!(device.line.broke_in.get().is_some() && found.films.len() == expected.films.len(), "{kind}");
+        assert_eq!(found.records.iter().map(has_ended).sum::<usize>(), 1, "{kind}");
+        let goes_on = made(&residual(&[format!("training.resume={:?}", path.display().to_string())]), Device::CPU);
+        assert!(goes_on.error.is_none(), "{kind}: the last one is whole: {:?}", goes_on.error);
     }
 }

@@ -1,6 +1,7 @@
 //! One GPU: asked for before it is touched, its context, streams, memory and compiled kernels.
 
 use super::DeviceError;
+use super::behind::Behind;
 use super::compile::{self, KernelCache};
 use super::memory::{Budget, Buffer};
 use crate::engine::accelerator::Health;
@@ -50,6 +51,7 @@ pub struct Gpu {
     context: Arc<CudaContext>,
     work: Arc<CudaStream>,
     transfer: Arc<CudaStream>,
+    behind: Behind,
     budget: Arc<Budget>,
     cache: KernelCache,
     modules: Mutex<HashMap<String, Arc<CudaModule>>>,
@@ -99,7 +101,7 @@ fn driver_version() -> Result<i32, DeviceError> {
 }
 
 impl Gpu {
-    /// Opens cuda:`ordinal`: its primary context (burn shares it), a stream for work and one for transfers.
+    /// Opens cuda:`ordinal`: its primary context (burn shares it), a stream for work, one for what comes in and one for what goes back.
     ///
     /// # Errors
     /// Why it cannot be used.
@@ -126,6 +128,7 @@ impl Gpu {
             }
         };
         let (work, transfer) = (stream().map_err(&opening)?, stream().map_err(&opening)?);
+        let behind = Behind::new(stream().map_err(&opening)?);
         let (free, total) = context.mem_get_info().map_err(&opening)?;
         let attribute = |which| context.attribute(which).map_err(&opening);
         let multiprocessors = attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)? as u32;
@@ -139,6 +142,7 @@ impl Gpu {
             driver_version: driver_version()?,
             work,
             transfer,
+            behind,
             budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64).filling(settings.poison.then_some(0xFF))),
             cache: KernelCache::new(settings.cache.clone()),
             modules: Mutex::new(HashMap::new()),
@@ -199,6 +203,9 @@ impl Gpu {
     /// The stream that snapshots come in on.
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
+    }
+    pub(super) fn behind(&self) -> &Behind {
+        &self.behind
     }
     pub(super) fn budget(&self) -> &Arc<Budget> {
         &self.budget

@@ -8,6 +8,7 @@ mod accelerator;
 mod ahead;
 mod answers;
 mod audit;
+mod behind;
 pub mod compile;
 mod device;
 mod error;

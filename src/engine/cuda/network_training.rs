@@ -219,7 +219,7 @@ impl Moments {
         let kept = match kept {
             Some(kept) => kept,
             None => {
-                let room = || gpu.alloc("a network to come back to", self.len);
+                let room = || gpu.alloc("a copy of a network", self.len);
                 [room()?, room()?, room()?, room()?]
             }
         };
@@ -257,8 +257,26 @@ pub struct DeviceTraining {
     losses: Buffer<f64>,
     /// None until a penalty on means needs it.
     batch: Option<WholeBatch>,
-    /// Tables and layers as they were after so many steps.
-    kept: Option<(usize, [Kept; 2])>,
+    kept: Option<NetworkCopy>,
+}
+
+/// Everything that steps change of tables and layers, as it was after so many steps.
+#[derive(Debug)]
+pub(super) struct NetworkCopy {
+    steps: usize,
+    parts: [Kept; 2],
+    lens: [usize; 2],
+}
+
+impl NetworkCopy {
+    /// Brings it back behind the work stream, into a model of its shape and the running mean.
+    pub(super) fn read_behind(&self, gpu: &Gpu, model: &mut Model, average: &mut Average) -> Result<(), DeviceError> {
+        let read = |part: usize, of: usize| gpu.read_behind(&self.parts[part][of], self.lens[part]);
+        let moments = |part: usize| Ok([read(part, 0)?, read(part, 1)?, read(part, 2)?]);
+        model.set_state([moments(0)?, moments(1)?], self.steps);
+        *average = Average { tables: read(0, 3)?, layers: read(1, 3)? };
+        Ok(())
+    }
 }
 
 /// What the penalty on means needs of a whole batch before any gradient.
@@ -404,9 +422,21 @@ impl DeviceTraining {
     /// # Errors
     /// Memory that is not there.
     pub fn keep(&mut self) -> Result<(), DeviceError> {
-        let [tables, layers] = self.kept.take().map_or([None, None], |(_, kept)| kept.map(Some));
-        self.kept = Some((self.time, [self.tables.keep(&self.gpu, tables)?, self.layers.keep(&self.gpu, layers)?]));
+        let room = self.kept.take();
+        self.kept = Some(self.copy(room)?);
         Ok(())
+    }
+
+    /// Copies everything that steps change to `room`, or to new memory, in the order of the work stream.
+    pub(super) fn copy(&self, room: Option<NetworkCopy>) -> Result<NetworkCopy, DeviceError> {
+        let [tables, layers] = room.map_or([None, None], |room| room.parts.map(Some));
+        let parts = [self.tables.keep(&self.gpu, tables)?, self.layers.keep(&self.gpu, layers)?];
+        Ok(NetworkCopy { steps: self.time, parts, lens: [self.tables.len, self.layers.len] })
+    }
+
+    /// Memory of such a copy, in bytes.
+    pub(super) fn copy_bytes(&self) -> u64 {
+        4 * size_of::<f32>() as u64 * (self.tables.len + self.layers.len) as u64
     }
 
     /// Comes back to what was kept last; nothing changes where nothing was.
@@ -414,10 +444,10 @@ impl DeviceTraining {
     /// # Errors
     /// What the device says.
     pub fn roll_back(&mut self) -> Result<(), DeviceError> {
-        let Some((time, [tables, layers])) = &self.kept else { return Ok(()) };
+        let Some(NetworkCopy { steps, parts: [tables, layers], .. }) = &self.kept else { return Ok(()) };
         self.tables.roll_back(&self.gpu, tables)?;
         self.layers.roll_back(&self.gpu, layers)?;
-        self.time = *time;
+        self.time = *steps;
         self.writer.kernels.round(&self.tables.parameters, &self.halves)
     }
 

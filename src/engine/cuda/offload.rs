@@ -3,18 +3,22 @@
 use super::answers::DeviceLearns;
 use super::labels::HELD_BACK;
 use super::layout::Outputs;
-use super::network_training::SampleWriter;
+use super::network_training::{NetworkCopy, SampleWriter};
 use super::predictor::{TableCopy, predict_from_host};
 use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep, Target};
-use crate::surrogate::{Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table};
+use crate::surrogate::{
+    Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table,
+};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 /// Labels that were traced on the device and stay there: so many times the ring's, but at most one part of the memory that is left.
 const TIMES_THE_RING: usize = 4;
 const MEMORY_SHARE: u64 = 8;
+/// A copy of the network for checkpoints takes at most one part of the memory that is left: frames may still want the rest.
+const COPY_SHARE: u64 = 2;
 
 /// Trains networks on a GPU.
 #[derive(Debug)]
@@ -39,7 +43,8 @@ impl Offload for CudaOffload {
             training.set_average(average)?;
             Ok(training)
         })?;
-        Some(Box::new(CudaTraining { gpu: gpu.clone(), training, held: None, pool: None, below: TableCopy::default(), seconds: 0.0 }))
+        let (gpu, below) = (gpu.clone(), TableCopy::default());
+        Some(Box::new(CudaTraining { gpu, training, held: None, pool: None, below, seconds: 0.0, room: Arc::default() }))
     }
 }
 
@@ -101,6 +106,30 @@ struct CudaTraining {
     below: TableCopy,
     /// Device seconds of steps, not yet asked for.
     seconds: f64,
+    /// Where the network is copied to: taken at the first copy, and not here while that is read.
+    room: Room,
+}
+
+type Room = Arc<Mutex<Option<NetworkCopy>>>;
+
+/// A copy of a network, which goes back to its room.
+struct CudaCopy {
+    gpu: Arc<Gpu>,
+    copy: Option<NetworkCopy>,
+    room: Room,
+}
+
+impl Drop for CudaCopy {
+    fn drop(&mut self) {
+        *self.room.lock().unwrap_or_else(PoisonError::into_inner) = self.copy.take();
+    }
+}
+
+impl OffloadedCopy for CudaCopy {
+    fn read(self: Box<Self>, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
+        let read = || self.copy.as_ref().map_or(Ok(()), |copy| copy.read_behind(&self.gpu, model, average));
+        self.gpu.health().ask(read).ok_or(DeviceLost)
+    }
 }
 
 impl CudaTraining {
@@ -205,6 +234,25 @@ impl OffloadedTraining for CudaTraining {
             Ok(())
         };
         self.gpu.health().ask(fetch).ok_or(DeviceLost)
+    }
+
+    fn copy(&mut self) -> Result<Copied, DeviceLost> {
+        self.ask(|Self { gpu, training, room, .. }| {
+            let taken = room.lock().unwrap_or_else(PoisonError::into_inner).take();
+            let (needed, left) = (training.copy_bytes(), gpu.memory_left());
+            if taken.is_none() && needed > left / COPY_SHARE {
+                let [needed, left] = [needed, left].map(|bytes| bytes.div_ceil(1 << 20));
+                let why =
+                    format!("a copy of the network takes {needed} MiB of the device, and of {left} MiB that are left frames may want half");
+                return Ok(Copied::NoRoom(why));
+            }
+            match training.copy(taken) {
+                Ok(copy) => Ok(Copied::There(Box::new(CudaCopy { gpu: gpu.clone(), copy: Some(copy), room: room.clone() }))),
+                // Under the cap, but others hold the rest.
+                Err(error @ DeviceError::OutOfMemory { .. }) => Ok(Copied::NoRoom(error.to_string())),
+                Err(error) => Err(error),
+            }
+        })
     }
 
     fn device_seconds(&mut self) -> f64 {

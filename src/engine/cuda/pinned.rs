@@ -1,10 +1,10 @@
 //! Page-locked host memory: what the device copies to while the host does other things.
 
 use super::{DeviceError, Gpu};
-use cudarc::driver::{CudaContext, result};
+use cudarc::driver::{CudaContext, CudaStream, result};
 use std::sync::Arc;
 
-/// Values that the device may write at any time between [`Pinned::copy_from`] and the next synchronisation of the work stream.
+/// Values that the device may write at any time between a copy and the next synchronisation of the stream that makes it.
 pub(super) struct Pinned<T: Copy> {
     values: *mut T,
     len: usize,
@@ -39,16 +39,25 @@ impl<T: Copy + Default> Pinned<T> {
     /// Enqueues a copy of the `count` values at the device address `from` to the front.
     ///
     /// # Safety
-    /// The device holds as many values there when the work stream comes to it, and `count` is at most `len`.
+    /// As for [`Self::copy_on`], of the work stream.
     pub(super) unsafe fn copy_from(&mut self, gpu: &Gpu, from: u64, count: usize) -> Result<(), DeviceError> {
+        // SAFETY: the caller's.
+        unsafe { self.copy_on(gpu.work(), from, count) }
+    }
+
+    /// The same on another stream.
+    ///
+    /// # Safety
+    /// The device holds as many values there when the stream comes to it, and `count` is at most `len`.
+    pub(super) unsafe fn copy_on(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
         debug_assert!(count <= self.len);
         // SAFETY: `count` values of `T` lie within the allocation.
         let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };
         // SAFETY: the caller's; the host memory lives until `drop`, which waits for the stream's context.
-        unsafe { result::memcpy_dtoh_async(to, from, gpu.work().cu_stream()) }.map_err(DeviceError::driver("copying from the device"))
+        unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(DeviceError::driver("copying from the device"))
     }
 
-    /// The values, once the work stream has been synchronised.
+    /// The values, once the copies have been waited for.
     pub(super) fn values(&self) -> &[T] {
         // SAFETY: initialised in `new`; copies in progress are the caller's to wait for, as the type says.
         unsafe { std::slice::from_raw_parts(self.values, self.len) }

@@ -121,11 +121,9 @@ impl DeviceTable {
     pub fn address(&self) -> u64 {
         self.values.address()
     }
-    /// The values.
+    /// The values, brought back while other work goes on.
     pub fn values(&self) -> Result<Vec<f32>, DeviceError> {
-        let mut out = vec![0.0; self.values.len()];
-        self.values.read(&mut out)?;
-        Ok(out)
+        self.gpu.read_behind(&self.values, self.values.len())
     }
 }
 

@@ -3,6 +3,7 @@
 use super::{Cycle, Place, fixed_steps};
 use crate::engine::answers::{Answers, Tally};
 use crate::engine::audit::{AuditFindings, AuditRequest};
+use crate::engine::checkpoints::Checkpoints;
 use crate::engine::feed::{Feed, Slide};
 use crate::engine::training::{Until, train};
 use crate::engine::{EngineError, Event, Frame, FrameRecord, StageSeconds};
@@ -55,6 +56,8 @@ impl Cycle<'_> {
         place: Place,
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<Frame, EngineError> {
+        let (stood_still, told) = std::mem::take(&mut self.stood_still);
+        slide.warnings.extend(told);
         let start = Instant::now();
         self.learn_shorter(slide, tracer)?;
         let shorter_seconds = start.elapsed().as_secs_f64();
@@ -81,7 +84,7 @@ impl Cycle<'_> {
             self.assess(front, tracer, &gate, &work, &mut record);
         }
         let audit_seconds = shorter_seconds + work.audit_seconds + auditing.elapsed().as_secs_f64();
-        let total = start.elapsed().as_secs_f64();
+        let total = stood_still + start.elapsed().as_secs_f64();
         if let Some(front) = front.as_deref() {
             // The measurement's time, not the frame's.
             record.verified = self.verify(front, tracer, &gate);
@@ -101,6 +104,10 @@ impl Cycle<'_> {
         }
         record.training = learned;
         record.sample_ring = self.ring.len() as u64;
+        record.checkpoint = self.checkpoints.as_mut().and_then(Checkpoints::look);
+        if let Some(failed) = record.checkpoint.as_ref().and_then(|checkpoint| checkpoint.failed.as_ref()) {
+            record.warnings.push(failed.clone());
+        }
         record.seconds = StageSeconds {
             slide: place.preparing,
             waiting: std::mem::take(&mut slide.waited),
@@ -110,6 +117,7 @@ impl Cycle<'_> {
             audit: audit_seconds,
             train: train_seconds,
             device: work.stats.device_seconds,
+            checkpoint: stood_still,
             total,
             elapsed: self.began.elapsed().as_secs_f64(),
         };

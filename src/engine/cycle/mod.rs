@@ -8,6 +8,7 @@ mod assess;
 mod frame;
 mod prepare;
 
+use super::checkpoints::{CheckpointTotals, Checkpoints};
 use super::feed::{Feed, Slide};
 use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup};
@@ -34,7 +35,7 @@ pub struct RunOptions {
     pub threads: usize,
     /// Where to write the trained surrogate at the end.
     pub checkpoint: Option<PathBuf>,
-    /// Writes it also after a frame when so many seconds have gone by since the last time: what is killed goes on from there.
+    /// Writes it also while the run goes on, when so many seconds have gone by since the last time: what is killed goes on from there.
     pub checkpoint_seconds: Option<f64>,
     /// Samples a pixel of warm-up frames; none: the scene's.
     pub warmup_samples: Option<usize>,
@@ -84,6 +85,8 @@ pub struct RunReport {
     pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
     pub window_bytes: usize,
+    /// What became of the checkpoints; none where none was asked for.
+    pub checkpoints: Option<CheckpointTotals>,
 }
 
 /// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
@@ -129,8 +132,10 @@ struct Cycle<'a> {
     /// Largest log-stretch that audit points of this slide have met.
     peak: f32,
     began: Instant,
-    /// When the surrogate was last written.
-    saved: Instant,
+    /// Where checkpoints are asked for.
+    checkpoints: Option<Checkpoints>,
+    /// Seconds that the loop stood still since the last frame for one, and what the next record should say of it.
+    stood_still: (f64, Option<String>),
 }
 
 /// Where a frame stands in the run.
@@ -189,7 +194,7 @@ fn drive(
     let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| {
         // They hold the first window, here and on the device.
         drop((tracer, slide));
-        cycle.later_slides(&mut feed, &map, sink)
+        cycle.later_slides(&mut feed, &map, begun, sink)
     });
     // What was learned is kept whether or not the run was stopped.
     match ended {
@@ -271,7 +276,8 @@ impl<'a> Cycle<'a> {
             stop,
             peak: f32::NEG_INFINITY,
             began,
-            saved: Instant::now(),
+            checkpoints: options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds)),
+            stood_still: (0.0, None),
         })
     }
 
@@ -311,10 +317,14 @@ impl<'a> Cycle<'a> {
         self.frames(tracer, slide, begun, sink)
     }
 
-    /// Goes on until the source ends.
-    fn later_slides(&mut self, feed: &mut Feed, map: &FlowMap, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
-        // The first slide's frames, with all that came before them.
-        let mut begun = self.began;
+    /// Goes on until the source ends. The first slide, whose frames are made, was begun at `begun`.
+    fn later_slides(
+        &mut self,
+        feed: &mut Feed,
+        map: &FlowMap,
+        mut begun: Instant,
+        sink: &mut (dyn FnMut(Event) + Send),
+    ) -> Result<(), Halt> {
         loop {
             self.train_meanwhile(feed, begun.elapsed().as_secs_f64());
             let next = feed.next_slide_unless(self.stop)?;
@@ -342,7 +352,7 @@ impl<'a> Cycle<'a> {
             }
             let frame = self.frame(tracer, slide, place, sink)?;
             sink(Event::Frame(frame));
-            self.save_if_due();
+            self.checkpoint_if_due();
             heed(self.stop)?;
             if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
                 return Err(Halt::TimeIsUp);
@@ -352,23 +362,19 @@ impl<'a> Cycle<'a> {
     }
 
     /// A disk that refuses costs the checkpoint, not the run.
-    fn save_if_due(&mut self) {
-        let due = self.options.checkpoint_seconds.is_some_and(|seconds| self.saved.elapsed().as_secs_f64() >= seconds);
-        if let (true, Some(path), Some(live)) = (due, &self.options.checkpoint, &self.live) {
-            self.saved = Instant::now();
-            if let Err(error) = live.save(path) {
-                tracing::warn!("{error}");
-            }
+    fn checkpoint_if_due(&mut self) {
+        if let (Some(checkpoints), Some(live)) = (&mut self.checkpoints, &mut self.live) {
+            self.stood_still = checkpoints.after_frame(self.frame - 1, &mut **live);
         }
     }
 
     fn finish(&mut self) -> Result<(), EngineError> {
         self.report.train_steps += self.learned_meanwhile.take().map_or(0, |learned| learned.steps);
-        if let (Some(path), Some(live)) = (&self.options.checkpoint, &self.live) {
-            live.save(path)?;
-        }
         self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
-        Ok(())
+        let (Some(checkpoints), Some(live)) = (&mut self.checkpoints, &self.live) else { return Ok(()) };
+        let last = checkpoints.finish(self.frame.checked_sub(1), &**live);
+        self.report.checkpoints = Some(checkpoints.totals().clone());
+        Ok(last?)
     }
 }
 

@@ -1,35 +1,34 @@
 //! What a checkpoint has of a network in training.
 
-use super::super::CheckpointError;
 use super::super::checkpoint::{Checkpoint, Entry};
-use super::super::network::Average;
-use super::{Progress, Trainer};
+use super::super::network::{Average, Model};
+use super::super::{CheckpointError, DeviceLost};
+use super::{Progress, Returning, Sent, Trainer};
 use std::sync::Arc;
+use std::time::Instant;
 
-impl Trainer {
-    pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
-        checkpoint.note("network.shape", self.shape_text());
-        checkpoint.note("network.inputs", self.model.shape.input_names().join(" "));
-        if let Some([first, last]) = self.times.starts {
-            checkpoint.note("network.start_range", format!("{first} {last}"));
+/// A network in training as it was, to be written.
+pub(in crate::surrogate) struct NetworkDraft {
+    notes: Vec<(String, String)>,
+    numbers: Source,
+}
+
+enum Source {
+    Here(Box<Model>, Arc<Average>),
+    Returning(Arc<Returning>),
+}
+
+impl NetworkDraft {
+    /// Adds notes and tensors, those on their way back once they are there.
+    pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceLost> {
+        for (key, text) in &self.notes {
+            checkpoint.note(&format!("network.{key}"), text.clone());
         }
-        checkpoint.note("network.tau", self.times.tau.to_string());
-        let (model, average, progress) = self.present();
-        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
-        let scale = &self.objective.scale;
-        let numbers = [("stall", stall), ("caution", caution), ("first_loss", first_loss), ("smooth", smooth), ("looked", looked)];
-        for (key, value) in numbers {
-            checkpoint.note(&format!("network.{key}"), value.to_string());
-        }
-        checkpoint.note("network.learning_rate", (self.rate * stall * caution).to_string());
+        let (model, average) = match &self.numbers {
+            Source::Here(model, average) => (&**model, &**average),
+            Source::Returning(returning) => returning.bring().map(|numbers| (&numbers.model, &*numbers.average))?,
+        };
         checkpoint.note("network.steps", model.steps().to_string());
-        checkpoint.note("network.drawn", drawn.to_string());
-        checkpoint.note("network.averaged", averaged.to_string());
-        checkpoint.note("network.standardised", self.standardised.to_string());
-        for output in 0..3 {
-            checkpoint.note(&format!("network.mean.{output}"), scale.mean[output].to_string());
-            checkpoint.note(&format!("network.deviation.{output}"), scale.deviation[output].to_string());
-        }
         let (entries, features) = (model.shape.table_entries(), model.shape.features);
         let [tables, layers] = model.state();
         let shapes = [vec![entries, features], vec![model.shape.layer_parameters()]];
@@ -41,11 +40,68 @@ impl Trainer {
                 checkpoint.push(Entry::new(&format!("network.{name}{part}"), shape, values));
             }
         }
-        let Average { tables, layers } = average.into_owned();
+        let Average { tables, layers } = average;
         if !tables.is_empty() {
             checkpoint.push(Entry::new("network.tables.average", &shapes[0], tables));
         }
         checkpoint.push(Entry::new("network.layers.average", &shapes[1], layers));
+        Ok(())
+    }
+}
+
+impl Trainer {
+    /// As it is now; what a device has is waited for.
+    pub(in crate::surrogate) fn draft(&self) -> NetworkDraft {
+        let (model, average, progress) = self.present();
+        NetworkDraft { notes: self.notes(progress), numbers: Source::Here(Box::new(model), average) }
+    }
+
+    /// The same without waiting, where the device has room for a copy; otherwise with the reason. None while an earlier one is on its way.
+    pub(in crate::surrogate) fn draft_behind(&mut self) -> Option<(NetworkDraft, Option<String>)> {
+        let begin = Instant::now();
+        if self.away.is_none() {
+            return Some((self.draft(), None));
+        }
+        match self.send_for() {
+            Ok(Sent::Before) => None,
+            Ok(Sent::For(returning)) => {
+                if let Some(away) = &mut self.away {
+                    (away.fetched_at, away.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
+                }
+                Some((NetworkDraft { notes: self.notes(self.progress), numbers: Source::Returning(returning) }, None))
+            }
+            Ok(Sent::NoRoom(why)) => Some((self.draft(), Some(why))),
+            // What came back last; training goes on from that too.
+            Err(lost) => Some((self.draft(), Some(lost.to_string()))),
+        }
+    }
+
+    /// What is stated as text.
+    fn notes(&self, progress: Progress) -> Vec<(String, String)> {
+        let mut notes = vec![("shape".to_owned(), self.shape_text()), ("inputs".into(), self.model.shape.input_names().join(" "))];
+        if let Some([first, last]) = self.times.starts {
+            notes.push(("start_range".into(), format!("{first} {last}")));
+        }
+        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
+        let rate = self.rate * stall * caution;
+        let numbers = [
+            ("tau", self.times.tau),
+            ("stall", stall),
+            ("caution", caution),
+            ("first_loss", first_loss),
+            ("smooth", smooth),
+            ("looked", looked),
+            ("learning_rate", rate),
+        ];
+        notes.extend(numbers.map(|(key, value)| (key.into(), value.to_string())));
+        notes.extend([("drawn", drawn), ("averaged", averaged)].map(|(key, value)| (key.into(), value.to_string())));
+        notes.push(("standardised".into(), self.standardised.to_string()));
+        let scale = &self.objective.scale;
+        for output in 0..3 {
+            notes.push((format!("mean.{output}"), scale.mean[output].to_string()));
+            notes.push((format!("deviation.{output}"), scale.deviation[output].to_string()));
+        }
+        notes
     }
 
     /// What must agree for a checkpoint to fit.

@@ -1,0 +1,260 @@
+//! Checkpoints of a run, written beside it: at most one at a time, by a thread of its own, while frames go on.
+
+use super::record::CheckpointRecord;
+use crate::surrogate::{CheckpointError, Draft, Surrogate};
+use serde::{Deserialize, Serialize};
+use std::path::PathBuf;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Longest that the end of a run waits for the disk, for the checkpoint under way and for the last one each: a disk that hangs longer loses.
+const DISK_LIMIT: Duration = Duration::from_secs(120);
+
+/// What became of a run's checkpoints.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct CheckpointTotals {
+    /// Written.
+    pub written: u64,
+    /// Not written, for reasons that were told.
+    pub failed: u64,
+    /// That fell due while one was being written, and were left for the next time.
+    pub postponed: u64,
+    /// Longest that the loop stood still for one, in seconds; that of the end of the run, where nothing goes on, is not among them.
+    pub longest_copy_seconds: f64,
+    /// The last one.
+    pub last: Option<CheckpointRecord>,
+}
+
+/// Writes checkpoints behind the cycle's back.
+pub(super) struct Checkpoints {
+    path: PathBuf,
+    /// Seconds between two; none: only at the end.
+    every: Option<f64>,
+    /// When one was last due.
+    due: Instant,
+    limit: Duration,
+    writing: Option<Writing>,
+    totals: CheckpointTotals,
+}
+
+/// One under way.
+struct Writing {
+    record: CheckpointRecord,
+    begun: Instant,
+    /// In a lock alone because threads that render see the cycle.
+    result: Mutex<Receiver<Result<u64, CheckpointError>>>,
+}
+
+impl Drop for Checkpoints {
+    /// Left without [`Checkpoints::finish`], after an error elsewhere: what is under way is completed.
+    fn drop(&mut self) {
+        // Told by then.
+        let _ = self.wait();
+    }
+}
+
+impl Checkpoints {
+    pub(super) fn new(path: PathBuf, every: Option<f64>) -> Self {
+        Self { path, every, due: Instant::now(), limit: DISK_LIMIT, writing: None, totals: CheckpointTotals::default() }
+    }
+
+    /// What became of all so far.
+    pub(super) fn totals(&self) -> &CheckpointTotals {
+        &self.totals
+    }
+
+    /// Begins one after `frame`, where one is due. Seconds that the loop stood still for it, and what should be said of it.
+    pub(super) fn after_frame(&mut self, frame: u64, live: &mut dyn Surrogate) -> (f64, Option<String>) {
+        if self.every.is_none_or(|seconds| self.due.elapsed().as_secs_f64() < seconds) {
+            return (0.0, None);
+        }
+        if let Some(writing) = &mut self.writing {
+            self.due = Instant::now();
+            writing.record.postponed += 1;
+            self.totals.postponed += 1;
+            return (0.0, None);
+        }
+        let begun = Instant::now();
+        // Otherwise an earlier copy is on its way, and it is due after the next frame.
+        let Some(draft) = live.draft_behind() else { return (0.0, None) };
+        self.due = begun;
+        let copy_seconds = begun.elapsed().as_secs_f64();
+        self.totals.longest_copy_seconds = self.totals.longest_copy_seconds.max(copy_seconds);
+        let told = draft.not_behind().map(|why| format!("the frames waited {copy_seconds:.2} s for a checkpoint: {why}"));
+        let record = CheckpointRecord { frame: Some(frame), copy_seconds, behind: told.is_none(), ..CheckpointRecord::default() };
+        self.write(record, begun, draft);
+        (copy_seconds, told)
+    }
+
+    fn write(&mut self, record: CheckpointRecord, begun: Instant, draft: Draft) {
+        let path = self.path.clone();
+        self.start(record, begun, move || draft.write(&path));
+    }
+
+    fn start(&mut self, record: CheckpointRecord, begun: Instant, write: impl FnOnce() -> Result<u64, CheckpointError> + Send + 'static) {
+        let (told, result) = channel();
+        let path = self.path.clone();
+        let work = {
+            let told = told.clone();
+            // Nobody listens any more once the disk has been given up.
+            move || drop(told.send(write()))
+        };
+        if let Err(source) = std::thread::Builder::new().name("ridgewatch-checkpoint".into()).spawn(work) {
+            let _ = told.send(Err(CheckpointError::Io { path, source }));
+        }
+        self.writing = Some(Writing { record, begun, result: Mutex::new(result) });
+    }
+
+    /// The one that was under way since the last frame, for a record: complete, or as far as it is.
+    pub(super) fn look(&mut self) -> Option<CheckpointRecord> {
+        self.hear(Duration::ZERO).map_or_else(|| self.under_way(), |(record, _)| Some(record))
+    }
+
+    fn under_way(&self) -> Option<CheckpointRecord> {
+        self.writing.as_ref().map(|w| CheckpointRecord { seconds: w.begun.elapsed().as_secs_f64(), ..w.record.clone() })
+    }
+
+    /// Hears of the one under way, if it ends within this time.
+    fn hear(&mut self, within: Duration) -> Option<(CheckpointRecord, Result<(), CheckpointError>)> {
+        let result = self.writing.as_mut()?.result.get_mut().unwrap_or_else(PoisonError::into_inner);
+        let result = match result.recv_timeout(within) {
+            Ok(result) => result,
+            Err(RecvTimeoutError::Timeout) => return None,
+            Err(RecvTimeoutError::Disconnected) => {
+                Err(CheckpointError::Writer { path: self.path.clone(), why: "the thread that wrote it panicked (see above)".into() })
+            }
+        };
+        let mut record = self.under_way()?;
+        self.writing = None;
+        let result = result.map(|bytes| record.bytes = Some(bytes));
+        match &result {
+            Ok(()) => self.totals.written += 1,
+            Err(error) => {
+                tracing::warn!("{error}");
+                record.failed = Some(error.to_string());
+                self.totals.failed += 1;
+            }
+        }
+        self.totals.last = Some(record.clone());
+        Some((record, result))
+    }
+
+    /// Waits for the one under way; an error once it takes longer than the limit.
+    fn wait(&mut self) -> Result<(), CheckpointError> {
+        if self.writing.is_none() {
+            return Ok(());
+        }
+        if let Some((_, result)) = self.hear(self.limit) {
+            return result;
+        }
+        let error = CheckpointError::Hangs { path: self.path.clone(), seconds: self.limit.as_secs() };
+        tracing::error!("{error}");
+        self.totals.failed += 1;
+        self.totals.last = self.under_way().map(|record| CheckpointRecord { failed: Some(error.to_string()), ..record });
+        self.writing = None;
+        Err(error)
+    }
+
+    /// Writes the last one, of a run whose last frame was `frame`, and waits for it.
+    ///
+    /// # Errors
+    /// What keeps it from being written. What became of the one before is told, and counted.
+    pub(super) fn finish(&mut self, frame: Option<u64>, live: &dyn Surrogate) -> Result<(), CheckpointError> {
+        if let Err(hangs @ CheckpointError::Hangs { .. }) = self.wait() {
+            return Err(hangs);
+        }
+        let begun = Instant::now();
+        let draft = live.draft();
+        let copy_seconds = begun.elapsed().as_secs_f64();
+        self.write(CheckpointRecord { frame, copy_seconds, ..CheckpointRecord::default() }, begun, draft);
+        self.wait()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Domain;
+    use crate::field::analytic::Analytic;
+    use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
+    use crate::surrogate::Table;
+    use std::sync::mpsc::Sender;
+
+    fn table() -> Table {
+        let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
+        Table::trace(&*cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap(), [3, 3, 1])
+    }
+
+    /// One that is due after every frame and writes until told what it came to.
+    fn slow(folder: &std::path::Path) -> (Checkpoints, Sender<Result<u64, CheckpointError>>) {
+        let mut checkpoints = Checkpoints::new(folder.join("weights"), Some(0.0));
+        let (end, told) = channel();
+        let record = CheckpointRecord { frame: Some(0), behind: true, ..CheckpointRecord::default() };
+        checkpoints.start(record, Instant::now(), move || told.recv().unwrap());
+        (checkpoints, end)
+    }
+
+    #[test]
+    fn frames_go_on_while_one_is_written_and_others_wait_for_the_next_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut checkpoints, end) = slow(folder.path());
+        let mut table = table();
+        for frame in 1..=5 {
+            assert_eq!(checkpoints.after_frame(frame, &mut table), (0.0, None), "nothing is waited for");
+            let record = checkpoints.look().unwrap();
+            assert_eq!((record.frame, record.bytes, record.postponed), (Some(0), None, frame));
+        }
+        end.send(Ok(77)).unwrap();
+        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        assert!(result.is_ok() && record.bytes == Some(77) && record.postponed == 5, "{record:?}");
+        assert_eq!(checkpoints.look(), None, "told once");
+        // The next one.
+        checkpoints.after_frame(6, &mut table);
+        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        assert!(result.is_ok() && record.frame == Some(6) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()));
+        checkpoints.finish(Some(7), &table).unwrap();
+        assert_eq!((checkpoints.totals.written, checkpoints.totals.failed, checkpoints.totals.postponed), (3, 0, 5));
+    }
+
+    #[test]
+    fn the_one_under_way_is_told_of_and_the_last_one_is_waited_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut checkpoints, end) = slow(folder.path());
+        let late = std::thread::spawn(move || {
+            std::thread::sleep(Duration::from_millis(50));
+            end.send(Err(CheckpointError::Writer { path: "elsewhere".into(), why: "refused by the test".into() })).unwrap();
+        });
+        checkpoints.finish(Some(3), &table()).unwrap();
+        late.join().unwrap();
+        let last = checkpoints.totals.last.clone().unwrap();
+        assert!(last.frame == Some(3) && last.bytes.is_some() && folder.path().join("weights").exists());
+        assert_eq!((checkpoints.totals.written, checkpoints.totals.failed), (1, 1), "the one before is counted");
+        // What cannot be written is an error at the end, and in a record while frames go on.
+        let mut nowhere = Checkpoints::new(folder.path().join("no/such/weights"), Some(0.0));
+        nowhere.after_frame(0, &mut table());
+        let (record, _) = nowhere.hear(Duration::from_secs(10)).unwrap();
+        assert!(record.failed.unwrap().contains("no/such/weights"));
+        assert!(matches!(nowhere.finish(Some(1), &table()), Err(CheckpointError::Io { .. })));
+        assert_eq!(nowhere.totals.failed, 2);
+    }
+
+    #[test]
+    fn a_writer_that_hangs_costs_the_limit_and_one_that_panics_an_error() {
+        let folder = tempfile::tempdir().unwrap();
+        let (mut checkpoints, end) = slow(folder.path());
+        checkpoints.limit = Duration::from_millis(50);
+        let begin = Instant::now();
+        assert!(matches!(checkpoints.finish(Some(1), &table()), Err(CheckpointError::Hangs { .. })));
+        drop(checkpoints);
+        // The limit, and what a busy machine adds to a wake-up.
+        assert!(begin.elapsed() < Duration::from_secs(5));
+        end.send(Ok(1)).unwrap();
+
+        let (mut checkpoints, end) = slow(folder.path());
+        // Its thread finds nobody to hear from.
+        drop(end);
+        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        assert!(matches!(result, Err(CheckpointError::Writer { .. })) && record.failed.unwrap().contains("panicked"));
+    }
+}
