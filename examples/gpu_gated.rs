@@ -30,9 +30,15 @@ const SLIDES: usize = 4;
 const FRAMES_A_SLIDE: usize = 190;
 /// Frames of a slide whose traced share is shown, from 0.
 const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 189];
-/// A network of 72 MB, and batches that keep the device busy.
-const NETWORK: [&str; 5] =
-    ["network.levels=6", "network.features=4", "network.growth=2.2", "network.log2_table=22", "network.batch=262144"];
+/// A network of 71 MB: few levels, the finest as dense as its table can hold; and batches that keep the device busy.
+const NETWORK: [&str; 6] = [
+    "network.levels=3",
+    "network.features=4",
+    "network.growth=1.8",
+    "network.base_resolution=128",
+    "network.log2_table=24",
+    "network.batch=262144",
+];
 
 /// `frames` pictures of a scene after its warm-up, added up, and their records.
 fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {

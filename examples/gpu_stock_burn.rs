@@ -83,7 +83,7 @@ fn main() -> Outcome<()> {
         unsafe { frozen.predict(points.address(), COUNT, values.address()) }?;
         let mut found = vec![0.0_f32; COUNT];
         values.read(&mut found)?;
-        let mut predict = || {
+        let predict = || {
             let outputs = still.forward(&shape, inputs.clone());
             done(Stock::sync(&device))?;
             drop(outputs);

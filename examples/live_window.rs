@@ -42,7 +42,7 @@ fn main() -> anyhow::Result<()> {
             }
         }
         file.flush()?;
-        println!("slide {slide}: step {}, {} missed, times {times:?}", taken.live.step, taken.live.missed);
+        println!("slide {slide}: step {}, {} missed, times {times:?}", taken.live.step, taken.live.missed_blocks);
     }
     Ok(())
 }

@@ -141,7 +141,7 @@ fn a_film_of_a_live_run_is_that_of_its_archive_whole_or_in_blocks() {
             for key in ["time", "queries", "traced", "frame", "slide"] {
                 assert_eq!(found[key], expected[key], "{blocks}: {key}");
             }
-            assert_eq!(found["live"]["missed"], 0);
+            assert_eq!(found["live"]["missed_blocks"], 0);
         }
         assert_eq!(pictures, film, "{blocks}");
     }
@@ -232,6 +232,14 @@ fn all_threads_step_back_for_the_simulation() {
         let found = niceness(sidecar.0.id());
         // Those that read, convert, write and make frames.
         assert!(found.len() > 4 && found.iter().all(|nice| *nice == expected.max(own)), "{name}: {found:?}");
+        let connection = place.files.join(format!("{name}.connection"));
+        let relay =
+            start(Command::new(env!("CARGO_BIN_EXE_ridgewatch")).args(["relay", &ring, "--connection", text(&connection)]).args(arguments));
+        until("the connection file", || connection.exists());
+        until("the relay's priority", || {
+            let found = niceness(relay.0.id());
+            found.len() > 1 && found.iter().all(|nice| *nice == expected.max(own))
+        });
     }
 }
 
@@ -298,7 +306,7 @@ fn every_step_is_taken_through_a_relay() {
     let records = records(&run);
     assert_eq!(records.len(), 4);
     for (n, record) in (4..).zip(&records) {
-        assert_eq!((&record["live"]["step"], &record["live"]["missed"]), (&n.into(), &0.into()), "{record}");
+        assert_eq!((&record["live"]["step"], &record["live"]["missed_blocks"]), (&n.into(), &0.into()), "{record}");
     }
     drop(relay);
 }

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::engine::{FrameRecord, StageSeconds};
+use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::Learned;
 use ridgewatch::trust::TrustedError;
 use std::collections::BTreeSet;
@@ -23,7 +24,9 @@ fn the_page_names_every_key_of_a_record_and_no_other() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/protocol.md")).unwrap();
     let record = page.split("## The record").nth(1).unwrap().split("\n## ").next().unwrap();
     let (fields, rest) = record.split_once("`trusted` and `verified`:").unwrap();
+    let (fields, live) = fields.split_once("`live`, of a simulation that runs now").unwrap();
     assert_eq!(quoted(fields, true), keys(&FrameRecord::default()));
+    assert_eq!(quoted(live, true), keys(&LiveRecord::default()));
     assert_eq!(quoted(rest.split("`training`:").next().unwrap(), true), keys(&TrustedError::default()));
     let paragraph = |start: &str| {
         let text = rest.split("\n\n").map(str::trim).find(|text| text.starts_with(start)).unwrap();

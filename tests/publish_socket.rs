@@ -104,6 +104,39 @@ async fn every_record_arrives_though_pictures_are_superseded() {
     assert!(statistics.superseded > 0 && statistics.records_dropped == 0, "{statistics:?}");
 }
 
+/// More strangers than there are places, from an address of their own, all of whom greet as ZMTP 3 says and stay.
+#[tokio::test(flavor = "multi_thread")]
+async fn strangers_who_greet_and_stay_keep_nobody_out() {
+    let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
+    let mut early = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
+    first_message(&publisher, &mut early).await;
+    let address: std::net::SocketAddr = publisher.endpoint().strip_prefix("tcp://").unwrap().parse().unwrap();
+    let mut strangers = Vec::new();
+    for _ in 0..300 {
+        let socket = tokio::net::TcpSocket::new_v4().unwrap();
+        socket.bind("127.0.0.2:0".parse().unwrap()).unwrap();
+        let mut stranger = socket.connect(address).await.unwrap();
+        let mut greeting = [0; 64];
+        (greeting[0], greeting[9], greeting[10]) = (0xff, 0x7f, 3);
+        greeting[12..16].copy_from_slice(b"NULL");
+        tokio::io::AsyncWriteExt::write_all(&mut stranger, &greeting).await.unwrap();
+        strangers.push(stranger);
+    }
+    let mut late = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
+    first_message(&publisher, &mut late).await;
+    // Who was there before them still is, and has its frames on one connection.
+    publisher.frame(frame(5000));
+    loop {
+        let header: FrameHeader = serde_json::from_slice(receive(&mut early).await.get(1).unwrap()).unwrap();
+        if header.frame == 5000 {
+            break;
+        }
+    }
+    drop(strangers);
+    let statistics = tokio::task::spawn_blocking(move || publisher.finish(Duration::from_millis(500))).await.unwrap();
+    assert_eq!(statistics.cut_offs, 0, "{statistics:?}");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn finishing_flushes_the_last_frame() {
     let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Png)).unwrap();

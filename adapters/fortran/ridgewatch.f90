@@ -34,9 +34,11 @@ module ridgewatch
     procedure :: sphere => publisher_sphere
     procedure :: block => publisher_block
     procedure :: start => publisher_start
+    procedure :: time_unit => publisher_time_unit
     procedure :: slots => publisher_slots
     procedure :: wait => publisher_wait
     procedure :: open => publisher_open
+    procedure :: statistics => publisher_statistics
     procedure :: close => publisher_close
     procedure, private :: publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
     generic :: publish => publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
@@ -87,6 +89,18 @@ module ridgewatch
       type(c_ptr), value :: description
       integer(c_int64_t), value :: start
       integer(c_int) :: c_start
+    end function
+    function c_time_unit(description, unit) bind(c, name="rw_describe_time_unit")
+      import
+      type(c_ptr), value :: description
+      character(kind=c_char), intent(in) :: unit(*)
+      integer(c_int) :: c_time_unit
+    end function
+    function c_statistics(field, published, overwrote) bind(c, name="rw_statistics")
+      import
+      type(c_ptr), value :: field
+      integer(c_int64_t), intent(inout) :: published, overwrote
+      integer(c_int) :: c_statistics
     end function
     function c_slots(description, slots) bind(c, name="rw_describe_slots")
       import
@@ -233,6 +247,27 @@ contains
     integer(int64), intent(in) :: start
     integer, intent(out), optional :: status
     call give(c_start(self%description, int(start, c_int64_t)), status)
+  end subroutine
+
+  !> Unit of the times, for people; without it "s".
+  subroutine publisher_time_unit(self, unit, status)
+    class(rw_publisher), intent(inout) :: self
+    character(*), intent(in) :: unit
+    integer, intent(out), optional :: status
+    call give(c_time_unit(self%description, trim(unit) // c_null_char), status)
+  end subroutine
+
+  !> Steps published, and how many of them overwrote one that nobody had taken; 0 where no ring is open.
+  subroutine publisher_statistics(self, published, overwrote, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(out) :: published, overwrote
+    integer, intent(out), optional :: status
+    integer(c_int64_t) :: steps, lost
+    steps = 0
+    lost = 0
+    call give(c_statistics(self%field, steps, lost), status)
+    published = steps
+    overwrote = lost
   end subroutine
 
   !> Steps that the ring holds.

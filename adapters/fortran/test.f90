@@ -6,10 +6,11 @@ program test
   type(rw_publisher) :: publisher, second
   real(real32) :: u32(4, 3, 2), v32(4, 3, 2), w32(4, 3, 2)
   real(real64) :: u64(0:5, 8, 2), v64(0:5, 8, 2), w64(0:5, 8, 2), plane(4, 3)
-  real(real32) :: east(4, 3)
+  real(real32) :: east(4, 3), west(4, 3)
   character(:), allocatable :: message
   character(200) :: ring
   integer :: i, j, k, status
+  integer(int64) :: published, overwrote, before, after, rate
 
   call publisher%begin(3)
   call publisher%uniform(1, 0d0, 3d0, 4)
@@ -68,8 +69,57 @@ program test
   call want(status == rw_ok, 11)
   call publisher%close(status)
   call want(status == rw_ok, 12)
+  ! Two blocks of one grid, beside each other, in hours.
+  call publisher%begin(2)
+  call second%begin(2)
+  call half(publisher, 0)
+  call half(second, 1)
+  call publisher%statistics(published, overwrote, status)
+  call want(status == rw_off .and. published == 0 .and. overwrote == 0, 13)
+  call publisher%open(status, trim(ring) // "/blocks")
+  call want(status == rw_ok, 14)
+  call second%open(status, trim(ring) // "/blocks")
+  call want(status == rw_ok, 15)
+  west = -east
+  call publisher%publish(1, 1d0, east(1:2, :), west(1:2, :), status)
+  call want(status == rw_ok, 16)
+  call second%publish(1, 1d0, east(3:4, :), west(3:4, :), status)
+  call want(status == rw_ok, 17)
+  ! Two steps fit. The third is waited for: a follower is to come. The fourth is not, since that was in vain.
+  call publisher%publish(2, 2d0, east(1:2, :), east(1:2, :), status)
+  call system_clock(before, rate)
+  call publisher%publish(3, 3d0, east(1:2, :), east(1:2, :), status)
+  call system_clock(after)
+  call want(status == rw_ok .and. after - before >= rate / 5, 18)
+  call publisher%publish(4, 4d0, east(1:2, :), east(1:2, :), status)
+  call system_clock(before)
+  call want(status == rw_ok .and. before - after < rate / 5, 19)
+  call publisher%statistics(published, overwrote, status)
+  call want(status == rw_ok .and. published == 4 .and. overwrote == 2, 20)
+  call second%statistics(published, overwrote)
+  call want(published == 1 .and. overwrote == 0, 21)
+  call publisher%close(status)
+  call want(status == rw_ok, 22)
+  call second%close(status)
+  call want(status == rw_ok, 23)
 
 contains
+
+  subroutine half(of, index)
+    type(rw_publisher), intent(inout) :: of
+    integer, intent(in) :: index
+    integer :: found
+    call of%uniform(1, 0d0, 3d0, 4)
+    call of%uniform(2, 0d0, 2d0, 3)
+    call of%block(index, 2, [1 + 2 * index, 1], [2, 3], found)
+    call want(found == rw_ok, 30)
+    call of%time_unit("h ", found)
+    call want(found == rw_ok, 31)
+    call of%slots(2, found)
+    call want(found == rw_ok, 32)
+    call of%wait(200, found)
+    call want(found == rw_ok, 33)
+  end subroutine
 
   subroutine want(holds, line)
     logical, intent(in) :: holds

@@ -1,5 +1,6 @@
 //! `ridgewatch attach`.
 
+use super::nice::Nice;
 use super::replay::{RunArguments, conduct};
 use super::{Common, Usage, located, messages};
 use anyhow::{Result, bail};
@@ -27,9 +28,8 @@ pub struct Options {
     /// Ends when the simulation ends; otherwise its restart is waited for.
     #[arg(long)]
     once: bool,
-    /// How far to step back for the simulation when both want the same core: 0 (not at all) to 19.
-    #[arg(long, default_value_t = 10, value_name = "N", value_parser = clap::value_parser!(i32).range(0..=19))]
-    nice: i32,
+    #[command(flatten)]
+    nice: Nice,
     #[command(flatten)]
     run: RunArguments,
 }
@@ -49,11 +49,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         }
     }
     options.run.apply(&mut scene)?;
-    if options.nice > 0
-        && let Err(error) = step_back(options.nice)
-    {
-        messages::note(format_args!("priority stays as it is: {error}"));
-    }
+    options.nice.step_back();
     let open = |scene: &SceneFile, stop: &AtomicBool| {
         let refused = |error| located(scene, error, SourceError::refused);
         let Some(live) = Live::connect(&scene.live, stop, &mut messages::note).map_err(refused)? else { return Ok(None) };
@@ -61,22 +57,6 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, EngineError::refused))
     };
     conduct(common, &options.run, scene, Some(CHECKPOINT_SECONDS), open)
-}
-
-/// Lowers the priority of all threads that are there; those that they start later have it too.
-fn step_back(nice: i32) -> std::io::Result<()> {
-    for task in std::fs::read_dir("/proc/self/task")? {
-        let Some(thread) = task?.file_name().to_str().and_then(|name| name.parse().ok()) else { continue };
-        // SAFETY: changes a priority and touches no memory.
-        if unsafe { libc::setpriority(libc::PRIO_PROCESS, thread, nice) } != 0 {
-            let error = std::io::Error::last_os_error();
-            // One that has ended meanwhile.
-            if error.raw_os_error() != Some(libc::ESRCH) {
-                return Err(error);
-            }
-        }
-    }
-    Ok(())
 }
 
 /// The scene that the paths mean.

@@ -72,7 +72,7 @@ fn cpu() -> Cpu {
 
 #[cfg(feature = "cuda")]
 fn gpu() -> Gpu {
-    use ridgewatch::engine::cuda::{Gpu as Opened, GpuSettings, probe};
+    use ridgewatch::engine::cuda::{Gpu as Opened, GpuSettings, nvrtc_version, probe};
     let found = match probe() {
         Ok(found) => found,
         Err(why) => return Gpu { usable: false, found: Vec::new(), why_not: Some(why.to_string()) },
@@ -82,8 +82,15 @@ fn gpu() -> Gpu {
         Ok(gpu) => {
             let (_, cap) = gpu.memory();
             let (major, minor) = gpu.capability();
-            let more = format!("driver for CUDA {}, compute capability {major}.{minor}, {} MiB to be used", gpu.driver(), cap >> 20);
-            Gpu { usable: true, found: [names, vec![more]].concat(), why_not: None }
+            let (nvrtc, minor_nvrtc) = nvrtc_version();
+            let more = format!(
+                "driver for CUDA {}, NVRTC {nvrtc}.{minor_nvrtc}, compute capability {major}.{minor}, {} MiB to be used",
+                gpu.driver(),
+                cap >> 20
+            );
+            // An NVRTC may know nothing of an old card, and an old driver nothing of what a new NVRTC made.
+            let why_not = gpu.module("sort.cu", &[]).err().map(|why| why.to_string());
+            Gpu { usable: why_not.is_none(), found: [names, vec![more]].concat(), why_not }
         }
         Err(why) => Gpu { usable: false, found: names, why_not: Some(why.to_string()) },
     }

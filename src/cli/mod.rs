@@ -6,6 +6,7 @@ mod doctor;
 mod ftle;
 mod inspect;
 pub mod messages;
+mod nice;
 mod publish;
 mod relay;
 mod render;

@@ -1,10 +1,11 @@
 //! `ridgewatch relay`.
 
+use super::nice::Nice;
 use super::{Common, Usage, messages, print_json};
 use anyhow::{Context, Result, bail};
 use ridgewatch_wire::message::{ConnectionFile, Key};
 use ridgewatch_wire::relay::{RelayCounts, serve};
-use std::net::TcpListener;
+use std::net::{IpAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -21,20 +22,35 @@ pub struct Options {
     /// Writes the address and the key here (mode 0600), for `ridgewatch attach` on the other node.
     #[arg(long, value_name = "FILE")]
     connection: PathBuf,
+    #[command(flatten)]
+    nice: Nice,
+}
+
+/// What is odd about a listener that was asked for by `host` and got this address: a name that other nodes know may stand for this machine's own
+/// loopback here (127.0.1.1 in Debian's /etc/hosts).
+fn out_of_reach(host: &str, address: IpAddr) -> Option<String> {
+    let meant = host == "localhost" || host.trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
+    (address.is_loopback() && !meant).then(|| {
+        format!("{host} stands for {address} on this machine, which no other node reaches: give --listen the address that they reach it by")
+    })
 }
 
 /// Relays until it is told to stop.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     if !common.overrides.is_empty() {
-        bail!(Usage("--set: relay takes no scene; accepted: RING, --listen, --connection".into()));
+        bail!(Usage("--set: relay takes no scene; accepted: RING, --listen, --connection, --nice".into()));
     }
     let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
     let Some(ring) = options.ring.clone().or_else(named) else {
         bail!(Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE)));
     };
     let listener = TcpListener::bind(&options.listen).with_context(|| format!("cannot listen at {}", options.listen))?;
-    let port = listener.local_addr()?.port();
+    let (address, port) = (listener.local_addr()?.ip(), listener.local_addr()?.port());
     let host = options.listen.rsplit_once(':').map_or("127.0.0.1", |(host, _)| host);
+    if let Some(warning) = out_of_reach(host, address) {
+        messages::note(warning);
+    }
+    options.nice.step_back();
     let key = Key::random()?;
     super::check_folder(&options.connection)?;
     ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;
@@ -69,4 +85,27 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         }))?;
     }
     Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[allow(clippy::unwrap_used)]
+    fn a_name_that_stands_for_the_loopback_is_warned_of() {
+        for (host, address, odd) in [
+            ("node17", "127.0.1.1", true),
+            ("node17", "::1", true),
+            ("node17", "10.0.0.17", false),
+            ("localhost", "127.0.0.1", false),
+            ("127.0.0.1", "127.0.0.1", false),
+            ("[::1]", "::1", false),
+            ("0.0.0.0", "0.0.0.0", false),
+        ] {
+            let warning = out_of_reach(host, address.parse().unwrap());
+            assert_eq!(warning.is_some(), odd, "{host} {address}");
+            assert!(warning.is_none_or(|words| words.contains(host) && words.contains(address)));
+        }
+    }
 }

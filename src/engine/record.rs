@@ -69,8 +69,8 @@ pub struct FrameRecord {
     pub majorant_exceeded: u64,
     /// Training since the last frame.
     pub training: Option<crate::surrogate::Learned>,
-    /// Samples in the ring.
-    pub ring: u64,
+    /// Samples in the ring of samples (`training.ring`).
+    pub sample_ring: u64,
     /// Points that a GPU traced ahead of flights that ended before them: work, but no queries, and not among `traced`.
     #[serde(default)]
     pub traced_ahead: u64,

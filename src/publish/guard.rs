@@ -3,19 +3,19 @@
 //! The crate takes memory for any length that a peer announces, and its PUB socket reads subscriptions from everybody: nine bytes of a stranger could end
 //! the run. So the socket itself listens where nobody else can reach it, connections over TCP end here, and a peer's bytes are handed on only as far as they
 //! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more is cut off, and nobody else notices. What the socket sends passes
-//! as it is.
+//! as it is. Who greets may stay, so that places are shared out by address: where none is left, the one that has most of them gives up its oldest.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Result};
+use std::net::IpAddr;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream, UnixStream};
-use tokio::sync::Semaphore;
+use tokio::task::AbortHandle;
 
 /// Connections at once.
 const CONNECTIONS: usize = 256;
@@ -45,23 +45,34 @@ pub(super) fn private_listener() -> Result<(UnixListener, File)> {
 /// Lets subscribers in, until it is dropped. The socket listens at `place`.
 pub(super) async fn guard(listener: TcpListener, place: File) {
     let socket = PathBuf::from(format!("/proc/self/fd/{}", place.as_raw_fd()));
-    let places = Arc::new(Semaphore::new(CONNECTIONS));
+    let mut guests: Vec<(IpAddr, AbortHandle)> = Vec::new();
     loop {
         let Ok((stream, peer)) = listener.accept().await else {
             // A peer that went before it was taken, or no descriptor left: later ones may fare better.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
-        // Who finds no place is closed, and may try again.
-        let Ok(place) = Arc::clone(&places).try_acquire_owned() else { continue };
+        guests.retain(|(_, connection)| !connection.is_finished());
+        if guests.len() >= CONNECTIONS {
+            let (address, oldest) = guests.remove(displaced(&guests));
+            tracing::debug!("a connection of {address} is cut off: {CONNECTIONS} are there, and most of them are its own");
+            oldest.abort();
+        }
         let socket = socket.clone();
-        tokio::spawn(async move {
+        let connection = tokio::spawn(async move {
             if let Err(error) = connection(stream, &socket).await {
                 tracing::debug!("{peer} is cut off: {error}");
             }
-            drop(place);
         });
+        guests.push((peer.ip(), connection.abort_handle()));
     }
+}
+
+/// Who goes, of guests as they came: of the address with most places the one that came first.
+fn displaced<T>(guests: &[(IpAddr, T)]) -> usize {
+    let places = |address: IpAddr| guests.iter().filter(|(one, _)| *one == address).count();
+    let most = guests.iter().map(|(address, _)| places(*address)).max().unwrap_or_default();
+    guests.iter().position(|(address, _)| places(*address) == most).unwrap_or_default()
 }
 
 /// One subscriber, until either side ends it.
@@ -170,6 +181,14 @@ mod tests {
         }
         let (out, done) = passed(&[b"GET / HTTP/1.1\r\n".as_slice(), &[0; 64]].concat());
         assert!(out.is_empty() && done.unwrap_err().to_string().contains("greeting"));
+    }
+
+    #[test]
+    fn whoever_has_most_places_gives_up_the_oldest() {
+        let guests = |last: &[u8]| last.iter().map(|n| (IpAddr::from([10, 0, 0, *n]), ())).collect::<Vec<_>>();
+        for (there, gone) in [(&[1, 2, 2, 3][..], 1), (&[1, 1, 2, 2], 0), (&[3, 1, 2, 2, 1, 2], 2), (&[5], 0)] {
+            assert_eq!(displaced(&guests(there)), gone, "{there:?}");
+        }
     }
 
     #[test]

@@ -128,7 +128,13 @@ samples = 4
     for (frames, learns_there) in [(&found, true), (&expected, false)] {
         for pair in frames.windows(2) {
             let [before, after] = [&pair[0].record, &pair[1].record];
-            assert!(after.ring > before.ring, "frame {}: {} samples, then {}", after.frame, before.ring, after.ring);
+            assert!(
+                after.sample_ring > before.sample_ring,
+                "frame {}: {} samples, then {}",
+                after.frame,
+                before.sample_ring,
+                after.sample_ring
+            );
             assert!(after.warnings.is_empty(), "{:?}", after.warnings);
             assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
         }

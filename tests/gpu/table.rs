@@ -1,37 +1,45 @@
 //! The table on the device against the CPU's.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, DevicePredict, DeviceTable, Tuning};
+use ridgewatch::engine::cuda::{CudaTracer, DeviceTable, Tuning};
 use ridgewatch::flow::{Boundary, FlowMap, Precision, VelocitySource, cpu_tracer};
 use ridgewatch::surrogate::{Predict, Surrogate, Table};
 
 fn check(source: &VelocitySource, nodes: [usize; 3]) {
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let gpu = gpu();
-    let domain = domain(source);
     let tracer = CudaTracer::new(store(), &gpu, source.clone(), &map, 0.0, Tuning::default()).unwrap();
-    let table = DeviceTable::trace(tracer.device(), &domain, nodes).unwrap();
-    let exact = Table::trace(&*cpu_tracer(source.clone(), &FlowMap { precision: Precision::F64, ..map }, 0.0).unwrap(), nodes);
+    let table = Table::trace(&tracer, nodes);
+    let on_cpu = |map: &FlowMap| Table::trace(&*cpu_tracer(source.clone(), map, 0.0).unwrap(), nodes);
+    let exact = on_cpu(&FlowMap { precision: Precision::F64, ..map.clone() });
+    let single = on_cpu(&map);
     assert_eq!((table.nodes(), table.not_finite()), (exact.nodes(), exact.not_finite()));
-    let values = table.values().unwrap();
-    let mut errors: Vec<f32> = values.iter().zip(exact.values()).map(|(a, b)| (a - b).abs()).collect();
-    errors.sort_by(f32::total_cmp);
-    // Rounding in single precision, amplified by the stretch (up to e^4); nodes on a cell face may take the gradient of either side.
-    assert!(errors[errors.len() * 9 / 10] < 2e-5, "{}", errors[errors.len() * 9 / 10]);
-    // Lookups: the very table, on the CPU.
+    // Rounding in single precision, amplified by the stretch (up to e^4): no worse than the CPU's. Nodes on a cell face may take the gradient of
+    // either side, as theirs do.
+    let errors = |values: &[f32]| {
+        let mut errors: Vec<f32> = values.iter().zip(exact.values()).map(|(a, b)| (a - b).abs()).collect();
+        errors.sort_by(f32::total_cmp);
+        [90, 99].map(|percent| errors[errors.len() * percent / 100])
+    };
+    let (ours, theirs) = (errors(table.values()), errors(single.values()));
+    println!("{nodes:?}: 90 and 99 % of the nodes are within {ours:?}, the CPU's single precision within {theirs:?}");
+    for (ours, theirs) in ours.into_iter().zip(theirs) {
+        assert!(ours <= 3.0 * theirs + 2e-6, "{nodes:?}: off by {ours:e}, the CPU by {theirs:e}");
+    }
+    // Lookups in and around the unit cube, against the same values on the host: every one.
+    let file = tempfile::NamedTempFile::new().unwrap();
+    table.save(file.path()).unwrap();
+    let mut host = single;
+    host.load(file.path()).unwrap();
     let points = fresh(&ridgewatch::field::Domain::cuboid([-0.1; 3], [1.1; 3]), 30_001);
-    let flat = gpu.upload("points", &points).unwrap();
-    let out = gpu.upload("values", &vec![f32::NAN; points.len()]).unwrap();
-    // SAFETY: both buffers hold as many entries as there are points.
-    unsafe { table.predict(flat.address(), points.len(), out.address()) }.unwrap();
-    let mut found = vec![f32::NAN; points.len()];
-    out.read(&mut found).unwrap();
-    let mut expected = vec![0.0; points.len()];
-    exact.predict(&points, &mut expected);
-    let mut errors: Vec<f32> = found.iter().zip(&expected).map(|(a, b)| (a - b).abs()).collect();
-    assert!(errors.iter().all(|e| !e.is_nan()), "every point has a value");
-    errors.sort_by(f32::total_cmp);
-    assert!(errors[errors.len() * 8 / 10] < 1e-4, "{}", errors[errors.len() * 8 / 10]);
+    let (mut there, mut here) = (vec![f32::NAN; points.len()], vec![f32::NAN; points.len()]);
+    assert!(DeviceTable::of(&table).is_some());
+    table.predict(&points, &mut there);
+    host.predict(&points, &mut here);
+    for (point, (there, here)) in points.iter().zip(there.iter().zip(&here)) {
+        // Seven interpolations between values of up to 5, each rounded once or, where the CPU does not fuse, twice.
+        assert!((there - here).abs() <= 5e-6, "{nodes:?} at {point:?}: {there} on the device, {here} on the host");
+    }
 }
 
 #[test]

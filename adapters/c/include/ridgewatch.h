@@ -39,7 +39,7 @@ typedef enum {
   RW_NO_SPACE = 4,
   // The folder or file belongs to somebody else.
   RW_FOREIGN = 5,
-  // The system refused.
+  // The system refused, or has no memory.
   RW_SYSTEM = 6,
   // The handle was opened by the parent process.
   RW_FORKED = 7,
@@ -130,7 +130,8 @@ rw_status rw_publish_strided_f64(rw_field *field,
 // Steps published, and how many of them overwrote one that nobody had taken; either may be null.
 rw_status rw_statistics(const rw_field *field, uint64_t *published, uint64_t *overwrote);
 
-// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle.
+// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle. Where memory is out
+// (`RW_SYSTEM`) the ring stays open and may be closed later.
 rw_status rw_close(rw_field *field);
 
 #ifdef __cplusplus

@@ -1,6 +1,7 @@
 //! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` is generated from this file (`make header`), its words are the comments here.
 //!
-//! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`].
+//! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`]. Rust aborts
+//! where memory is out, so what is large is asked for ([`copied`]), and whoever describes or opens asks first for what all that is small may take ([`SMALL`]).
 //!
 //! What C promises with each pointer that it gives: it is null, or from this library and not yet freed, or points to as many values as the
 //! function's comment says; texts end with a zero. A description and `rw_close` are for one thread at a time.
@@ -8,7 +9,9 @@
 // The promises of the callers stand above, once for all functions.
 #![allow(clippy::missing_safety_doc)]
 
-use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, WireError};
+use ridgewatch_wire::{
+    AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, WireError, even,
+};
 use std::cell::RefCell;
 use std::ffi::{CStr, c_char};
 use std::panic::{AssertUnwindSafe, catch_unwind};
@@ -34,7 +37,7 @@ pub enum Status {
     RwNoSpace = 4,
     /// The folder or file belongs to somebody else.
     RwForeign = 5,
-    /// The system refused.
+    /// The system refused, or has no memory.
     RwSystem = 6,
     /// The handle was opened by the parent process.
     RwForked = 7,
@@ -99,7 +102,7 @@ impl Failure {
                 WireError::NoSpace { .. } => Status::RwNoSpace,
                 WireError::Foreign { .. } => Status::RwForeign,
                 WireError::Forked { .. } => Status::RwForked,
-                WireError::Io { .. } => Status::RwSystem,
+                WireError::Io { .. } | WireError::NoMemory { .. } => Status::RwSystem,
                 _ => Status::RwArgument,
             },
         }
@@ -133,6 +136,33 @@ fn tell(text: std::fmt::Arguments) {
             error[end] = 0;
         }
     });
+}
+
+/// Most bytes that one call takes beside coordinates: texts, paths, the handles, the words of an error. Less than from where malloc maps memory of its own, so
+/// that what was asked for and given back is there for what follows.
+const SMALL: usize = 1 << 16;
+
+/// Asks for memory.
+fn room<T>(count: usize) -> Result<Vec<T>, WireError> {
+    let mut room = Vec::new();
+    room.try_reserve_exact(count).map_err(|_| WireError::NoMemory { bytes: count.saturating_mul(size_of::<T>()) })?;
+    Ok(room)
+}
+
+/// Coordinates in memory that was asked for.
+fn copied(coordinates: impl ExactSizeIterator<Item = f64>) -> Result<Vec<f64>, WireError> {
+    let mut copy = room(coordinates.len())?;
+    copy.extend(coordinates);
+    Ok(copy)
+}
+
+/// [`guarded`] for what takes memory.
+fn guarded_with_room(body: impl FnOnce() -> Result<(), Failure>) -> Status {
+    guarded(|| {
+        // Kept from being optimised away.
+        std::hint::black_box(&mut room::<u8>(SMALL)?);
+        body()
+    })
 }
 
 /// Runs a body so that neither an error nor a panic leaves it but as a status.
@@ -174,7 +204,7 @@ pub extern "C" fn rw_error() -> *const c_char {
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     let mut made = std::ptr::null_mut();
-    guarded(|| {
+    guarded_with_room(|| {
         if !(2..=3).contains(&dimensions) {
             return Err(Failure::Argument("dimensions: accepted: 2 or 3"));
         }
@@ -208,13 +238,23 @@ pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
 /// `description` is null or points to a description that nobody else uses.
 unsafe fn describe(description: *mut RwDescription, change: impl FnOnce(&mut RwDescription) -> Result<(), Failure>) -> Status {
     // SAFETY: the caller's promise.
-    guarded(|| change(unsafe { description.as_mut() }.ok_or(Failure::Argument("description: null"))?))
+    guarded_with_room(|| change(unsafe { description.as_mut() }.ok_or(Failure::Argument("description: null"))?))
 }
 
-fn set_axis(description: &mut RwDescription, axis: u32, mut given: AxisDescription, period: f64) -> Result<(), Failure> {
-    const NAMES: [&str; 3] = ["x", "y", "z"];
-    given.period = (period != 0.0).then_some(period);
-    given.name = NAMES.get(axis as usize).copied().unwrap_or_default().into();
+const NAMES: [&str; 3] = ["x", "y", "z"];
+
+/// What an axis is but for its coordinates.
+fn axis_of(axis: u32, coordinates: Vec<f64>, period: Option<f64>) -> AxisDescription {
+    AxisDescription { name: NAMES.get(axis as usize).copied().unwrap_or_default().into(), unit: String::new(), coordinates, period }
+}
+
+fn set_axis(
+    description: &mut RwDescription,
+    axis: u32,
+    coordinates: impl ExactSizeIterator<Item = f64>,
+    period: f64,
+) -> Result<(), Failure> {
+    let given = axis_of(axis, copied(coordinates)?, (period != 0.0).then_some(period));
     let place = description.axes.get_mut(axis as usize).ok_or(Failure::Argument("axis: accepted: below the number of dimensions"))?;
     *place = Some(given);
     Ok(())
@@ -234,7 +274,7 @@ pub unsafe extern "C" fn rw_describe_uniform(
     period: f64,
 ) -> Status {
     // SAFETY: the caller's promise.
-    unsafe { describe(description, |d| set_axis(d, axis, AxisDescription::uniform("", "", first, last, nodes), period)) }
+    unsafe { describe(description, |d| set_axis(d, axis, even(first, last, nodes), period)) }
 }
 
 /// An axis with its own `nodes` coordinates, strictly ascending.
@@ -251,8 +291,8 @@ pub unsafe extern "C" fn rw_describe_rectilinear(
             return Err(Failure::Argument("coordinates: accepted: at most 1048576 numbers"));
         }
         // SAFETY: the caller's promise, for a number of nodes that was checked.
-        let coordinates = unsafe { std::slice::from_raw_parts(coordinates, nodes as usize) }.to_vec();
-        set_axis(d, axis, AxisDescription { name: String::new(), unit: String::new(), coordinates, period: None }, period)
+        let coordinates = unsafe { std::slice::from_raw_parts(coordinates, nodes as usize) };
+        set_axis(d, axis, coordinates.iter().copied(), period)
     };
     // SAFETY: the caller's promise.
     unsafe { describe(description, change) }
@@ -321,7 +361,10 @@ pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, 
         }
         // SAFETY: the caller's promise.
         let unit = unsafe { CStr::from_ptr(unit) };
-        d.time_unit = unit.to_str().map_err(|_| Failure::Argument("unit: not UTF-8"))?.to_owned();
+        let unit = unit.to_str().map_err(|_| Failure::Argument("unit: not UTF-8"))?;
+        let mut copy = room(unit.len())?;
+        copy.extend_from_slice(unit.as_bytes());
+        d.time_unit = String::from_utf8(copy).map_err(|_| Failure::Argument("unit: not UTF-8"))?;
         Ok(())
     };
     // SAFETY: the caller's promise.
@@ -355,7 +398,7 @@ pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milli
 /// `*field` is null unless `RW_OK` is returned.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
-    guarded(|| {
+    guarded_with_room(|| {
         // SAFETY: the caller's promise.
         let field = unsafe { field.as_mut() }.ok_or(Failure::Argument("field: null"))?;
         *field = std::ptr::null_mut();
@@ -368,8 +411,11 @@ pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDesc
         };
         // SAFETY: the caller's promise.
         let given = unsafe { description.as_ref() }.ok_or(Failure::Argument("description: null"))?;
-        let axes: Option<Vec<_>> = given.axes.iter().cloned().collect();
-        let axes = axes.ok_or(Failure::Argument("description: an axis is missing"))?;
+        let copy = |(axis, given): (usize, &Option<AxisDescription>)| {
+            let given = given.as_ref().ok_or(Failure::Argument("description: an axis is missing"))?;
+            Ok(axis_of(axis as u32, copied(given.coordinates.iter().copied())?, given.period))
+        };
+        let axes = given.axes.iter().enumerate().map(copy).collect::<Result<Vec<_>, Failure>>()?;
         let mut description = Description::whole(given.geometry, axes, &given.time_unit);
         description.start = given.start;
         if let Some(block) = given.block {
@@ -478,10 +524,11 @@ pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u6
     })
 }
 
-/// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle.
+/// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle. Where memory is out
+/// (`RW_SYSTEM`) the ring stays open and may be closed later.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_close(field: *mut RwField) -> Status {
-    guarded(|| {
+    guarded_with_room(|| {
         if field.is_null() {
             return Err(Failure::Off);
         }

@@ -296,6 +296,87 @@ int main(int argc, char **argv) {
 }
 "#;
 
+/// Whatever memory is left, each call ends in a status. In children, so that a limit holds for one of them and a signal is seen.
+#[test]
+fn where_memory_is_out_calls_fail_and_nothing_is_aborted() {
+    let build = tempfile("memory");
+    let source = build.0.join("memory.c");
+    std::fs::write(&source, OUT_OF_MEMORY).unwrap();
+    let program = build.0.join("memory");
+    compile(&source, &program, Link::Shared, &[]);
+    let ring = Folder::new("memory");
+    let out = Command::new(&program).arg(&ring.0).env("LD_LIBRARY_PATH", library_folder()).env_remove("RIDGEWATCH_RING").output().unwrap();
+    let (said, told) = (String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
+    assert!(out.status.success(), "{said}{told}");
+    println!("{said}");
+    assert!(!ring.0.exists(), "nothing stays behind");
+}
+
+const OUT_OF_MEMORY: &str = r#"
+#define _DEFAULT_SOURCE
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/resource.h>
+#include <sys/wait.h>
+#include <unistd.h>
+#include <ridgewatch.h>
+enum { NODES = 1 << 18, PIECES = 1 << 14, DESCRIBED = 10, AXIS = 11, OPENED = 12, CLOSED = 13, ODD = 20 };
+static double coordinates[NODES];
+static void *pieces[PIECES];
+
+/* A description of 4 MiB, a block of 8 nodes. */
+static int attempt(const char *ring) {
+    rw_description *d = rw_describe(3);
+    if (!d) return strstr(rw_error(), "no memory") ? DESCRIBED : ODD;
+    const uint64_t offset[3] = {0, 0, 0}, extent[3] = {2, 2, 2};
+    if (rw_describe_uniform(d, 0, 0, 1, NODES, 0) || rw_describe_rectilinear(d, 1, coordinates, NODES, 0) || rw_describe_uniform(d, 2, 0, 1, 2, 0)
+        || rw_describe_block(d, 0, 2, offset, extent)) return strstr(rw_error(), "no memory") ? AXIS : ODD;
+    rw_field *field;
+    const int status = rw_open(ring, d, &field);
+    if (status) return status == RW_SYSTEM && !field && *rw_error() ? OPENED : ODD + status;
+    const float plane[8] = {0};
+    if (rw_publish_f32(field, 0, 0, plane, plane, plane)) return ODD;
+    const int closed = rw_close(field);
+    return closed == RW_OK ? 0 : closed == RW_SYSTEM ? CLOSED : ODD;
+}
+
+int main(int argc, char **argv) {
+    if (argc != 2) return 1;
+    for (long i = 0; i < NODES; i++) coordinates[i] = i;
+    int ends[64] = {0};
+    for (int filled = 0; filled < 2; filled++)
+        for (long room = 0; room < 24L << 20; room += filled ? (room < 1 << 20 ? 8 << 10 : 1 << 20) : 128 << 10) {
+            const pid_t child = fork();
+            if (!child) {
+                long pages = 0;
+                FILE *about = fopen("/proc/self/statm", "r");
+                if (!about || fscanf(about, "%ld", &pages) != 1) _exit(ODD);
+                fclose(about);
+                const rlim_t most = pages * 4096 + (filled ? 32 << 20 : room);
+                const struct rlimit limit = {most, most};
+                if (setrlimit(RLIMIT_AS, &limit)) _exit(ODD);
+                if (filled) {
+                    /* All of it is taken, in pieces and crumbs, then so much given back. */
+                    for (int i = 0; i < PIECES; i++) pieces[i] = malloc(8000);
+                    for (int crumb = 4096; crumb >= 16; crumb /= 2) while (malloc(crumb)) {}
+                    for (long i = 0; i < room / 8000; i++) free(pieces[i]);
+                }
+                _exit(attempt(argv[1]));
+            }
+            int status;
+            if (child < 0 || waitpid(child, &status, 0) != child) return 2;
+            if (!WIFEXITED(status) || WEXITSTATUS(status) >= ODD) {
+                fprintf(stderr, "with %ld bytes (filled: %d): status %x\n", room, filled, status);
+                return 3;
+            }
+            ends[WEXITSTATUS(status)]++;
+        }
+    printf("no description %d, no axis %d, not opened %d, not closed %d, published %d\n", ends[DESCRIBED], ends[AXIS], ends[OPENED], ends[CLOSED], ends[0]);
+    return ends[DESCRIBED] && ends[AXIS] && ends[OPENED] && ends[0] ? 0 : 4;
+}
+"#;
+
 fn tempfile(name: &str) -> Folder {
     let folder = Folder(std::env::temp_dir().join(format!("rw-c-{name}-{}", std::process::id())));
     std::fs::create_dir_all(&folder.0).unwrap();

@@ -30,6 +30,7 @@ fn fortran_arrays_arrive_as_they_are() {
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
     let following = Following::begin(&ring).unwrap();
     let following_globe = Following::begin(&ring.join("globe")).unwrap();
+    let following_blocks = Following::begin(&ring.join("blocks")).unwrap();
     let out = Command::new(&program).env("LD_LIBRARY_PATH", &library).env("RIDGEWATCH_RING", &ring).output().unwrap();
     assert!(out.status.success(), "{}{}", String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
     let mut reader = RingReader::open(&ring, 0, &Limits::default()).unwrap();
@@ -55,7 +56,21 @@ fn fortran_arrays_arrive_as_they_are() {
     assert_eq!((description.axes[0].period, description.axes[1].coordinates.as_slice()), (Some(360.0), &[-60.0, 0.0, 60.0][..]));
     let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step on the globe") };
     assert_eq!((info.step, info.time, values.as_slice()), (7, 2.0, (1..=24).map(|n| n as f32).collect::<Vec<_>>().as_slice()));
-    drop((following_globe, following));
+    let blocks = ring.join("blocks");
+    for block in 0..2u32 {
+        let mut reader = RingReader::open(&blocks, block, &Limits::default()).unwrap();
+        let description = &reader.header().description;
+        assert_eq!((description.time_unit.as_str(), description.block.count), ("h", 2));
+        assert_eq!((description.block.offset, description.block.extent), ([2 * u64::from(block), 0, 0], [2, 3, 1]));
+        // Of the first block two steps were overwritten.
+        let (step, sign) = if block == 0 { (3, 1.0) } else { (1, -1.0) };
+        let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step of block {block}") };
+        assert_eq!((info.step, info.time), (step, step as f64));
+        let east: Vec<f32> = (0..6).map(|n| (1 + n % 2 + 2 * block as usize + 4 * (n / 2)) as f32).collect();
+        let expected: Vec<f32> = east.iter().copied().chain(east.iter().map(|u| sign * u)).collect();
+        assert_eq!(values, expected);
+    }
+    drop((following_blocks, following_globe, following));
     std::fs::remove_dir_all(&build).unwrap();
     assert!(!ring.exists());
 }

@@ -38,7 +38,7 @@ pub struct AxisDescription {
 impl AxisDescription {
     /// `nodes` nodes from `first` to `last`, evenly spaced.
     pub fn uniform(name: &str, unit: &str, first: f64, last: f64, nodes: u64) -> Self {
-        Self { name: name.into(), unit: unit.into(), coordinates: even(first, last, nodes), period: None }
+        Self { name: name.into(), unit: unit.into(), coordinates: even(first, last, nodes).collect(), period: None }
     }
 
     fn check(&self) -> Result<(), WireError> {
@@ -91,10 +91,11 @@ impl AxisDescription {
     }
 }
 
-fn even(first: f64, last: f64, nodes: u64) -> Vec<f64> {
+/// Coordinates of `nodes` nodes from `first` to `last`, evenly spaced; for those who must ask for their memory.
+pub fn even(first: f64, last: f64, nodes: u64) -> impl ExactSizeIterator<Item = f64> {
     let step = (last - first) / nodes.saturating_sub(1).max(1) as f64;
     // No more than an axis may have, whatever is asked for: the check refuses it by its length.
-    (0..nodes.min(AXIS_NODES + 1)).map(|i| if i + 1 == nodes { last } else { first + step * i as f64 }).collect()
+    (0..nodes.min(AXIS_NODES + 1) as usize).map(move |i| if i as u64 + 1 == nodes { last } else { first + step * i as f64 })
 }
 
 /// Which part of the global grid a producer has.
@@ -230,8 +231,18 @@ impl Description {
         Ok(())
     }
 
-    pub(crate) fn encode(&self) -> Vec<u8> {
+    /// The bytes of its parts.
+    fn encoded_bytes(&self) -> usize {
+        let axis = |a: &AxisDescription| 24 + a.name.len() + a.unit.len() + 8 * a.coordinates.len();
+        84 + self.time_unit.len() + self.axes.iter().map(axis).sum::<usize>()
+    }
+
+    /// # Errors
+    /// No memory.
+    pub(crate) fn encode(&self) -> Result<Vec<u8>, WireError> {
         let mut out = Writer::default();
+        let bytes = self.encoded_bytes();
+        out.0.try_reserve_exact(bytes).map_err(|_| WireError::no_memory(bytes))?;
         let (kind, radius) = match self.geometry {
             Geometry::Cartesian => (0, 0.0),
             Geometry::Sphere { radius } => (1, radius),
@@ -246,7 +257,8 @@ impl Description {
         out.three(self.block.extent);
         out.text(&self.time_unit);
         self.axes.iter().for_each(|axis| axis.encode(&mut out));
-        out.0
+        debug_assert_eq!(out.0.len(), bytes);
+        Ok(out.0)
     }
 
     pub(crate) fn decode(bytes: &[u8], limits: &Limits) -> Result<Self, WireError> {

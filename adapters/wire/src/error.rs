@@ -95,6 +95,12 @@ pub enum WireError {
         /// The limit.
         limit: u64,
     },
+    /// No memory.
+    #[error("no memory for {bytes} bytes")]
+    NoMemory {
+        /// Bytes asked for.
+        bytes: usize,
+    },
     /// The process is a fork of the one that opened the ring.
     #[error("the ring was opened by process {opened}, this is its fork {here}: open one under another name here")]
     Forked {
@@ -132,6 +138,10 @@ pub enum WireError {
 impl WireError {
     pub(crate) fn io(path: &std::path::Path, what: &'static str, source: std::io::Error) -> Self {
         Self::Io { path: path.to_owned(), what, source }
+    }
+
+    pub(crate) fn no_memory(bytes: usize) -> Self {
+        Self::NoMemory { bytes }
     }
 
     pub(crate) fn field(field: &'static str, found: impl std::fmt::Display, accepted: impl Into<String>) -> Self {

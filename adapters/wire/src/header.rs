@@ -69,8 +69,11 @@ impl Header {
     }
 
     /// The fixed part and the description, with the bytes of the whole file and the offset of the first slot.
-    pub(crate) fn encode(&self) -> (Vec<u8>, Vec<u8>, u64, u64) {
-        let description = self.description.encode();
+    ///
+    /// # Errors
+    /// No memory.
+    pub(crate) fn encode(&self) -> Result<(Vec<u8>, Vec<u8>, u64, u64), WireError> {
+        let description = self.description.encode()?;
         let (total, first) = self.extent(description.len());
         let mut out = Writer(MAGIC.to_vec());
         out.u32(VERSION);
@@ -85,7 +88,7 @@ impl Header {
         out.u64(self.pid);
         let sum = checksum(&[&out.0, &description]);
         out.u64(sum);
-        (out.0, description, total, first)
+        Ok((out.0, description, total, first))
     }
 
     /// Length of the description that a fixed part announces.

@@ -27,7 +27,7 @@ mod system;
 
 pub use assemble::{Assembler, Incomplete, Step};
 pub use copy::{Element, Field};
-pub use description::{AxisDescription, BlockExtent, Description, Geometry, Limits};
+pub use description::{AxisDescription, BlockExtent, Description, Geometry, Limits, even};
 pub use error::WireError;
 pub use follow::{Event, RingFollower};
 pub use header::{Header, MAGIC, VERSION};

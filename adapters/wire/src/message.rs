@@ -17,6 +17,7 @@ use hmac::{Hmac, Mac};
 use sha2::Sha256;
 use std::io::{Read, Write};
 use std::path::Path;
+use std::str::FromStr;
 
 #[cfg(target_endian = "big")]
 compile_error!("rings and messages are little-endian and are not converted");
@@ -27,7 +28,7 @@ const GREETING: [u8; 12] = *b"RIDGEWIRE\0\0\0";
 const MAGIC: [u8; 4] = *b"RWMS";
 /// First bytes of what a follower asks.
 const ASK_MAGIC: [u8; 4] = *b"RWAS";
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 /// Bytes of what a follower asks, with its signature.
 pub const ASK_BYTES: usize = 20 + SIGNATURE;
 /// Bytes of a message's head, and of its signature.
@@ -107,10 +108,14 @@ impl ConnectionFile {
         let file = open_private(path, false)?;
         let mut text = String::new();
         file.take(FILE_BYTES).read_to_string(&mut text).map_err(|e| WireError::io(path, "cannot be read", e))?;
-        Self::parse(&text)
+        text.parse()
     }
+}
 
-    fn parse(text: &str) -> Result<Self, WireError> {
+impl FromStr for ConnectionFile {
+    type Err = WireError;
+
+    fn from_str(text: &str) -> Result<Self, WireError> {
         let value = |key: &'static str| {
             let line = text.lines().find_map(|line| line.strip_prefix(key)?.trim_start().strip_prefix('='));
             line.map(str::trim).ok_or_else(|| WireError::field(key, "missing", "a connection file as `ridgewatch relay` writes it"))
@@ -145,6 +150,8 @@ pub enum Kind {
     Pulse,
     /// A producer has opened a block, or had before the session began; its description comes with it.
     Opened,
+    /// The process of a block's producer has ended without closing it.
+    Lost,
 }
 
 /// What a follower says.
@@ -268,9 +275,9 @@ impl Session {
     /// Sends a message; `description` when a block was opened, `values` with a step.
     ///
     /// # Errors
-    /// The connection broke, or the peer takes nothing any more.
+    /// The connection broke, the peer takes nothing any more, or no memory.
     pub fn send(&mut self, to: &mut impl Write, facts: &Facts, description: Option<&Description>, values: &[f32]) -> Result<(), WireError> {
-        let description = description.map(Description::encode).unwrap_or_default();
+        let description = description.map(Description::encode).transpose()?.unwrap_or_default();
         // SAFETY: floats without padding are bytes.
         let values = unsafe { std::slice::from_raw_parts(values.as_ptr().cast::<u8>(), size_of_val(values)) };
         self.number += 1;
@@ -282,6 +289,7 @@ impl Session {
             Kind::Ended => 2,
             Kind::Pulse => 3,
             Kind::Opened => 4,
+            Kind::Lost => 5,
         });
         head.u32(facts.block);
         head.u64(facts.generation);
@@ -363,7 +371,8 @@ impl Session {
             2 => Kind::Ended,
             3 => Kind::Pulse,
             4 => Kind::Opened,
-            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended), 3 (pulse) or 4 (opened)")),
+            5 => Kind::Lost,
+            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended), 3 (pulse), 4 (opened) or 5 (lost)")),
         };
         let (block, generation, step, time) = (input.u32()?, input.u64()?, input.u64()?, input.f64()?);
         let (published, missed) = (input.u64()?, input.u64()?);
@@ -455,7 +464,7 @@ mod tests {
         ] {
             let error = found.unwrap();
             assert!(matches!(error, WireError::Version { what: w, found: 1, known: VERSION } if w == what), "{what}: {error}");
-            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 2 and knows no other"));
+            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 3 and knows no other"));
         }
     }
 

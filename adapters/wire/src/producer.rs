@@ -69,7 +69,7 @@ impl Producer {
     /// killed run left is replaced. All memory is taken here.
     ///
     /// # Errors
-    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name; no room.
+    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name; no room; no memory.
     pub fn open(ring: &Path, description: Description, slots: u32, policy: Policy) -> Result<Self, WireError> {
         description.check(&Limits { step_bytes: u64::MAX })?;
         if !(2..=SLOTS).contains(&slots) {
@@ -88,11 +88,11 @@ impl Producer {
             generation: system::since_1970(),
             pid: u64::from(std::process::id()),
         };
-        let (fixed, description, total, first_slot) = header.encode();
         // Under another name until it is whole; a name that a killed run may have left is this producer's to remove, since it has the lock.
         let part = ring.join(format!(".block-{block:05}.part"));
         let _ = std::fs::remove_file(&part);
-        let made = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e)).and_then(|file| {
+        let made = header.encode().and_then(|(fixed, description, total, first_slot)| {
+            let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
             let map = Map::create(&file, &path, total)?;
             let producer = Self {
                 ring: ring.to_owned(),
@@ -118,6 +118,8 @@ impl Producer {
             Err(error) => {
                 let _ = std::fs::remove_file(&part);
                 lock.remove();
+                // Only where it is empty.
+                let _ = std::fs::remove_dir(ring);
                 Err(error)
             }
         }

@@ -31,6 +31,9 @@ const FOLLOWERS: usize = 16;
 /// Connections at once that have not proved the key yet.
 const STRANGERS: usize = 16;
 
+/// Steps of a block that a [`RelayFollower`] holds, at most: one that is received, one that waits, and two on their way back.
+pub const BUFFERS: u64 = 4;
+
 /// What a relay has done.
 #[derive(Debug, Default)]
 pub struct RelayCounts {
@@ -230,8 +233,10 @@ impl Relay {
                     self.counts.bytes.fetch_add(size_of_val(values.as_slice()) as u64, Ordering::Relaxed);
                     (Facts { kind: Kind::Step, block, generation, step, time, published, missed }, None)
                 }
-                // What went without closing ends for the follower too.
-                Some(Event::Ended { block, generation, .. }) => (Facts { kind: Kind::Ended, block, generation, ..quiet }, None),
+                Some(Event::Ended { block, generation, closed }) => {
+                    let kind = if closed { Kind::Ended } else { Kind::Lost };
+                    (Facts { kind, block, generation, ..quiet }, None)
+                }
                 Some(Event::Refused(error)) => {
                     (self.tell)(format!("refused: {error}"));
                     continue;
@@ -426,9 +431,9 @@ impl Receiving {
                     return Ok(Err(error));
                 }
                 (Kind::Step, _) => Event::Step { block, generation, step, time, published, missed },
-                (Kind::Ended, _) => {
+                (kind @ (Kind::Ended | Kind::Lost), _) => {
                     self.blocks.remove(&block);
-                    Event::Ended { block, generation, closed: true }
+                    Event::Ended { block, generation, closed: kind == Kind::Ended }
                 }
                 (Kind::Pulse, _) => continue,
             };
@@ -466,11 +471,22 @@ impl Receiving {
 fn connect(place: &ConnectionFile) -> Result<(TcpStream, Session), WireError> {
     let address = place.address.as_str();
     let broken = |e| WireError::io(Path::new(address), "cannot be reached", e);
-    let found = address.to_socket_addrs().map_err(broken)?.next();
-    let found = found.ok_or_else(|| WireError::field("address", address, "HOST:PORT of a relay"))?;
-    let stream = TcpStream::connect_timeout(&found, PATIENCE).map_err(broken)?;
+    let found: Vec<SocketAddr> = address.to_socket_addrs().map_err(broken)?.collect();
+    let stream = reach(&found).map_err(broken)?;
     let session = greet(&stream, |within| Session::connect(within, &place.key))?;
     Ok((stream, session))
+}
+
+/// The first address of a name that answers. [`PATIENCE`] is for all of them, in equal parts.
+fn reach(addresses: &[SocketAddr]) -> std::io::Result<TcpStream> {
+    let mut failed = ErrorKind::AddrNotAvailable.into();
+    for address in addresses {
+        match TcpStream::connect_timeout(address, PATIENCE / addresses.len() as u32) {
+            Ok(stream) => return Ok(stream),
+            Err(error) => failed = error,
+        }
+    }
+    Err(failed)
 }
 
 #[cfg(test)]
@@ -487,6 +503,17 @@ mod tests {
             libc::setsockopt(stream.as_raw_fd(), libc::SOL_SOCKET, libc::SO_LINGER, value, length)
         };
         assert_eq!(done, 0);
+    }
+
+    #[test]
+    fn all_addresses_of_a_name_are_tried() {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let open = listener.local_addr().unwrap();
+        // Nobody listens there any more.
+        let closed = TcpListener::bind("127.0.0.2:0").unwrap().local_addr().unwrap();
+        assert_eq!(reach(&[closed, open]).unwrap().peer_addr().unwrap(), open);
+        assert_eq!(reach(&[closed, closed]).unwrap_err().kind(), ErrorKind::ConnectionRefused);
+        assert_eq!(reach(&[]).unwrap_err().kind(), ErrorKind::AddrNotAvailable);
     }
 
     #[test]

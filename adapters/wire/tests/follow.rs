@@ -86,6 +86,29 @@ fn a_solver_that_ends_and_one_that_starts_anew_are_followed() {
     assert!(!folder.0.exists());
 }
 
+/// A child that publishes one step and waits to be killed.
+fn doomed(folder: &Folder, step: u64) -> libc::pid_t {
+    // SAFETY: the child makes a producer and waits to be killed; no other thread of it is needed.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+        publish(&producer, step);
+        loop {
+            std::thread::sleep(Duration::from_secs(1));
+        }
+    }
+    child
+}
+
+fn kill(child: libc::pid_t) {
+    let mut status = 0;
+    // SAFETY: that child.
+    unsafe {
+        libc::kill(child, libc::SIGKILL);
+        libc::waitpid(child, &mut status, 0);
+    }
+}
+
 #[test]
 fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
     let folder = Folder::new("killed");
@@ -125,23 +148,10 @@ fn a_solver_that_is_killed_and_replaced_at_once_is_followed() {
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     for round in 0..5 {
-        // SAFETY: the child makes a producer and waits to be killed; no other thread of it is needed.
-        let child = unsafe { libc::fork() };
-        if child == 0 {
-            let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
-            publish(&producer, 10 * round);
-            loop {
-                std::thread::sleep(Duration::from_secs(1));
-            }
-        }
+        let child = doomed(&folder, 10 * round);
         let seen = events(&mut poll, &format!("step {}", 10 * round));
         assert_eq!(seen.last().unwrap(), &format!("step {} missed 0", 10 * round), "{seen:?}");
-        let mut status = 0;
-        // SAFETY: that child.
-        unsafe {
-            libc::kill(child, libc::SIGKILL);
-            libc::waitpid(child, &mut status, 0);
-        }
+        kill(child);
         // Before the follower has had time to look.
         let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
         publish(&producer, 10 * round + 1);
@@ -321,6 +331,23 @@ fn a_pulse_is_no_answer_and_what_was_asked_is_not_asked_again() {
     // The first, then one after each answer; after a pulse that the follower lives.
     let expected = std::iter::once(Ask::Next).chain(SENT.map(|kind| if kind == Kind::Pulse { Ask::Hold } else { Ask::Next }));
     assert_eq!(relay.join().unwrap(), expected.collect::<Vec<_>>());
+}
+
+#[test]
+fn a_relay_tells_a_killed_solver_from_one_that_ended() {
+    let folder = Folder::new("lost");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let mut follower = relay.follow(LONG);
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    let child = doomed(&folder, 7);
+    assert_eq!(events(&mut poll, "step 7"), ["opened 4", "step 7 missed 0"]);
+    kill(child);
+    assert_eq!(events(&mut poll, "ended"), ["ended false"]);
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 8);
+    assert_eq!(events(&mut poll, "step 8"), ["opened 4", "step 8 missed 0"]);
+    drop(producer);
+    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
 }
 
 #[test]

@@ -75,7 +75,7 @@ fn wrong_keys_are_refused_by_either_side() {
     let address = listener.local_addr().unwrap();
     let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &Key::random().unwrap()));
     let (mut stream, _) = listener.accept().unwrap();
-    stream.write_all(b"RIDGEWIRE\0\0\0\x02\0\0\0").unwrap();
+    stream.write_all(b"RIDGEWIRE\0\0\0\x03\0\0\0").unwrap();
     stream.write_all(&[7; 32]).unwrap();
     let mut greeting = [0; 80];
     stream.read_exact(&mut greeting).unwrap();

@@ -7,7 +7,7 @@
 mod counting;
 
 use counting::{HELD, PEAK};
-use ridgewatch_wire::message::{Facts, Key, Kind, Session};
+use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::{
     AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, Read, ReadAt, RingReader, block_path,
 };
@@ -229,11 +229,72 @@ fn sessions(key: &Key) -> (Session, Session) {
     (Session::accept(&mut listener.accept().unwrap().0, key).unwrap(), client.join().unwrap())
 }
 
+/// What a follower asks, changed on the way: only what is as it was sent is taken, and it only once.
+#[test]
+fn mutated_asks() {
+    let (mut relay, mut follower) = sessions(&Key::random().unwrap());
+    let mut random = Random(4);
+    let (mut refused, mut taken) = (0u64, 0u64);
+    for case in 0..cases() {
+        let mut sent = Vec::with_capacity(ASK_BYTES);
+        follower.ask(&mut sent, if case % 2 == 0 { Ask::Next } else { Ask::Hold }).unwrap();
+        let mut bytes = sent.clone();
+        if case % 8 != 0 {
+            mutate(&mut bytes, &[0..20, 0..ASK_BYTES], &mut random);
+            bytes.resize(ASK_BYTES, 0);
+        }
+        let bytes: [u8; ASK_BYTES] = bytes.try_into().unwrap();
+        let held = HELD.get();
+        PEAK.set(held);
+        let found = relay.check_ask(&bytes);
+        assert!(PEAK.get() - held <= 1 << 12, "case {case} took {} bytes", PEAK.get() - held);
+        assert_eq!(found.is_ok(), bytes == *sent, "case {case}: {found:?}");
+        if found.is_ok() {
+            assert!(relay.check_ask(&bytes).is_err(), "case {case} was taken twice");
+            taken += 1;
+        } else {
+            refused += 1;
+        }
+    }
+    println!("{} mutated asks: {refused} refused, {taken} taken", cases());
+    assert!(taken >= cases() / 8 && refused > cases() * 3 / 4, "{refused} {taken}");
+}
+
+#[test]
+fn mutated_connection_files() {
+    let good = format!("ridgewatch-connection = 1\naddress = node17:40123\nkey = {}\n", "0123456789abcdef".repeat(4));
+    assert!(good.parse::<ConnectionFile>().is_ok());
+    let mut random = Random(5);
+    let (mut refused, mut taken) = (0u64, 0u64);
+    for case in 0..cases() {
+        let mut bytes = good.clone().into_bytes();
+        let length = bytes.len();
+        mutate(&mut bytes, &[0..length, 24..length], &mut random);
+        // What is no UTF-8 is refused by the reading of the file.
+        let text = String::from_utf8_lossy(&bytes).into_owned();
+        let held = HELD.get();
+        PEAK.set(held);
+        match text.parse::<ConnectionFile>() {
+            Ok(file) => {
+                taken += 1;
+                assert!(file.address.len() < length);
+            }
+            Err(error) => {
+                refused += 1;
+                assert!(!error.to_string().is_empty());
+            }
+        }
+        assert!(PEAK.get() - held <= 1 << 12, "case {case} took {} bytes", PEAK.get() - held);
+    }
+    println!("{} mutated connection files: {refused} refused, {taken} taken", cases());
+    assert!(refused > cases() / 2 && taken > cases() / 100, "{refused} {taken}");
+}
+
 #[test]
 fn mutated_greetings() {
     let key = Key::random().unwrap();
     // What a follower would send; it cannot fit the relay's fresh numbers, so nothing of it is ever accepted.
-    let mut good = b"RIDGEWIRE\0\0\0\x02\0\0\0".to_vec();
+    let mut good = b"RIDGEWIRE\0\0\0\x03\0\0\0".to_vec();
     good.extend([9; 64]);
     let mut random = Random(3);
     for _ in 0..cases().min(100_000) {

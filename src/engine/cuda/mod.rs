@@ -40,6 +40,7 @@ pub use super::device::Storage;
 pub use accelerator::CudaAccelerator;
 pub use answers::{DeviceAnswers, DeviceLearns, DevicePredict, Divided, Division, Panel, Traced};
 pub use audit::Audits;
+pub use compile::nvrtc_version;
 pub use device::{FoundDevice, Gpu, GpuSettings, probe};
 pub use error::DeviceError;
 pub use labels::keeps_label;

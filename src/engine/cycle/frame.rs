@@ -100,7 +100,7 @@ impl Cycle<'_> {
             }
         }
         record.training = learned;
-        record.ring = self.ring.len() as u64;
+        record.sample_ring = self.ring.len() as u64;
         record.seconds = StageSeconds {
             slide: place.preparing,
             waiting: std::mem::take(&mut slide.waited),

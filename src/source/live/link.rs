@@ -3,7 +3,7 @@
 use super::LiveSettings;
 use crate::source::SourceError;
 use ridgewatch_wire::message::ConnectionFile;
-use ridgewatch_wire::relay::RelayFollower;
+use ridgewatch_wire::relay::{BUFFERS, RelayFollower};
 use ridgewatch_wire::{Event, Limits, RING_VARIABLE, RingFollower};
 use std::path::PathBuf;
 use std::time::Duration;
@@ -51,6 +51,14 @@ impl Link {
                 relays.rotate_left(1);
                 relays.iter_mut().enumerate().find_map(|(k, relay)| relay.poll(values, if k == 0 { IDLE } else { Duration::ZERO }))
             }
+        }
+    }
+
+    /// Steps of the global field that are held on the way, at most: a relay's follower has [`BUFFERS`] blocks, and no two relays the same.
+    pub fn steps_held(&self) -> u64 {
+        match self {
+            Link::Ring(_) => 0,
+            Link::Relays(_) => BUFFERS,
         }
     }
 

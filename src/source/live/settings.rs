@@ -34,7 +34,7 @@ pub struct LiveSettings {
     pub ring: Option<PathBuf>,
     /// Connection files of relays on other nodes, instead of a ring.
     pub connections: Vec<PathBuf>,
-    /// GiB of memory for the window and the one that the current frame uses (half each).
+    /// GiB of memory for the window, the one that the current frame uses, and what is on its way to them: steps that wait for their blocks, and buffers.
     pub memory_gib: f64,
     /// Newest steps or every step.
     pub follow: Follow,

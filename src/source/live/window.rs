@@ -14,6 +14,8 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 /// Steps that may wait for their blocks at once.
 const PENDING: usize = 4;
+/// Snapshots beside the windows: the one that is being made, and one that was left out, against which interpolation is measured.
+const BESIDE: u64 = 2;
 /// Warnings that are kept for the next frame; the rest is counted.
 const WARNINGS: usize = 16;
 /// Late steps in a row after which the simulation is taken to have been set back.
@@ -35,7 +37,7 @@ pub struct LiveRecord {
     /// Whole steps that came, in all.
     pub steps: u64,
     /// Blocks of steps that were overwritten before they were read, in all.
-    pub missed: u64,
+    pub missed_blocks: u64,
     /// Steps left out for want of memory, in all.
     pub thinned: u64,
     /// Least distance in time of the steps that are kept.
@@ -137,16 +139,21 @@ pub struct LiveWindow {
 
 impl LiveWindow {
     pub(super) fn start(live: Live, tau: f64, stride: usize) -> Result<Self, SourceError> {
-        let snapshot = 16 * live.grid.nodes() as u64;
-        // The window, the one that the frame in progress still uses, and one that is being made.
-        let room = ((memory(&live.settings) / snapshot.max(1)).saturating_sub(1) / 2) as usize;
+        let nodes = live.grid.nodes() as u64;
+        let (snapshot, step) = (16 * nodes, 4 * nodes * live.description.components() as u64);
+        // Those that wait, the one that is read, and what the way to it holds: the simulation may come back in blocks.
+        let steps = (PENDING as u64 + 1 + live.link.steps_held()) * step;
+        // The window, and the one that the frame in progress still uses.
+        let room = memory(&live.settings).saturating_sub(steps + BESIDE * snapshot) / (2 * snapshot.max(1));
         if room < 3 {
+            let least = (steps + (BESIDE + 6) * snapshot) as f64 / f64::from(1 << 30);
             return Err(SourceError::Setting {
                 key: "live.memory_gib",
                 found: live.settings.memory_gib.to_string(),
-                accepted: format!("at least {:.3}: three snapshots, twice, and one more", 7.0 * snapshot as f64 / f64::from(1 << 30)),
+                accepted: format!("at least {least:.3}: three snapshots, twice, and what is on its way to them"),
             });
         }
+        let room = room as usize;
         let state = State {
             window: Window::new(tau),
             begun_at: None,
@@ -258,7 +265,7 @@ impl Reader {
             match self.live.link.poll(&mut values) {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
                 Some(Event::Step { block, generation, step, time, published, missed }) => {
-                    self.shared.lock().live.missed += missed;
+                    self.shared.lock().live.missed_blocks += missed;
                     let whole = self.assembler.block(block, generation, step, time, published, &mut values);
                     self.tell_incomplete();
                     match whole {

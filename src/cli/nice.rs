@@ -1,0 +1,37 @@
+//! `--nice`: whoever runs beside a simulation steps back for it.
+
+use super::messages;
+
+/// How far to step back.
+#[derive(Debug, clap::Args)]
+pub struct Nice {
+    /// How far to step back for the simulation when both want the same core: 0 (not at all) to 19.
+    #[arg(long, default_value_t = 10, value_name = "N", value_parser = clap::value_parser!(i32).range(0..=19))]
+    nice: i32,
+}
+
+impl Nice {
+    /// Lowers the priority of all threads that are there; those that they start later have it too. Where the system refuses, that is said.
+    pub fn step_back(&self) {
+        if self.nice > 0
+            && let Err(error) = lower(self.nice)
+        {
+            messages::note(format_args!("priority stays as it is: {error}"));
+        }
+    }
+}
+
+fn lower(nice: i32) -> std::io::Result<()> {
+    for task in std::fs::read_dir("/proc/self/task")? {
+        let Some(thread) = task?.file_name().to_str().and_then(|name| name.parse().ok()) else { continue };
+        // SAFETY: changes a priority and touches no memory.
+        if unsafe { libc::setpriority(libc::PRIO_PROCESS, thread, nice) } != 0 {
+            let error = std::io::Error::last_os_error();
+            // One that has ended meanwhile.
+            if error.raw_os_error() != Some(libc::ESRCH) {
+                return Err(error);
+            }
+        }
+    }
+    Ok(())
+}
