@@ -10,6 +10,7 @@
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaAccelerator, Gpu, GpuSettings};
 use ridgewatch::engine::{Device, Event, FrameRecord, RunOptions, Settings, Setup, Storage, run, stratified_points, trace};
+use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
 use ridgewatch::surrogate::Kind;
@@ -65,7 +66,7 @@ fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let slide = setup.feed.next_slide().unwrap().unwrap();
     let (tracer, _) = device.tracer(slide.velocity, &setup.plan.map, slide.time).unwrap();
     let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
-    let labels = trace(&*tracer, &points, false).samples.log_stretch;
+    let labels = trace(&*tracer, &points, Extras::default()).samples.log_stretch;
     let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).collect();
     TransferSettings::default().scaled_to(&ftle)
 }

@@ -54,7 +54,7 @@ mod bench {
     use ridgewatch::flow::{
         Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
     };
-    use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale};
+    use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale, Target};
     use std::error::Error;
     use std::sync::Arc;
     use std::time::Instant;
@@ -104,6 +104,8 @@ mod bench {
             ("hash 8x2, growth 2, T = 2^19, 2x64", hash(8, 2, 2.0, 19, 64)),
             ("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)),
             ("hash 6x4, growth 1.6, T = 2^21, 2x64 (the default)", NetworkSettings::default()),
+            ("hash 8x2, growth 2, T = 2^19, 2x64, start time", NetworkSettings { inputs: vec![Input::Start], ..hash(8, 2, 2.0, 19, 64) }),
+            ("hash 8x2, growth 2, T = 2^19, 2x64, flow map", NetworkSettings { target: Target::FlowMap, ..hash(8, 2, 2.0, 19, 64) }),
             ("hash 8x2, growth 2, T = 2^19, 2x128", hash(8, 2, 2.0, 19, 128)),
             ("hash 8x2, growth 2, T = 2^19, 2x16", hash(8, 2, 2.0, 19, 16)),
             ("frequency 10, 4x64", frequency(4, 64)),
@@ -114,11 +116,12 @@ mod bench {
             let parameters = shape.parameters() as f64 * 1e-6;
             let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
             let mut points = gpu.alloc("points", 1 << 24)?;
-            let values = gpu.upload("values", &vec![0.5f32; 1 << 24])?;
+            // Room for arrivals, which are three numbers each.
+            let values = gpu.upload("values", &vec![0.5f32; 3 << 24])?;
             let mut pool = training.ring(1 << 26)?;
             for part in 0..4 {
                 training.draw_points(&cube, 3, part << 24, &mut points)?;
-                // SAFETY: both buffers hold 2^24 entries and outlive the work below.
+                // SAFETY: both buffers hold 2^24 entries or more and outlive the work below.
                 unsafe { training.append(&mut pool, &cube, points.address(), values.address(), 1 << 24, None)? };
             }
             let network = training.frozen()?;

@@ -14,19 +14,21 @@ struct Lists {
     float* points;  // three an entry
     uint32_t* places;
     float* values;
-    uint32_t* lengths;  // of the surrogate's, of the tracer's
+    const float* arrivals;  // three an entry of the tracer's; null: not asked for
+    uint32_t* lengths;      // of the surrogate's, of the tracer's
     uint32_t capacity;
     uint32_t pad;
 };
-static_assert(sizeof(Lists) == 40, "layout");
+static_assert(sizeof(Lists) == 48, "layout");
 
 struct Labels {
-    Four* at;  // domain point, log-stretch
+    Four* at;         // domain point, log-stretch
+    float* arrivals;  // three each; null: not kept
     uint32_t* length;
     uint32_t capacity;
     uint32_t shift;
 };
-static_assert(sizeof(Labels) == 24, "layout");
+static_assert(sizeof(Labels) == 32, "layout");
 
 extern "C" __global__ void __launch_bounds__(256)
 answer_split(const __grid_constant__ Choice choice, const float* __restrict__ points, uint32_t count, float* __restrict__ log_stretch,
@@ -61,5 +63,8 @@ answer_join(Lists lists, uint32_t predicted, uint32_t traced, float* __restrict_
     const float* point = lists.points + 3 * (size_t)at;
     if (!keeps_label(point, labels.shift)) return;
     const uint32_t label = reserve(labels.length);
-    if (label < labels.capacity) labels.at[label] = {point[0], point[1], point[2], value};
+    if (label >= labels.capacity) return;
+    labels.at[label] = {point[0], point[1], point[2], value};
+    if (!labels.arrivals) return;
+    for (int k = 0; k < 3; ++k) labels.arrivals[3 * (size_t)label + k] = lists.arrivals[3 * (size_t)at + k];
 }

@@ -83,6 +83,22 @@ RW_FN float load(const float* p) {
     return *p;
 #endif
 }
+RW_FN uint32_t load(const uint32_t* p) {
+#if RW_DEVICE
+    return __ldg(p);
+#else
+    uint32_t value;
+    std::memcpy(&value, p, 4);
+    return value;
+#endif
+}
+RW_FN uint16_t load(const uint16_t* p) {
+#if RW_DEVICE
+    return __ldg(p);
+#else
+    return *p;
+#endif
+}
 RW_FN Words4 load(const Words4* p) {
 #if RW_DEVICE
     uint4 v = __ldg(reinterpret_cast<const uint4*>(p));

@@ -77,33 +77,82 @@ network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t f
     }
 }
 
-// Traced points (domain coordinates) as samples: the target is what the log-stretch has beyond `base`, scaled (Objective::targets). Of every
+// Traced points (domain coordinates) and their labels as samples. Labels: log-stretch, of which the target is what it has beyond `base`, scaled;
+// or arrivals (domain coordinates, 3 floats each), of which it is how far they are from their points (Objective::targets). Of every
 // 2^held_back points one gets none, the one that the host may keep as a label; with 0 all get one.
 extern "C" __global__ void __launch_bounds__(256)
 network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ Reading reading, const float* __restrict__ points,
-                const float* __restrict__ log_stretch, uint32_t n, uint32_t held_back, Four* __restrict__ samples) {
+                const float* __restrict__ labels, uint32_t n, uint32_t held_back, Four* __restrict__ samples) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
     if (i >= n) return;
     const float point[3] = {points[3 * size_t(i)], points[3 * size_t(i) + 1], points[3 * size_t(i) + 2]};
-    float unit[3], target;
+    float unit[3];
     to_unit(domain, point, unit);
-    if (reading.published) {
-        const float y = log_stretch[i] / reading.tau;
-        target = copysignf(log1pf(fabsf(y)), y);
-    } else {
-        const float below = reading.base.values ? look_up(reading.base, unit) : 0.0f;
-        target = (log_stretch[i] - below - reading.mean) / reading.deviation;
+    Sample sample;
+    read_point(reading, points, i, sample.place);
+    RW_UNROLL for (int k = 0; k < 3; ++k) sample.place[k] = unit[k];
+#if RW_FLOW_MAP
+    const int axes[DIMS] = {RW_AXES};
+    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) {
+        const int axis = axes[k];
+        const float arrival = float((double(labels[3 * size_t(i) + axis]) - domain.min[axis]) / domain.extent[axis]);
+        sample.target[k] = (arrival - unit[axis] - reading.mean[k]) / reading.deviation[k];
     }
+#else
+    if (reading.published) {
+        const float y = labels[i] / reading.tau;
+        sample.target[0] = copysignf(log1pf(fabsf(y)), y);
+    } else {
+        const float below = reading.base.values ? look_up_base(reading, sample.place) : 0.0f;
+        sample.target[0] = (labels[i] - below - reading.mean[0]) / reading.deviation[0];
+    }
+#endif
+    float all = point[0] + point[1] + point[2];
+    RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) all += sample.target[k];
     // No place, no target.
-    if (!isfinite(point[0] + point[1] + point[2]) || (held_back && keeps_label(point, held_back))) target = not_a_number();
-    place_times(reading, unit);
-    samples[i] = {unit[0], unit[1], unit[2], target};
+    if (!is_finite(all) || (held_back && keeps_label(point, held_back))) {
+        RW_UNROLL for (int k = 0; k < OUTPUTS; ++k) sample.target[k] = not_a_number();
+    }
+    place_times(reading, sample.place);
+    store_sample(samples + i * size_t(SAMPLE_FOURS), sample);
 }
 
 // Adds the number of samples that have a target to `count`.
 extern "C" __global__ void __launch_bounds__(256)
 network_usable(const Four* __restrict__ samples, uint32_t n, uint32_t* __restrict__ count) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;
-    const uint32_t usable = __ballot_sync(0xffffffffu, i < n && isfinite(samples[i < n ? i : 0u].w));
+    const uint32_t usable = __ballot_sync(0xffffffffu, i < n && is_usable(load_sample(samples + (i < n ? i : 0u) * size_t(SAMPLE_FOURS))));
     if ((threadIdx.x & 31u) == 0u && usable) atomicAdd(count, uint32_t(__popc(usable)));
+}
+
+// The penalty on the difference of a batch's means needs all its outputs before any gradient: its points are predicted at, as `points` and
+// `further` (see Reading), and what was predicted is held against the labels, both in linear scale.
+extern "C" __global__ void __launch_bounds__(256)
+network_drawn(const __grid_constant__ Draw draw, float* __restrict__ points, float* __restrict__ further) {
+    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
+    if (i >= draw.batch) return;
+    const Sample sample = drawn_sample(draw, i);
+    RW_UNROLL for (int k = 0; k < PLACES; ++k) {
+        if (k < 3) points[3 * size_t(i) + k] = sample.place[k];
+        else further[(PLACES - 3) * size_t(i) + k - 3] = sample.place[k];
+    }
+}
+
+extern "C" __global__ void __launch_bounds__(256)
+network_means(const __grid_constant__ Draw draw, const float* __restrict__ predicted, Means* __restrict__ means) {
+    const uint32_t i = blockIdx.x * 256u + threadIdx.x;
+    double difference = 0.0;
+    bool usable = false;
+    if (i < draw.batch) {
+        const Sample sample = drawn_sample(draw, i);
+        usable = is_usable(sample);
+        const float label = copysignf(expm1f(fabsf(sample.target[0])), sample.target[0]);
+        difference = usable ? double(predicted[i]) - double(label) : 0.0;
+    }
+    const uint32_t all = __ballot_sync(0xffffffffu, usable);
+    for (int apart = 16; apart > 0; apart /= 2) difference += __shfl_xor_sync(0xffffffffu, difference, apart);
+    if ((threadIdx.x & 31u) == 0u && all) {
+        atomicAdd(&means->difference, difference);
+        atomicAdd(&means->usable, double(__popc(all)));
+    }
 }

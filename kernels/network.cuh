@@ -5,16 +5,33 @@
 // that gathers a pair of features is the one that needs them, and the one that gets their gradient back. Values are half precision, sums
 // single precision.
 //
-// Macros: RW_AXES (places of the unit point that hold an input, where times take those of axes along which the flow does not vary), RW_DIMS
-// of them; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH
-// and RW_HIDDEN, neurons of and number of hidden layers;
-// RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, the shared memory of prediction and of training.
+// Macros: RW_AXES (places that hold an input: axes have their own, times take those of axes along which the flow does not vary, and further
+// ones), RW_DIMS of them, the first RW_SPACE of which are axes; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH and RW_HIDDEN,
+// neurons of and number of hidden layers; RW_FLOW_MAP (1: an output an axis, whose derivatives along the axes are the tangent of the flow
+// map; 0: one output); RW_PENALTY, whether the loss has a penalty on means; RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, the
+// shared memory of prediction and of training.
 #pragma once
 #include "base.cuh"
+
+#if !RW_DEVICE
+struct float2 {
+    float x, y;
+};
+inline float2 make_float2(float x, float y) { return {x, y}; }
+inline void sincospif(float x, float* sine, float* cosine) {
+    *sine = float(std::sin(3.14159265358979323846 * double(x)));
+    *cosine = float(std::cos(3.14159265358979323846 * double(x)));
+}
+#endif
 
 namespace rw {
 
 constexpr int DIMS = RW_DIMS, LEVELS = RW_LEVELS, FEATURES = RW_FEATURES, OCTAVES = RW_OCTAVES, WIDTH = RW_WIDTH, HIDDEN = RW_HIDDEN;
+constexpr int SPACE = RW_SPACE, OUTPUTS = RW_FLOW_MAP ? SPACE : 1;
+// Groups of rows that a sample becomes where it is differentiated: values, and their tangents along each axis.
+constexpr int GROUPS = 1 + SPACE;
+// Places of a sample.
+constexpr int PLACES = DIMS > 3 ? DIMS : 3;
 constexpr int ENCODED = LEVELS > 0 ? LEVELS * FEATURES : 2 * DIMS * OCTAVES;
 constexpr int CORNERS = 1 << DIMS;
 // In blocks of 16, as the matrix instruction takes them; what is beyond the network is 0.
@@ -24,56 +41,182 @@ constexpr int SKEW = 8;
 constexpr int STRIDE = 16 * WIDTH_BLOCKS + SKEW;
 constexpr int HEAD_STRIDE = 8 + SKEW;
 
-// One level of the hash grid.
-struct Level {
-    float cells[3];
-    uint32_t last_cell[3];
-    uint32_t factor[3];  // multiplier of each axis' node: of the hash, or the stride of a dense level
-    uint32_t mask;       // entries - 1 of a hashed level
+// First parameter of a layer of the flat vector: inputs * outputs weights, input-major, then biases (Architecture::layers).
+RW_FN constexpr int layer_start(int layer) {
+    return layer == 0 ? 0 : (ENCODED + 1) * WIDTH + (layer - 1) * (WIDTH + 1) * WIDTH;
+}
+
+// One level of the hash grid, with room for three inputs, or four.
+constexpr int LEVEL_INPUTS = DIMS > 3 ? 4 : 3;
+struct alignas(8) Level {
+    float cells[LEVEL_INPUTS];
+    uint32_t last_cell[LEVEL_INPUTS];
+    uint32_t factor[LEVEL_INPUTS];  // multiplier of each input's node: of the hash, or the stride of a dense level
+    uint32_t mask;                  // entries - 1 of a hashed level
     uint32_t hashed;
     uint32_t entries;
-    uint32_t offset;     // first entry in padded tables, a multiple of 64
-    uint32_t start;      // first entry in burn's tables
+    uint32_t offset;  // first entry in padded tables, a multiple of 64
+    uint32_t start;   // first entry in burn's tables
 };
-static_assert(sizeof(Level) == 56, "layout");
+static_assert(sizeof(Level) == (DIMS > 3 ? 72 : 56), "layout");
 
 struct Grid {
     Level levels[LEVELS > 0 ? LEVELS : 1];
 };
 
-// The cell around a point: entries of its corners in padded tables, and multilinear weights.
+#if RW_LEVELS > 0
+
+// Lower and upper node of the cell around a point, by what they add to an entry, and their shares of it.
+struct Sides {
+    uint32_t node[DIMS][2];
+    float share[DIMS][2];
+};
+
+RW_FN Sides sides(const Level& level, const float (&point)[DIMS]) {
+    Sides at;
+    RW_UNROLL for (int axis = 0; axis < DIMS; ++axis) {
+        const float position = min_(max_(point[axis], 0.0f), 1.0f) * level.cells[axis];
+        const uint32_t whole = uint32_t(position), cell = whole < level.last_cell[axis] ? whole : level.last_cell[axis];
+        const float fraction = position - float(cell);
+        at.node[axis][0] = cell * level.factor[axis];
+        at.node[axis][1] = at.node[axis][0] + level.factor[axis];
+        at.share[axis][0] = 1.0f - fraction;
+        at.share[axis][1] = fraction;
+    }
+    return at;
+}
+
+// Entries of the corners in padded tables, and multilinear weights.
 struct Cell {
     uint32_t index[CORNERS];
     float weight[CORNERS];
 };
 
-RW_FN Cell locate(const Level& level, const float (&point)[DIMS]) {
-    uint32_t node[DIMS][2];
-    float share[DIMS][2];
-    RW_UNROLL for (int axis = 0; axis < DIMS; ++axis) {
-        const float position = min_(max_(point[axis], 0.0f), 1.0f) * level.cells[axis];
-        const uint32_t whole = uint32_t(position), cell = whole < level.last_cell[axis] ? whole : level.last_cell[axis];
-        const float fraction = position - float(cell);
-        node[axis][0] = cell * level.factor[axis];
-        node[axis][1] = node[axis][0] + level.factor[axis];
-        share[axis][0] = 1.0f - fraction;
-        share[axis][1] = fraction;
-    }
+RW_FN Cell corners(const Level& level, const Sides& at) {
     Cell cell;
     RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
-        uint32_t sum = node[0][corner & 1], hash = sum;
-        float weight = share[0][corner & 1];
+        uint32_t sum = at.node[0][corner & 1], hash = sum;
+        float weight = at.share[0][corner & 1];
         RW_UNROLL for (int axis = 1; axis < DIMS; ++axis) {
-            const uint32_t other = node[axis][corner >> axis & 1];
+            const uint32_t other = at.node[axis][corner >> axis & 1];
             sum += other;
             hash ^= other;
-            weight *= share[axis][corner >> axis & 1];
+            weight *= at.share[axis][corner >> axis & 1];
         }
         cell.index[corner] = level.offset + (level.hashed ? hash & level.mask : sum);
         cell.weight[corner] = weight;
     }
     return cell;
 }
+
+RW_FN Cell locate(const Level& level, const float (&point)[DIMS]) { return corners(level, sides(level, point)); }
+
+// Derivative of a corner's weight along an input.
+RW_FN float weight_slope(const Level& level, const Sides& at, int corner, int along) {
+    float slope = corner >> along & 1 ? level.cells[along] : -level.cells[along];
+    RW_UNROLL for (int axis = 0; axis < DIMS; ++axis) slope *= axis == along ? 1.0f : at.share[axis][corner >> axis & 1];
+    return slope;
+}
+
+#endif
+
+RW_FN float2 unpack(uint32_t both) { return make_float2(from_half(uint16_t(both)), from_half(uint16_t(both >> 16))); }
+
+// Two neighbouring features of an entry; with one feature a level there is but one.
+struct Features {
+    const uint16_t* tables;
+
+    RW_FN float2 pair(uint32_t entry, int feature) const {
+        return unpack(load(reinterpret_cast<const uint32_t*>(tables) + entry * uint32_t(FEATURES / 2) + uint32_t(feature / 2)));
+    }
+    RW_FN float single(uint32_t entry) const { return from_half(load(tables + entry)); }
+};
+
+#if RW_LEVELS == 0
+// Where the sine of a column is taken, in half turns: (1/2) 2^octave p.
+RW_FN float half_turns(const float (&point)[DIMS], int column) {
+    const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
+    float position = point[0];
+    RW_UNROLL for (int k = 1; k < DIMS; ++k) position = axis == k ? point[k] : position;
+    position = 2.0f * min_(max_(position, 0.0f), 1.0f) - 1.0f;
+    // The sine of (pi / 2) 2^octave p: exact up to the last step, since powers of two and whole turns cost nothing.
+    return 0.5f * position * float(1u << octave);
+}
+#endif
+
+// Columns `column` and `column + 1` of an encoded point.
+RW_FN float2 encode([[maybe_unused]] const Level* levels, [[maybe_unused]] const Features& features, const float (&point)[DIMS], int column) {
+    if (column >= ENCODED) return make_float2(0.0f, 0.0f);
+    float2 sum = make_float2(0.0f, 0.0f);
+#if RW_LEVELS == 0
+    sincospif(half_turns(point, column), &sum.x, &sum.y);
+#elif RW_FEATURES == 1
+    const Cell first = locate(levels[column], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) sum.x = fma_(first.weight[corner], features.single(first.index[corner]), sum.x);
+    if (column + 1 < ENCODED) {
+        const Cell second = locate(levels[column + 1], point);
+        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner)
+            sum.y = fma_(second.weight[corner], features.single(second.index[corner]), sum.y);
+    }
+#else
+    const Cell cell = locate(levels[column / FEATURES], point);
+    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
+        const float2 pair = features.pair(cell.index[corner], column % FEATURES);
+        sum.x = fma_(cell.weight[corner], pair.x, sum.x);
+        sum.y = fma_(cell.weight[corner], pair.y, sum.y);
+    }
+#endif
+    return sum;
+}
+
+#if RW_FLOW_MAP
+
+// The same columns, and their tangents: `step` times the derivatives along each axis.
+RW_FN void encode_tangents(float2 (&sums)[GROUPS], [[maybe_unused]] const Level* levels, [[maybe_unused]] const Features& features,
+                           const float (&point)[DIMS], int column, float step) {
+    RW_UNROLL for (int group = 0; group < GROUPS; ++group) sums[group] = make_float2(0.0f, 0.0f);
+    if (column >= ENCODED) return;
+#if RW_LEVELS == 0
+    sincospif(half_turns(point, column), &sums[0].x, &sums[0].y);
+    const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
+    const float rate = 3.14159265f * step * float(1u << octave);
+    RW_UNROLL for (int along = 0; along < SPACE; ++along) {
+        if (along == axis) sums[1 + along] = make_float2(rate * sums[0].y, -rate * sums[0].x);
+    }
+#else
+    auto add_level = [&](int number, auto add_corner) {
+        const Level& level = levels[number];
+        const Sides at = sides(level, point);
+        const Cell cell = corners(level, at);
+        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
+            float factors[GROUPS] = {cell.weight[corner]};
+            RW_UNROLL for (int along = 0; along < SPACE; ++along) factors[1 + along] = step * weight_slope(level, at, corner, along);
+            add_corner(cell.index[corner], factors);
+        }
+    };
+#if RW_FEATURES == 1
+    add_level(column, [&](uint32_t entry, const float (&factors)[GROUPS]) {
+        const float value = features.single(entry);
+        RW_UNROLL for (int group = 0; group < GROUPS; ++group) sums[group].x = fma_(factors[group], value, sums[group].x);
+    });
+    if (column + 1 >= ENCODED) return;
+    add_level(column + 1, [&](uint32_t entry, const float (&factors)[GROUPS]) {
+        const float value = features.single(entry);
+        RW_UNROLL for (int group = 0; group < GROUPS; ++group) sums[group].y = fma_(factors[group], value, sums[group].y);
+    });
+#else
+    add_level(column / FEATURES, [&](uint32_t entry, const float (&factors)[GROUPS]) {
+        const float2 pair = features.pair(entry, column % FEATURES);
+        RW_UNROLL for (int group = 0; group < GROUPS; ++group) {
+            sums[group].x = fma_(factors[group], pair.x, sums[group].x);
+            sums[group].y = fma_(factors[group], pair.y, sums[group].y);
+        }
+    });
+#endif
+#endif
+}
+
+#endif
 
 #if RW_DEVICE
 
@@ -82,7 +225,6 @@ RW_FN uint32_t pack(float low, float high) {
     asm("cvt.rn.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
     return both;
 }
-RW_FN float2 unpack(uint32_t both) { return make_float2(from_half(uint16_t(both)), from_half(uint16_t(both >> 16))); }
 
 // d += a b, of 16x16 with 16x8.
 RW_FN void multiply(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
@@ -129,13 +271,8 @@ struct alignas(16) Weights {
     uint16_t hidden[HIDDEN > 1 ? HIDDEN - 1 : 1][16 * WIDTH_BLOCKS][STRIDE];
     uint16_t head[16 * WIDTH_BLOCKS][HEAD_STRIDE];
     float biases[HIDDEN][16 * WIDTH_BLOCKS];
-    float head_bias;
+    float head_bias[OUTPUTS];
 };
-
-// First parameter of a layer of the flat vector: inputs * outputs weights, input-major, then biases (Architecture::layers).
-RW_FN constexpr int layer_start(int layer) {
-    return layer == 0 ? 0 : (ENCODED + 1) * WIDTH + (layer - 1) * (WIDTH + 1) * WIDTH;
-}
 
 // By the whole block; ends with a barrier.
 RW_FN void read_layers(Weights& weights, const float* __restrict__ layers) {
@@ -155,49 +292,9 @@ RW_FN void read_layers(Weights& weights, const float* __restrict__ layers) {
         matrix(&weights.hidden[layer - 1][0][0], PADDED, PADDED, STRIDE, layers + layer_start(layer), WIDTH, WIDTH);
         vector(weights.biases[layer], PADDED, layers + layer_start(layer) + WIDTH * WIDTH, WIDTH);
     }
-    matrix(&weights.head[0][0], PADDED, 8, HEAD_STRIDE, layers + layer_start(HIDDEN), WIDTH, 1);
-    vector(&weights.head_bias, 1, layers + layer_start(HIDDEN) + WIDTH, 1);
+    matrix(&weights.head[0][0], PADDED, 8, HEAD_STRIDE, layers + layer_start(HIDDEN), WIDTH, OUTPUTS);
+    vector(weights.head_bias, OUTPUTS, layers + layer_start(HIDDEN) + WIDTH * OUTPUTS, OUTPUTS);
     __syncthreads();
-}
-
-// Two neighbouring features of an entry; with one feature a level there is but one.
-struct Features {
-    const uint16_t* tables;
-
-    RW_FN float2 pair(uint32_t entry, int feature) const {
-        return unpack(__ldg(reinterpret_cast<const uint32_t*>(tables) + entry * uint32_t(FEATURES / 2) + uint32_t(feature / 2)));
-    }
-    RW_FN float single(uint32_t entry) const { return from_half(__ldg(tables + entry)); }
-};
-
-// Columns `column` and `column + 1` of an encoded point.
-RW_FN float2 encode(const Level* levels, const Features& features, const float (&point)[DIMS], int column) {
-    if (column >= ENCODED) return make_float2(0.0f, 0.0f);
-    float2 sum = make_float2(0.0f, 0.0f);
-#if RW_LEVELS == 0
-    const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
-    float position = point[0];
-    RW_UNROLL for (int k = 1; k < DIMS; ++k) position = axis == k ? point[k] : position;
-    position = 2.0f * min_(max_(position, 0.0f), 1.0f) - 1.0f;
-    // The sine of (pi / 2) 2^octave p: exact up to the last step, since powers of two and whole turns cost nothing.
-    sincospif(0.5f * position * float(1u << octave), &sum.x, &sum.y);
-#elif RW_FEATURES == 1
-    const Cell first = locate(levels[column], point);
-    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) sum.x = fma_(first.weight[corner], features.single(first.index[corner]), sum.x);
-    if (column + 1 < ENCODED) {
-        const Cell second = locate(levels[column + 1], point);
-        RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner)
-            sum.y = fma_(second.weight[corner], features.single(second.index[corner]), sum.y);
-    }
-#else
-    const Cell cell = locate(levels[column / FEATURES], point);
-    RW_UNROLL for (int corner = 0; corner < CORNERS; ++corner) {
-        const float2 pair = features.pair(cell.index[corner], column % FEATURES);
-        sum.x = fma_(cell.weight[corner], pair.x, sum.x);
-        sum.y = fma_(cell.weight[corner], pair.y, sum.y);
-    }
-#endif
-    return sum;
 }
 
 // The warp's 16 points, of which a lane holds those of its two rows.
@@ -210,6 +307,20 @@ RW_FN void encode_rows(Rows<ENCODED_BLOCKS>& rows, const Level* levels, const Fe
     }
 }
 
+#if RW_FLOW_MAP
+// The same and their tangents, a group each.
+RW_FN void encode_rows(Rows<ENCODED_BLOCKS> (&rows)[GROUPS], const Level* levels, const Features& features, const float (&points)[2][DIMS],
+                       float step) {
+    RW_UNROLL for (int block = 0; block < ENCODED_BLOCKS; ++block) {
+        RW_UNROLL for (int part = 0; part < 4; ++part) {
+            float2 pairs[GROUPS];
+            encode_tangents(pairs, levels, features, points[part & 1], 16 * block + 8 * (part >> 1) + 2 * int(lane() & 3u), step);
+            RW_UNROLL for (int group = 0; group < GROUPS; ++group) rows[group].block[block][part] = pack(pairs[group].x, pairs[group].y);
+        }
+    }
+}
+#endif
+
 RW_FN void add(float* at, float x, float y) {
 #if __CUDA_ARCH__ >= 900
     atomicAdd(reinterpret_cast<float2*>(at), make_float2(x, y));
@@ -219,6 +330,7 @@ RW_FN void add(float* at, float x, float y) {
 #endif
 }
 
+#if RW_LEVELS > 0
 // The gradient of columns `column` and `column + 1` goes to the entries that they came from.
 RW_FN void scatter(const Level* levels, const float (&point)[DIMS], int column, float x, float y, float* __restrict__ gradient) {
     if (column >= ENCODED) return;
@@ -247,12 +359,10 @@ RW_FN void scatter(const Level* levels, const float (&point)[DIMS], int column, 
 #endif
 }
 
-// rows * matrix, with the biases where sums start; `matrix` has 16 * IN rows and 16 * WIDTH_BLOCKS columns.
-template <int IN>
-RW_FN void forward(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uint16_t (*matrix)[STRIDE], const float* biases) {
-    RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
-        RW_UNROLL for (int k = 0; k < 2; ++k) sums.block[n][k] = sums.block[n][k + 2] = biases[8 * n + 2 * (lane() & 3u) + k];
-    }
+#endif
+
+// sums += rows * matrix, which has 16 * IN rows and 16 * WIDTH_BLOCKS columns.
+template <int IN> RW_FN void add_product(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uint16_t (*matrix)[STRIDE]) {
     const uint32_t row = (lane() >> 3 & 1u) * 8u + (lane() & 7u), column = (lane() >> 4) * 8u;
     RW_UNROLL for (int k = 0; k < IN; ++k) {
         RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
@@ -264,11 +374,24 @@ RW_FN void forward(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uin
     }
 }
 
-// rows * the transposed matrix, which has as many rows as there are sums.
-template <int OUT> RW_FN void backward(Sums<OUT>& sums, const Rows<WIDTH_BLOCKS>& rows, const uint16_t (*matrix)[STRIDE]) {
-    RW_UNROLL for (int n = 0; n < OUT; ++n) {
+// rows * matrix, with the biases where sums start.
+template <int IN>
+RW_FN void forward(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uint16_t (*matrix)[STRIDE], const float* biases) {
+    RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
+        RW_UNROLL for (int k = 0; k < 2; ++k) sums.block[n][k] = sums.block[n][k + 2] = biases[8 * n + 2 * (lane() & 3u) + k];
+    }
+    add_product(sums, rows, matrix);
+}
+
+template <int BLOCKS> RW_FN void clear(Sums<BLOCKS>& sums) {
+    RW_UNROLL for (int n = 0; n < BLOCKS; ++n) {
         RW_UNROLL for (int k = 0; k < 4; ++k) sums.block[n][k] = 0.0f;
     }
+}
+
+// rows * the transposed matrix, which has as many rows as there are sums.
+template <int OUT> RW_FN void backward(Sums<OUT>& sums, const Rows<WIDTH_BLOCKS>& rows, const uint16_t (*matrix)[STRIDE]) {
+    clear(sums);
     const uint32_t row = (lane() >> 4) * 8u + (lane() & 7u), column = (lane() >> 3 & 1u) * 8u;
     RW_UNROLL for (int k = 0; k < WIDTH_BLOCKS; ++k) {
         RW_UNROLL for (int n = 0; n < OUT / 2; ++n) {
@@ -292,20 +415,33 @@ RW_FN void activate(Rows<WIDTH_BLOCKS>& rows, const Sums<2 * WIDTH_BLOCKS>& sums
     }
 }
 
-// Outputs of the warp's rows: lanes 4g hold those of samples g and g + 8.
-RW_FN void head(float (&outputs)[2], const Rows<WIDTH_BLOCKS>& rows, const Weights& weights) {
-    float sums[4] = {weights.head_bias, 0.0f, weights.head_bias, 0.0f};
+// `from` where the activation passed it, as rows.
+RW_FN void gate(Rows<WIDTH_BLOCKS>& delta, const Rows<WIDTH_BLOCKS>& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
+    RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
+        RW_UNROLL for (int part = 0; part < 4; ++part) {
+            const float(&sums)[4] = from.block[2 * n + (part >> 1)];
+            const uint32_t active = passed.block[n][part];
+            delta.block[n][part] = pack(active & 0x00007fffu ? sums[2 * (part & 1)] : 0.0f, active & 0x7fff0000u ? sums[2 * (part & 1) + 1] : 0.0f);
+        }
+    }
+}
+
+// sums += rows * the last layer: lane 4g + q has, of samples g and g + 8, outputs 2q and 2q + 1.
+RW_FN void add_head(float (&sums)[4], const Rows<WIDTH_BLOCKS>& rows, const Weights& weights) {
     RW_UNROLL for (int k = 0; k < WIDTH_BLOCKS; ++k) {
         uint32_t b[2];
         read_turned(b, &weights.head[16 * k + (lane() & 15u)][0]);
         multiply(sums, rows.block[k], b[0], b[1]);
     }
-    outputs[0] = sums[0];
-    outputs[1] = sums[2];
 }
 
-// All layers; `rows` keeps what each hidden layer gave.
-RW_FN void layers_forward(float (&outputs)[2], const Rows<ENCODED_BLOCKS>& encoded, Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Weights& weights) {
+// Output `output` of the sample of row `g + 8 * row`, in all its lanes.
+RW_FN float output_of(const float (&sums)[4], int row, int output) {
+    return __shfl_sync(0xffffffffu, sums[2 * row + (output & 1)], (lane() & ~3u) + uint32_t(output >> 1));
+}
+
+// The hidden layers; `rows` keeps what each gave.
+RW_FN void hidden_forward(const Rows<ENCODED_BLOCKS>& encoded, Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Weights& weights) {
     {
         Sums<2 * WIDTH_BLOCKS> sums;
         forward(sums, encoded, weights.first, weights.biases[0]);
@@ -316,7 +452,36 @@ RW_FN void layers_forward(float (&outputs)[2], const Rows<ENCODED_BLOCKS>& encod
         forward(sums, rows[layer - 1], weights.hidden[layer - 1], weights.biases[layer]);
         activate(rows[layer], sums);
     }
-    head(outputs, rows[HIDDEN - 1], weights);
+}
+
+// All layers.
+RW_FN void layers_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& encoded, Rows<WIDTH_BLOCKS> (&rows)[HIDDEN], const Weights& weights) {
+    hidden_forward(encoded, rows, weights);
+    RW_UNROLL for (int k = 0; k < 4; ++k) {
+        const int output = OUTPUTS == 1 ? k & 1 : 2 * int(lane() & 3u) + (k & 1);
+        outputs[k] = output < OUTPUTS ? weights.head_bias[output] : 0.0f;
+    }
+    add_head(outputs, rows[HIDDEN - 1], weights);
+}
+
+// A tangent through all layers: linear wherever the activation passed the values in `passed`.
+RW_FN void tangent_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& encoded, const Rows<WIDTH_BLOCKS> (&passed)[HIDDEN],
+                           const Weights& weights) {
+    Rows<WIDTH_BLOCKS> rows;
+    {
+        Sums<2 * WIDTH_BLOCKS> sums;
+        clear(sums);
+        add_product(sums, encoded, weights.first);
+        gate(rows, passed[0], sums);
+    }
+    RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) {
+        Sums<2 * WIDTH_BLOCKS> sums;
+        clear(sums);
+        add_product(sums, rows, weights.hidden[layer - 1]);
+        gate(rows, passed[layer], sums);
+    }
+    RW_UNROLL for (int k = 0; k < 4; ++k) outputs[k] = 0.0f;
+    add_head(outputs, rows, weights);
 }
 
 #endif

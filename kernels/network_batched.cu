@@ -147,8 +147,8 @@ batched_slices(const float* __restrict__ layers, uint32_t n, uint16_t* __restric
 struct alignas(16) Tile {
     uint16_t values[ROWS][ROW];
     Slice stages[STAGES];
-    Four samples[ROWS];
-    float slopes[ROWS];
+    Sample samples[ROWS];
+    float slopes[ROWS][OUTPUTS];
     Level levels[LEVELS > 0 ? LEVELS : 1];
 };
 // What launches ask for.
@@ -264,93 +264,168 @@ RW_FN void add_pair(float* row, int column, float x, float y) {
     }
 }
 
-// Gradient with respect to a hidden layer's sums, from that of the layer above; adds up its biases' gradient.
-RW_FN void backward_tile(Tile& tile, Stream& stream, const uint32_t* passed, float* bias_gradient) {
+// Products with the slices to come where the activation passed; `also(column, sum)` is told of the sums over this lane's rows of its column
+// and the next.
+template <class Also> RW_FN void masked_tile(Tile& tile, Stream& stream, int depth, const uint32_t* passed, Also also) {
     auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
-    multiply_tile<PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int pass, uint32_t (&pairs)[M][N][2]) {
+    multiply_tile<PASSES>(tile, stream, depth, begin, [&](const float (&sums)[M][N][4], int pass, uint32_t (&pairs)[M][N][2]) {
         uint32_t bits[M];
         RW_UNROLL for (int m = 0; m < M; ++m) bits[m] = passed[(pass * M + m) * THREADS + threadIdx.x];
         RW_UNROLL for (int n = 0; n < N; ++n) {
-            float2 bias = make_float2(0.0f, 0.0f);
+            float2 sum = make_float2(0.0f, 0.0f);
             RW_UNROLL for (int m = 0; m < M; ++m) {
                 RW_UNROLL for (int half = 0; half < 2; ++half) {
                     const uint32_t bit = 1u << passed_bit(n, half);
                     const float x = bits[m] & bit ? sums[m][n][2 * half] : 0.0f, y = bits[m] & bit << 16 ? sums[m][n][2 * half + 1] : 0.0f;
-                    bias.x += x;
-                    bias.y += y;
+                    sum.x += x;
+                    sum.y += y;
                     pairs[m][n][half] = pack(x, y);
                 }
             }
-            RW_UNROLL for (int apart = 4; apart < 32; apart *= 2) {
-                bias.x += __shfl_xor_sync(0xffffffffu, bias.x, apart);
-                bias.y += __shfl_xor_sync(0xffffffffu, bias.y, apart);
-            }
-            if (lane() < 4u) add_pair(bias_gradient, pass * COLUMNS + lane_column(n), bias.x, bias.y);
+            also(pass * COLUMNS + lane_column(n), sum);
         }
     });
 }
 
-// Encodes the tile's samples.
-RW_FN void encode_tile(Tile& tile, const uint16_t* tables) {
+// Gradient with respect to a hidden layer's sums, from that of the layer above; adds up its biases' gradient.
+RW_FN void backward_tile(Tile& tile, Stream& stream, const uint32_t* passed, float* bias_gradient) {
+    masked_tile(tile, stream, PADDED, passed, [&](int column, float2 bias) {
+        RW_UNROLL for (int apart = 4; apart < 32; apart *= 2) {
+            bias.x += __shfl_xor_sync(0xffffffffu, bias.x, apart);
+            bias.y += __shfl_xor_sync(0xffffffffu, bias.y, apart);
+        }
+        if (lane() < 4u) add_pair(bias_gradient, column, bias.x, bias.y);
+    });
+}
+
+#if RW_FLOW_MAP
+// Tangents of a layer's values, from those of the values before it.
+RW_FN void tangent_tile(Tile& tile, Stream& stream, int depth, const uint32_t* passed) {
+    masked_tile(tile, stream, depth, passed, [](int, float2) {});
+}
+
+template <int VALUE> struct Number {
+    static constexpr int value = VALUE;
+};
+#endif
+
+// Weight of the last layer, as rounded as those of the others.
+RW_FN float head_weight(const float* __restrict__ head, int column, int output) {
+    return column < WIDTH ? from_half(to_half(head[column * OUTPUTS + output])) : 0.0f;
+}
+
+// Encodes the tile's samples; with a `group` beyond 0 their tangents along an axis.
+template <int GROUP = 0> RW_FN void encode_tile(Tile& tile, const uint16_t* tables, [[maybe_unused]] float step = 1.0f) {
     for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
         const int row = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
-        const Four sample = tile.samples[row];
-        const float unit[3] = {sample.x, sample.y, sample.z};
         float point[DIMS];
-        inputs(point, unit);
-        const float2 pair = encode(tile.levels, {tables}, point, column);
+        inputs(point, tile.samples[row].place);
+        float2 pair;
+#if RW_FLOW_MAP
+        if constexpr (GROUP > 0) {
+            float2 pairs[GROUPS];
+            encode_tangents(pairs, tile.levels, {tables}, point, column, step);
+            pair = pairs[GROUP];
+        } else
+#endif
+            pair = encode(tile.levels, {tables}, point, column);
         *reinterpret_cast<uint32_t*>(&tile.values[row][column]) = pack(pair.x, pair.y);
     }
 }
 
-// Outputs of the OWN rows that a warp has of a tile, in all its lanes. `head` are the weights of the last layer and its bias.
+// Outputs of the OWN rows that a warp has of a tile, in all its lanes. `head` are the weights of the last layer and its biases, which tangents
+// go without.
 constexpr int OWN = ROWS / WARPS;
 RW_FN int own_row() { return threadIdx.x / 32 * OWN; }
-RW_FN void outputs_of(float (&outputs)[OWN], const Tile& tile, const float* __restrict__ head) {
-    RW_UNROLL for (int row = 0; row < OWN; ++row) outputs[row] = 0.0f;
-    for (int column = 2 * lane(); column < WIDTH; column += 64) {
-        const float x = from_half(to_half(head[column])), y = column + 1 < WIDTH ? from_half(to_half(head[column + 1])) : 0.0f;
-        RW_UNROLL for (int row = 0; row < OWN; ++row) {
-            const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[own_row() + row][column]));
-            outputs[row] = fma_(pair.y, y, fma_(pair.x, x, outputs[row]));
+RW_FN void outputs_of(float (&outputs)[OWN][OUTPUTS], const Tile& tile, const float* __restrict__ head, bool biased = true) {
+    RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+        RW_UNROLL for (int row = 0; row < OWN; ++row) outputs[row][output] = 0.0f;
+        for (int column = 2 * lane(); column < WIDTH; column += 64) {
+            const float x = head_weight(head, column, output), y = head_weight(head, column + 1, output);
+            RW_UNROLL for (int row = 0; row < OWN; ++row) {
+                const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[own_row() + row][column]));
+                outputs[row][output] = fma_(pair.y, y, fma_(pair.x, x, outputs[row][output]));
+            }
         }
-    }
-    RW_UNROLL for (int row = 0; row < OWN; ++row) {
-        for (int apart = 16; apart > 0; apart /= 2) outputs[row] += __shfl_xor_sync(0xffffffffu, outputs[row], apart);
-        outputs[row] += head[WIDTH];
+        RW_UNROLL for (int row = 0; row < OWN; ++row) {
+            for (int apart = 16; apart > 0; apart /= 2) outputs[row][output] += __shfl_xor_sync(0xffffffffu, outputs[row][output], apart);
+            if (biased) outputs[row][output] += head[WIDTH * OUTPUTS + output];
+        }
     }
 }
 
-// Log-stretch at `n` points (3 floats each, unit coordinates). `slices` and `biases` as `batched_slices` leaves them.
+// The warp's rows of the tile are points from number `first` on of `n`; each lane has that of its own.
+template <class Give> RW_FN void for_own_row(uint32_t first, uint32_t n, Give give) {
+    const int row = own_row() + int(lane());
+    if (int(lane()) < OWN && first + row < n) give(row, first + row);
+}
+
+#if RW_FLOW_MAP
+// Log-stretch of the tile's points, by differentiating the network along each axis. `passed`: HIDDEN times PASSES * M * THREADS.
+RW_FN void predict_tile(Tile& tile, Stream& stream, const uint16_t* tables, const float* __restrict__ biases, const float* __restrict__ head,
+                        const Reading& reading, uint32_t* passed, uint32_t first, uint32_t n, float* __restrict__ out) {
+    constexpr int PASSED = PASSES * M * THREADS;
+    encode_tile(tile, tables);
+    forward_tile(tile, stream, ENCODED_PADDED, biases, passed);
+#pragma unroll 1
+    for (int layer = 1; layer < HIDDEN; ++layer) forward_tile(tile, stream, PADDED, biases + layer * PADDED, passed + layer * PASSED);
+    float tangents[OUTPUTS][SPACE];
+    auto follow = [&](auto group) {
+        constexpr int GROUP = decltype(group)::value;
+        __syncthreads();
+        encode_tile<GROUP>(tile, tables, reading.step);
+        tangent_tile(tile, stream, ENCODED_PADDED, passed);
+#pragma unroll 1
+        for (int layer = 1; layer < HIDDEN; ++layer) tangent_tile(tile, stream, PADDED, passed + layer * PASSED);
+        float outputs[OWN][OUTPUTS];
+        outputs_of(outputs, tile, head, false);
+        RW_UNROLL for (int row = 0; row < OWN; ++row) {
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output)
+                tangents[output][GROUP - 1] = int(lane()) == row ? outputs[row][output] : tangents[output][GROUP - 1];
+        }
+    };
+    follow(Number<1>());
+    follow(Number<2>());
+    if constexpr (SPACE > 2) follow(Number<SPACE>());
+    for_own_row(first, n, [&](int, uint32_t at) { out[at] = read_tangents(reading, tangents); });
+}
+#else
+// Log-stretch of the tile's points.
+RW_FN void predict_tile(Tile& tile, Stream& stream, const uint16_t* tables, const float* __restrict__ biases, const float* __restrict__ head,
+                        const Reading& reading, uint32_t*, uint32_t first, uint32_t n, float* __restrict__ out) {
+    encode_tile(tile, tables);
+    forward_tile(tile, stream, ENCODED_PADDED, biases, nullptr);
+#pragma unroll 1
+    for (int layer = 1; layer < HIDDEN; ++layer) forward_tile(tile, stream, PADDED, biases + layer * PADDED, nullptr);
+    float outputs[OWN][OUTPUTS], output = 0.0f;
+    outputs_of(outputs, tile, head);
+    RW_UNROLL for (int row = 0; row < OWN; ++row) output = int(lane()) == row ? outputs[row][0] : output;
+    for_own_row(first, n, [&](int row, uint32_t at) { out[at] = read_output(reading, output, tile.samples[row].place); });
+}
+#endif
+
+// Log-stretch at `n` points (3 floats each, unit coordinates). `slices` and `biases` as `batched_slices` leaves them. `passed`: for a flow map
+// HIDDEN times PASSES * M * THREADS a block.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
                 const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Reading reading,
-                const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
+                const float* __restrict__ points, uint32_t n, uint32_t* passed, float* __restrict__ out) {
     Tile& tile = *reinterpret_cast<Tile*>(memory);
     read_levels(tile.levels, grid);
+    passed += blockIdx.x * size_t(HIDDEN * PASSES * M * THREADS);
     Stream stream(slices, tile.stages, FORWARD_SLICES);
     for (uint32_t first = blockIdx.x * ROWS; first < n; first += gridDim.x * ROWS) {
         __syncthreads();
         if (threadIdx.x < ROWS) {
             // Rows beyond repeat the last one.
             const size_t at = first + threadIdx.x < n ? first + threadIdx.x : n - 1u;
-            float unit[3] = {points[3 * at], points[3 * at + 1], points[3 * at + 2]};
-            place_times(reading, unit);
-            tile.samples[threadIdx.x] = {unit[0], unit[1], unit[2], 0.0f};
+            Sample sample = {};
+            read_point(reading, points, at, sample.place);
+            place_times(reading, sample.place);
+            tile.samples[threadIdx.x] = sample;
         }
         __syncthreads();
-        encode_tile(tile, tables);
-        forward_tile(tile, stream, ENCODED_PADDED, biases, nullptr);
-#pragma unroll 1
-        for (int layer = 1; layer < HIDDEN; ++layer) forward_tile(tile, stream, PADDED, biases + layer * PADDED, nullptr);
-        float outputs[OWN], output = 0.0f;
-        outputs_of(outputs, tile, head);
-        RW_UNROLL for (int row = 0; row < OWN; ++row) output = int(lane()) == row ? outputs[row] : output;
-        const int row = own_row() + int(lane());
-        if (int(lane()) < OWN && first + row < n) {
-            const float unit[3] = {tile.samples[row].x, tile.samples[row].y, tile.samples[row].z};
-            out[first + row] = read_output(reading, output, unit);
-        }
+        predict_tile(tile, stream, tables, biases, head, reading, passed, first, n, out);
     }
 }
 
@@ -361,54 +436,91 @@ template <int LENGTH> RW_FN void leave(const Tile& tile, uint16_t* __restrict__ 
 }
 
 // Sample number `position` of a batch; without a target beyond it.
-RW_FN Four sample_at(const Draw& draw, uint32_t position) {
-    if (position >= draw.batch) return {0.0f, 0.0f, 0.0f, not_a_number()};
-    return drawn_sample(draw, position);
+RW_FN Sample sample_at(const Draw& draw, uint32_t position) {
+    return position < draw.batch ? drawn_sample(draw, position) : no_sample();
 }
 
 // Gradients of the head, and, in place of the values of the last hidden layer, with respect to its sums, whose biases' gradient is added up;
-// the squared error of each sample, over the batch, is added to the loss. A sample whose target is not finite counts for nothing.
-RW_FN void head_tile(Tile& tile, const float* __restrict__ head, uint32_t batch, float* head_gradient, float* bias_gradient, double* loss) {
-    float outputs[OWN];
+// the squared errors of each sample, over outputs and batch, are added to the loss. A sample without targets counts for nothing.
+RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& draw, float* head_gradient, float* bias_gradient, double* loss) {
+    float outputs[OWN][OUTPUTS];
     outputs_of(outputs, tile, head);
+#if RW_PENALTY
+    const float penalty = penalty_slope(draw);
+    float penalties = 0.0f;
+#endif
     RW_UNROLL for (int row = 0; row < OWN; ++row) {
-        const float target = tile.samples[own_row() + row].w;
-        if (int(lane()) == row) tile.slopes[own_row() + row] = isfinite(target) ? 2.0f * (outputs[row] - target) : 0.0f;
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            const float target = tile.samples[own_row() + row].target[output];
+            if (int(lane()) == row) tile.slopes[own_row() + row][output] = is_finite(target) ? 2.0f * (outputs[row][output] - target) : 0.0f;
+        }
+#if RW_PENALTY
+        const float target = tile.samples[own_row() + row].target[0];
+        if (int(lane()) == row) penalties = is_finite(target) ? penalty * expf(fabsf(outputs[row][0])) : 0.0f;
+#endif
     }
     __syncthreads();
     if (threadIdx.x < 32u) {
-        float squares = 0.0f, sum = 0.0f;
-        for (int row = lane(); row < ROWS; row += 32) {
-            squares = fma_(0.25f * tile.slopes[row], tile.slopes[row], squares);
-            sum += tile.slopes[row];
-        }
-        for (int apart = 16; apart > 0; apart /= 2) {
-            squares += __shfl_xor_sync(0xffffffffu, squares, apart);
-            sum += __shfl_xor_sync(0xffffffffu, sum, apart);
-        }
-        if (lane() == 0u) {
-            atomicAdd(loss, double(squares) / batch);
-            atomicAdd(head_gradient + WIDTH, sum);
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            float squares = 0.0f, sum = 0.0f;
+            for (int row = lane(); row < ROWS; row += 32) {
+                squares = fma_(0.25f * tile.slopes[row][output], tile.slopes[row][output], squares);
+                sum += tile.slopes[row][output];
+            }
+            for (int apart = 16; apart > 0; apart /= 2) {
+                squares += __shfl_xor_sync(0xffffffffu, squares, apart);
+                sum += __shfl_xor_sync(0xffffffffu, sum, apart);
+            }
+            if (lane() == 0u) {
+                atomicAdd(loss, double(squares) / OUTPUTS / draw.batch);
+                atomicAdd(head_gradient + WIDTH * OUTPUTS + output, sum);
+            }
         }
     }
+#if RW_PENALTY
+    // The squares are added up: from here on slopes are those of the penalty too.
+    __syncthreads();
+    if (int(lane()) < OWN) tile.slopes[own_row() + lane()][0] += penalties;
+    for (int apart = 16; apart > 0; apart /= 2) penalties += __shfl_xor_sync(0xffffffffu, penalties, apart);
+    if (lane() == 0u) atomicAdd(head_gradient + WIDTH, penalties);
+    __syncthreads();
+#endif
     // Two columns a thread; of narrow layers several threads share the rows.
     constexpr int PAIRS = PADDED / 2, SHARES = PAIRS < THREADS ? THREADS / PAIRS : 1, SHARE = ROWS / SHARES;
     for (int i = threadIdx.x; i < PAIRS * SHARES; i += THREADS) {
         const int column = 2 * (i % PAIRS), first = i / PAIRS * SHARE;
-        const float x = column < WIDTH ? from_half(to_half(head[column])) : 0.0f, y = column + 1 < WIDTH ? from_half(to_half(head[column + 1])) : 0.0f;
-        float2 weights = make_float2(0.0f, 0.0f), bias = make_float2(0.0f, 0.0f);
+        float x[OUTPUTS], y[OUTPUTS];
+        float2 weights[OUTPUTS], bias = make_float2(0.0f, 0.0f);
+        RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+            x[output] = head_weight(head, column, output), y[output] = head_weight(head, column + 1, output);
+            weights[output] = make_float2(0.0f, 0.0f);
+        }
         for (int row = first; row < first + SHARE; ++row) {
             uint32_t& at = *reinterpret_cast<uint32_t*>(&tile.values[row][column]);
             const uint32_t active = at;
             const float2 pair = unpack(active);
-            const float slope = tile.slopes[row], low = active & 0x00007fffu ? slope * x : 0.0f, high = active & 0x7fff0000u ? slope * y : 0.0f;
-            weights.x = fma_(pair.x, slope, weights.x);
-            weights.y = fma_(pair.y, slope, weights.y);
+            float low = 0.0f, high = 0.0f;
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+                const float slope = tile.slopes[row][output];
+                low = fma_(slope, x[output], low);
+                high = fma_(slope, y[output], high);
+                weights[output].x = fma_(pair.x, slope, weights[output].x);
+                weights[output].y = fma_(pair.y, slope, weights[output].y);
+            }
+            low = active & 0x00007fffu ? low : 0.0f;
+            high = active & 0x7fff0000u ? high : 0.0f;
             bias.x += low;
             bias.y += high;
             at = pack(low, high);
         }
-        add_pair(head_gradient, column, weights.x, weights.y);
+        if constexpr (OUTPUTS == 1) {
+            add_pair(head_gradient, column, weights[0].x, weights[0].y);
+        } else {
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+                if (column < WIDTH) atomicAdd(head_gradient + column * OUTPUTS + output, weights[output].x);
+                if (column + 1 < WIDTH) atomicAdd(head_gradient + (column + 1) * OUTPUTS + output, weights[output].y);
+            }
+        }
         add_pair(bias_gradient, column, bias.x, bias.y);
     }
     __syncthreads();
@@ -429,6 +541,9 @@ batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
     Tile& tile = *reinterpret_cast<Tile*>(memory);
     read_levels(tile.levels, grid);
     passed += blockIdx.x * size_t((HIDDEN - 1) * PASSED);
+#if RW_PENALTY
+    if (first == 0 && blockIdx.x == 0 && threadIdx.x == 0) atomicAdd(loss, penalty_loss(draw));
+#endif
     Stream stream(slices, tile.stages, ALL_SLICES);
     for (uint32_t row = blockIdx.x * ROWS; row < rows; row += gridDim.x * ROWS) {
         auto of = [&](uint16_t* all, int layer) { return all + (layer * size_t(held) + row) * PADDED; };
@@ -447,7 +562,7 @@ batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
             leave<PADDED>(tile, of(values, layer));
         }
         __syncthreads();
-        head_tile(tile, head, draw.batch, layer_gradient + layer_start(HIDDEN), layer_gradient + bias_start(HIDDEN - 1), loss);
+        head_tile(tile, head, draw, layer_gradient + layer_start(HIDDEN), layer_gradient + bias_start(HIDDEN - 1), loss);
         leave<PADDED>(tile, of(deltas, HIDDEN - 1));
 #pragma unroll 1
         for (int layer = HIDDEN - 2; layer >= 0; --layer) {
@@ -466,12 +581,10 @@ batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         });
         for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {
             const int at = i / (ENCODED_PADDED / 2), column = i % (ENCODED_PADDED / 2) * 2;
-            const Four sample = tile.samples[at];
             // What has no target would only add zeros.
-            if (!isfinite(sample.w)) continue;
-            const float unit[3] = {sample.x, sample.y, sample.z};
+            if (!is_usable(tile.samples[at])) continue;
             float point[DIMS];
-            inputs(point, unit);
+            inputs(point, tile.samples[at].place);
             const float2 pair = unpack(*reinterpret_cast<const uint32_t*>(&tile.values[at][column]));
             scatter(tile.levels, point, column, pair.x, pair.y, table_gradient);
         }

@@ -10,7 +10,7 @@ constexpr int TOGETHER = 16 * WIDTH_BLOCKS * HIDDEN <= 128 ? 2 : 1;
 extern __shared__ __align__(16) unsigned char shared[];
 
 // points: 3 floats each, unit coordinates. Log-stretch goes to `out`.
-extern "C" __global__ void __launch_bounds__(THREADS, TOGETHER)
+extern "C" __global__ void __launch_bounds__(THREADS, RW_FLOW_MAP ? 1 : TOGETHER)
 network_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const float* __restrict__ layers,
                 const __grid_constant__ Reading reading, const float* __restrict__ points, uint32_t n, float* __restrict__ out) {
     Weights& weights = *reinterpret_cast<Weights*>(shared);
@@ -19,25 +19,42 @@ network_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ 
     read_layers(weights, layers);
     const uint32_t tiles = (n + 15u) / 16u, stride = gridDim.x * WARPS, g = lane() >> 2;
     for (uint32_t tile = blockIdx.x * WARPS + threadIdx.x / 32u; tile < tiles; tile += stride) {
-        float units[2][3], rows[2][DIMS];
+        float units[2][PLACES], rows[2][DIMS];
         RW_UNROLL for (int row = 0; row < 2; ++row) {
             const uint32_t sample = tile * 16u + g + 8u * row, at = sample < n ? sample : n - 1u;
-            RW_UNROLL for (int k = 0; k < 3; ++k) units[row][k] = points[3 * size_t(at) + k];
+            read_point(reading, points, at, units[row]);
             place_times(reading, units[row]);
             inputs(rows[row], units[row]);
         }
+        Rows<WIDTH_BLOCKS> hidden[HIDDEN];
+        // Lane 4g writes sample g, lane 4g + 1 sample g + 8.
+        const uint32_t q = lane() & 3u, sample = tile * 16u + g + 8u * q;
+#if RW_FLOW_MAP
+        Rows<ENCODED_BLOCKS> encoded[GROUPS];
+        encode_rows(encoded, levels, {tables}, rows, reading.step);
+        hidden_forward(encoded[0], hidden, weights);
+        float tangents[OUTPUTS][SPACE];
+        RW_UNROLL for (int along = 0; along < SPACE; ++along) {
+            float outputs[4];
+            tangent_forward(outputs, encoded[1 + along], hidden, weights);
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+                const float first = output_of(outputs, 0, output), second = output_of(outputs, 1, output);
+                tangents[output][along] = q ? second : first;
+            }
+        }
+        if (q < 2u && sample < n) out[sample] = read_tangents(reading, tangents);
+#else
         Rows<ENCODED_BLOCKS> encoded;
         encode_rows(encoded, levels, {tables}, rows);
-        Rows<WIDTH_BLOCKS> hidden[HIDDEN];
-        float outputs[2];
+        float outputs[4];
         layers_forward(outputs, encoded, hidden, weights);
-        // Lane 4g writes sample g, lane 4g + 1 sample g + 8.
-        const uint32_t from = lane() & ~3u, q = lane() & 3u, sample = tile * 16u + g + 8u * q;
-        const float first = __shfl_sync(0xffffffffu, outputs[0], from), second = __shfl_sync(0xffffffffu, outputs[1], from);
+        const float first = output_of(outputs, 0, 0), second = output_of(outputs, 1, 0);
         if (q < 2u && sample < n) {
-            const float unit[3] = {q ? units[1][0] : units[0][0], q ? units[1][1] : units[0][1], q ? units[1][2] : units[0][2]};
+            float unit[PLACES];
+            RW_UNROLL for (int k = 0; k < PLACES; ++k) unit[k] = q ? units[1][k] : units[0][k];
             out[sample] = read_output(reading, q ? second : first, unit);
         }
+#endif
     }
 }
 
@@ -91,17 +108,6 @@ template <int BLOCKS> RW_FN void store(uint16_t* to, int stride, const Rows<BLOC
     }
 }
 
-// `from` where the activation passed it, as rows.
-RW_FN void gate(Rows<WIDTH_BLOCKS>& delta, const Rows<WIDTH_BLOCKS>& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
-    RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
-        RW_UNROLL for (int part = 0; part < 4; ++part) {
-            const float(&sums)[4] = from.block[2 * n + (part >> 1)];
-            const uint32_t active = passed.block[n][part];
-            delta.block[n][part] = pack(active & 0x00007fffu ? sums[2 * (part & 1)] : 0.0f, active & 0x7fff0000u ? sums[2 * (part & 1) + 1] : 0.0f);
-        }
-    }
-}
-
 constexpr int WIDEST = ENCODED_BLOCKS > WIDTH_BLOCKS ? ENCODED_BLOCKS : WIDTH_BLOCKS;
 constexpr int IN_STRIDE = 16 * WIDEST + SKEW;
 
@@ -113,8 +119,8 @@ struct alignas(16) Workspace {
 // What launches ask for.
 static_assert(sizeof(Weights) == RW_WEIGHTS_BYTES && sizeof(Workspace) == RW_WORKSPACE_BYTES, "layout");
 
-// Adds, for each sample of the batch, the gradient of its squared error; their mean is the loss, so the optimizer divides by the batch.
-// A target that is not finite counts for nothing.
+// Adds, for each sample of the batch, the gradient of its squared errors; the mean over outputs and batch is the loss, so the optimizer divides
+// by both. A sample without targets counts for nothing.
 extern "C" __global__ void __launch_bounds__(THREADS, TOGETHER)
 network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const float* __restrict__ layers, const Draw draw,
                  float* __restrict__ table_gradient, float* __restrict__ layer_gradient, double* __restrict__ loss) {
@@ -130,42 +136,56 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
     first.clear();
     last.clear();
     RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].clear();
+#if RW_PENALTY
+    const float penalty = penalty_slope(draw);
+#endif
     float squares = 0.0f;
     for (uint32_t tile = blockIdx.x; tile < tiles; tile += gridDim.x) {
-        float points[2][DIMS], targets[2];
+        float points[2][DIMS], targets[2][OUTPUTS];
         RW_UNROLL for (int row = 0; row < 2; ++row) {
             const uint32_t position = tile * ROWS + 16u * (threadIdx.x / 32u) + g + 8u * row;
-            Four sample = {0.0f, 0.0f, 0.0f, not_a_number()};
-            if (position < draw.batch) sample = drawn_sample(draw, position);
-            const float unit[3] = {sample.x, sample.y, sample.z};
-            inputs(points[row], unit);
-            targets[row] = sample.w;
+            const Sample sample = position < draw.batch ? drawn_sample(draw, position) : no_sample();
+            inputs(points[row], sample.place);
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) targets[row][output] = sample.target[output];
         }
         Rows<ENCODED_BLOCKS> encoded;
         encode_rows(encoded, levels, {tables}, points);
         Rows<WIDTH_BLOCKS> hidden[HIDDEN];
-        float outputs[2];
+        float outputs[4];
         layers_forward(outputs, encoded, hidden, work.weights);
 
         // Gradient with respect to the outputs; all four lanes of a sample need it.
-        float slopes[2];
+        float slopes[2][OUTPUTS];
         RW_UNROLL for (int row = 0; row < 2; ++row) {
-            const float output = __shfl_sync(0xffffffffu, outputs[row], lane() & ~3u);
-            const float difference = isfinite(targets[row]) ? output - targets[row] : 0.0f;
-            if (q == 0u) squares = fma_(difference, difference, squares);
-            slopes[row] = 2.0f * difference;
+            RW_UNROLL for (int output = 0; output < OUTPUTS; ++output) {
+                const float found = output_of(outputs, row, output);
+                const float difference = is_finite(targets[row][output]) ? found - targets[row][output] : 0.0f;
+                if (q == 0u) squares = fma_(difference, difference, squares);
+                slopes[row][output] = 2.0f * difference;
+#if RW_PENALTY
+                if (is_finite(targets[row][output])) slopes[row][output] = fma_(penalty, expf(fabsf(found)), slopes[row][output]);
+#endif
+            }
         }
         // The head.
         store(&work.in[0][0], IN_STRIDE, hidden[HIDDEN - 1]);
-        RW_UNROLL for (int row = 0; row < 2; ++row)
-            *reinterpret_cast<uint32_t*>(&work.delta[16 * (threadIdx.x / 32u) + g + 8 * row][2 * q]) = q == 0u ? pack(slopes[row], 0.0f) : 0u;
+        RW_UNROLL for (int row = 0; row < 2; ++row) {
+            uint32_t pair = q == 0u ? pack(slopes[row][0], OUTPUTS > 1 ? slopes[row][OUTPUTS > 1] : 0.0f) : 0u;
+            if (OUTPUTS > 2 && q == 1u) pair = pack(slopes[row][OUTPUTS - 1], 0.0f);
+            *reinterpret_cast<uint32_t*>(&work.delta[16 * (threadIdx.x / 32u) + g + 8 * row][2 * q]) = pair;
+        }
         __syncthreads();
         last.add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
         Rows<WIDTH_BLOCKS> delta;
         {
             Sums<2 * WIDTH_BLOCKS> sums;
             RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
-                RW_UNROLL for (int k = 0; k < 4; ++k) sums.block[n][k] = slopes[k >> 1] * from_half(work.weights.head[8 * n + 2 * q + (k & 1)][0]);
+                RW_UNROLL for (int k = 0; k < 4; ++k) {
+                    const uint16_t(&head)[HEAD_STRIDE] = work.weights.head[8 * n + 2 * q + (k & 1)];
+                    float sum = slopes[k >> 1][0] * from_half(head[0]);
+                    RW_UNROLL for (int output = 1; output < OUTPUTS; ++output) sum = fma_(slopes[k >> 1][output], from_half(head[output]), sum);
+                    sums.block[n][k] = sum;
+                }
             }
             gate(delta, hidden[HIDDEN - 1], sums);
         }
@@ -192,7 +212,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         RW_UNROLL for (int n = 0; n < 2 * ENCODED_BLOCKS; ++n) {
             RW_UNROLL for (int row = 0; row < 2; ++row) {
                 // What has no target would only add zeros.
-                if (isfinite(targets[row]))
+                if (is_finite(targets[row][0]))
                     scatter(levels, points[row], 8 * n + 2 * int(q), sums.block[n][2 * row], sums.block[n][2 * row + 1], table_gradient);
             }
         }
@@ -201,13 +221,17 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
     }
     first.flush(layer_gradient, ENCODED, WIDTH);
     RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].flush(layer_gradient + layer_start(layer), WIDTH, WIDTH);
-    last.flush(layer_gradient + layer_start(HIDDEN), WIDTH, 1);
+    last.flush(layer_gradient + layer_start(HIDDEN), WIDTH, OUTPUTS);
     for (int apart = 16; apart > 0; apart /= 2) squares += __shfl_xor_sync(0xffffffffu, squares, apart);
     if (lane() == 0u) losses[threadIdx.x / 32u] = squares;
     __syncthreads();
     if (threadIdx.x == 0) {
         double sum = 0.0;
         for (int warp = 0; warp < WARPS; ++warp) sum += losses[warp];
-        atomicAdd(loss, sum / draw.batch);
+        sum = sum / OUTPUTS / draw.batch;
+#if RW_PENALTY
+        if (blockIdx.x == 0) sum += penalty_loss(draw);
+#endif
+        atomicAdd(loss, sum);
     }
 }

@@ -25,6 +25,8 @@ mod device;
 mod lost;
 #[path = "gpu/network.rs"]
 mod network;
+#[path = "gpu/network_flow_map.rs"]
+mod network_flow_map;
 #[path = "gpu/network_loop.rs"]
 mod network_loop;
 mod network_support;

@@ -6,7 +6,7 @@
 
 use ridgewatch::engine::cuda::compile::{Request, SOURCES};
 use ridgewatch::engine::cuda::{Tiling, is_fused, network_defines};
-use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings};
+use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings, Target};
 
 /// Macros in which the gridded kernel is compiled here.
 fn grid(changes: &[(&str, &str)]) -> Vec<String> {
@@ -29,8 +29,9 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
 }
 
 /// Encodings, widths and depths: what fills the registers, and what has no second feature or no tables.
-fn networks() -> Vec<Architecture> {
+fn networks() -> Vec<Network> {
     let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
+    let both = vec![Input::Start, Input::Duration];
     let settings = [
         (usual.clone(), &[0, 1, 2][..]),
         (NetworkSettings { width: 128, features: 4, ..usual.clone() }, &[0, 1, 2]),
@@ -40,9 +41,30 @@ fn networks() -> Vec<Architecture> {
         (NetworkSettings { encoding: Encoding::Frequency, width: 512, hidden_layers: 16, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..usual.clone() }, &[0, 1, 2]),
         (NetworkSettings { width: 200, hidden_layers: 5, ..usual.clone() }, &[0, 1]),
-        (NetworkSettings { inputs: vec![Input::Start], ..usual }, &[0, 1]),
+        (NetworkSettings { inputs: vec![Input::Start], ..usual.clone() }, &[0, 1]),
+        (NetworkSettings { inputs: vec![Input::Start], ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { encoding: Encoding::Frequency, inputs: both.clone(), octaves: 4, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { target: Target::FlowMap, inputs: both, ..usual.clone() }, &[0, 1]),
+        (NetworkSettings { target: Target::FlowMap, features: 4, ..usual.clone() }, &[0, 1, 2]),
+        (NetworkSettings { target: Target::FlowMap, features: 1, width: 21, ..usual.clone() }, &[0, 2]),
+        (NetworkSettings { target: Target::FlowMap, encoding: Encoding::Frequency, width: 256, hidden_layers: 8, ..usual }, &[0, 1, 2]),
     ];
-    settings.iter().map(|(settings, axes)| Architecture::new(settings, axes, [1.0; 3]).unwrap()).collect()
+    let shape = |(settings, axes): &(NetworkSettings, &[usize])| Architecture::new(settings, axes, [1.0; 3]).unwrap();
+    let all = settings.iter().map(|settings| Network { shape: shape(settings), penalty: false });
+    // One that a warp holds, and one that goes in batches.
+    all.chain([0, 6].map(|number| Network { shape: shape(&settings[number]), penalty: true })).collect()
+}
+
+/// An architecture, and whether its loss has a penalty on means.
+struct Network {
+    shape: Architecture,
+    penalty: bool,
+}
+
+impl Network {
+    fn defines(&self) -> Vec<String> {
+        network_defines(&self.shape, self.penalty).unwrap()
+    }
 }
 
 fn variants(source: &str) -> Vec<Vec<String>> {
@@ -66,17 +88,15 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
         ],
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
-        "network.cu" => networks().iter().map(|shape| network_defines(shape).unwrap()).collect(),
-        "network_fused.cu" => {
-            networks().iter().filter(|shape| is_fused(shape, usize::MAX)).map(|shape| network_defines(shape).unwrap()).collect()
-        }
+        "network.cu" => networks().iter().map(Network::defines).collect(),
+        "network_fused.cu" => networks().iter().filter(|network| is_fused(&network.shape, usize::MAX)).map(Network::defines).collect(),
         // All shapes, for no device has room for all of them at once; with the shared memory of H200, A100 and the RTX cards since Ampere.
         "network_batched.cu" => networks()
             .iter()
-            .flat_map(|shape| {
-                let mut tilings: Vec<Tiling> = [227, 163, 99].map(|kibibytes| Tiling::of(shape, kibibytes << 10).unwrap()).into();
+            .flat_map(|network| {
+                let mut tilings: Vec<Tiling> = [227, 163, 99].map(|kibibytes| Tiling::of(&network.shape, kibibytes << 10).unwrap()).into();
                 tilings.dedup();
-                tilings.into_iter().map(|tiling| network_defines(shape).unwrap().into_iter().chain(tiling.defines()).collect())
+                tilings.into_iter().map(|tiling| network.defines().into_iter().chain(tiling.defines()).collect())
             })
             .collect(),
         _ => vec![Vec::new()],

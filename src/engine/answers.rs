@@ -17,7 +17,7 @@ pub struct Answers<'a> {
     keep: usize,
     stride: usize,
     since_kept: usize,
-    keep_arrival: bool,
+    extras: Extras,
     /// Traced queries, kept evenly over the frame (fewer than `keep`), with the log-stretch that was traced.
     pub samples: Samples,
     /// Figures of the frame so far.
@@ -37,8 +37,8 @@ pub struct Asked<'a> {
     pub trace_budget: Option<f64>,
     /// Traced samples to keep: fewer than so many.
     pub keep: usize,
-    /// Whether arrival and Jacobian are kept with each of them.
-    pub flow_map: bool,
+    /// What is kept with each of them.
+    pub extras: Extras,
 }
 
 /// Counts and times of one frame's answers.
@@ -78,7 +78,7 @@ impl<'a> Answers<'a> {
             keep,
             stride: 1,
             since_kept: 0,
-            keep_arrival: false,
+            extras: Extras::default(),
             samples: Samples::default(),
             tally: Tally::default(),
             traced: Traced::default(),
@@ -86,15 +86,15 @@ impl<'a> Answers<'a> {
         }
     }
 
-    /// Keeps arrival and Jacobian with each sample, for surrogates that learn the flow map.
-    pub fn with_flow_map(mut self, yes: bool) -> Self {
-        self.keep_arrival = yes;
+    /// Keeps these with each sample, for surrogates that learn the flow map.
+    pub fn with_extras(mut self, extras: Extras) -> Self {
+        self.extras = extras;
         self
     }
 
     /// Whom to ask, for an engine that asks them itself.
     pub fn asked(&self) -> Asked<'a> {
-        Asked { surrogate: self.surrogate, gate: self.gate, trace_budget: self.trace_budget, keep: self.keep, flow_map: self.keep_arrival }
+        Asked { surrogate: self.surrogate, gate: self.gate, trace_budget: self.trace_budget, keep: self.keep, extras: self.extras }
     }
 
     /// Takes in the figures and samples of a frame whose queries were answered without this.
@@ -115,7 +115,7 @@ impl<'a> Answers<'a> {
     /// what is kept is spread evenly over the frame.
     fn keep_samples(&mut self, count: usize) {
         let domain = self.domain();
-        let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
+        let extras = self.extras;
         for i in 0..count {
             self.since_kept += 1;
             if self.since_kept < self.stride {
@@ -146,17 +146,21 @@ fn halve(samples: &mut Samples) {
     every_other(&mut samples.jacobian);
 }
 
+/// An arrival in unit coordinates; it may lie outside [0, 1].
+pub(super) fn unit_arrival(domain: &Domain, arrival: [f32; 3]) -> [f32; 3] {
+    let extent = domain.extent();
+    std::array::from_fn(|k| ((f64::from(arrival[k]) - domain.min[k]) / extent[k]) as f32)
+}
+
 /// Appends traced seed `i` to `samples`, in unit coordinates.
 pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3], traced: &Traced, i: usize, extras: Extras) {
     samples.points.push(domain.to_unit(point));
     samples.log_stretch.push(traced.log_stretch[i]);
-    let extent = domain.extent();
     if extras.arrival {
-        let arrival = traced.arrival[i];
-        samples.arrival.push(std::array::from_fn(|k| ((f64::from(arrival[k]) - domain.min[k]) / extent[k]) as f32));
+        samples.arrival.push(unit_arrival(domain, traced.arrival[i]));
     }
     if extras.jacobian {
-        let j = traced.jacobian[i];
+        let (j, extent) = (traced.jacobian[i], domain.extent());
         samples.jacobian.push(std::array::from_fn(|e| (f64::from(j[e]) * extent[e % 3] / extent[e / 3]) as f32));
     }
 }
@@ -201,8 +205,7 @@ impl LogStretch for Answers<'_> {
             let start = Instant::now();
             scratch.points.clear();
             scratch.points.extend(scratch.to_trace.iter().map(|&i| points[i as usize]));
-            let extras = Extras { arrival: self.keep_arrival, jacobian: self.keep_arrival };
-            self.tracer.trace(&scratch.points, extras, &mut self.traced);
+            self.tracer.trace(&scratch.points, self.extras, &mut self.traced);
             for (k, &i) in scratch.to_trace.iter().enumerate() {
                 log_stretch[i as usize] = self.traced.log_stretch[k];
                 traced[i as usize] = true;

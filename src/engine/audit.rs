@@ -56,11 +56,10 @@ pub struct Audit {
     pub lived_share: f64,
 }
 
-/// Traces `unit` points.
-pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], flow_map: bool) -> Audit {
+/// Traces `unit` points; samples come with `extras`.
+pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], extras: Extras) -> Audit {
     let domain = tracer.domain();
     let points: Vec<[f32; 3]> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
-    let extras = Extras { arrival: flow_map, jacobian: flow_map };
     let mut traced = Traced::default();
     tracer.trace(&points, extras, &mut traced);
     // Sums are those of the chunks in order, on any number of threads.
@@ -134,7 +133,7 @@ pub struct AuditRequest<'a> {
     pub stream: u64,
     /// In whose ramp residuals are measured.
     pub transfer: &'a Transfer,
-    /// Whether what was traced is wanted as samples to learn from, and with it arrival and Jacobian.
+    /// Whether what was traced is wanted as samples to learn from, and with what extras.
     pub samples: Option<Extras>,
 }
 
@@ -157,8 +156,7 @@ pub struct AuditFindings {
 /// Draws, traces and holds `surrogate` to what was traced, on the CPU (the tracer's device may be another).
 pub fn audit(request: AuditRequest<'_>, tracer: &dyn Tracer, surrogate: Option<&dyn Predict>) -> AuditFindings {
     let unit = stratified_points(&request.strata, request.seed, request.stream);
-    let flow_map = request.samples.is_some_and(|extras| extras.jacobian);
-    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, flow_map);
+    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, request.samples.unwrap_or_default());
     AuditFindings {
         drawn,
         points: samples.len(),

@@ -3,7 +3,7 @@
 use crate::scenes::{cartesian, device, even, gpu, opened, smooth, store, turbulence};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{
-    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Panel,
+    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs, Panel,
     SnapshotStore, Tuning, keeps_label,
 };
 use ridgewatch::engine::{Answers, Device, Event, Frame, RunOptions, Setup, Tally, residuals, run, stratified_points, trace};
@@ -65,7 +65,7 @@ impl Stage {
         // A gate as runs earn it, probes held against the table, at the first tolerance that trusts a third of the cells.
         let trust = |tolerance: f64| TrustMap::new(&TrustSettings { tolerance, ..TrustSettings::default() }, host.domain());
         let strata = Strata::even(trust(0.03).shape(), 32);
-        let probes = trace(&*host, &stratified_points(&strata, 5, 0), false);
+        let probes = trace(&*host, &stratified_points(&strata, 5, 0), Extras::default());
         let renderer = Renderer::new(scene.clone(), host.domain(), map.tau).unwrap();
         let measured = residuals(&table, &probes.samples, renderer.transfer(), map.tau);
         let gate = |i: i32| {
@@ -114,6 +114,7 @@ impl Stage {
                 gate: &self.gate,
                 trace_budget: how.budget,
                 keep: how.keep,
+                arrivals: how.pupil.is_some(),
             })
             .unwrap();
         let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut divided, None, &NEVER).unwrap();
@@ -278,18 +279,19 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
 }
 
 /// Keeps what it is told to learn from.
-struct Heard(RefCell<Vec<([f32; 3], f32)>>);
+struct Heard(RefCell<Vec<([f32; 3], f32, [f32; 3])>>);
 
 impl DeviceLearns for Heard {
-    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError> {
-        let (mut at, mut values) = (vec![[0.0_f32; 3]; count], vec![0.0_f32; count]);
+    unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
+        let (mut at, mut values, mut arrivals) = (vec![[0.0_f32; 3]; count], vec![0.0_f32; count], vec![[0.0_f32; 3]; count]);
         gpu().synchronize()?;
         // SAFETY: the caller's; the work that wrote them is done.
         unsafe {
             cudarc::driver::result::memcpy_dtoh_sync(at.as_flattened_mut(), points).unwrap();
-            cudarc::driver::result::memcpy_dtoh_sync(&mut values, log_stretch).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(&mut values, traced.log_stretch).unwrap();
+            cudarc::driver::result::memcpy_dtoh_sync(arrivals.as_flattened_mut(), traced.arrival).unwrap();
         }
-        self.0.borrow_mut().extend(at.into_iter().zip(values));
+        self.0.borrow_mut().extend(at.into_iter().zip(values).zip(arrivals).map(|((at, value), arrival)| (at, value, arrival)));
         Ok(())
     }
 }
@@ -306,11 +308,16 @@ fn what_stays_on_the_device_is_what_was_traced() {
     let (_, _, tally, labels) = stage.on_gpu(&mut side, &mut stage.renderer(), 0, 1, &how);
     let heard = heard.0.into_inner();
     assert_eq!(heard.len() as u64, tally.traced);
-    let bits = |point: [f32; 3], value: f32| (stage.domain().to_unit(point).map(f32::to_bits), value.to_bits());
-    let mut held_back: Vec<_> =
-        heard.iter().filter(|(point, _)| keeps_label(*point, 3)).map(|&(point, value)| bits(point, value)).collect();
-    let mut back: Vec<_> =
-        labels.points.iter().zip(&labels.log_stretch).map(|(point, value)| (point.map(f32::to_bits), value.to_bits())).collect();
+    // As traced on the host: in the unit coordinates of labels, which do not end at the domain's edges.
+    let domain = stage.domain();
+    let arrival = |p: [f32; 3]| std::array::from_fn(|k| ((f64::from(p[k]) - domain.min[k]) / domain.extent()[k]) as f32);
+    let bits = |point: [f32; 3], value: f32, arrival: [f32; 3]| (point.map(f32::to_bits), value.to_bits(), arrival.map(f32::to_bits));
+    let mut held_back: Vec<_> = (heard.iter().filter(|(point, ..)| keeps_label(*point, 3)))
+        .map(|&(point, value, there)| bits(domain.to_unit(point), value, arrival(there)))
+        .collect();
+    let mut back: Vec<_> = (labels.points.iter().zip(&labels.log_stretch).zip(&labels.arrival))
+        .map(|((&point, &value), &arrival)| bits(point, value, arrival))
+        .collect();
     held_back.sort_unstable();
     back.sort_unstable();
     assert!(back.len() > 100 && back == held_back, "{} came back, {} were held back", back.len(), held_back.len());

@@ -17,7 +17,7 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
     let settings = TransferSettings { low: Some(0.1), high: Some(0.3), ..TransferSettings::default() };
     let transfer = Transfer::new(&settings, 1.0).unwrap();
     let mut audits = Audits::new(&gpu).unwrap();
-    for (stream, samples) in [(0, None), (1 << 40, Some(Extras::default()))] {
+    for (stream, samples) in [(0, None), (1, Some(Extras { arrival: true, jacobian: false })), (1 << 40, Some(Extras::default()))] {
         let request = AuditRequest { strata: strata.clone(), seed: 77, stream, transfer: &transfer, samples };
         let expected = audit(request.clone(), &tracer, Some(&table));
         let found = audits.audit(&request, &tracer, on_device).unwrap();
@@ -28,6 +28,7 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
         assert!((found.lived_share - expected.lived_share).abs() < 1e-12);
         assert_eq!(found.samples.points, expected.samples.points);
         assert_eq!(found.samples.log_stretch, expected.samples.log_stretch);
+        assert_eq!(found.samples.arrival, expected.samples.arrival);
         let [found, expected] = [found, expected].map(|findings| findings.errors.unwrap());
         let bits = |cell: &CellErrors| {
             let CellErrors { count, optical, square, fourth, second, third, log_square } = *cell;

@@ -15,13 +15,14 @@ use ridgewatch::surrogate::network::{
 };
 use ridgewatch::surrogate::{Brought, Offload, Predict, SampleRing, Samples, Table};
 
-/// Of the cases that the CPU trains, those that the kernels take; and wider ones, that go through them in one pass or two.
+/// Whether all inputs have their places in a point, and there is one output; the others are tested in `network_flow_map`.
+pub(super) fn is_plain(case: &Case) -> bool {
+    case.settings.target == Target::Ftle && case.axes.len() + case.settings.inputs.len() <= 3
+}
+
+/// Of the cases that the CPU trains, the plain ones; and wider ones, that go through the kernels in one pass or two.
 pub(super) fn cases() -> Vec<Case> {
-    // A sample has room for three inputs.
-    let inputs = |case: &Case| case.axes.len() + case.settings.inputs.len();
-    let taken = |case: &Case| case.settings.target == Target::Ftle && inputs(case) <= 3;
-    let without_penalty = |case: Case| Case { settings: NetworkSettings { mean_penalty: 0.0, ..case.settings }, ..case };
-    let mut cases: Vec<Case> = network_support::cases().into_iter().filter(taken).map(without_penalty).collect();
+    let mut cases: Vec<Case> = network_support::cases().into_iter().filter(is_plain).collect();
     let frequency = NetworkSettings { encoding: Encoding::Frequency, ..few_entries() };
     cases.extend([
         Case { name: "256 wide", settings: NetworkSettings { width: 256, hidden_layers: 3, ..frequency.clone() }, axes: &[0, 1, 2] },
@@ -73,7 +74,7 @@ pub(super) fn prepare(case: &Case) -> (Model, Objective, Samples) {
 }
 
 /// Biases of either sign that decide alone which neurons pass, smaller weights: rounding then switches none, and gradients compare.
-fn settled(model: &Model) -> Model {
+pub(super) fn settled(model: &Model) -> Model {
     let mut values = model.layers();
     let (_, hidden) = model.shape.layers.split_last().unwrap();
     for layer in hidden {
@@ -168,43 +169,46 @@ pub(super) fn gradients(model: &Model) -> Vec<f64> {
 #[test]
 #[ignore = "needs a GPU"]
 fn gradients_equal_finite_differences_and_burns() {
-    for case in cases() {
-        let (model, objective, _) = prepare(&case);
-        let model = settled(&model);
-        let count = afforded(&model);
-        let samples = labels(count, 11);
-        let mut device = training(&model, &objective);
-        let pool = device.upload(&samples, None).unwrap();
-        let loss = device.train_steps(&pool, None, &[step(count, 1e-9)]).unwrap()[0];
-        let found = gradients(&stored(&device, &model));
-        let mut stock = model.clone();
-        let stock_loss = stock_step(&mut stock, &objective, &samples, count, 1e-9);
-        assert!((loss / stock_loss - 1.0).abs() < 2e-3, "{}: loss {loss}, burn's {stock_loss}", case.name);
-        let burns = gradients(&stock);
-        let apart: Vec<f64> = found.iter().zip(&burns).map(|(a, b)| a - b).collect();
-        let from_burn = norm(&apart) / norm(&burns);
+    cases().iter().for_each(check_gradients);
+}
 
-        let mut reference = Reference::new(&model);
-        let tables = reference.tables.len();
-        let all = tables + reference.layers.len();
-        let (mut differences, mut apart) = (Vec::new(), Vec::new());
-        for parameter in (0..all).step_by((all / 100).max(1)) {
-            let mut at = |step: f64| {
-                let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
-                let kept = std::mem::replace(value, *value + step);
-                let loss = reference.loss(&objective, &samples);
-                let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
-                *value = kept;
-                loss
-            };
-            differences.push((at(1e-6) - at(-1e-6)) / 2e-6);
-            apart.push(found[parameter] - differences[differences.len() - 1]);
-        }
-        let from_differences = norm(&apart) / norm(&differences);
-        measured!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
-        // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
-        assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
+/// Loss and gradient of a batch against burn's and against finite differences in f64.
+pub(super) fn check_gradients(case: &Case) {
+    let (model, objective, _) = prepare(case);
+    let model = settled(&model);
+    let count = afforded(&model);
+    let samples = labels(count, 11);
+    let mut device = training(&model, &objective);
+    let pool = device.upload(&samples, None).unwrap();
+    let loss = device.train_steps(&pool, None, &[step(count, 1e-9)]).unwrap()[0];
+    let found = gradients(&stored(&device, &model));
+    let mut stock = model.clone();
+    let stock_loss = stock_step(&mut stock, &objective, &samples, count, 1e-9);
+    assert!((loss / stock_loss - 1.0).abs() < 2e-3, "{}: loss {loss}, burn's {stock_loss}", case.name);
+    let burns = gradients(&stock);
+    let apart: Vec<f64> = found.iter().zip(&burns).map(|(a, b)| a - b).collect();
+    let from_burn = norm(&apart) / norm(&burns);
+
+    let mut reference = Reference::new(&model);
+    let tables = reference.tables.len();
+    let all = tables + reference.layers.len();
+    let (mut differences, mut apart) = (Vec::new(), Vec::new());
+    for parameter in (0..all).step_by((all / 100).max(1)) {
+        let mut at = |step: f64| {
+            let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
+            let kept = std::mem::replace(value, *value + step);
+            let loss = reference.loss(&objective, &samples);
+            let value = if parameter < tables { &mut reference.tables[parameter] } else { &mut reference.layers[parameter - tables] };
+            *value = kept;
+            loss
+        };
+        differences.push((at(1e-6) - at(-1e-6)) / 2e-6);
+        apart.push(found[parameter] - differences[differences.len() - 1]);
     }
+    let from_differences = norm(&apart) / norm(&differences);
+    measured!("{}: gradients off burn's by {from_burn:.1e}, off finite differences by {from_differences:.1e}", case.name);
+    // Halves carry 11 bits, and their roundings average out; one of 64,000 neurons that switches is 2e-3.
+    assert!(from_burn < 3e-3 && from_differences < 3e-3, "{}: {from_burn} {from_differences}", case.name);
 }
 
 /// What does not fit into a warp's registers goes through the network in parts: these batches are of several (but for small ones).
@@ -318,18 +322,11 @@ fn held_out_and_broken_samples_are_not_learned_from() {
 #[test]
 #[ignore = "needs a GPU"]
 fn what_the_kernels_do_not_take_is_refused() {
-    let refused = |settings: &NetworkSettings| {
-        let shape = Architecture::new(settings, &[0, 1, 2], [1.0; 3]).unwrap();
-        let objective = Objective::new(settings, &shape, [1.0; 3], 1.0);
-        DeviceTraining::new(&gpu(), &Model::new(shape, 1, false), &objective).unwrap_err()
-    };
-    let usual = NetworkSettings { log2_table: 10, ..NetworkSettings::default() };
-    for settings in [
-        NetworkSettings { target: Target::FlowMap, ..usual.clone() },
-        NetworkSettings { loss: Loss::Published, mean_penalty: 1.0, ..usual },
-    ] {
-        assert!(matches!(refused(&settings), DeviceError::Unsupported { .. }), "{settings:?}");
-    }
+    let settings = NetworkSettings { log2_table: 10, target: Target::FlowMap, jacobian_weight: 0.3, ..NetworkSettings::default() };
+    let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
+    let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
+    let refused = DeviceTraining::new(&gpu(), &Model::new(shape, 1, false), &objective).unwrap_err();
+    assert!(matches!(refused, DeviceError::Unsupported { .. }), "{refused}");
 }
 
 /// Points that bring no times along are answered for those that the network is asked for, on the device and from the host.
@@ -345,9 +342,6 @@ fn times_stand_where_no_axis_does() {
         let times = if case.settings.inputs == [Input::Start] { [0.3, 0.9] } else { [0.9, 0.3] };
         assert_eq!(predict(&network.above(None).at(times), &points), predict(&network, &brought), "{}", case.name);
     }
-    let settings = NetworkSettings { inputs: vec![Input::Start], ..NetworkSettings::default() };
-    let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
-    assert!(!DeviceNetwork::takes(&gpu(), &shape), "four inputs");
 }
 
 #[test]

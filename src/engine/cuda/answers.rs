@@ -44,12 +44,12 @@ pub trait DevicePredict {
 
 /// A network on the device that learns from what is traced there.
 pub trait DeviceLearns {
-    /// Enqueues on the work stream: takes in `count` points (device address `points`, three f32 each, domain coordinates) and their traced
-    /// log-stretch (f32 each), but for those that the host may keep.
+    /// Enqueues on the work stream: takes in `count` points (device address `points`, three f32 each, domain coordinates) and what was traced of
+    /// them, but for those that the host may keep.
     ///
     /// # Safety
-    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
-    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError>;
+    /// The memory at all addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError>;
 }
 
 /// Every query traced.
@@ -86,6 +86,8 @@ pub struct Panel<'a> {
     pub trace_budget: Option<f64>,
     /// Traced answers that come back as labels: fewer than so many (4,194,304 at most).
     pub keep: usize,
+    /// Whether arrivals are labels too.
+    pub arrivals: bool,
 }
 
 /// Points that are answered together, at most and at least.
@@ -108,6 +110,8 @@ struct Memory {
     points: Buffer<[f32; 3]>,
     places: Buffer<u32>,
     values: Buffer<f32>,
+    /// Where the tracer's points arrive; none until that is asked for.
+    arrivals: Option<Buffer<[f32; 3]>>,
     /// Lengths of the surrogate's list, of the tracer's list, and of the labels.
     lengths: Buffer<u32>,
     pinned: Pinned<u32>,
@@ -123,6 +127,7 @@ impl Memory {
             points: gpu.alloc(what, capacity)?,
             places: gpu.alloc(what, capacity)?,
             values: gpu.alloc(what, capacity)?,
+            arrivals: None,
             lengths: gpu.alloc(what, 3)?,
             pinned: Pinned::new(gpu, 3)?,
         })
@@ -172,6 +177,9 @@ impl Division {
         };
         let memory = self.memory.insert(memory);
         memory.lengths.fill_bytes(0)?;
+        if panel.arrivals && memory.arrivals.is_none() {
+            memory.arrivals = Some(gpu.alloc("the lists of a gated frame", memory.capacity)?);
+        }
         let trusted: Vec<u8> = panel.gate.cells().iter().map(|&trusted| u8::from(trusted)).collect();
         let trusted = panel.surrogate.map(|_| gpu.upload("a gate", &trusted)).transpose()?;
         let choice = ChoiceArgument {
@@ -185,7 +193,7 @@ impl Division {
             pad: 0,
         };
         Ok(Divided {
-            labels: Labels::new(&gpu, panel.keep, if panel.pupil.is_some() { HELD_BACK } else { 0 })?,
+            labels: Labels::new(&gpu, panel.keep, if panel.pupil.is_some() { HELD_BACK } else { 0 }, panel.arrivals)?,
             split: &self.split,
             join: &self.join,
             memory,
@@ -255,6 +263,7 @@ impl Divided<'_> {
             points: self.memory.points.address(),
             places: self.memory.places.address(),
             values: self.memory.values.address(),
+            arrivals: self.memory.arrivals.as_ref().filter(|_| self.panel.arrivals).map_or(0, Buffer::address),
             lengths: self.memory.lengths.address(),
             capacity: capacity as u32,
             pad: 0,
@@ -274,18 +283,14 @@ impl Divided<'_> {
         }
         let answered = gpu.mark()?;
         let back = (capacity - traced) as u64;
+        let arrival = if lists.arrivals == 0 { 0 } else { lists.arrivals + 12 * back };
+        let out = Outputs { log_stretch: lists.values + 4 * back, arrival, ..Outputs::default() };
         // SAFETY: as above, at their back.
-        unsafe {
-            self.panel.tracer.trace(
-                lists.points + 12 * back,
-                traced,
-                &Outputs { log_stretch: lists.values + 4 * back, ..Outputs::default() },
-            )?;
-        }
+        unsafe { self.panel.tracer.trace(lists.points + 12 * back, traced, &out) }?;
         let tracing = gpu.mark()?;
         if let Some(pupil) = self.panel.pupil {
             // SAFETY: as above.
-            unsafe { pupil.learn_from(lists.points + 12 * back, lists.values + 4 * back, traced) }?;
+            unsafe { pupil.learn_from(lists.points + 12 * back, &out, traced) }?;
         }
         let (labels, emptied) = self.labels.offer(traced, stored, lists.lengths + 8)?;
         if emptied {

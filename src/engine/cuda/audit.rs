@@ -4,7 +4,9 @@
 use super::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
 use super::pinned::Pinned;
 use super::{Buffer, CudaTracer, DeviceError, DeviceLand, DevicePredict, Gpu, launch, threads};
+use crate::engine::answers::unit_arrival;
 use crate::engine::audit::{AuditFindings, AuditRequest, draws};
+use crate::field::Domain;
 use crate::flow::Tracer;
 use crate::surrogate::Samples;
 use crate::trust::Audited;
@@ -32,6 +34,8 @@ struct Memory {
     land: Buffer<u8>,
     traced: Buffer<f32>,
     lived: Buffer<f32>,
+    /// None until they are asked for.
+    arrivals: Option<Buffer<[f32; 3]>>,
     predicted: Buffer<f32>,
     optical: Buffer<f32>,
     begins: Buffer<u32>,
@@ -49,6 +53,7 @@ impl Memory {
             land: gpu.alloc(what, points)?,
             traced: gpu.alloc(what, points)?,
             lived: gpu.alloc(what, points)?,
+            arrivals: None,
             predicted: gpu.alloc(what, points)?,
             optical: gpu.alloc(what, points)?,
             begins: gpu.alloc(what, cells + 1)?,
@@ -87,7 +92,7 @@ impl Audits {
         Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// What [`crate::engine::audit()`] does, to the last bit where both trace and predict the same; arrival and Jacobian do not come back.
+    /// What [`crate::engine::audit()`] does, to the last bit where both trace and predict the same; Jacobians do not come back.
     ///
     /// # Errors
     /// Memory that is not there, or a device fault.
@@ -116,6 +121,11 @@ impl Audits {
         };
         memory.begins.write(&begins)?;
         let gpu = &self.gpu;
+        let arrivals = request.samples.is_some_and(|extras| extras.arrival);
+        if arrivals && memory.arrivals.is_none() {
+            memory.arrivals = Some(gpu.alloc("audit points", memory.unit.len())?);
+        }
+        let arrival = memory.arrivals.as_ref().filter(|_| arrivals).map_or(0, Buffer::address);
         let stream = gpu.work();
         let (key, stream_words) = draws(request.seed, request.stream);
         let domain = tracer.domain();
@@ -149,7 +159,7 @@ impl Audits {
                 tracer.device().trace(
                     points.points,
                     count,
-                    &Outputs { log_stretch: points.traced, lived: points.lived, ..Outputs::default() },
+                    &Outputs { log_stretch: points.traced, lived: points.lived, arrival, ..Outputs::default() },
                 )?;
                 predictor.predict(points.unit, count, points.predicted)?;
                 let mut call = stream.launch_builder(&self.measure);
@@ -157,7 +167,7 @@ impl Audits {
                 memory.optical_back.copy_from(gpu, points.optical, count)?;
             }
             if request.samples.is_some() {
-                keep(memory, count, &mut samples)?;
+                keep(memory, count, arrivals.then_some(domain), &mut samples)?;
             }
             gpu.synchronize()?;
             optical.extend_from_slice(&memory.optical_back.values()[..count]);
@@ -179,8 +189,8 @@ impl Audits {
     }
 }
 
-/// Brings a batch's points over that do not lie on land.
-fn keep(memory: &Memory, count: usize, samples: &mut Samples) -> Result<(), DeviceError> {
+/// Brings a batch's points over that do not lie on land; with a domain also where in it they arrive.
+fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &mut Samples) -> Result<(), DeviceError> {
     fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
         let mut values = vec![zero; count];
         from.read(&mut values)?;
@@ -191,6 +201,10 @@ fn keep(memory: &Memory, count: usize, samples: &mut Samples) -> Result<(), Devi
     let at_sea = || (0..count).filter(|&i| land[i] == 0);
     samples.points.extend(at_sea().map(|i| unit[i]));
     samples.log_stretch.extend(at_sea().map(|i| traced[i]));
+    if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
+        let arrivals = back(buffer, [0.0; 3], count)?;
+        samples.arrival.extend(at_sea().map(|i| unit_arrival(domain, arrivals[i])));
+    }
     Ok(())
 }
 

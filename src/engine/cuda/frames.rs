@@ -45,7 +45,7 @@ fn tally(stats: &RenderStats) -> Tally {
 }
 
 impl DeviceRenderer for CudaFrames {
-    /// With RK4 alone, with a table, or with a network that the kernels take; the others, and labels that are a flow map, need the CPU.
+    /// With RK4 alone, with a table, or with a network that the kernels take; the others, and Jacobians as labels, need the CPU.
     fn render(
         &mut self,
         renderer: &mut Renderer,
@@ -58,7 +58,7 @@ impl DeviceRenderer for CudaFrames {
     ) -> Result<Option<(Film, RenderStats)>, EngineError> {
         let Some(tracer) = own(tracer) else { return Ok(None) };
         let asked = answers.asked();
-        if asked.flow_map {
+        if asked.extras.jacobian {
             return Ok(None);
         }
         let predictor = match asked.surrogate {
@@ -84,6 +84,7 @@ impl DeviceRenderer for CudaFrames {
             gate: asked.gate,
             trace_budget: asked.trace_budget,
             keep: asked.keep,
+            arrivals: asked.extras.arrival,
         })?;
         let (film, stats) = self.renderer.render_samples(renderer, picture, samples, &mut divided, progress, stop)?;
         let tally = Tally {
@@ -96,15 +97,15 @@ impl DeviceRenderer for CudaFrames {
         Ok(Some((film, stats)))
     }
 
-    /// Where the surrogate predicts on the device, unless flow maps are to come back.
+    /// Where the surrogate predicts on the device, unless Jacobians are to come back.
     fn audit(
         &mut self,
         request: &AuditRequest<'_>,
         tracer: &dyn Tracer,
         surrogate: &dyn Predict,
     ) -> Result<Option<AuditFindings>, DeviceError> {
-        let flow_map = request.samples.is_some_and(|extras| extras.arrival || extras.jacobian);
-        let Some(tracer) = own(tracer).filter(|_| !flow_map) else { return Ok(None) };
+        let jacobian = request.samples.is_some_and(|extras| extras.jacobian);
+        let Some(tracer) = own(tracer).filter(|_| !jacobian) else { return Ok(None) };
         let Some(predictor) = self.predictors.of(surrogate, tracer)? else { return Ok(None) };
         self.audits.audit(request, tracer, &predictor).map(Some)
     }

@@ -19,13 +19,13 @@ use std::sync::Arc;
 
 type HostTrace = unsafe extern "C" fn(*const c_void, *const c_void, *const c_void, f64, *const Verdict, *const f32, u32, *const Outputs);
 
-/// Compiles `kernels/host.cpp` with these macros.
-fn library(folder: &Path, defines: &[String]) -> libloading::Library {
+/// Compiles `source` of `kernels/` with these macros.
+pub(super) fn library(folder: &Path, source: &str, defines: &[String]) -> libloading::Library {
     let kernels = concat!(env!("CARGO_MANIFEST_DIR"), "/kernels");
     let out = folder.join("kernel.so");
     let mut command = Command::new("g++");
     command.args(["-std=c++17", "-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-I", kernels, "-o"]);
-    command.arg(&out).args(defines.iter().map(|d| format!("-D{d}"))).arg(format!("{kernels}/host.cpp"));
+    command.arg(&out).args(defines.iter().map(|d| format!("-D{d}"))).arg(format!("{kernels}/{source}"));
     let done = command.output().expect("g++ is installed (`make packages` sees to it)");
     assert!(done.status.success(), "{command:?}\n{}", String::from_utf8_lossy(&done.stderr));
     // SAFETY: the library has no initialisers.
@@ -80,7 +80,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
         }
     };
     defines.sort();
-    let library = library(folder.path(), &defines);
+    let library = library(folder.path(), "host.cpp", &defines);
     let n = seeds.len();
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
@@ -110,7 +110,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
 const HALF_SCALE: f32 = 1.0 / 256.0;
 
 /// A number in half precision, by rounding of our own.
-fn half(x: f32) -> u16 {
+pub(super) fn half(x: f32) -> u16 {
     if x.is_nan() {
         return 0x7e00;
     }
@@ -468,7 +468,7 @@ fn round_to_half(x: f32) -> f32 {
 fn halves_round_to_nearest() {
     let folder = tempfile::tempdir().unwrap();
     let defines = ["RW_CLOSED=1", "RW_REAL=float", "RW_FORM=0", "RW_BOUNDARY=3", "RW_DIFFERENCES=0", "RW_STARTS=0"].map(String::from);
-    let library = library(folder.path(), &defines);
+    let library = library(folder.path(), "host.cpp", &defines);
     // SAFETY: the function has this signature.
     let half: libloading::Symbol<unsafe extern "C" fn(f32) -> f32> = unsafe { library.get(b"host_half") }.unwrap();
     // SAFETY: as above.

@@ -5,6 +5,7 @@
 
 use super::layout::LabelsArgument;
 use super::{Buffer, DeviceError, Gpu};
+use crate::engine::answers::unit_arrival;
 use crate::field::Domain;
 use crate::render::rng::philox;
 use crate::surrogate::Samples;
@@ -17,8 +18,28 @@ const MOST: usize = 1 << 22;
 /// training must be held out on both sides.
 pub(super) const HELD_BACK: u32 = 3;
 
-/// A traced point: domain coordinates, log-stretch.
-pub type Label = [f32; 4];
+/// A traced point.
+#[derive(Debug, Clone, Copy)]
+struct Label {
+    /// Domain coordinates, log-stretch.
+    at: [f32; 4],
+    /// Where it arrives, domain coordinates; NaN where that is not asked for.
+    arrival: [f32; 3],
+}
+
+impl Label {
+    fn point(&self) -> [f32; 3] {
+        let [x, y, z, _] = self.at;
+        [x, y, z]
+    }
+}
+
+/// Labels on the device.
+#[derive(Debug)]
+struct Memory {
+    at: Buffer<[f32; 4]>,
+    arrivals: Option<Buffer<[f32; 3]>>,
+}
 
 /// Whether the label at a point belongs to the kept share of 1 in 2^shift.
 pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
@@ -35,15 +56,20 @@ pub struct Labels {
     offered: u64,
     /// Brought back before the memory on the device was full.
     back: Vec<Label>,
-    memory: Option<Buffer<Label>>,
+    memory: Option<Memory>,
+    arrivals: bool,
 }
 
 impl Labels {
-    /// Keeps fewer than `keep`, of every 2^shift points one at most; none where `keep` is 1 or 0.
-    pub fn new(gpu: &Gpu, keep: usize, shift: u32) -> Result<Self, DeviceError> {
+    /// Keeps fewer than `keep`, of every 2^shift points one at most; none where `keep` is 1 or 0. `arrivals`: with those of each.
+    pub fn new(gpu: &Gpu, keep: usize, shift: u32, arrivals: bool) -> Result<Self, DeviceError> {
         let keep = if keep > 1 { keep.min(MOST) } else { 0 };
-        let memory = (keep > 0).then(|| gpu.alloc("labels", Self::with_luck(keep))).transpose()?;
-        Ok(Self { keep, shift, offered: 0, back: Vec::new(), memory })
+        let room = Self::with_luck(keep);
+        let memory = || -> Result<Memory, DeviceError> {
+            let arrivals = arrivals.then(|| gpu.alloc("labels", room)).transpose()?;
+            Ok(Memory { at: gpu.alloc("labels", room)?, arrivals })
+        };
+        Ok(Self { keep, shift, offered: 0, back: Vec::new(), memory: (keep > 0).then(memory).transpose()?, arrivals })
     }
 
     /// Six standard deviations more than a number that is drawn, and a few.
@@ -54,33 +80,40 @@ impl Labels {
     /// What the kernel is told for `traced` further points. `stored` labels are in the device's memory, whose count is at `length`; when
     /// they leave too little room they come back first, and the count is to be set to 0 (true).
     pub fn offer(&mut self, traced: usize, stored: usize, length: u64) -> Result<(LabelsArgument, bool), DeviceError> {
-        let Some(memory) = &self.memory else { return Ok((LabelsArgument { at: 0, length, capacity: 0, shift: 0 }, false)) };
+        let Some(memory) = &self.memory else {
+            return Ok((LabelsArgument { at: 0, arrivals: 0, length, capacity: 0, shift: 0 }, false));
+        };
         self.offered += traced as u64;
         // Three quarters, so that what is drawn in excess does not cost half of it.
         while self.offered >> self.shift > (self.keep - self.keep / 4) as u64 {
             self.shift += 1;
         }
-        let (address, capacity) = (memory.address(), memory.len());
+        let (at, capacity) = (memory.at.address(), memory.at.len());
+        let arrivals = memory.arrivals.as_ref().map_or(0, Buffer::address);
         let full = stored + Self::with_luck(traced >> self.shift) > capacity;
         if full {
             self.take(stored)?;
         }
-        Ok((LabelsArgument { at: address, length, capacity: capacity as u32, shift: self.shift }, full))
+        Ok((LabelsArgument { at, arrivals, length, capacity: capacity as u32, shift: self.shift }, full))
     }
 
     /// Brings `stored` labels back, all that are on the device.
     pub fn take(&mut self, stored: usize) -> Result<(), DeviceError> {
         let Some(memory) = &self.memory else { return Ok(()) };
-        let mut fresh = vec![[0.0; 4]; stored.min(memory.len())];
-        memory.read(&mut fresh)?;
-        self.back.append(&mut fresh);
+        let mut at = vec![[0.0; 4]; stored.min(memory.at.len())];
+        memory.at.read(&mut at)?;
+        let mut arrivals = vec![[f32::NAN; 3]; at.len()];
+        if let Some(buffer) = &memory.arrivals {
+            buffer.read(&mut arrivals)?;
+        }
+        self.back.extend(at.into_iter().zip(arrivals).map(|(at, arrival)| Label { at, arrival }));
         self.thin();
         Ok(())
     }
 
     fn thin(&mut self) {
         let shift = self.shift;
-        self.back.retain(|&[x, y, z, _]| keeps_label([x, y, z], shift));
+        self.back.retain(|label| keeps_label(label.point(), shift));
     }
 
     /// All that is kept and was brought back, in unit coordinates of `domain`.
@@ -89,10 +122,12 @@ impl Labels {
             self.shift += 1;
             self.thin();
         }
-        self.back.par_sort_unstable_by_key(|label| label.map(f32::to_bits));
+        self.back.par_sort_unstable_by_key(|label| label.at.map(f32::to_bits));
+        let arrivals = if self.arrivals { &self.back[..] } else { &[] };
         Samples {
-            points: self.back.par_iter().map(|&[x, y, z, _]| domain.to_unit([x, y, z])).collect(),
-            log_stretch: self.back.iter().map(|label| label[3]).collect(),
+            points: self.back.par_iter().map(|label| domain.to_unit(label.point())).collect(),
+            log_stretch: self.back.iter().map(|label| label.at[3]).collect(),
+            arrival: arrivals.par_iter().map(|label| unit_arrival(domain, label.arrival)).collect(),
             ..Samples::default()
         }
     }

@@ -174,6 +174,7 @@ pub struct ListsArgument {
     pub points: u64,
     pub places: u64,
     pub values: u64,
+    pub arrivals: u64,
     pub lengths: u64,
     pub capacity: u32,
     pub pad: u32,
@@ -184,6 +185,7 @@ pub struct ListsArgument {
 #[derive(Debug, Clone, Copy)]
 pub struct LabelsArgument {
     pub at: u64,
+    pub arrivals: u64,
     pub length: u64,
     pub capacity: u32,
     pub shift: u32,
@@ -285,7 +287,7 @@ mod tests {
         assert_eq!((size_of::<SortFrame>(), size_of::<TableFrame>()), (52, 64));
         // static_asserts in the kernels' sources hold the other side of these.
         assert_eq!((size_of::<TableArgument>(), size_of::<LandArgument>(), size_of::<ChoiceArgument>()), (24, 96, 176));
-        assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (40, 24));
+        assert_eq!((size_of::<ListsArgument>(), size_of::<LabelsArgument>()), (48, 32));
         assert_eq!((size_of::<AuditDrawArgument>(), size_of::<AuditBatchArgument>()), (176, 16));
         assert_eq!((size_of::<AuditPointsArgument>(), size_of::<CellFindings>()), (56, 80));
     }

@@ -22,6 +22,8 @@ mod layout;
 mod memory;
 mod network;
 mod network_batched;
+#[cfg(test)]
+mod network_host_parity;
 mod network_layout;
 mod network_training;
 mod offload;

@@ -6,10 +6,10 @@
 use super::launch::Resident;
 use super::layout::TableArgument;
 use super::network_batched::{Batched, GradientTo, Tiling};
-use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument, UnitBoxArgument};
+use super::network_layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, HASH, Loss, Objective, Target, row};
+use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
 use std::sync::Arc;
 
@@ -32,17 +32,27 @@ pub fn is_fused(shape: &Architecture, shared_memory: usize) -> bool {
     hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST && workspace <= shared_memory
 }
 
-/// The macros that `network*.cu` are compiled with for an architecture; none where it has several outputs, or more than three inputs.
-pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
+/// Whether a loss has a penalty on the difference of the batch means.
+pub(super) fn has_penalty(objective: &Objective) -> bool {
+    objective.target == Target::Ftle && objective.loss == Loss::Published && objective.mean_penalty != 0.0
+}
+
+/// The macros that `network*.cu` are compiled with for an architecture, and a loss with or without a penalty on means; none where it has no
+/// hidden layer, or the flow map of a single axis.
+pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
-    if shape.target != Target::Ftle || hidden == 0 {
+    let flow_map = shape.target == Target::FlowMap;
+    if hidden == 0 || (flow_map && shape.dimensions() < 2) {
         return None;
     }
-    let axes: Vec<String> = places(shape)?.iter().map(usize::to_string).collect();
+    let axes: Vec<String> = places(shape).iter().map(usize::to_string).collect();
     let (weights, workspace) = shared_bytes(shape);
     Some(vec![
         format!("RW_AXES={}", axes.join(",")),
         format!("RW_DIMS={}", shape.inputs()),
+        format!("RW_SPACE={}", shape.dimensions()),
+        format!("RW_FLOW_MAP={}", u8::from(flow_map)),
+        format!("RW_PENALTY={}", u8::from(penalty)),
         format!("RW_LEVELS={}", shape.levels.len()),
         format!("RW_FEATURES={}", shape.features),
         format!("RW_OCTAVES={}", shape.octaves),
@@ -53,23 +63,55 @@ pub fn network_defines(shape: &Architecture) -> Option<Vec<String>> {
     ])
 }
 
-/// Which of the three numbers of a unit point holds each input: axes have their own, times those of axes that the network is not shown. None
-/// where there are too many.
-fn places(shape: &Architecture) -> Option<Vec<usize>> {
-    let mut free = (0..3).filter(|place| !shape.space().contains(place));
-    let times = shape.times().iter().map(|_| free.next());
-    shape.space().iter().map(|&axis| Some(axis)).chain(times).collect()
+/// Numbers of a unit point.
+pub(super) const POINT: usize = 3;
+
+/// Which place of a sample holds each input: axes have their own among the three of its point, times take those of axes that the network is
+/// not shown, and what places they need behind these.
+fn places(shape: &Architecture) -> Vec<usize> {
+    let free = (0..).filter(|place| !shape.space().contains(place));
+    shape.space().iter().copied().chain(free.take(shape.times().len())).collect()
 }
 
-/// Unit times at those places; NaN at the others, and everywhere where there are none, for what a point brings along.
-pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> [f32; 3] {
-    let mut placed = [f32::NAN; 3];
-    let (Some(times), Some(places)) = (times, places(shape)) else { return placed };
-    let row = row([f32::NAN; 3], times);
-    for (place, &column) in places.into_iter().zip(&shape.axes) {
-        placed[place] = row[column];
+/// `PLACES` of `network.cuh`, and floats of a sample, in whole `Four`s.
+fn sample_room(shape: &Architecture) -> [usize; 2] {
+    let places = shape.inputs().max(POINT);
+    [places, (places + shape.outputs()).next_multiple_of(4)]
+}
+
+/// Places of a sample behind its point.
+pub(super) fn further_places(shape: &Architecture) -> usize {
+    sample_room(shape)[0] - POINT
+}
+
+/// `Four`s of a sample.
+pub(super) fn sample_fours(shape: &Architecture) -> usize {
+    sample_room(shape)[1] / 4
+}
+
+/// Unit times at those places; NaN at the others. Where none are asked for, a point brings along what it has places for.
+pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> PlacedTimes {
+    let mut placed = [f32::NAN; 5];
+    let row: Row = row([f32::NAN; 3], times.unwrap_or(UNTIMED));
+    for (place, &column) in places(shape).into_iter().zip(&shape.axes) {
+        if times.is_some() || place >= POINT {
+            placed[place] = row[column];
+        }
     }
     placed
+}
+
+/// Length of tangents: between that of the finest and of the coarsest slope of the encoding, so that halves hold both.
+fn tangent_step(shape: &Architecture) -> f32 {
+    let step = match shape.encoding {
+        Encoding::HashGrid => {
+            let cells = || shape.levels.iter().flat_map(|level| &level.cells[..shape.dimensions()]).map(|&cells| cells as f32);
+            1.0 / (cells().fold(1.0, f32::max) * cells().fold(f32::MAX, f32::min)).sqrt()
+        }
+        Encoding::Frequency => 1.0 / (std::f32::consts::PI * (0.5 * (shape.octaves as f32 - 1.0)).exp2()),
+    };
+    // A power of two changes no digit.
+    step.log2().round().exp2()
 }
 
 /// Sizes of `Weights` in `network.cuh` and `Workspace` in `network_fused.cu`, which asserts them.
@@ -78,7 +120,7 @@ fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     let [encoded, width] = [shape.encoded(), shape.layers[0].outputs].map(|n| n.next_multiple_of(16));
     let (row, head_row) = (width + 8, 16);
     let halves = encoded * row + (hidden - 1).max(1) * width * row + width * head_row;
-    let weights = (2 * halves + 4 * (hidden * width + 1)).next_multiple_of(16);
+    let weights = (2 * halves + 4 * (hidden * width + shape.outputs())).next_multiple_of(16);
     (weights, weights + 2 * TILE * (encoded.max(width) + 8 + row))
 }
 
@@ -105,19 +147,21 @@ pub(super) struct NetworkKernels {
     pub(super) samples: CudaFunction,
     pub(super) usable: CudaFunction,
     pub(super) points: CudaFunction,
+    pub(super) drawn: CudaFunction,
+    pub(super) means: CudaFunction,
 }
 
 impl NetworkKernels {
     /// Compiles them, or takes them from the cache.
-    pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture) -> Result<Arc<Self>, DeviceError> {
+    pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture, objective: &Objective) -> Result<Arc<Self>, DeviceError> {
         let refuse = |what: String| Err(DeviceError::Unsupported { what });
         if gpu.capability() < OLDEST {
             let (major, minor) = gpu.capability();
             return refuse(format!("a network on compute capability {major}.{minor}; it needs 8.0 or later"));
         }
-        let Some(defines) = network_defines(shape) else {
+        let Some(defines) = network_defines(shape, has_penalty(objective)) else {
             return refuse(format!(
-                "a network of {} hidden layers and the inputs {} for the target {:?}; the device takes the target ftle with at least one layer and at most three inputs",
+                "a network of {} hidden layers and the inputs {} for the target {:?}; the device takes at least one layer, and a flow map of two axes or three",
                 shape.layers.len() - 1,
                 shape.input_names().join(", "),
                 shape.target
@@ -144,6 +188,8 @@ impl NetworkKernels {
             samples: kernel("network_samples")?,
             usable: kernel("network_usable")?,
             points: kernel("network_points")?,
+            drawn: kernel("network_drawn")?,
+            means: kernel("network_means")?,
             gpu: gpu.clone(),
             shape: shape.clone(),
             grid,
@@ -155,7 +201,7 @@ impl NetworkKernels {
     ///
     /// # Safety
     /// As for [`DevicePredict::predict`]; `halves` are the padded tables and `layers` the flat vector of this architecture.
-    unsafe fn predict(
+    pub(super) unsafe fn predict(
         &self,
         halves: u64,
         layers: u64,
@@ -209,48 +255,59 @@ impl NetworkKernels {
 }
 
 /// Levels as the kernels read them, and the values of the padded tables.
-fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
-    let mut grid = GridArgument::default();
+pub(super) fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
+    let mut levels = Vec::new();
     let mut offset = 0;
-    for (level, argument) in shape.levels.iter().zip(&mut grid.levels) {
+    for level in &shape.levels {
         let mut stride = 1_u32;
         let factor = std::array::from_fn(|axis| {
             let dense = stride;
             stride = stride.wrapping_mul(level.cells[axis] + 1);
             if level.hashed { HASH[axis] } else { dense }
         });
-        let [x, y, z, _] = level.cells;
-        *argument = LevelArgument {
-            cells: [x, y, z].map(|n| n as f32),
-            last_cell: [x, y, z].map(|n| n - 1),
+        levels.push(LevelArgument {
+            cells: level.cells.map(|n| n as f32),
+            last_cell: level.cells.map(|n| n - 1),
             factor,
             mask: (level.entries - 1) as u32,
             hashed: u32::from(level.hashed),
             entries: level.entries as u32,
             offset: offset as u32,
             start: level.offset as u32,
-        };
+        });
         offset += level.entries.next_multiple_of(PADDING);
     }
     if u32::try_from(offset).is_err() {
         return Err(DeviceError::Unsupported { what: format!("tables of {offset} entries") });
     }
-    Ok((grid, offset * shape.features))
+    Ok((GridArgument::new(&levels, shape.inputs()), offset * shape.features))
 }
 
 /// How outputs become log-stretch, above `base` by `share` of them where there is one, and the times that points have ([`placed_times`]).
-pub(super) fn reading(objective: &Objective, times: [f32; 3], base: Option<&DeviceTable>, share: f32) -> ReadingArgument {
+pub(super) fn reading(
+    shape: &Architecture,
+    objective: &Objective,
+    times: PlacedTimes,
+    base: Option<&DeviceTable>,
+    share: f32,
+) -> ReadingArgument {
     let table = base.map_or(TableArgument { nodes: [0; 3], dimensions: 0, values: 0 }, |base| {
         let nodes = base.nodes().map(|n| n as i32);
         TableArgument { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: base.address() }
     });
+    let (step, Objective { scale, extent, .. }) = (tangent_step(shape), objective);
     ReadingArgument {
-        mean: objective.scale.mean[0],
-        deviation: objective.scale.deviation[0],
+        mean: scale.mean,
+        deviation: scale.deviation,
         tau: objective.tau,
-        published: i32::from(objective.loss == Loss::Published),
+        published: i32::from(objective.target == Target::Ftle && objective.loss == Loss::Published),
         share,
         times,
+        step,
+        factor: std::array::from_fn(|output| {
+            std::array::from_fn(|along| scale.deviation[output] * extent[output] / (extent[along] * step))
+        }),
+        further: 0,
         base: table,
     }
 }
@@ -281,7 +338,9 @@ impl DeviceNetwork {
     /// Whether the kernels take networks of this architecture on this device.
     pub fn takes(gpu: &Gpu, shape: &Architecture) -> bool {
         let most = gpu.shared_memory();
-        gpu.capability() >= OLDEST && network_defines(shape).is_some() && (is_fused(shape, most) || Tiling::of(shape, most).is_some())
+        gpu.capability() >= OLDEST
+            && network_defines(shape, false).is_some()
+            && (is_fused(shape, most) || Tiling::of(shape, most).is_some())
     }
 
     /// Brings parameters over, as burn's tensors hold them.
@@ -295,7 +354,7 @@ impl DeviceNetwork {
         tables: &[f32],
         layers: &[f32],
     ) -> Result<Self, DeviceError> {
-        let kernels = NetworkKernels::new(gpu, shape)?;
+        let kernels = NetworkKernels::new(gpu, shape, objective)?;
         let tables = gpu.upload("a network's tables", tables)?;
         let layers = gpu.upload("a network's layers", layers)?;
         Self::of(&kernels, objective, &tables, layers)
@@ -318,7 +377,8 @@ impl DeviceNetwork {
         2 * self.kernels.padded + 4 * self.layers.len()
     }
 
-    /// Above a table, by a share of the network. Where times are inputs, points bring them along, at the places of axes that are none.
+    /// Above a table, by a share of the network. Where times are inputs, points bring them along at the places of axes that are none; those
+    /// that find no place there are those of samples that say nothing of time.
     pub fn above<'a>(&'a self, base: Option<(&'a DeviceTable, f32)>) -> NetworkAbove<'a> {
         NetworkAbove { network: self, base, times: None }
     }
@@ -345,7 +405,8 @@ impl DevicePredict for NetworkAbove<'_> {
         }
         let DeviceNetwork { kernels, halves, layers, objective } = self.network;
         let times = placed_times(&kernels.shape, self.times);
-        let reading = reading(objective, times, self.base.map(|(table, _)| table), self.base.map_or(1.0, |(_, share)| share));
+        let (base, share) = self.base.map_or((None, 1.0), |(table, share)| (Some(table), share));
+        let reading = reading(&kernels.shape, objective, times, base, share);
         // SAFETY: the caller's; the parameters are of these kernels' architecture.
         unsafe { kernels.predict(halves.address(), layers.address(), &reading, points, count, out) }
     }

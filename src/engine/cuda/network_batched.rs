@@ -2,9 +2,9 @@
 //! are products over all samples. See `kernels/network_batched.cu`.
 
 use super::launch::Resident;
-use super::network_layout::{DrawArgument, GridArgument, LevelArgument, ReadingArgument};
+use super::network_layout::{DrawArgument, GridArgument, ReadingArgument};
 use super::{Buffer, DeviceError, Gpu, launch, threads};
-use crate::surrogate::network::Architecture;
+use crate::surrogate::network::{Architecture, Target};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -48,7 +48,9 @@ impl Tiling {
         let encoded_passes = shape.encoded().div_ceil(columns);
         let row = passes.max(encoded_passes) * columns;
         let slice = 2 * DEPTH * (columns + SKEW);
-        let levels = size_of::<LevelArgument>() * shape.levels.len().max(1);
+        let levels = GridArgument::level_bytes(shape.inputs()) * shape.levels.len().max(1);
+        // Places and targets of a sample, and slopes.
+        let sample = 4 * (shape.inputs().max(3) + 2 * shape.outputs());
         let all = TILINGS.map(|(rows, stages)| Self {
             rows,
             stages,
@@ -56,8 +58,7 @@ impl Tiling {
             columns,
             encoded: shape.encoded().next_multiple_of(DEPTH),
             encoded_passes,
-            // Values, slices, samples and slopes.
-            tile_bytes: (2 * rows * (row + SKEW) + stages * slice + 20 * rows + levels).next_multiple_of(16),
+            tile_bytes: (2 * rows * (row + SKEW) + stages * slice + sample * rows + levels).next_multiple_of(16),
             product_bytes: stages * (2 * DEPTH * (PANEL + SKEW) + slice),
         });
         all.into_iter().find(|t| t.rows * row <= TILE_VALUES && t.tile_bytes.max(t.product_bytes) <= shared_memory)
@@ -87,9 +88,9 @@ impl Tiling {
         [forward, forward + (others + back) * self.width()]
     }
 
-    /// Words that say which of a tile's values the activation passed, of all layers but the last.
-    fn passed(&self, hidden: usize) -> usize {
-        (hidden - 1) * self.passes * (self.rows / 32) * THREADS as usize
+    /// Words that say which of a tile's values the activation passed, of so many layers.
+    fn passed(&self, layers: usize) -> usize {
+        layers * self.passes * (self.rows / 32) * THREADS as usize
     }
 }
 
@@ -106,6 +107,7 @@ pub(super) struct Batched {
     /// First value of the head in the flat vector.
     head: usize,
     tables: bool,
+    flow_map: bool,
     round: CudaFunction,
     predict: Resident,
     gradient: Resident,
@@ -117,6 +119,8 @@ pub(super) struct Batched {
 #[derive(Debug, Default)]
 struct Memory {
     rounded: Option<Rounded>,
+    /// Which values passed, where a flow map is predicted.
+    passed: Option<Buffer<u32>>,
     training: Option<Training>,
 }
 
@@ -167,6 +171,7 @@ impl Batched {
             hidden,
             head: head.weights,
             tables: !shape.levels.is_empty(),
+            flow_map: shape.target == Target::FlowMap,
             round: kernel("batched_slices")?,
             predict: resident("batched_predict", tiling.tile_bytes)?,
             gradient: resident("batched_gradient", tiling.tile_bytes)?,
@@ -211,9 +216,13 @@ impl Batched {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
         let [forward, _] = self.tiling.slices(self.hidden, self.tables);
         let (slices, biases) = self.rounded(&mut memory.rounded, layers, forward)?;
-        let (head, n) = (layers + 4 * self.head as u64, count as u32);
+        if self.flow_map && memory.passed.is_none() {
+            memory.passed = Some(self.passed(&self.predict, self.hidden)?);
+        }
+        let (head, n, passed) = (layers + 4 * self.head as u64, count as u32, memory.passed.as_ref().map_or(0, Buffer::address));
         let mut call = self.gpu.work().launch_builder(&self.predict.function);
-        call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(reading).arg(&points).arg(&n).arg(&out);
+        call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(reading).arg(&points).arg(&n);
+        call.arg(&passed).arg(&out);
         // SAFETY: the caller's, and the arguments are those of `batched_predict`.
         unsafe { launch(&mut call, self.predict.config(count.div_ceil(self.tiling.rows))) }
     }
@@ -224,7 +233,7 @@ impl Batched {
     /// Device addresses as for [`Self::predict`] and in [`GradientTo`]; the samples of `draw` are there.
     pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
-        let Memory { rounded, training } = &mut *memory;
+        let Memory { rounded, training, .. } = &mut *memory;
         let [_, all] = self.tiling.slices(self.hidden, self.tables);
         let (slices, biases) = self.rounded(rounded, layers, all)?;
         let training = match training {
@@ -265,7 +274,12 @@ impl Batched {
             encoded: self.gpu.alloc("encoded samples", rows * self.tiling.encoded)?,
             values: self.gpu.alloc("the layers' values", self.hidden * rows * width)?,
             deltas: self.gpu.alloc("gradients of the layers' values", self.hidden * rows * width)?,
-            passed: self.gpu.alloc("which values passed", self.gradient.blocks as usize * self.tiling.passed(self.hidden))?,
+            passed: self.passed(&self.gradient, self.hidden - 1)?,
         })
+    }
+
+    /// Room for which values of so many layers passed, in all blocks of a kernel.
+    fn passed(&self, kernel: &Resident, layers: usize) -> Result<Buffer<u32>, DeviceError> {
+        self.gpu.alloc("which values passed", kernel.blocks as usize * self.tiling.passed(layers))
     }
 }

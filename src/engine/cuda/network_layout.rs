@@ -1,18 +1,18 @@
 //! Structures that the network's kernels read, laid out as in `kernels/network.cuh`, `kernels/network_data.cuh` and `kernels/network.cu`.
 
 use super::layout::TableArgument;
+use crate::surrogate::network::GRID_INPUTS;
 use cudarc::driver::DeviceRepr;
 
 /// Most levels of a hash grid.
 const MOST_LEVELS: usize = 32;
 
-/// `Level`.
-#[repr(C)]
+/// What `Level` says.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LevelArgument {
-    pub cells: [f32; 3],
-    pub last_cell: [u32; 3],
-    pub factor: [u32; 3],
+    pub cells: [f32; GRID_INPUTS],
+    pub last_cell: [u32; GRID_INPUTS],
+    pub factor: [u32; GRID_INPUTS],
     pub mask: u32,
     pub hashed: u32,
     pub entries: u32,
@@ -21,22 +21,50 @@ pub struct LevelArgument {
 }
 
 /// `Grid`, of which a kernel takes as many levels as it is compiled for.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default)]
+#[repr(C, align(8))]
+#[derive(Debug, Clone, Copy)]
 pub struct GridArgument {
-    pub levels: [LevelArgument; MOST_LEVELS],
+    words: [u32; 18 * MOST_LEVELS],
 }
+
+impl GridArgument {
+    /// Bytes of a `Level`, which has room for three inputs, or four.
+    pub const fn level_bytes(inputs: usize) -> usize {
+        if inputs > 3 { 72 } else { 56 }
+    }
+
+    /// At most as many levels as there is room for.
+    pub fn new(levels: &[LevelArgument], inputs: usize) -> Self {
+        let (room, held) = (Self::level_bytes(inputs) / 4, inputs.clamp(3, GRID_INPUTS));
+        let mut grid = Self { words: [0; 18 * MOST_LEVELS] };
+        for (level, to) in levels.iter().zip(grid.words.chunks_exact_mut(room)) {
+            let cells = level.cells.map(f32::to_bits);
+            let lists = [&cells[..held], &level.last_cell[..held], &level.factor[..held]];
+            let rest = [level.mask, level.hashed, level.entries, level.offset, level.start];
+            for (to, from) in to.iter_mut().zip(lists.into_iter().flatten().chain(&rest)) {
+                *to = *from;
+            }
+        }
+        grid
+    }
+}
+
+/// Unit times at the places of samples that hold them; NaN at the others.
+pub type PlacedTimes = [f32; 5];
 
 /// `Reading`.
 #[repr(C)]
 #[derive(Debug, Clone, Copy)]
 pub struct ReadingArgument {
-    pub mean: f32,
-    pub deviation: f32,
+    pub mean: [f32; 3],
+    pub deviation: [f32; 3],
     pub tau: f32,
     pub published: i32,
     pub share: f32,
-    pub times: [f32; 3],
+    pub times: PlacedTimes,
+    pub step: f32,
+    pub factor: [[f32; 3]; 3],
+    pub further: u64,
     pub base: TableArgument,
 }
 
@@ -53,7 +81,8 @@ pub struct DrawArgument {
     pub batch: u32,
     pub random: u32,
     pub hold_out: u32,
-    pub pad: u32,
+    pub penalty: f32,
+    pub means: u64,
 }
 
 /// `Adam`.
@@ -92,7 +121,7 @@ mod tests {
     #[test]
     fn sizes_are_those_of_cpp() {
         // static_asserts in the kernels' sources hold the other side.
-        assert_eq!((size_of::<LevelArgument>(), size_of::<ReadingArgument>()), (56, 56));
-        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (56, 16, 48));
+        assert_eq!(size_of::<ReadingArgument>(), 128);
+        assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (64, 16, 48));
     }
 }

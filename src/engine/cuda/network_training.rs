@@ -3,13 +3,15 @@
 //! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
-use super::network::{DeviceNetwork, NetworkKernels, copied, copy, placed_times, reading, unit_box};
+use super::network::{
+    DeviceNetwork, NetworkKernels, POINT, copied, copy, further_places, has_penalty, placed_times, reading, sample_fours, unit_box,
+};
 use super::network_batched::GradientTo;
-use super::network_layout::{AdamArgument, DrawArgument};
+use super::network_layout::{AdamArgument, DrawArgument, ReadingArgument};
 use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
-use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Loss, Model, Objective, PlannedStep};
+use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Model, Objective, PlannedStep, Target};
 use cudarc::driver::PushKernelArg;
 use std::borrow::Cow;
 use std::ops::Range;
@@ -27,18 +29,52 @@ pub(super) struct SampleWriter {
     objective: Objective,
 }
 
+/// Traced points, as device addresses.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct TracedPoints {
+    /// Three f32 each, with the times at the places of axes that are no inputs, unless those of all are the same.
+    pub(super) points: u64,
+    /// Log-stretch (f32 each), or for the flow map arrivals (three f32 each, as points).
+    pub(super) labels: u64,
+    /// Times that points have no place for (so many f32 each); 0: none.
+    further: u64,
+}
+
 impl SampleWriter {
-    /// Points of samples on the host, with their times where the network is shown them.
-    fn placed<'a>(&self, samples: &'a Samples, range: Range<usize>) -> Cow<'a, [[f32; 3]]> {
+    /// Points of samples on the host, with their times where the network is shown them; and those times that find no place in a point.
+    fn placed<'a>(&self, samples: &'a Samples, range: Range<usize>) -> (Cow<'a, [[f32; 3]]>, Vec<f32>) {
         let shape = &self.kernels.shape;
         if shape.times().is_empty() {
-            return Cow::Borrowed(&samples.points[range]);
+            return (Cow::Borrowed(&samples.points[range]), Vec::new());
         }
+        let mut further = Vec::new();
         let with_times = |index: usize| {
             let times = placed_times(shape, Some(samples.times_of(index)));
+            further.extend(&times[POINT..][..further_places(shape)]);
             std::array::from_fn(|k| if times[k].is_nan() { samples.points[index][k] } else { times[k] })
         };
-        range.map(with_times).collect()
+        (range.map(with_times).collect(), further)
+    }
+
+    /// Labels of samples on the host; none is NaN.
+    fn labels<'a>(&self, samples: &'a Samples, range: Range<usize>) -> Cow<'a, [f32]> {
+        match self.target() {
+            Target::Ftle => Cow::Borrowed(&samples.log_stretch[range]),
+            Target::FlowMap => match samples.arrival.get(range.clone()) {
+                Some(arrivals) => Cow::Borrowed(arrivals.as_flattened()),
+                None => Cow::Owned(vec![f32::NAN; 3 * range.len()]),
+            },
+        }
+    }
+
+    /// What the network is trained on.
+    pub(super) fn target(&self) -> Target {
+        self.kernels.shape.target
+    }
+
+    /// Bytes of a sample.
+    pub(super) fn sample_bytes(&self) -> usize {
+        size_of::<[f32; 4]>() * sample_fours(&self.kernels.shape)
     }
 
     /// Traced points on the device go to the places of `to`. Of every 2^held_back of them one cannot be learned from
@@ -51,8 +87,7 @@ impl SampleWriter {
         ring: &DeviceSamples,
         to: Range<usize>,
         domain: &Domain,
-        points: u64,
-        log_stretch: u64,
+        traced: TracedPoints,
         base: Option<&DeviceTable>,
         times: Option<[f32; 2]>,
         held_back: u32,
@@ -60,13 +95,17 @@ impl SampleWriter {
         if to.is_empty() {
             return Ok(());
         }
-        assert!(to.end <= ring.samples.len(), "a ring of {} for samples {to:?}", ring.samples.len());
-        let (domain, times) = (unit_box(domain), placed_times(&self.kernels.shape, times));
-        let reading = reading(&self.objective, times, base, 1.0);
-        let (n, at) = (to.len() as u32, ring.samples.address_of(to.start));
+        assert!(to.end <= ring.capacity(), "a ring of {} for samples {to:?}", ring.capacity());
+        let (domain, shape, TracedPoints { points, labels, further }) = (unit_box(domain), &self.kernels.shape, traced);
+        let mut times = placed_times(shape, times);
+        if further != 0 {
+            times[POINT..].fill(f32::NAN);
+        }
+        let reading = ReadingArgument { further, ..reading(shape, &self.objective, times, base, 1.0) };
+        let (n, at) = (to.len() as u32, ring.samples.address_of(ring.fours * to.start));
         let stream = self.kernels.gpu.work();
         let mut call = stream.launch_builder(&self.kernels.samples);
-        call.arg(&domain).arg(&reading).arg(&points).arg(&log_stretch).arg(&n).arg(&held_back).arg(&at);
+        call.arg(&domain).arg(&reading).arg(&points).arg(&labels).arg(&n).arg(&held_back).arg(&at);
         // SAFETY: the arguments of `network_samples`; the caller's addresses, and as many samples fit behind `at`.
         unsafe { launch(&mut call, threads(to.len(), 256)) }
     }
@@ -80,19 +119,21 @@ impl SampleWriter {
         ring: &mut DeviceSamples,
         domain: &Domain,
         points: u64,
-        log_stretch: u64,
+        labels: u64,
         count: usize,
         base: Option<&DeviceTable>,
         times: Option<[f32; 2]>,
         held_back: u32,
     ) -> Result<(), DeviceError> {
-        let capacity = ring.samples.len();
+        let capacity = ring.capacity();
+        let label_bytes = if self.target() == Target::FlowMap { 12 } else { 4 };
         let skipped = count.saturating_sub(capacity);
         let before_the_end = (count - skipped).min(capacity - ring.next);
         for (from, part) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
-            let to = ring.next..ring.next + part;
+            let (to, from) = (ring.next..ring.next + part, from as u64);
+            let traced = TracedPoints { points: points + 12 * from, labels: labels + label_bytes * from, further: 0 };
             // SAFETY: the caller's.
-            unsafe { self.place(ring, to, domain, points + 12 * from as u64, log_stretch + 4 * from as u64, base, times, held_back) }?;
+            unsafe { self.place(ring, to, domain, traced, base, times, held_back) }?;
             ring.next = (ring.next + part) % capacity;
         }
         ring.len = (ring.len + count).min(capacity);
@@ -100,10 +141,12 @@ impl SampleWriter {
     }
 }
 
-/// Samples to learn from: unit point and target. A ring: the newest take the place of the oldest.
+/// Samples to learn from: unit point, further times, targets. A ring: the newest take the place of the oldest.
 #[derive(Debug)]
 pub struct DeviceSamples {
     samples: Buffer<[f32; 4]>,
+    /// Of a sample.
+    fours: usize,
     len: usize,
     next: usize,
 }
@@ -119,17 +162,21 @@ impl DeviceSamples {
         self.len == 0
     }
 
+    fn capacity(&self) -> usize {
+        self.samples.len() / self.fours
+    }
+
     /// Forgets all samples.
     pub(super) fn clear(&mut self) {
         (self.len, self.next) = (0, 0);
     }
 
-    /// Unit point and target of each.
+    /// Unit point, further times and targets of each, in one or two times four numbers.
     ///
     /// # Errors
     /// What the device says.
     pub fn values(&self) -> Result<Vec<[f32; 4]>, DeviceError> {
-        let mut values = vec![[0.0; 4]; self.len];
+        let mut values = vec![[0.0; 4]; self.fours * self.len];
         self.samples.read(&mut values)?;
         Ok(values)
     }
@@ -208,31 +255,70 @@ pub struct DeviceTraining {
     /// The tables, rounded and padded.
     halves: Buffer<u16>,
     losses: Buffer<f64>,
+    /// None until a penalty on means needs it.
+    batch: Option<WholeBatch>,
     /// Tables and layers as they were after so many steps.
     kept: Option<(usize, [Kept; 2])>,
 }
 
-/// Whether a loss needs the mean over the whole batch before any gradient.
-fn has_penalty(objective: &Objective) -> bool {
-    objective.loss == Loss::Published && objective.mean_penalty != 0.0
+/// What the penalty on means needs of a whole batch before any gradient.
+#[derive(Debug)]
+struct WholeBatch {
+    points: Buffer<[f32; 3]>,
+    /// Times that points have no place for.
+    further: Buffer<f32>,
+    predicted: Buffer<f32>,
+    /// `Means`.
+    means: Buffer<f64>,
+}
+
+impl WholeBatch {
+    fn new(gpu: &Gpu, shape: &Architecture, count: usize) -> Result<Self, DeviceError> {
+        let what = "a batch's outputs";
+        Ok(Self {
+            points: gpu.alloc(what, count)?,
+            further: gpu.alloc(what, count * further_places(shape))?,
+            predicted: gpu.alloc(what, count)?,
+            means: gpu.alloc(what, 2)?,
+        })
+    }
+
+    /// Predicts at the samples of `draw`, and leaves how far their mean is off; `layers` and `halves` as for [`NetworkKernels::predict`].
+    fn measure(&mut self, writer: &SampleWriter, halves: u64, layers: u64, draw: &DrawArgument) -> Result<(), DeviceError> {
+        let SampleWriter { kernels, objective } = writer;
+        let stream = kernels.gpu.work();
+        let (points, predicted, means) = (self.points.address(), self.predicted.address(), self.means.address());
+        let further = if self.further.len() == 0 { 0 } else { self.further.address() };
+        self.means.zero_front(2)?;
+        let count = draw.batch as usize;
+        // SAFETY: the arguments of `network_drawn`; there is room for the batch.
+        unsafe { launch(stream.launch_builder(&kernels.drawn).arg(draw).arg(&points).arg(&further), threads(count, 256)) }?;
+        // Points bring their times along, and a duration of 1 leaves the FTLE.
+        let times = [f32::NAN; 5];
+        let reading = ReadingArgument { further, tau: 1.0, ..reading(&kernels.shape, objective, times, None, 1.0) };
+        // SAFETY: parameters are of this architecture, and there is room for the batch.
+        unsafe { kernels.predict(halves, layers, &reading, points, count, predicted) }?;
+        // SAFETY: the arguments of `network_means`.
+        unsafe { launch(stream.launch_builder(&kernels.means).arg(draw).arg(&predicted).arg(&means), threads(count, 256)) }
+    }
 }
 
 impl DeviceTraining {
     /// Whether the kernels train networks of this architecture on this device.
     pub fn takes(gpu: &Gpu, shape: &Architecture, objective: &Objective) -> bool {
-        DeviceNetwork::takes(gpu, shape) && !has_penalty(objective)
+        DeviceNetwork::takes(gpu, shape) && !objective.derivatives()
     }
 
     /// Brings a model over; the mean of the parameters starts at them.
     ///
     /// # Errors
-    /// What the kernels do not take: several outputs, the published penalty on means. Memory that is not there.
+    /// What the kernels do not take: derivatives of the flow map. Memory that is not there.
     pub fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective) -> Result<Self, DeviceError> {
-        if has_penalty(objective) {
-            let what = "training with the published penalty on the difference of the batch means (network.mean_penalty)".into();
+        if objective.derivatives() {
+            let what = "training on the derivatives of the flow map (network.jacobian_weight)".into();
             return Err(DeviceError::Unsupported { what });
         }
-        let kernels = NetworkKernels::new(gpu, &model.shape)?;
+        let kernels = NetworkKernels::new(gpu, &model.shape, objective)?;
         let [tables, layers] = model.state();
         let training = Self {
             gpu: gpu.clone(),
@@ -242,6 +328,7 @@ impl DeviceTraining {
             layers: Moments::upload(gpu, "a network's layers", &layers, layers[0].len())?,
             halves: gpu.alloc("a network's rounded tables", kernels.padded)?,
             losses: gpu.alloc("losses", STEPS)?,
+            batch: None,
             kept: None,
             writer: SampleWriter { kernels, objective: objective.clone() },
         };
@@ -348,7 +435,8 @@ impl DeviceTraining {
     /// # Errors
     /// Memory that is not there.
     pub fn ring(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
-        Ok(DeviceSamples { samples: self.gpu.alloc("samples", capacity)?, len: 0, next: 0 })
+        let fours = sample_fours(self.shape());
+        Ok(DeviceSamples { samples: self.gpu.alloc("samples", fours * capacity)?, fours, len: 0, next: 0 })
     }
 
     /// Brings samples over. The network learns what they have beyond `base`.
@@ -378,10 +466,13 @@ impl DeviceTraining {
         let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
         for from in range.clone().step_by(WRITTEN) {
             let part = from..(from + WRITTEN).min(range.end);
-            let points = self.gpu.upload("samples", &self.writer.placed(samples, part.clone()))?;
-            let log_stretch = self.gpu.upload("samples", &samples.log_stretch[part.clone()])?;
-            // SAFETY: both buffers hold as many entries and are freed in the order of the work stream.
-            unsafe { self.writer.place(ring, part, &unit, points.address(), log_stretch.address(), base, None, 0) }?;
+            let (points, further) = self.writer.placed(samples, part.clone());
+            let (points, further) = (self.gpu.upload("samples", &points)?, self.gpu.upload("samples", &further)?);
+            let labels = self.gpu.upload("samples", &self.writer.labels(samples, part.clone()))?;
+            let further_address = if further.len() == 0 { 0 } else { further.address() };
+            let traced = TracedPoints { points: points.address(), labels: labels.address(), further: further_address };
+            // SAFETY: these buffers hold as many entries and are freed in the order of the work stream.
+            unsafe { self.writer.place(ring, part, &unit, traced, base, None, 0) }?;
         }
         ring.len = ring.len.max(range.end);
         Ok(())
@@ -408,7 +499,7 @@ impl DeviceTraining {
     }
 
     /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`, times at the places of axes that are no
-    /// inputs) and their log-stretch (f32 each).
+    /// inputs) and their labels: log-stretch (f32 each), or for the flow map arrivals (three f32 each, coordinates of `domain`).
     /// What is not finite is never learned from.
     ///
     /// # Errors
@@ -424,14 +515,14 @@ impl DeviceTraining {
         ring: &mut DeviceSamples,
         domain: &Domain,
         points: u64,
-        log_stretch: u64,
+        labels: u64,
         count: usize,
         base: Option<&DeviceTable>,
     ) -> Result<(), DeviceError> {
-        let capacity = ring.samples.len();
+        let capacity = ring.capacity();
         assert!(count <= capacity, "a ring of {capacity} for {count} samples");
         // SAFETY: the caller's.
-        unsafe { self.writer.append(ring, domain, points, log_stretch, count, base, None, 0) }
+        unsafe { self.writer.append(ring, domain, points, labels, count, base, None, 0) }
     }
 
     /// Fills `points` with uniform points of the domain, a function of `seed` and their numbers, `first` and on.
@@ -486,10 +577,11 @@ impl DeviceTraining {
         number: usize,
     ) -> Result<(), DeviceError> {
         assert!(!samples.is_empty() && step.count > 0 && (step.drawn.is_some() || step.count <= samples.len()), "samples for a batch");
-        let Self { gpu, writer: SampleWriter { kernels, .. }, tables, layers, .. } = self;
+        let Self { gpu, writer, tables, layers, batch, .. } = self;
+        let SampleWriter { kernels, objective } = &*writer;
         let stream = gpu.work();
         let (seed, counter) = step.drawn.unwrap_or_default();
-        let draw = DrawArgument {
+        let mut draw = DrawArgument {
             samples: samples.samples.address(),
             more: more.map_or(0, |more| more.samples.address()),
             seed,
@@ -499,13 +591,23 @@ impl DeviceTraining {
             batch: step.count as u32,
             random: u32::from(step.drawn.is_some()),
             hold_out: if step.hold_out { HELD_OUT as u32 } else { 0 },
-            pad: 0,
+            penalty: objective.mean_penalty,
+            means: 0,
         };
         let (halves, loss) = (self.halves.address(), self.losses.address_of(number));
         let [table_parameters, table_first, table_second, table_gradient] =
             [&tables.parameters, &tables.first, &tables.second, &tables.gradient].map(Buffer::address);
         let [layer_parameters, layer_first, layer_second, layer_gradient] =
             [&layers.parameters, &layers.first, &layers.second, &layers.gradient].map(Buffer::address);
+        if has_penalty(objective) {
+            let batch = match batch.take().filter(|batch| batch.points.len() >= step.count) {
+                Some(batch) => batch,
+                None => WholeBatch::new(gpu, &kernels.shape, step.count)?,
+            };
+            let batch = self.batch.insert(batch);
+            batch.measure(writer, halves, layer_parameters, &draw)?;
+            draw.means = batch.means.address();
+        }
         let to = GradientTo { tables: table_gradient, layers: layer_gradient, loss };
         // SAFETY: buffers are of this architecture, indices of samples below their number.
         unsafe { kernels.gradient(halves, layer_parameters, &draw, to) }?;
@@ -516,7 +618,7 @@ impl DeviceTraining {
             rate: adam.rate,
             epsilon: adam.epsilon,
             correction: adam.correction,
-            gradient: (1.0 / step.count as f64) as f32,
+            gradient: (1.0 / (step.count * kernels.shape.outputs()) as f64) as f32,
         };
         if kernels.padded > 0 {
             let (n, lazy) = (kernels.padded as u64, u32::from(step.lazy));

@@ -2,11 +2,12 @@
 
 use super::answers::DeviceLearns;
 use super::labels::HELD_BACK;
+use super::layout::Outputs;
 use super::network_training::SampleWriter;
 use super::predictor::{TableCopy, predict_from_host};
 use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep};
+use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep, Target};
 use crate::surrogate::{Brought, DeviceLost, Offload, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table};
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -77,10 +78,17 @@ pub(super) struct Pupil<'a> {
 }
 
 impl DeviceLearns for Pupil<'_> {
-    unsafe fn learn_from(&self, points: u64, log_stretch: u64, count: usize) -> Result<(), DeviceError> {
+    unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
         let (writer, mut samples) = (&self.pool.writer, self.pool.samples());
+        let labels = match writer.target() {
+            Target::Ftle => traced.log_stretch,
+            Target::FlowMap => traced.arrival,
+        };
+        if labels == 0 {
+            return Ok(());
+        }
         // SAFETY: the caller's.
-        unsafe { writer.append(&mut samples, self.domain, points, log_stretch, count, self.base, Some(self.times), HELD_BACK) }
+        unsafe { writer.append(&mut samples, self.domain, points, labels, count, self.base, Some(self.times), HELD_BACK) }
     }
 }
 
@@ -140,10 +148,11 @@ impl CudaTraining {
         if let Some(pool) = &self.pool {
             return Ok(pool.clone());
         }
-        let most = self.gpu.memory_left() / MEMORY_SHARE / size_of::<[f32; 4]>() as u64;
+        let writer = self.training.writer();
+        let most = self.gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
         // The kernels count samples, those of the ring included, in 32 bits.
         let capacity = TIMES_THE_RING.saturating_mul(ring).min(most as usize).clamp(1, 1 << 31);
-        let pool = LabelPool { writer: self.training.writer(), samples: Mutex::new(self.training.ring(capacity)?) };
+        let pool = LabelPool { writer, samples: Mutex::new(self.training.ring(capacity)?) };
         Ok(self.pool.insert(Arc::new(pool)).clone())
     }
 }

@@ -7,7 +7,7 @@ use crate::engine::answers::Tally;
 use crate::engine::audit;
 use crate::engine::stop::Interruptible;
 use crate::engine::{FrameRecord, TrustedError};
-use crate::flow::Tracer;
+use crate::flow::{Extras, Tracer};
 use crate::surrogate::Predict;
 use crate::trust::{Audited, Gate, Strata};
 use std::sync::atomic::Ordering;
@@ -57,7 +57,7 @@ impl Cycle<'_> {
         let unit = audit::stratified_points(&strata, self.plan.scene.seed, 2 * self.frame + 1);
         let interruptible = Interruptible::new(tracer, self.stop);
         let verified = self.threads.render().install(|| {
-            let fresh = audit::trace(&interruptible, &unit, false);
+            let fresh = audit::trace(&interruptible, &unit, Extras::default());
             let residuals = audit::residuals(front, &fresh.samples, self.renderer.transfer(), tracer.tau());
             audit::trusted_error(&Audited::of(&residuals, strata), gate)
         });

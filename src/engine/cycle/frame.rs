@@ -6,7 +6,7 @@ use crate::engine::audit::{AuditFindings, AuditRequest};
 use crate::engine::feed::{Feed, Slide};
 use crate::engine::training::{Until, train};
 use crate::engine::{EngineError, Event, Frame, FrameRecord, StageSeconds};
-use crate::flow::{Extras, Tracer, VelocitySource};
+use crate::flow::{Tracer, VelocitySource};
 use crate::render::{Film, Method, RenderStats};
 use crate::surrogate::{Learned, Predict, SampleRing, Samples, Surrogate};
 use crate::trust::{Gate, Strata};
@@ -146,8 +146,8 @@ impl Cycle<'_> {
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };
         let rendered = AtomicBool::new(false);
         self.threads.device_trains = self.live.as_ref().is_some_and(|live| live.is_offloaded());
-        let (flow_map, keep) = (self.wants_flow_map(), self.keep_a_frame());
-        let samples = self.learns().then_some(Extras { arrival: flow_map, jacobian: flow_map });
+        let (extras, keep) = (self.label_extras(), self.keep_a_frame());
+        let samples = self.learns().then_some(extras);
         let (mut learned, mut work) = (None, None);
         {
             let (ring, live, threads) = (&mut self.ring, &mut self.live, &self.threads);
@@ -170,7 +170,7 @@ impl Cycle<'_> {
                     }
                 });
                 let mut render = || -> Result<Rendered, EngineError> {
-                    let mut answers = Answers::new(tracer, front, gate, scene.trust.trace_budget, keep).with_flow_map(flow_map);
+                    let mut answers = Answers::new(tracer, front, gate, scene.trust.trace_budget, keep).with_extras(extras);
                     let progress = std::sync::Mutex::new(&mut *sink);
                     let report = |share: f32| {
                         if let Ok(mut sink) = progress.lock() {

@@ -302,10 +302,8 @@ impl<'a> Cycle<'a> {
         }
         let offered = self.options.device.offload().is_some();
         if offered && self.live.as_ref().is_some_and(|live| live.learns() && !live.is_offloaded()) {
-            let inputs = self.plan.domain.dimensions + self.plan.scene.network.inputs.len();
-            slide.warnings.push(format!(
-                "the network is trained on the CPU: a GPU takes the target ftle, no penalty on means, and at most 3 inputs (here {inputs})"
-            ));
+            let what = "the network is trained on the CPU: a GPU takes no network.jacobian_weight above 0, and layers that its shared memory holds";
+            slide.warnings.push(what.into());
         }
         slide.warnings.extend(self.beyond_the_range(slide.time));
         self.pilot(tracer)?;

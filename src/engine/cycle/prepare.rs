@@ -78,9 +78,9 @@ impl Cycle<'_> {
         let per_cell = scene.trust.min_samples.ceil() as usize;
         let strata = Strata::even(self.trust.shape(), per_cell as u32);
         let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
-        let flow_map = self.wants_flow_map();
+        let extras = self.label_extras();
         let interruptible = Interruptible::new(tracer, self.stop);
-        let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, flow_map));
+        let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
         heed(self.stop)?;
         let domain = tracer.domain();
         self.threads.render().install(|| {
@@ -97,7 +97,7 @@ impl Cycle<'_> {
     pub(super) fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let gate = Gate::uniform(false);
         let interruptible = Interruptible::new(tracer, self.stop);
-        let mut answers = Answers::new(&interruptible, None, &gate, None, self.keep_a_frame()).with_flow_map(self.wants_flow_map());
+        let mut answers = Answers::new(&interruptible, None, &gate, None, self.keep_a_frame()).with_extras(self.label_extras());
         let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
         self.threads.render().install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
         heed(stop)?;
@@ -135,8 +135,11 @@ impl Cycle<'_> {
         self.live.as_ref().is_some_and(|live| live.learns())
     }
 
-    pub(super) fn wants_flow_map(&self) -> bool {
-        self.plan.scene.network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table
+    /// What the network learns from beside the log-stretch.
+    pub(super) fn label_extras(&self) -> Extras {
+        let network = &self.plan.scene.network;
+        let arrival = network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table;
+        Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 }
     }
 
     /// Labels of durations below tau, where those are an input of the network: one from each of some even parts of (0, tau], drawn anew for every
@@ -158,10 +161,10 @@ impl Cycle<'_> {
             };
             let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
             let unit = audit::stratified_points(&strata, seed, SHORTER_STREAM + draw);
-            let flow_map = self.wants_flow_map();
+            let extras = self.label_extras();
             let (shorter, _) = self.threads.render().install(|| self.options.device.tracer(slide.velocity.clone(), &map, slide.time))?;
             let interruptible = Interruptible::new(&*shorter, self.stop);
-            let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, flow_map));
+            let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
             found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];
             self.probed += found.drawn as u64;
             self.ring.push(&found.samples);
@@ -221,7 +224,7 @@ pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, slide: &Slide) -> 
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
         let unit = audit::stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
-        let labels = audit::trace(tracer, &unit, false).samples.log_stretch;
+        let labels = audit::trace(tracer, &unit, Extras::default()).samples.log_stretch;
         let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {
             return Err(EngineError::AllMissing {

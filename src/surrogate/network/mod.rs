@@ -24,9 +24,9 @@ mod train;
 
 #[cfg(feature = "cuda")]
 pub(crate) use adam::Adam;
-#[cfg(feature = "cuda")]
-pub(crate) use architecture::HASH;
 pub use architecture::{Architecture, Layer, Level};
+#[cfg(feature = "cuda")]
+pub(crate) use architecture::{GRID_INPUTS, HASH};
 pub use model::Model;
 pub use module::Network;
 pub(crate) use module::{mix, uniform};

@@ -1,0 +1,203 @@
+//! Networks of the flow map, and with more inputs than a point has places for, on the device: against the same network in f64, against finite
+//! differences, against burn's gradients, and in runs against the CPU.
+
+use super::network::{check_gradients, few_entries, is_plain, predict, prepare, settled};
+use super::network_support::reference::{Reference, norm};
+use super::network_support::{self, Case};
+use super::scenes::*;
+use nalgebra::DMatrix;
+use ridgewatch::config::SceneFile;
+use ridgewatch::engine::cuda::{DeviceNetwork, GpuSettings};
+use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::field::Domain;
+use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Objective, Target, row};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+/// Of the cases that the CPU trains, those that are not plain; and what fills registers, and goes through the kernels in tiles.
+fn cases() -> Vec<Case> {
+    let without_derivatives = |case: Case| Case { settings: NetworkSettings { jacobian_weight: 0.0, ..case.settings }, ..case };
+    let mut cases: Vec<Case> = network_support::cases().into_iter().filter(|case| !is_plain(case)).map(without_derivatives).collect();
+    let (plane, space) = (&[0, 1][..], &[0, 1, 2][..]);
+    let flow_map = NetworkSettings { target: Target::FlowMap, ..few_entries() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, ..flow_map.clone() };
+    let (start, both) = (vec![Input::Start], vec![Input::Start, Input::Duration]);
+    let ftle = |settings: &NetworkSettings| NetworkSettings { target: Target::Ftle, ..settings.clone() };
+    cases.extend([
+        Case { name: "flow map, width 128", settings: NetworkSettings { width: 128, ..flow_map.clone() }, axes: space },
+        Case { name: "flow map, 16 features a sample more", settings: NetworkSettings { features: 8, ..flow_map.clone() }, axes: plane },
+        Case { name: "flow map, 256 wide", settings: NetworkSettings { width: 256, hidden_layers: 3, ..frequency.clone() }, axes: space },
+        Case {
+            name: "flow map, deep, tables",
+            settings: NetworkSettings { width: 100, hidden_layers: 5, ..flow_map.clone() },
+            axes: plane,
+        },
+        Case { name: "flow map and start", settings: NetworkSettings { inputs: start.clone(), ..flow_map.clone() }, axes: space },
+        Case { name: "flow map and both times", settings: NetworkSettings { inputs: both.clone(), ..frequency.clone() }, axes: space },
+        Case { name: "space and start", settings: NetworkSettings { inputs: start.clone(), ..ftle(&flow_map) }, axes: space },
+        Case { name: "plane and both times", settings: NetworkSettings { inputs: both.clone(), ..ftle(&flow_map) }, axes: plane },
+        Case { name: "space and both times", settings: NetworkSettings { inputs: both, ..ftle(&frequency) }, axes: space },
+        Case { name: "space and start, 256 wide", settings: NetworkSettings { inputs: start, width: 256, ..ftle(&flow_map) }, axes: space },
+    ]);
+    cases
+}
+
+/// Log-stretch from the reference's outputs and their derivatives: that of the flow map by the singular values of its Jacobian.
+fn log_stretch(objective: &Objective, rows: &[Vec<f64>]) -> f64 {
+    let deviation = |output: usize| f64::from(objective.scale.deviation[output]);
+    if objective.target == Target::Ftle {
+        return rows[0][0] * deviation(0) + f64::from(objective.scale.mean[0]);
+    }
+    let dimensions = rows[0].len();
+    let jacobian = DMatrix::from_fn(dimensions, dimensions, |output, along| {
+        let unit = rows[1 + along][output] * deviation(output) + if output == along { 1.0 } else { 0.0 };
+        unit * f64::from(objective.extent[output]) / f64::from(objective.extent[along])
+    });
+    jacobian.singular_values().max().ln()
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn flow_maps_are_differentiated_as_the_reference_s() {
+    for case in cases() {
+        let (model, objective, _) = prepare(&case);
+        // Where no neuron switches by rounding, which a derivative would show.
+        let model = settled(&model);
+        let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
+        // Not a multiple of any tile, with corners.
+        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 3003);
+        points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0]]);
+        let times = [0.3, 0.85];
+        let found = predict(&network.above(None).at(times), &points);
+        for (name, reference, tolerance) in [
+            // What is left is the order of sums in single precision, and halves that this rounds to the other side.
+            ("in halves", Reference::in_halves(&model), 4e-4),
+            // Halves carry 11 bits.
+            ("exact", Reference::new(&model), 2e-3),
+        ] {
+            let expected: Vec<f64> = points.iter().map(|&p| log_stretch(&objective, &reference.outputs(row(p, times)))).collect();
+            let apart: Vec<f64> = found.iter().zip(&expected).map(|(a, b)| f64::from(*a) - b).collect();
+            let worst = apart.iter().fold(0.0, |m: f64, e| if e.is_nan() { f64::INFINITY } else { m.max(e.abs()) });
+            let error = norm(&apart) / norm(&expected);
+            measured!("{}: log-stretch off f64 ({name}) by {error:.1e} of its root mean square, {worst:.1e} at most", case.name);
+            assert!(error < tolerance, "{}: {name}: {error}", case.name);
+            assert!(worst < 20.0 * tolerance * norm(&expected) / (expected.len() as f64).sqrt(), "{}: {name}: {worst}", case.name);
+        }
+    }
+}
+
+#[test]
+#[ignore = "needs a GPU"]
+fn gradients_of_flow_maps_and_further_inputs() {
+    cases().iter().for_each(check_gradients);
+}
+
+/// A small run whose frames are answered by a network that learns, in space.
+const TURBULENCE: &str = "
+[source]
+kind = \"turbulence\"
+nodes = [48, 24, 24]
+[time]
+tau = 6
+frames_per_slide = 5
+[flow]
+steps = 12
+[surrogate]
+kind = \"network\"
+[network]
+levels = 4
+features = 2
+log2_table = 14
+base_resolution = 8
+width = 32
+batch = 4096
+[training]
+steps_per_frame = 150
+[render]
+method = \"gated\"
+width = 48
+height = 24
+samples = 8
+[transfer]
+low = 0.1
+high = 0.3
+";
+
+/// The same in the plane.
+const GYRE: &str = "
+[source]
+kind = \"double_gyre\"
+[domain]
+min = [0, 0, 0]
+max = [2, 1, 0.2]
+[time]
+tau = 5
+step = 0.5
+slides = 2
+frames_per_slide = 3
+[flow]
+steps = 25
+[surrogate]
+kind = \"network\"
+[network]
+log2_table = 14
+levels = 4
+width = 32
+batch = 4096
+[training]
+steps_per_frame = 150
+[render]
+method = \"gated\"
+width = 48
+height = 24
+samples = 8
+";
+
+fn frames(scene: &str, keys: &[&str], device: &Device) -> Vec<Frame> {
+    let keys: Vec<String> = keys.iter().map(ToString::to_string).collect();
+    let scene = SceneFile::parse(Path::new("a test"), scene, &keys).unwrap();
+    let mut frames = Vec::new();
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            frames.push(frame);
+        }
+    };
+    let options = RunOptions { device: device.clone(), ..RunOptions::default() };
+    run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).unwrap();
+    frames
+}
+
+/// Frames, audits, labels and training stay on the device, and what it learns is worth what the CPU learns.
+#[test]
+#[ignore = "needs a GPU"]
+fn runs_learn_on_the_device_what_the_cpu_learns() {
+    let gpu = device(GpuSettings::default());
+    let runs: [(&str, &str, &[&str]); 6] = [
+        ("flow map in space", TURBULENCE, &["network.target=\"flow_map\""]),
+        ("flow map in the plane", GYRE, &["network.target=\"flow_map\""]),
+        ("flow map in the plane and start", GYRE, &["network.target=\"flow_map\"", "network.inputs=[\"start\"]"]),
+        ("space and start", TURBULENCE, &["network.inputs=[\"start\"]", "time.slides=2"]),
+        ("plane and both times", GYRE, &["network.inputs=[\"start\", \"duration\"]"]),
+        ("published loss", GYRE, &["network.loss=\"published\"", "network.mean_penalty=1.0"]),
+    ];
+    for (name, scene, keys) in runs {
+        let (found, expected) = (frames(scene, keys, &gpu), frames(scene, keys, &Device::CPU));
+        for (frames, there) in [(&found, true), (&expected, false)] {
+            for frame in frames {
+                let record = &frame.record;
+                assert!(record.warnings.is_empty(), "{name}: {:?}", record.warnings);
+                assert_eq!(record.training.as_ref().unwrap().device_seconds.is_some(), there, "{name}");
+                // A GPU that walks answers points ahead of their flights; one that only traces does not.
+                assert_eq!(record.traced_ahead > 0, there, "{name}");
+            }
+        }
+        let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
+        let loss = |frames: &[Frame]| frames.iter().map(|frame| frame.record.training.as_ref().unwrap().loss.unwrap()).collect::<Vec<_>>();
+        let (ours, theirs) = (psnr(&found), psnr(&expected));
+        measured!("{name}: what the network knows, dB: GPU {ours:.1?}, CPU {theirs:.1?}");
+        let (first, last) = (loss(&found)[0], loss(&found)[found.len() - 1]);
+        assert!(last < 0.5 * first, "{name}: it learns: {first} to {last}");
+        // A device learns from all that it traces, the CPU from what is kept.
+        assert!(ours[ours.len() - 1] > theirs[theirs.len() - 1] - 1.0, "{name}: as much: {ours:?} and {theirs:?}");
+    }
+}
