@@ -198,7 +198,7 @@ samples = 8
 #[test]
 #[ignore = "needs a GPU"]
 fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
-    let seeds = if small() { 2 } else { 16 };
+    let seeds = if small() { 1 } else { 16 };
     let pictures = |device: &Device, first: u64, keys: &[&str]| -> Vec<Frame> {
         let options = RunOptions { device: device.clone(), ..RunOptions::default() };
         let keys = |seed: u64| keys.iter().map(|key| (*key).to_owned()).chain([format!("seed={seed}")]).collect::<Vec<String>>();
@@ -213,7 +213,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
         assert!(record.traced_share > 0.05 && record.traced_share < 0.9, "traced: {}", record.traced_share);
     }
     if small() {
-        println!("not held against the CPU's: {seeds} seeds say nothing");
+        println!("not held against the CPU's: one seed says nothing");
         return;
     }
     let expected = pictures(&Device::CPU, 100, &[]);
