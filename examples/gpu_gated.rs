@@ -2,7 +2,8 @@
 //! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
 //! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
 //! traced share, with the device's memory over a thousand frames, and what checkpoints cost their length. Prints; needs a GPU.
-//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [table.key=value]`, where keys are those of a scene.
+//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [published] [table.key=value]`, where keys are those of a scene.
+//! `published`: frames with the smallest of the published networks.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -15,6 +16,7 @@ use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
 use ridgewatch::surrogate::Kind;
+use ridgewatch::surrogate::network::Encoding;
 use ridgewatch::trust::Strata;
 use std::path::Path;
 use std::sync::Arc;
@@ -119,6 +121,43 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
     )
 }
 
+/// Frames that are traced, and that a network of 8 layers of 256 above frequencies answers, which is trained between them.
+fn published(mut scene: Settings, device: &Device, size: &str) {
+    (scene.network.encoding, scene.network.hidden_layers, scene.network.width, scene.network.batch) =
+        (Encoding::Frequency, 8, 256, 1 << 16);
+    scene.surrogate.kind = Kind::Network;
+    scene.time.warmup_frames = LEARNING;
+    println!("<!-- block gated-published -->");
+    println!(
+        "{size}, 22 steps; medians of {FRAMES} frames of one sample after {LEARNING}, in which the network of 8x256 is trained too.\n"
+    );
+    println!(
+        "| answers | frame, ms (and longest) | on the device: picture | training | trace | predict | queries | traced | network alone, dB |"
+    );
+    println!("|{}", "---|".repeat(9));
+    for (name, method) in
+        [("RK4", Method::Reference), ("network, RK4 where it is not trusted", Method::Gated), ("network alone", Method::Surrogate)]
+    {
+        scene.render.method = method;
+        let (_, records) = pictures(&scene, device);
+        let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
+        println!(
+            "| {name} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.0} | {:.1} % | {} |",
+            median_and_most(&records, |r| 1e3 * r.seconds.total),
+            ms(|r| r.seconds.device),
+            ms(|r| r.training.as_ref().and_then(|learned| learned.device_seconds).unwrap_or(0.0)),
+            ms(|r| r.seconds.trace),
+            ms(|r| r.seconds.predict),
+            median(&records, |r| r.queries as f64),
+            100.0 * median(&records, |r| r.traced_share),
+            records[0]
+                .surrogate_psnr
+                .map_or("-".to_owned(), |_| format!("{:.1}", median(&records, |r| r.surrogate_psnr.unwrap_or(f64::NAN))))
+        );
+    }
+    println!();
+}
+
 fn main() {
     let (told, words): (Vec<String>, Vec<String>) = std::env::args().skip(1).partition(|a| a.contains('='));
     let asked = |what: &str| words.iter().all(|w| w.parse::<usize>().is_ok()) || words.iter().any(|w| w == what);
@@ -137,6 +176,12 @@ fn main() {
     scene.transfer = Some(colours(&scene, &device));
     (scene.time.warmup_frames, scene.time.frames_per_slide) = (WARM_UP, FRAMES);
     let size = format!("{}x{}", scene.render.width, scene.render.height);
+    if asked("published") {
+        published(scene.clone(), &device, &format!("{size} pixels of {nodes:?} nodes"));
+    }
+    if !["tables", "networks", "slides"].into_iter().any(asked) {
+        return;
+    }
 
     let mut truth = scene.clone();
     truth.seed = 77;

@@ -3,8 +3,8 @@
 //! [published-speed] [published] [seconds]`
 //!
 //! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
-//! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled) and stands still
-//! while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform points, against f64 with
+//! it; the clock runs through tracing and training, from the first seed on (the window is there, kernels are compiled), through those that say
+//! how large labels are too, and stands still while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform points, against f64 with
 //! 220 steps (1000 for the double gyre, whose points are x, y and the start time).
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
@@ -46,7 +46,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 mod bench {
     use ridgewatch::engine::cuda::{
         Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
-        Outputs, SnapshotStore, Tuning,
+        Outputs, SnapshotStore, Storage, Tuning,
     };
     use ridgewatch::field::Domain;
     use ridgewatch::field::analytic::Analytic;
@@ -81,6 +81,11 @@ mod bench {
 
     fn hash(levels: usize, features: usize, growth: f32, log2_table: u32, width: usize) -> NetworkSettings {
         NetworkSettings { levels, features, growth, log2_table, width, ..NetworkSettings::default() }
+    }
+
+    /// The finest grid, which knows most after some seconds.
+    fn finest() -> NetworkSettings {
+        NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }
     }
 
     fn step(count: usize, drawn: u64, rate: f64) -> PlannedStep {
@@ -135,7 +140,6 @@ mod bench {
             }
             println!("{row}|");
         }
-        println!();
         Ok(())
     }
 
@@ -205,6 +209,14 @@ mod bench {
         20.0 * (peak / square.sqrt()).log10()
     }
 
+    /// Something that draws points.
+    fn drawer(gpu: &Arc<Gpu>, domain: &Domain) -> Outcome<DeviceTraining> {
+        let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
+        let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
+        let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
+        Ok(DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?)
+    }
+
     /// Points where a field is known.
     struct KnownPoints {
         /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
@@ -216,10 +228,7 @@ mod bench {
     impl KnownPoints {
         fn new(gpu: &Arc<Gpu>, domain: &Domain, tracer: &DeviceTracer, exact: &DeviceTracer) -> Outcome<Self> {
             let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
-            let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
-            let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
-            let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
-            let drawer = DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?;
+            let drawer = drawer(gpu, domain)?;
             let (mut seeds, mut tested) = (Batch::new(gpu, TESTED)?, Batch::new(gpu, TESTED)?);
             drawer.draw_points(domain, 99, 0, &mut seeds.points)?;
             drawer.draw_points(&unit, 99, 0, &mut tested.points)?;
@@ -233,6 +242,8 @@ mod bench {
     /// A field with its tracer, and points where it is known.
     struct Known {
         gpu: Arc<Gpu>,
+        source: VelocitySource,
+        store: SnapshotStore,
         tracer: CudaTracer,
         domain: Domain,
         steps: usize,
@@ -254,10 +265,10 @@ mod bench {
                 Field::Hard => 44,
             };
             let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
-            let exact = CudaTracer::new(&store, &gpu, source, &map(220, Precision::F64), 0.0, Tuning::default())?;
+            let exact = CudaTracer::new(&store, &gpu, source.clone(), &map(220, Precision::F64), 0.0, Tuning::default())?;
             let domain = tracer.domain().clone();
             let points = KnownPoints::new(&gpu, &domain, tracer.device(), exact.device())?;
-            Ok(Self { gpu, tracer, domain, steps, points })
+            Ok(Self { gpu, source, store, tracer, domain, steps, points })
         }
     }
 
@@ -276,46 +287,62 @@ mod bench {
         })
     }
 
+    /// Milliseconds and samples a second.
+    struct Rates {
+        /// Milliseconds that 2^18 samples are predicted in; samples predicted a second, of 2^22; trained a second, by the batches asked for.
+        few: f64,
+        predicted: f64,
+        trained: Vec<f64>,
+    }
+
+    /// 2^18 samples.
+    const FEW: usize = 1 << 18;
+    const MANY: usize = 1 << 22;
+
+    fn rates(gpu: &Arc<Gpu>, settings: &NetworkSettings, rate: f64, batches: &[usize]) -> Outcome<Rates> {
+        let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
+        let shape = Architecture::new(settings, &[0, 1, 2], cube.extent())?;
+        let objective = Objective::new(settings, &shape, cube.extent(), 1.0);
+        let mut training = DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?;
+        let mut points = gpu.alloc("points", MANY)?;
+        training.draw_points(&cube, 3, 0, &mut points)?;
+        let values = gpu.upload("values", &vec![0.5f32; MANY])?;
+        let network = training.frozen()?;
+        // SAFETY: both buffers hold `MANY` entries.
+        let predicted = |count| time(gpu, || unsafe { network.predict(points.address(), count, values.address()) });
+        let (few, many) = (predicted(FEW)?, predicted(MANY)?);
+        let mut pool = training.ring(MANY)?;
+        // SAFETY: as above.
+        unsafe { training.append(&mut pool, &cube, points.address(), values.address(), MANY, None)? };
+        let mut drawn = 0;
+        let trained = batches.iter().map(|&batch| {
+            const STEPS: u64 = 4;
+            let milliseconds = time(gpu, || {
+                let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, rate)).collect();
+                drawn += STEPS * batch as u64;
+                training.train_steps(&pool, None, &steps).map(|_| ())
+            })?;
+            Ok(STEPS as f64 * batch as f64 / milliseconds * 1e3)
+        });
+        let trained = trained.collect::<Result<_, DeviceError>>()?;
+        Ok(Rates { few, predicted: MANY as f64 / many * 1e3, trained })
+    }
+
     /// What the published networks do in a second; with the operations of their products alone.
     pub fn published_speed() -> Outcome<()> {
-        const COUNT: usize = 1 << 18;
-        const MANY: usize = 1 << 22;
         let gpu = Gpu::open(0, &GpuSettings::default())?;
-        let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
         println!("<!-- block network-published-speed -->");
         println!(
             "| network | 2^18 predicted, ms | 2^22 predicted, G/s | TFLOP/s | trained, M/s, batch 2^18 | TFLOP/s | batch 2^16 | 2^14 |"
         );
         println!("|---|---|---|---|---|---|---|---|");
         for (name, settings) in published_settings() {
-            let shape = Architecture::new(&settings, &[0, 1, 2], cube.extent())?;
-            let objective = Objective::new(&settings, &shape, cube.extent(), 1.0);
+            let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3])?;
             let products: usize = shape.layers.iter().map(|layer| layer.inputs * layer.outputs).sum();
             // Training: forward, backward but for the first layer, and the gradients of the weights.
             let (forward, all) =
                 (2e-12 * products as f64, 2e-12 * (3 * products - shape.layers[0].inputs * shape.layers[0].outputs) as f64);
-            let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
-            let mut points = gpu.alloc("points", MANY)?;
-            training.draw_points(&cube, 3, 0, &mut points)?;
-            let values = gpu.upload("values", &vec![0.5f32; MANY])?;
-            let network = training.frozen()?;
-            // SAFETY: both buffers hold `MANY` entries.
-            let predicted = |count| time(&gpu, || unsafe { network.predict(points.address(), count, values.address()) });
-            let (few, many) = (predicted(COUNT)?, predicted(MANY)?);
-            let mut pool = training.ring(MANY)?;
-            // SAFETY: as above.
-            unsafe { training.append(&mut pool, &cube, points.address(), values.address(), MANY, None)? };
-            let mut drawn = 0;
-            let mut trained = |batch: usize| -> Result<f64, DeviceError> {
-                const STEPS: u64 = 4;
-                let milliseconds = time(&gpu, || {
-                    let steps: Vec<PlannedStep> = (0..STEPS).map(|i| step(batch, drawn + i * batch as u64, 1e-3)).collect();
-                    drawn += STEPS * batch as u64;
-                    training.train_steps(&pool, None, &steps).map(|_| ())
-                })?;
-                Ok(STEPS as f64 * batch as f64 / milliseconds * 1e3)
-            };
-            let (predicted, trained) = (MANY as f64 / many * 1e3, [trained(COUNT)?, trained(1 << 16)?, trained(1 << 14)?]);
+            let Rates { few, predicted, trained } = rates(&gpu, &settings, 1e-3, &[FEW, 1 << 16, 1 << 14])?;
             println!(
                 "| {name} | {few:.2} | {:.3} | {:.0} | {:.1} | {:.0} | {:.1} | {:.1} |",
                 predicted * 1e-9,
@@ -326,32 +353,57 @@ mod bench {
                 trained[2] * 1e-6
             );
         }
-        println!();
         Ok(())
     }
 
-    /// What the published networks know after some seconds, beside tracing 2^18 samples.
+    /// The tables of the paper that the published networks are of, redone: what they and hash grids know after some seconds, what they predict and
+    /// train in a second, beside the published tracing and ours.
     pub fn published(seconds: f64) -> Outcome<()> {
-        const COUNT: usize = 1 << 18;
-        const PACE: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
-        let Known { gpu, tracer, domain, points: KnownPoints { tested, truth, .. }, .. } = Known::new(Field::Easy, 0)?;
-        let mut batch = Batch::new(&gpu, COUNT)?;
-        let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
-        let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
-        let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
-        let drawer = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
-        drawer.draw_points(&domain, 3, 0, &mut batch.points)?;
-        println!("<!-- block network-published -->");
-        let ours = time(&gpu, || batch.trace(tracer.device()))?;
+        const PUBLISHED: Pace = Pace { batch: 1 << 16, rate: 1e-3 };
+        const HASH: Pace = Pace { batch: BATCH, rate: 1e-2 };
+        let Known { gpu, source, store, tracer, domain, points: KnownPoints { seeds, tested, truth }, .. } = Known::new(Field::Easy, 0)?;
         let megabytes = 12e-6 * (SHAPE.iter().product::<usize>() * SNAPSHOTS) as f64;
-        println!("Velocities: {megabytes:.0} MB. 2^18 samples traced, 22 steps: {ours:.2} ms.\n");
-        println!("| network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
-        println!("|---|---|---|---|---|---|---|---|");
-        for (name, settings) in published_settings() {
-            let row = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, PACE, seconds, |network| {
+        let drawer = drawer(&gpu, &domain)?;
+        println!("<!-- block network-published -->");
+        println!(
+            "| | MB | 2^18 samples, ms | M/s | trained, M/s, batch 2^18 | PSNR, dB, at once or after 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |"
+        );
+        println!("|{}", "---|".repeat(11));
+        let six = FlowMap { integrator: Integrator::Differences, gap: 1e-6, ..map(110, Precision::F64) };
+        let pairs = Tuning { storage: Storage::F16Pairs, ..Tuning::default() };
+        // The order that the published way traces in is that of its seeds, whose number then makes no difference.
+        let as_they_come = Tuning { sorted: false, keep: false, spread: false, ..Tuning::default() };
+        for (name, map, tuning, many) in [
+            ("traced as published: six particles, f64, 110 steps", six, as_they_come, FEW),
+            ("traced: tangent, f32, 22 steps", map(22, Precision::F32), Tuning::default(), MANY),
+            ("traced: tangent, f32, 11 steps, window of f16 in pairs", map(11, Precision::F32), pairs, MANY),
+        ] {
+            let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, 0.0, tuning)?;
+            let milliseconds = |count| -> Outcome<f64> {
+                let mut batch = Batch::new(&gpu, count)?;
+                drawer.draw_points(&domain, 3, 0, &mut batch.points)?;
+                Ok(time(&gpu, || batch.trace(tracer.device()))?)
+            };
+            let (few, large) = (milliseconds(FEW)?, milliseconds(many)?);
+            seeds.trace(tracer.device())?;
+            let rate = many as f64 / large * 1e-3;
+            println!("| {name} | {megabytes:.0} | {few:.2} | {rate:.1} | - | {:.1} | - | - | - | - | - |", psnr(&seeds.found()?, &truth));
+        }
+        let hashes =
+            [("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)), ("hash 4x4, growth 1.6, base 128, T = 2^24, 2x64", finest())];
+        let published = published_settings().map(|(name, settings)| (name, settings, PUBLISHED));
+        for (name, settings, pace) in published.chain(hashes.into_iter().map(|(name, settings)| (name.to_owned(), settings, HASH))) {
+            let Rates { few, predicted, trained } = rates(&gpu, &settings, pace.rate, &[FEW])?;
+            let learned = learn(&gpu, &domain, tracer.device(), None, 0.0, &settings, pace, seconds, |network| {
                 Ok(psnr(&tested.predict(network)?, &truth))
             })?;
-            println!("| {name} {row}");
+            println!(
+                "| {name} | {:.0} | {few:.2} | {:.1} | {:.1} {}",
+                learned.megabytes,
+                predicted * 1e-6,
+                trained[0] * 1e-6,
+                learned.row()
+            );
         }
         println!();
         Ok(())
@@ -359,7 +411,7 @@ mod bench {
 
     pub fn quality(name: &str, field: Field, seconds: f64) -> Outcome<()> {
         const PACE: Pace = Pace { batch: BATCH, rate: 1e-2 };
-        let Known { gpu, tracer, domain, steps, points: KnownPoints { seeds, tested, truth } } = Known::new(field, 0)?;
+        let Known { gpu, tracer, domain, steps, points: KnownPoints { seeds, tested, truth }, .. } = Known::new(field, 0)?;
         println!("<!-- block network-{name} -->");
         println!("Labels, traced with {steps} steps: {:.1} dB. Tables, by their nodes:\n", psnr(&seeds.found()?, &truth));
 
@@ -386,7 +438,7 @@ mod bench {
         println!("|---|---|---|---|---|---|---|---|---|");
         let based = |base_resolution, settings| NetworkSettings { base_resolution, ..settings };
         let small = ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64));
-        let large = ("4x4, growth 1.6, base 128, T = 2^24", based(128, hash(4, 4, 1.6, 24, 64)));
+        let large = ("4x4, growth 1.6, base 128, T = 2^24", finest());
         let alone = [
             ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
             small.clone(),
@@ -402,10 +454,10 @@ mod bench {
         ];
         for (kind, base, networks) in [("alone", None, alone), ("above the first table", Some(&table), above)] {
             for (name, settings) in networks {
-                let row = learn(&gpu, &domain, tracer.device(), base, traced, &settings, PACE, seconds, |network| {
+                let learned = learn(&gpu, &domain, tracer.device(), base, traced, &settings, PACE, seconds, |network| {
                     Ok(psnr(&tested.predict(network)?, &truth))
                 })?;
-                println!("| {kind} | {name} {row}");
+                println!("| {kind} | {name} | {:.0} {}", learned.megabytes, learned.row());
             }
         }
         println!();
@@ -465,22 +517,48 @@ mod bench {
         println!("| network | MB | 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |");
         println!("|---|---|---|---|---|---|---|---|");
         let of_start = |settings| NetworkSettings { inputs: vec![Input::Start], start_range: Some(STARTS), ..settings };
+        let learned = |name: &str, settings: &NetworkSettings, pace: Pace| -> Outcome<()> {
+            let learned = learn(&gpu, &space_time, &tracer, None, 0.0, settings, pace, seconds, |network| {
+                Ok(psnr(&tested.predict(network)?, &truth))
+            })?;
+            println!("| {name} | {:.0} {}", learned.megabytes, learned.row());
+            Ok(())
+        };
         for (name, settings) in [
             ("8x2, growth 2, T = 2^19", hash(8, 2, 2.0, 19, 64)),
             ("8x2, growth 2, T = 2^22", hash(8, 2, 2.0, 22, 64)),
             ("6x4, growth 2.2, T = 2^22", hash(6, 4, 2.2, 22, 64)),
-            ("4x4, growth 1.6, base 128, T = 2^24", NetworkSettings { base_resolution: 128, ..hash(4, 4, 1.6, 24, 64) }),
+            ("4x4, growth 1.6, base 128, T = 2^24", finest()),
         ] {
-            let row = learn(&gpu, &space_time, &tracer, None, 0.0, &of_start(settings), PACE, seconds, |network| {
-                Ok(psnr(&tested.predict(network)?, &truth))
-            })?;
-            println!("| {name} {row}");
+            learned(name, &of_start(settings), PACE)?;
         }
+        let (name, settings) = published_settings().next().ok_or("no network")?;
+        learned(&format!("{name}, frequencies, as published"), &of_start(settings), Pace { batch: 1 << 16, rate: 1e-3 })?;
         println!();
         Ok(())
     }
 
-    /// Trains for some seconds; one row of the table. `before`: seconds that the clock starts at, where there is a table to be traced.
+    /// What a network knew after the seconds of [`MARKS`], and what it took.
+    struct Learned {
+        /// Of what prediction reads.
+        megabytes: f64,
+        psnr: Vec<f64>,
+        labels: u64,
+        trained: u64,
+    }
+
+    const MARKS: [f64; 4] = [1.0, 2.0, 5.0, 10.0];
+
+    impl Learned {
+        /// Cells of a table: PSNR by time, millions of labels traced and of samples trained on.
+        fn row(&self) -> String {
+            let cell = |i: usize| self.psnr.get(i).map_or("-".to_owned(), |psnr| format!("{psnr:.1}"));
+            let cells: Vec<String> = (0..MARKS.len()).map(cell).collect();
+            format!("| {} | {:.0} | {:.0} |", cells.join(" | "), self.labels as f64 * 1e-6, self.trained as f64 * 1e-6)
+        }
+    }
+
+    /// Trains for some seconds. `before`: seconds that the clock starts at, where there is a table to be traced.
     fn learn(
         gpu: &Arc<Gpu>,
         domain: &Domain,
@@ -491,56 +569,58 @@ mod bench {
         pace: Pace,
         seconds: f64,
         measure: impl Fn(&dyn DevicePredict) -> Outcome<f64>,
-    ) -> Outcome<String> {
+    ) -> Outcome<Learned> {
+        const SCOUTS: usize = 1 << 14;
         // The start time takes the third axis' place.
         let axes = if settings.inputs.is_empty() { &[0, 1, 2][..] } else { &[0, 1] };
         let shape = Architecture::new(settings, axes, domain.extent())?;
         let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
         let model = Model::new(shape, 1, base.is_some());
-        let mut chunk = Batch::new(gpu, CHUNK)?;
-        // How large the labels are; the clock does not run, since a few thousand of them would do.
+        let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK)?, Batch::new(gpu, SCOUTS)?);
         let scout = DeviceTraining::new(gpu, &model, &objective)?;
-        scout.draw_points(domain, 5, 0, &mut chunk.points)?;
-        chunk.trace(tracer)?;
-        let mut pool = scout.ring(CHUNK)?;
-        // SAFETY: both buffers hold `CHUNK` entries.
-        unsafe { scout.append(&mut pool, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
+        let mut pool = scout.ring(SCOUTS)?;
+        gpu.synchronize()?;
+        // How large the labels are.
+        let start = Instant::now();
+        scout.draw_points(domain, 5, 0, &mut scouts.points)?;
+        scouts.trace(tracer)?;
+        // SAFETY: both buffers hold `SCOUTS` entries.
+        unsafe { scout.append(&mut pool, domain, scouts.points.address(), scouts.values.address(), SCOUTS, base)? };
         objective.scale = scale(&pool, base.is_some())?;
-        drop((scout, pool));
+        let mut clock = start.elapsed().as_secs_f64() + if base.is_some() { before } else { 0.0 };
+        drop((scout, pool, scouts));
         let mut training = DeviceTraining::new(gpu, &model, &objective)?;
         let mut ring = training.ring(KEPT)?;
         gpu.synchronize()?;
 
-        let mut clock = if base.is_some() { before } else { 0.0 };
-        let (mut labels, mut trained, mut marks) = (0_u64, 0_u64, vec![1.0, 2.0, 5.0, 10.0]);
-        let mut row = String::new();
-        while clock < seconds && !marks.is_empty() {
+        let mut learned = Learned { megabytes: 0.0, psnr: Vec::new(), labels: 0, trained: 0 };
+        while clock < seconds && learned.psnr.len() < MARKS.len() {
+            let Learned { labels, trained, psnr, .. } = &mut learned;
             let start = Instant::now();
-            training.draw_points(domain, 7, labels, &mut chunk.points)?;
+            training.draw_points(domain, 7, *labels, &mut chunk.points)?;
             chunk.trace(tracer)?;
-            // SAFETY: as above.
+            // SAFETY: both buffers hold `CHUNK` entries.
             unsafe { training.append(&mut ring, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
-            labels += CHUNK as u64;
+            *labels += CHUNK as u64;
             let done = training.steps();
             let steps: Vec<PlannedStep> = (0..STEPS)
                 .map(|i| {
                     // The mean runs over the last tenth of the steps.
                     let number = done + i + 1;
                     let average_share = if number % 8 == 0 { (8.0 / (0.1 * number as f32)).min(1.0) } else { 0.0 };
-                    PlannedStep { average_share, ..step(pace.batch, trained + (i * pace.batch) as u64, pace.rate) }
+                    PlannedStep { average_share, ..step(pace.batch, *trained + (i * pace.batch) as u64, pace.rate) }
                 })
                 .collect();
             training.train_steps(&ring, None, &steps)?;
-            trained += (STEPS * pace.batch) as u64;
+            *trained += (STEPS * pace.batch) as u64;
             clock += start.elapsed().as_secs_f64();
-            if clock >= marks[0] {
-                marks.remove(0);
+            if clock >= MARKS[psnr.len()] {
                 let network = training.frozen()?;
-                row += &format!("| {:.1} ", measure(&network.above(base.map(|table| (table, 1.0))))?);
+                psnr.push(measure(&network.above(base.map(|table| (table, 1.0))))?);
             }
         }
-        let bytes = training.frozen()?.bytes() as f64 * 1e-6;
-        Ok(format!("| {bytes:.0} {row}| {:.0} | {:.0} |", labels as f64 * 1e-6, trained as f64 * 1e-6))
+        learned.megabytes = training.frozen()?.bytes() as f64 * 1e-6;
+        Ok(learned)
     }
 
     /// Mean and deviation of the targets so far; a residual keeps the mean 0.

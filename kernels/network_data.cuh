@@ -39,7 +39,8 @@ RW_FN float look_up_base(const Reading& reading, const float (&unit)[PLACES]) {
 }
 
 RW_FN float read_output(const Reading& reading, float output, const float (&unit)[PLACES]) {
-    const float value = reading.published ? reading.tau * copysignf(expm1f(fabsf(output)), output) : fma_(output, reading.deviation[0], reading.mean[0]);
+    const float linear = fma_(output, reading.deviation[0], reading.mean[0]);
+    const float value = reading.published ? reading.tau * copysignf(expm1f(fabsf(output)), output) : linear;
     return reading.base.values ? fma_(reading.share, value, look_up_base(reading, unit)) : value;
 }
 
@@ -139,7 +140,8 @@ RW_FN uint32_t drawn(const Draw& draw, uint32_t position) {
 
 RW_FN Sample drawn_sample(const Draw& draw, uint32_t position) {
     const uint32_t number = drawn(draw, position);
-    return load_sample(number < draw.first ? draw.samples + number * size_t(SAMPLE_FOURS) : draw.more + (number - draw.first) * size_t(SAMPLE_FOURS));
+    const Four* from = number < draw.first ? draw.samples : draw.more;
+    return load_sample(from + (number < draw.first ? number : number - draw.first) * size_t(SAMPLE_FOURS));
 }
 
 // Difference of the means of a batch.

@@ -10,6 +10,11 @@ macro_rules! measured {
     ($($figure:tt)*) => { println!("measured: {}", format_args!($($figure)*)) };
 }
 
+/// Whether tests are to be small: kernels are then watched access by access (`gpu-check`), which takes a hundred times as long.
+fn small() -> bool {
+    std::env::var_os("GPU_CHECK_SMALL").is_some()
+}
+
 #[path = "gpu/answers.rs"]
 mod answers;
 #[path = "gpu/audit.rs"]
@@ -25,6 +30,8 @@ mod network_flow_map;
 #[path = "gpu/network_loop.rs"]
 mod network_loop;
 mod network_support;
+#[path = "gpu/network_training.rs"]
+mod network_training;
 #[path = "gpu/render.rs"]
 mod render;
 #[path = "gpu/scenes.rs"]

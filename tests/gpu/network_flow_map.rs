@@ -25,7 +25,7 @@ fn cases() -> Vec<Case> {
     let ftle = |settings: &NetworkSettings| NetworkSettings { target: Target::Ftle, ..settings.clone() };
     cases.extend([
         Case { name: "flow map, width 128", settings: NetworkSettings { width: 128, ..flow_map.clone() }, axes: space },
-        Case { name: "flow map, 16 features a sample more", settings: NetworkSettings { features: 8, ..flow_map.clone() }, axes: plane },
+        Case { name: "flow map, 8 features", settings: NetworkSettings { features: 8, ..flow_map.clone() }, axes: plane },
         Case { name: "flow map, 256 wide", settings: NetworkSettings { width: 256, hidden_layers: 3, ..frequency.clone() }, axes: space },
         Case {
             name: "flow map, deep, tables",
@@ -99,6 +99,7 @@ kind = \"turbulence\"
 nodes = [48, 24, 24]
 [time]
 tau = 6
+slides = 1
 frames_per_slide = 5
 [flow]
 steps = 12
@@ -167,6 +168,11 @@ fn frames(scene: &str, keys: &[&str], device: &Device) -> Vec<Frame> {
     frames
 }
 
+/// Of the first slide.
+fn frames_of_a_slide(frames: &[Frame]) -> usize {
+    frames.iter().take_while(|frame| frame.record.slide == 0).count()
+}
+
 /// Frames, audits, labels and training stay on the device, and what it learns is worth what the CPU learns.
 #[test]
 #[ignore = "needs a GPU"]
@@ -192,12 +198,13 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
             }
         }
         let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
-        let loss = |frames: &[Frame]| frames.iter().map(|frame| frame.record.training.as_ref().unwrap().loss.unwrap()).collect::<Vec<_>>();
         let (ours, theirs) = (psnr(&found), psnr(&expected));
         measured!("{name}: what the network knows, dB: GPU {ours:.1?}, CPU {theirs:.1?}");
-        let (first, last) = (loss(&found)[0], loss(&found)[found.len() - 1]);
-        assert!(last < 0.5 * first, "{name}: it learns: {first} to {last}");
-        // A device learns from all that it traces, the CPU from what is kept.
-        assert!(ours[ours.len() - 1] > theirs[theirs.len() - 1] - 1.0, "{name}: as much: {ours:?} and {theirs:?}");
+        let last = frames_of_a_slide(&found) - 1;
+        // The first frame is answered by what the run began with.
+        assert!(ours[last] > ours[0] + 5.0 && theirs[last] > theirs[0] + 5.0, "{name}: both learn: {ours:?} and {theirs:?}");
+        // On the CPU, runs of other seeds end up to 3 dB apart.
+        assert!(ours[last] > theirs[last] - 4.0, "{name}: as much: {ours:?} and {theirs:?}");
+        assert!(ours[ours.len() - 1] > ours[0] + 5.0, "{name}: after a slide too: {ours:?}");
     }
 }

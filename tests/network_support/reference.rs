@@ -1,8 +1,9 @@
 //! Networks in f64, and labels for them.
 
 use super::uniform_points;
+use rayon::prelude::*;
 use ridgewatch::surrogate::Samples;
-use ridgewatch::surrogate::network::{Architecture, Encoding, Loss, Model, Objective, Row, Target, row};
+use ridgewatch::surrogate::network::{Architecture, Encoding, Level, Loss, Model, Objective, Row, Target, row};
 
 /// Rounded to half precision (11 bits, 2^-24 at least apart), ties to even.
 fn half(x: f64) -> f64 {
@@ -37,47 +38,58 @@ impl<'a> Reference<'a> {
         halves
     }
 
-    /// Outputs and their derivatives along the inputs: `[1 + inputs][outputs]`.
-    pub fn outputs(&self, row: Row) -> Vec<Vec<f64>> {
-        let shape = self.shape;
-        let x: Vec<f32> = shape.axes.iter().map(|&a| row[a]).collect();
+    /// Inputs of the network.
+    fn inputs(&self, row: Row) -> Vec<f32> {
+        self.shape.axes.iter().map(|&a| row[a]).collect()
+    }
+
+    /// Entries around a point, and what each counts for the value and for the derivative along each input.
+    fn corners(level: &Level, x: &[f32]) -> Vec<(usize, Vec<f64>)> {
         let d = x.len();
+        let mut cell = vec![0_u32; d];
+        let mut share = vec![0.0_f64; d];
+        for a in 0..d {
+            // The cell is found in f32 as everywhere: a point on an edge must not fall to the other side.
+            let position = x[a] * level.cells[a] as f32;
+            cell[a] = (position as u32).min(level.cells[a] - 1);
+            share[a] = f64::from(position - cell[a] as f32);
+        }
+        let corner = |corner: u32| {
+            let side = |a: usize| (corner >> a) & 1;
+            let node: Vec<u32> = (0..d).map(|a| cell[a] + side(a)).collect();
+            let index = if level.hashed {
+                let primes = [1_u32, 2_654_435_761, 805_459_861, 3_674_653_429];
+                let hash = (0..d).fold(0, |h, a| h ^ node[a].wrapping_mul(primes[a]));
+                hash as usize % level.entries
+            } else {
+                (0..d).rev().fold(0, |i, a| i * (level.cells[a] as usize + 1) + node[a] as usize)
+            };
+            let along = |group: usize| -> f64 {
+                (0..d)
+                    .map(|a| match (group == a + 1, side(a)) {
+                        (true, 1) => f64::from(level.cells[a]),
+                        (true, _) => -f64::from(level.cells[a]),
+                        (false, 1) => share[a],
+                        (false, _) => 1.0 - share[a],
+                    })
+                    .product()
+            };
+            (level.offset + index, (0..=d).map(along).collect())
+        };
+        (0..1_u32 << d).map(corner).collect()
+    }
+
+    /// The encoded point and its derivatives along the inputs.
+    fn encoded(&self, x: &[f32]) -> Vec<Vec<f64>> {
+        let (shape, d) = (self.shape, x.len());
         let mut rows = vec![Vec::new(); 1 + d];
         match shape.encoding {
             Encoding::HashGrid => {
                 for level in &shape.levels {
-                    let mut cell = vec![0_u32; d];
-                    let mut share = vec![0.0_f64; d];
-                    for a in 0..d {
-                        // The cell is found in f32 as everywhere: a point on an edge must not fall to the other side.
-                        let position = x[a] * level.cells[a] as f32;
-                        cell[a] = (position as u32).min(level.cells[a] - 1);
-                        share[a] = f64::from(position - cell[a] as f32);
-                    }
+                    let corners = Self::corners(level, x);
                     for f in 0..shape.features {
                         for (group, row) in rows.iter_mut().enumerate() {
-                            let mut sum = 0.0;
-                            for corner in 0..1_u32 << d {
-                                let side = |a: usize| (corner >> a) & 1;
-                                let node: Vec<u32> = (0..d).map(|a| cell[a] + side(a)).collect();
-                                let index = if level.hashed {
-                                    let primes = [1_u32, 2_654_435_761, 805_459_861, 3_674_653_429];
-                                    let hash = (0..d).fold(0, |h, a| h ^ node[a].wrapping_mul(primes[a]));
-                                    hash as usize % level.entries
-                                } else {
-                                    (0..d).rev().fold(0, |i, a| i * (level.cells[a] as usize + 1) + node[a] as usize)
-                                };
-                                let weight: f64 = (0..d)
-                                    .map(|a| match (group == a + 1, side(a)) {
-                                        (true, 1) => f64::from(level.cells[a]),
-                                        (true, _) => -f64::from(level.cells[a]),
-                                        (false, 1) => share[a],
-                                        (false, _) => 1.0 - share[a],
-                                    })
-                                    .product();
-                                sum += weight * self.tables[(level.offset + index) * shape.features + f];
-                            }
-                            row.push(sum);
+                            row.push(corners.iter().map(|(entry, share)| share[group] * self.tables[entry * shape.features + f]).sum());
                         }
                     }
                 }
@@ -96,6 +108,13 @@ impl<'a> Reference<'a> {
                 }
             }
         }
+        rows
+    }
+
+    /// Outputs and their derivatives along the inputs: `[1 + inputs][outputs]`.
+    pub fn outputs(&self, row: Row) -> Vec<Vec<f64>> {
+        let shape = self.shape;
+        let mut rows = self.encoded(&self.inputs(row));
         for (number, layer) in shape.layers.iter().enumerate() {
             rows.iter_mut().flatten().for_each(|x| *x = (self.between)(*x));
             let linear = |row: &[f64], bias: bool| -> Vec<f64> {
@@ -120,20 +139,15 @@ impl<'a> Reference<'a> {
     pub fn loss(&self, objective: &Objective, samples: &Samples) -> f64 {
         let count = samples.len() as f64;
         let outputs = self.shape.outputs();
-        let (mut loss, mut linear) = (0.0, 0.0);
-        for i in 0..samples.len() {
+        let of_one = |i: usize| {
+            let (mut loss, mut linear) = (0.0, 0.0);
             let rows = self.outputs(row(samples.points[i], samples.times[i]));
             if objective.target == Target::Ftle {
-                let y = f64::from(samples.log_stretch[i]);
-                let target = match objective.loss {
-                    Loss::MeanSquare => (y - f64::from(objective.scale.mean[0])) / f64::from(objective.scale.deviation[0]),
-                    Loss::Published => {
-                        let y = y / f64::from(objective.tau);
-                        linear += (rows[0][0].abs().exp() - 1.0).copysign(rows[0][0]) - y;
-                        (1.0 + y.abs()).ln().copysign(y)
-                    }
-                };
-                loss += (rows[0][0] - target).powi(2) / count;
+                if objective.loss == Loss::Published {
+                    let y = f64::from(samples.log_stretch[i]) / f64::from(objective.tau);
+                    linear = (rows[0][0].abs().exp() - 1.0).copysign(rows[0][0]) - y;
+                }
+                loss = (rows[0][0] - target(objective, samples.log_stretch[i])).powi(2) / count;
             } else {
                 let axes = self.shape.space();
                 for (o, &axis) in axes.iter().enumerate() {
@@ -149,11 +163,127 @@ impl<'a> Reference<'a> {
                     }
                 }
             }
-        }
+            (loss, linear)
+        };
+        // Added up in order: finite differences must not see the order change.
+        let all: Vec<(f64, f64)> = (0..samples.len()).into_par_iter().map(of_one).collect();
+        let (mut loss, linear) = all.iter().fold((0.0, 0.0), |sum, one| (sum.0 + one.0, sum.1 + one.1));
         if objective.loss == Loss::Published && objective.target == Target::Ftle {
             loss += f64::from(objective.mean_penalty) * (linear / count).powi(2);
         }
         loss
+    }
+
+    /// Gradient of [`Self::loss`], tables first; of the target `ftle` without the penalty on means. With halves, gradients with respect to the
+    /// layers' sums are in half precision too where they are multiplied.
+    pub fn gradient(&self, objective: &Objective, samples: &Samples, kernel: Kernel, rounding: Rounding) -> Vec<f64> {
+        assert!(objective.target == Target::Ftle && (objective.loss == Loss::MeanSquare || objective.mean_penalty == 0.0));
+        let zeros = || vec![0.0; self.tables.len() + self.layers.len()];
+        let sum = |mut to: Vec<f64>, from: Vec<f64>| {
+            to.iter_mut().zip(&from).for_each(|(to, from)| *to += from);
+            to
+        };
+        let of_one = |mut to: Vec<f64>, i: usize| {
+            let target = target(objective, samples.log_stretch[i]);
+            self.add_gradient(&mut to, row(samples.points[i], samples.times[i]), target, kernel, &mut rounding.of(i));
+            to
+        };
+        let mut all = (0..samples.len()).into_par_iter().with_min_len(50).fold(zeros, of_one).reduce(zeros, sum);
+        all.iter_mut().for_each(|g| *g /= samples.len() as f64);
+        all
+    }
+
+    /// Adds the gradient of one sample's squared error.
+    fn add_gradient(&self, to: &mut [f64], row: Row, target: f64, kernel: Kernel, rounding: &mut Rounding) {
+        let (shape, between, x) = (self.shape, self.between, self.inputs(row));
+        // What goes into each layer. ReLU passes what is not 0 after it was rounded.
+        let mut values = vec![self.encoded(&x).swap_remove(0)];
+        values[0].iter_mut().for_each(|v| *v = between(*v + rounding.off(v.abs())));
+        for (number, layer) in shape.layers.iter().enumerate() {
+            let mut sums = self.layers[layer.biases..layer.biases + layer.outputs].to_vec();
+            let mut sizes: Vec<f64> = sums.iter().map(|s| s.abs()).collect();
+            for (value, weights) in values[number].iter().zip(self.layers[layer.weights..layer.biases].chunks(layer.outputs)) {
+                for ((sum, size), weight) in sums.iter_mut().zip(&mut sizes).zip(weights) {
+                    *sum += value * weight;
+                    *size += (value * weight).abs();
+                }
+            }
+            sums.iter_mut().zip(&sizes).for_each(|(sum, &size)| *sum += rounding.off(size));
+            if number + 1 < shape.layers.len() {
+                sums.iter_mut().for_each(|z| *z = between(z.max(0.0)));
+            }
+            values.push(sums);
+        }
+        let slope = 2.0 * (values[shape.layers.len()][0] - target);
+        let (tables, layers) = to.split_at_mut(self.tables.len());
+        // With respect to the sums of the layer at hand: as it is, and as it is multiplied.
+        let mut delta = vec![slope];
+        for (number, layer) in shape.layers.iter().enumerate().rev() {
+            let is_head = number + 1 == shape.layers.len();
+            let halves: Vec<f64> = delta.iter().map(|&d| between(d)).collect();
+            let multiplied = if is_head && kernel == Kernel::Batched { &delta } else { &halves };
+            let added = if kernel == Kernel::Fused { &halves } else { &delta };
+            layers[layer.biases..layer.biases + layer.outputs].iter_mut().zip(added).for_each(|(to, d)| *to += d);
+            for (to, value) in layers[layer.weights..layer.biases].chunks_mut(layer.outputs).zip(&values[number]) {
+                to.iter_mut().zip(multiplied).for_each(|(to, d)| *to += value * d);
+            }
+            let back = if is_head { &delta } else { &halves };
+            let of_input = |(value, weights): (&f64, &[f64])| {
+                let (sum, size) = weights.iter().zip(back).fold((0.0, 0.0), |(sum, size), (w, d)| (sum + w * d, size + (w * d).abs()));
+                if number == 0 || *value != 0.0 { sum + rounding.off(size) } else { 0.0 }
+            };
+            delta = values[number].iter().zip(self.layers[layer.weights..layer.biases].chunks(layer.outputs)).map(of_input).collect();
+        }
+        for (number, level) in shape.levels.iter().enumerate() {
+            for (entry, share) in Self::corners(level, &x) {
+                for f in 0..shape.features {
+                    let d = delta[number * shape.features + f];
+                    tables[entry * shape.features + f] += share[0] * if kernel == Kernel::Batched { between(d) } else { d };
+                }
+            }
+        }
+    }
+}
+
+/// Which kernels of the device a gradient is compared with: they round at different places.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kernel {
+    /// `network_fused.cu`: what is added up over samples is in halves; what goes to the tables is not.
+    Fused,
+    /// `network_batched.cu`: the other way round.
+    Batched,
+}
+
+/// What sums are off by, at random: up to `part` of the sum of their terms' magnitudes.
+#[derive(Debug, Clone, Copy)]
+pub struct Rounding {
+    pub part: f64,
+    pub seed: u64,
+}
+
+impl Rounding {
+    pub const NONE: Self = Self { part: 0.0, seed: 0 };
+
+    /// Of one sample's sums.
+    fn of(self, sample: usize) -> Self {
+        Self { seed: (self.seed << 32) + sample as u64, ..self }
+    }
+
+    fn off(&mut self, size: f64) -> f64 {
+        self.seed = self.seed.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        self.part * size * ((self.seed >> 11) as f64 / (1_u64 << 52) as f64 - 1.0)
+    }
+}
+
+/// What the output is to be.
+fn target(objective: &Objective, log_stretch: f32) -> f64 {
+    let s = f64::from(log_stretch);
+    match objective.loss {
+        Loss::MeanSquare => (s - f64::from(objective.scale.mean[0])) / f64::from(objective.scale.deviation[0]),
+        Loss::Published => {
+            let y = s / f64::from(objective.tau);
+            (1.0 + y.abs()).ln().copysign(y)
+        }
     }
 }
 

@@ -11,6 +11,9 @@ use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
 
+/// Steps that are begun to be read in one look, if the producer overtakes each of them.
+const ATTEMPTS: usize = 4;
+
 /// Bytes that can be read anywhere: a file, or memory in tests.
 pub trait ReadAt {
     /// Bytes there.
@@ -135,8 +138,8 @@ impl<F: ReadAt> RingReader<F> {
         &self.path
     }
 
-    /// Reads the oldest step that was not read yet and is still there: its components, one behind the other, x fastest, in native f32.
-    /// `values` keeps its memory from call to call.
+    /// Reads the oldest step that was not read yet and is still there: its components, one behind the other, x fastest, in native f32. Where the producer
+    /// overtakes the reading, the newest one instead, which will be there for longest. `values` keeps its memory from call to call.
     ///
     /// # Errors
     /// The file went away or was cut short; its counts run backwards.
@@ -145,7 +148,7 @@ impl<F: ReadAt> RingReader<F> {
         let began = self.next;
         // Ended before the count is read: no step can come after it.
         let ended = self.word(STATE)? == ENDED;
-        loop {
+        for _ in 0..ATTEMPTS {
             let published = self.word(PUBLISHED)?;
             if published < began {
                 return Err(WireError::field("published", published, format!("at least {began}, which was seen before")));
@@ -163,8 +166,11 @@ impl<F: ReadAt> RingReader<F> {
                 return Ok(Read::Step(info));
             }
             // It was overwritten meanwhile.
-            self.next += 1;
+            self.next = (self.next + 1).max(self.word(PUBLISHED)?.saturating_sub(1));
         }
+        // The producer is faster than any reading; what else is to be done comes first.
+        self.next = began;
+        Ok(Read::Nothing)
     }
 
     /// Tells the producer that this follower has taken all steps before the next, and lives. Which of the 64 marks is its own says

@@ -89,6 +89,47 @@ fn a_step_that_is_overwritten_while_it_is_read_is_never_seen() {
     assert_eq!(seen.0 + seen.1, 3000, "each step is seen or counted");
 }
 
+/// A ring into which the producer publishes so many steps while the first values are read.
+struct Overtaken<'a>(std::fs::File, &'a Producer, std::cell::Cell<u64>);
+
+impl ReadAt for Overtaken<'_> {
+    fn length(&self) -> std::io::Result<u64> {
+        self.0.length()
+    }
+
+    fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+        ReadAt::read_at(&self.0, to, offset)?;
+        if offset > 12288 && to.len() > 32 {
+            for n in 4..4 + self.2.take() {
+                publish(self.1, n, n as f64).unwrap();
+            }
+        }
+        Ok(())
+    }
+
+    fn write_at(&self, from: &[u8], offset: u64) -> std::io::Result<()> {
+        ReadAt::write_at(&self.0, from, offset)
+    }
+}
+
+#[test]
+fn a_reader_that_was_overtaken_goes_on_with_the_newest() {
+    for (more, step, missed) in [(0, 0, 0), (1, 4, 4), (3, 6, 6), (20, 23, 23)] {
+        let folder = Folder::new("overtaken");
+        let producer = Producer::open(&folder.0, cube([5, 4, 3]), 4, Policy::NewestWins).unwrap();
+        for n in 0..4 {
+            publish(&producer, n, n as f64).unwrap();
+        }
+        let file = std::fs::File::open(block_path(&folder.0, 0)).unwrap();
+        let ring = Overtaken(file, &producer, more.into());
+        let mut reader = RingReader::over("overtaken".into(), ring, &Limits::default()).unwrap();
+        let mut buffer = Vec::new();
+        let Read::Step(info) = reader.read(&mut buffer).unwrap() else { panic!("nothing was read") };
+        assert_eq!((info.step, info.missed), (step, missed), "{more} more");
+        assert_eq!(buffer, values(producer.description(), step).concat());
+    }
+}
+
 /// A ring whose slots are overwritten by a newer step at the moment that their values are read.
 struct Racing(std::cell::RefCell<Vec<u8>>);
 
