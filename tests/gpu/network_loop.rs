@@ -124,7 +124,7 @@ width = 48
 height = 24
 samples = 4
 ";
-    let keys = if small() { vec!["training.steps_per_frame=20".to_owned()] } else { Vec::new() };
+    let keys = if small() { vec!["training.steps_per_frame=20".to_owned(), "time.slides=2".to_owned()] } else { Vec::new() };
     let made = |device: &Device| frames(GYRE, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
     let (found, expected) = (made(&device(GpuSettings::default())), made(&Device::CPU));
     let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
@@ -142,10 +142,10 @@ samples = 4
             assert!(after.warnings.is_empty(), "{:?}", after.warnings);
             assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
         }
-        assert!(psnr(frames)[15] > psnr(frames)[0] + 5.0, "it learns");
+        assert!(psnr(frames)[frames.len() - 1] > psnr(frames)[0] + 5.0, "it learns");
     }
     // A device learns from all that it traces, the CPU from what is kept.
-    assert!(psnr(&found)[15] > psnr(&expected)[15] - 1.0, "as much");
+    assert!(psnr(&found).last().unwrap() > &(psnr(&expected).last().unwrap() - 1.0), "as much");
 }
 
 /// A rate at which Adam throws every weight across the whole landscape: a run rolls back, counts it, and shows what it can.
@@ -160,8 +160,11 @@ fn a_run_whose_network_diverges_goes_on() {
     measured!("a rate of 1: {rollbacks} rollbacks, {lost} steps lost");
     assert!(rollbacks > 0 && lost > 0 && learned.iter().all(|l| l.device_seconds.is_some()), "{learned:?}");
     for frame in &frames {
-        assert!(frame.film.rgba.iter().flatten().all(|value| value.is_finite()), "frame {}", frame.record.frame);
-        assert!(frame.record.warnings.is_empty(), "{:?}", frame.record.warnings);
+        let record = &frame.record;
+        assert!(frame.film.rgba.iter().flatten().all(|value| value.is_finite()), "frame {}", record.frame);
+        let diverged = record.training.as_ref().is_some_and(|learned| learned.rollbacks > 0);
+        assert!(record.warnings.len() == usize::from(diverged), "{:?}", record.warnings);
+        assert!(record.warnings.iter().all(|warning| warning.contains("training diverged")), "{:?}", record.warnings);
     }
     let [first, last] = [&frames[0], &frames[5]].map(|frame| frame.record.surrogate_psnr.unwrap());
     assert!(last > first + 5.0, "{first} dB, then {last}");
@@ -208,7 +211,8 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
         let keys = |seed: u64| keys.iter().map(|key| (*key).to_owned()).chain([format!("seed={seed}")]).collect::<Vec<String>>();
         (first..first + seeds).map(|seed| frames(ANSWERED, &keys(seed), &options).pop().unwrap()).collect()
     };
-    let found = pictures(&device(GpuSettings::default()), 0, &[]);
+    let few: &[&str] = if small() { &["training.steps_per_frame=20", "time.frames_per_slide=3"] } else { &[] };
+    let found = pictures(&device(GpuSettings::default()), 0, few);
     for frame in &found {
         let record = &frame.record;
         assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
