@@ -152,6 +152,24 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     assert_eq!(rms(&*calm, &held_out), before);
 }
 
+/// A flow that stretches three times as much from window to window: losses grow by 9, but nothing has diverged.
+#[test]
+fn a_flow_that_grows_is_not_taken_for_a_divergence() {
+    let tracer = DoubleGyre::new(0.0, 10.0, 20);
+    let calm = traced(&tracer, uniform_points(1, 5_000), false);
+    for kind in [Kind::Network, Kind::Residual] {
+        let mut surrogate = surrogate(kind, &small(), &tracer);
+        let mut growth = 0.01;
+        for window in 0..8 {
+            let log_stretch = calm.log_stretch.iter().map(|s| growth * s).collect();
+            let learned = surrogate.learn(&SampleRing::holding(&Samples { log_stretch, ..calm.clone() }), 60.0, 40);
+            assert_eq!((learned.rollbacks, learned.steps), (0, 40), "{kind:?}, window {window}: {learned:?}");
+            surrogate.window_slid(&tracer);
+            growth *= 3.0;
+        }
+    }
+}
+
 #[test]
 fn a_resumed_run_goes_on_bit_for_bit() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);

@@ -254,10 +254,7 @@ impl Trainer {
             return;
         }
         self.kept = None;
-        self.progress.averaged = 0;
-        self.progress.stall = 1.0;
-        self.progress.smooth = 0.0;
-        self.progress.looked = 0.0;
+        self.progress.window_slid();
     }
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
@@ -344,7 +341,7 @@ impl Trainer {
             let mut diverged = false;
             for (loss, (_, averaged)) in found.into_iter().zip(&planned) {
                 counted += 1;
-                diverged = self.progress.diverges(loss, *first_of_call.get_or_insert(loss));
+                diverged = self.progress.diverges(loss, *first_of_call.get_or_insert(loss), *averaged);
                 if diverged {
                     break;
                 }
