@@ -294,7 +294,14 @@ fn main() {
             ..RunOptions::default()
         };
         let report = run(Setup::new(scene.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
-        let seen = seen.split_off(LEARNING);
+        let settling: Vec<(FrameRecord, u64, usize)> = seen.drain(..LEARNING).collect();
+        let settling: Vec<&FrameRecord> = settling.iter().map(|s| &s.0).collect();
+        lines.push(format!(
+            "{name}, warm-up: its first frame took {:.1} ms, the longest of the {} behind it {:.1} ms.",
+            1e3 * settling[0].seconds.total,
+            settling.len() - 1,
+            lengths(&settling).into_iter().fold(0.0, f64::max)
+        ));
         for (slide, frames) in seen.chunks(FRAMES_A_SLIDE).enumerate() {
             let shown = SHOWN.map(|n| format!("{:.1} %, {:.0}", 100.0 * frames[n].0.traced_share, 1e3 * frames[n].0.seconds.total));
             println!("| {name} | {} | {} | {:.0} |", slide + 1, shown.join(" | "), 1e3 * frames[0].0.seconds.slide);

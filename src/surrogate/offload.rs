@@ -38,6 +38,9 @@ pub trait OffloadedTraining: Send + Sync {
     /// Brings over what `ring` has got since the last call, with what the labels have beyond `base` as targets.
     fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost>;
 
+    /// What was traced on the device so far is wrong from now on: the window has slid.
+    fn forget_labels(&mut self);
+
     /// Takes steps on the samples that were brought over; the loss of each, before it.
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost>;
 

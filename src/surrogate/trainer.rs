@@ -60,6 +60,8 @@ struct Away {
     fetch_seconds: f64,
     /// On its way back, for the thread here, or for a checkpoint.
     returning: Option<Arc<Returning>>,
+    /// It holds weights that were rolled back since.
+    is_disowned: bool,
     brings: Option<JoinHandle<()>>,
     /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
     step_seconds: f64,
@@ -255,6 +257,9 @@ impl Trainer {
         }
         self.kept = None;
         self.progress.window_slid();
+        if let Some(away) = &mut self.away {
+            away.training.forget_labels();
+        }
     }
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
@@ -283,7 +288,7 @@ impl Trainer {
             let reached = self.steps();
             self.lose_device();
             learned.steps = self.steps().saturating_sub(began) as u64;
-            learned.lost_steps += (reached - self.steps()) as u64;
+            learned.lost_steps += reached.saturating_sub(self.steps()) as u64;
         }
         learned.device_seconds = self.away.as_mut().map(|away| away.training.device_seconds());
         learned.seconds = start.elapsed().as_secs_f64();
@@ -384,6 +389,7 @@ impl Trainer {
             fetched_at: Instant::now(),
             fetch_seconds: 0.0,
             returning: None,
+            is_disowned: false,
             brings: None,
             step_seconds: 0.0,
             frozen: OnceLock::new(),
@@ -430,6 +436,7 @@ impl Trainer {
             Copied::NoRoom(why) => Sent::NoRoom(why),
             Copied::There(copy) => {
                 let returning = Returning::new(copy, self.model.clone(), self.progress);
+                away.is_disowned = false;
                 Sent::For(away.returning.insert(returning).clone())
             }
         })
@@ -440,6 +447,7 @@ impl Trainer {
         let Some(away) = &mut self.away else { return };
         let Some(returning) = away.returning.take() else { return };
         match returning.arrived() {
+            Some(_) if std::mem::take(&mut away.is_disowned) => {}
             Some(Ok(numbers)) => {
                 let Numbers { model, average, predictor } = numbers.clone();
                 let stale = (std::mem::replace(&mut self.model, model), std::mem::replace(&mut self.average, average));
@@ -552,6 +560,7 @@ impl Trainer {
             (Some(away), _) => {
                 away.training.roll_back()?;
                 (away.steps, away.frozen) = (kept.steps, OnceLock::new());
+                away.is_disowned = away.returning.is_some();
             }
             (None, Some((state, average))) => {
                 self.model.set_state(state.clone(), kept.steps);
@@ -568,7 +577,8 @@ impl Trainer {
         let (mut model, last) = (self.model.clone(), self.average.clone());
         let Some(away) = &self.away else { return (model, last, self.progress) };
         let mut average = Average::clone(&last);
-        match (away.training.fetch(&mut model, &mut average), away.returning.as_ref().and_then(|r| Some((r.progress, r.arrived()?)))) {
+        let returning = away.returning.as_ref().filter(|_| !away.is_disowned);
+        match (away.training.fetch(&mut model, &mut average), returning.and_then(|r| Some((r.progress, r.arrived()?)))) {
             (Ok(()), _) => (model, Arc::new(average), self.progress),
             (Err(DeviceLost), Some((progress, Ok(numbers)))) => (numbers.model.clone(), numbers.average.clone(), progress),
             (Err(DeviceLost), _) => (self.model.clone(), last, away.fetched),

@@ -201,6 +201,8 @@ struct Network {
 }
 
 impl OffloadedTraining for Network {
+    fn forget_labels(&mut self) {}
+
     fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
         self.there.call("bringing samples over")?;
         self.samples.points.resize(ring.len(), [f32::NAN; 3]);

@@ -44,7 +44,8 @@ impl Offload for CudaOffload {
             Ok(training)
         })?;
         let (gpu, below) = (gpu.clone(), TableCopy::default());
-        Some(Box::new(CudaTraining { gpu, training, held: None, pool: None, below, seconds: 0.0, room: Arc::default() }))
+        let (held, pool, pool_base) = (None, None, None);
+        Some(Box::new(CudaTraining { gpu, training, held, pool, pool_base, below, seconds: 0.0, room: Arc::default() }))
     }
 }
 
@@ -103,6 +104,8 @@ struct CudaTraining {
     training: DeviceTraining,
     held: Option<Held>,
     pool: Option<Arc<LabelPool>>,
+    /// The stamp of the table, if any, that the pool's targets are relative to; the outer none: whichever is next.
+    pool_base: Option<Option<u64>>,
     below: TableCopy,
     /// Device seconds of steps, not yet asked for.
     seconds: f64,
@@ -151,8 +154,10 @@ impl CudaTraining {
             None => self.training.ring(ring.capacity())?,
         };
         if known.is_none() {
-            // All comes over anew, and what was traced here was of another window or another table; the memory stays.
+            // All comes over anew; the memory stays.
             samples.clear();
+        }
+        if self.pool_base.replace(stamp).is_some_and(|of| of != stamp) {
             pool.samples().clear();
         }
         // In two dimensions tables have one node along z.
@@ -189,6 +194,13 @@ impl CudaTraining {
 impl OffloadedTraining for CudaTraining {
     fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
         self.ask(|training| training.follow(ring, base))
+    }
+
+    fn forget_labels(&mut self) {
+        if let Some(pool) = &self.pool {
+            pool.samples().clear();
+        }
+        self.pool_base = None;
     }
 
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
