@@ -37,15 +37,17 @@ length = int.from_bytes(data[:8], "little")
 header, body = json.loads(data[8 : 8 + length]), data[8 + length :]
 notes = header.pop("__metadata__")
 tensors = {name: np.frombuffer(body[slice(*entry["data_offsets"])], "<f4").reshape(entry["shape"]) for name, entry in header.items()}
-shape, end = json.JSONDecoder().raw_decode(notes["network.shape"])
-if shape["target"] != "ftle" or "MeanSquare" not in notes["network.shape"][end:]:
-    sys.exit(f"{sys.argv[1]}: its target is not ftle, or its loss not mean_square")
+if notes.get("network.loss") != "mean_square" or (shape := json.loads(notes["network.shape"]))["target"] != "ftle":
+    sys.exit(f"{sys.argv[1]}: no network, or its loss (network.loss) is not mean_square, or its target not ftle")
 
 # What the network is shown, a column an input, all in the unit interval.
 points, names = np.loadtxt(sys.stdin, ndmin=2), notes["network.inputs"].split()
 first, last = map(float, notes.get("network.start_range", "0 1").split())
 ranges = {"x": (0, 1), "y": (0, 1), "z": (0, 1), "start": (first, last), "duration": (0, float(notes["network.tau"]))}
-given = dict(zip(["x", "y", "z"] + [name for name in names if len(name) > 1], points.T))
+columns = ["x", "y", "z"] + [name for name in names if len(name) > 1]
+if points.shape[1] != len(columns):
+    sys.exit(f"points have {points.shape[1]} columns; this network takes {len(columns)}: {' '.join(columns)}")
+given = dict(zip(columns, points.T))
 inputs = np.stack([(given[name] - ranges[name][0]) / (ranges[name][1] - ranges[name][0]) for name in names], 1).clip(0, 1)
 if shape["levels"]:
     values = np.hstack([features(inputs, level, tensors["network.tables.average"]) for level in shape["levels"]])

@@ -6,22 +6,32 @@ mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
-use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Times};
+use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target, Times};
 use ridgewatch::surrogate::{Kind, SampleRing, SurrogateSettings, build};
 use std::io::Write;
+use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// The example's answers at unit points.
-fn evaluated(checkpoint: &std::path::Path, points: &[[f32; 3]], times: &str) -> Vec<f32> {
+/// The example's answers at unit points, or what it says instead.
+fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<f32>, String> {
     let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/evaluate_network.py");
-    let mut child = Command::new(python).args([script.as_ref(), checkpoint]).stdin(Stdio::piped()).stdout(Stdio::piped()).spawn().unwrap();
+    let mut child = Command::new(python)
+        .args([script.as_ref(), checkpoint])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
     let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z} {times}\n")).collect();
-    // The script reads everything before it writes anything.
-    child.stdin.take().unwrap().write_all(text.as_bytes()).unwrap();
+    // The script reads everything before it writes anything, or refuses and reads nothing.
+    let fed = child.stdin.take().unwrap().write_all(text.as_bytes());
     let output = child.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", output.status);
-    String::from_utf8(output.stdout).unwrap().lines().map(|line| line.parse().unwrap()).collect()
+    if !output.status.success() {
+        return Err(String::from_utf8(output.stderr).unwrap());
+    }
+    fed.unwrap();
+    Ok(String::from_utf8(output.stdout).unwrap().lines().map(|line| line.parse().unwrap()).collect())
 }
 
 #[test]
@@ -62,11 +72,36 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
         }
         let mut expected = vec![0.0; points.len()];
         surrogate.predict(&points, &mut expected);
-        let found = evaluated(&path, &points, times);
+        let found = evaluated(&path, &points, times).unwrap();
         assert_eq!(found.len(), expected.len());
         for ((point, found), expected) in points.iter().zip(&found).zip(&expected) {
             // f64 there, f32 here.
             assert!((found - expected).abs() < 2e-4 * expected.abs().max(1.0), "{name}: {point:?}: {found} for {expected}");
         }
+    }
+}
+
+#[test]
+#[ignore = "needs Python with NumPy (`make test-data` has it)"]
+fn what_the_reader_does_not_take_it_says() {
+    let folder = tempfile::tempdir().unwrap();
+    let tracer = DoubleGyre::new(0.0, 3.0, 30);
+    let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
+    let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
+    let published = NetworkSettings { loss: Loss::Published, ..hash.clone() };
+    let flow_map = NetworkSettings { target: Target::FlowMap, ..hash.clone() };
+    for (name, network, kind, times, told) in [
+        ("no start", &start, Kind::Network, "", "points have 3 columns; this network takes 4: x y z start"),
+        ("a time too many", &hash, Kind::Network, "2.5", "points have 4 columns; this network takes 3: x y z"),
+        ("published", &published, Kind::Network, "", "is not mean_square"),
+        ("flow map", &flow_map, Kind::Network, "", "its target not ftle"),
+        ("table", &hash, Kind::Table, "", "no network"),
+    ] {
+        let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
+        let surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
+        let path = folder.path().join(name);
+        surrogate.save(&path).unwrap();
+        let said = evaluated(&path, &uniform_points(8, 5), times).unwrap_err();
+        assert!(said.contains(told) && !said.contains("Traceback"), "{name}: {said}");
     }
 }

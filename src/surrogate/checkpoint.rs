@@ -154,7 +154,7 @@ impl<'a> Checkpoint<'a> {
         Ok(checkpoint)
     }
 
-    fn mismatch(&self, found: String, expected: String) -> CheckpointError {
+    pub(super) fn mismatch(&self, found: String, expected: String) -> CheckpointError {
         CheckpointError::Mismatch { path: self.path.clone(), found, expected }
     }
 

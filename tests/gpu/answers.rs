@@ -1,12 +1,11 @@
 //! Frames that a surrogate answers where it is trusted, and scenes with land: walked, predicted and traced on the GPU, against the CPU.
 
-use crate::scenes::{cartesian, device, even, gpu, opened, smooth, store, turbulence};
-use ridgewatch::config::SceneFile;
+use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
 use ridgewatch::engine::cuda::{
     CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs, Panel,
     SnapshotStore, Tuning, keeps_label,
 };
-use ridgewatch::engine::{Answers, Device, Event, Frame, RunOptions, Setup, Tally, residuals, run, stratified_points, trace};
+use ridgewatch::engine::{Answers, Device, RunOptions, Tally, residuals, stratified_points, trace};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
@@ -16,7 +15,6 @@ use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, Tra
 use ridgewatch::surrogate::{Predict, Samples, Table};
 use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
 use std::cell::RefCell;
-use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -342,9 +340,8 @@ fn memory_is_flat_over_gated_frames() {
     assert_eq!(stage.gpu.memory().0, after_first);
 }
 
-/// The frames of a small gated run.
-fn frames(device: Device, method: &str) -> Vec<Frame> {
-    let text = "
+/// A small run.
+const RUN: &str = "
 [source]
 kind = \"turbulence\"
 nodes = [64, 32, 32]
@@ -361,23 +358,13 @@ width = 160
 height = 80
 samples = 8
 ";
-    let scene = SceneFile::parse(Path::new("a test"), text, &[format!("render.method=\"{method}\"")]).unwrap();
-    let mut frames = Vec::new();
-    let options = RunOptions { device, ..RunOptions::default() };
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            frames.push(frame);
-        }
-    };
-    run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &NEVER).unwrap();
-    frames
-}
 
 #[test]
 #[ignore = "needs a GPU"]
 fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
     for method in ["reference", "gated", "surrogate"] {
-        let (found, expected) = (frames(device(GpuSettings::default()), method), frames(Device::CPU, method));
+        let made = |device: Device| frames(RUN, &[format!("render.method=\"{method}\"")], &RunOptions { device, ..RunOptions::default() });
+        let (found, expected) = (made(device(GpuSettings::default())), made(Device::CPU));
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
             let (gpu, cpu) = (&found.record, &expected.record);

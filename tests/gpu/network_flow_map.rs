@@ -6,13 +6,10 @@ use super::network_support::reference::{Reference, norm};
 use super::network_support::{self, Case};
 use super::scenes::*;
 use nalgebra::DMatrix;
-use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{DeviceNetwork, GpuSettings};
-use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::engine::{Device, Frame, RunOptions};
 use ridgewatch::field::Domain;
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Objective, Target, row};
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
 /// Of the cases that the CPU trains, those that are not plain; and what fills registers, and goes through the kernels in tiles.
 fn cases() -> Vec<Case> {
@@ -154,20 +151,6 @@ height = 24
 samples = 8
 ";
 
-fn frames(scene: &str, keys: &[&str], device: &Device) -> Vec<Frame> {
-    let keys: Vec<String> = keys.iter().map(ToString::to_string).collect();
-    let scene = SceneFile::parse(Path::new("a test"), scene, &keys).unwrap();
-    let mut frames = Vec::new();
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            frames.push(frame);
-        }
-    };
-    let options = RunOptions { device: device.clone(), ..RunOptions::default() };
-    run(Setup::new(scene.settings()).unwrap(), &options, &mut sink, &AtomicBool::new(false)).unwrap();
-    frames
-}
-
 /// Of the first slide.
 fn frames_of_a_slide(frames: &[Frame]) -> usize {
     frames.iter().take_while(|frame| frame.record.slide == 0).count()
@@ -187,7 +170,9 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         ("published loss", GYRE, &["network.loss=\"published\"", "network.mean_penalty=1.0"]),
     ];
     for (name, scene, keys) in runs {
-        let (found, expected) = (frames(scene, keys, &gpu), frames(scene, keys, &Device::CPU));
+        let keys: Vec<String> = keys.iter().map(ToString::to_string).collect();
+        let made = |device: &Device| frames(scene, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
+        let (found, expected) = (made(&gpu), made(&Device::CPU));
         for (frames, there) in [(&found, true), (&expected, false)] {
             for frame in frames {
                 let record = &frame.record;

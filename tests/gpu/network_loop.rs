@@ -3,15 +3,12 @@
 use super::network_support::{DoubleGyre, traced, uniform_points};
 use super::scenes::*;
 use super::small;
-use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaOffload, GpuSettings};
-use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::engine::{Device, Frame, RunOptions};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, Offload, SampleRing, SurrogateSettings, build};
-use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
 /// A small run that trains a fixed number of steps a frame.
 const SCENE: &str = "
@@ -44,18 +41,6 @@ samples = 8
 low = 0.1
 high = 0.3
 ";
-
-fn frames(scene: &str, keys: &[String], options: &RunOptions) -> Vec<Frame> {
-    let scene = SceneFile::parse(Path::new("a test"), scene, keys).unwrap();
-    let mut frames = Vec::new();
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            frames.push(frame);
-        }
-    };
-    run(Setup::new(scene.settings()).unwrap(), options, &mut sink, &AtomicBool::new(false)).unwrap();
-    frames
-}
 
 /// What the device learned is worth as much as what the CPU learned, goes into a checkpoint, and either goes on from the other's.
 #[test]

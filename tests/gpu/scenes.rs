@@ -1,7 +1,8 @@
 //! Flows that the tests trace, and the two ways to trace them.
 
-use ridgewatch::engine::Device;
+use ridgewatch::config::SceneFile;
 use ridgewatch::engine::cuda::{CudaAccelerator, CudaTracer, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
+use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
@@ -11,6 +12,8 @@ use ridgewatch::flow::{
 };
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
 /// The device that tests share.
@@ -27,6 +30,19 @@ pub fn opened(settings: GpuSettings) -> Arc<Gpu> {
 /// A device for whole runs.
 pub fn device(settings: GpuSettings) -> Device {
     Device::Gpu { gpu: Arc::new(CudaAccelerator::new(opened(settings), Storage::F32)), may_fall_back: false }
+}
+
+/// All frames of a scene with further `keys`.
+pub fn frames(scene: &str, keys: &[String], options: &RunOptions) -> Vec<Frame> {
+    let scene = SceneFile::parse(Path::new("a test"), scene, keys).unwrap();
+    let mut frames = Vec::new();
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event {
+            frames.push(frame);
+        }
+    };
+    run(Setup::new(scene.settings()).unwrap(), options, &mut sink, &AtomicBool::new(false)).unwrap();
+    frames
 }
 
 /// Snapshots on it.

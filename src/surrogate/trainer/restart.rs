@@ -78,10 +78,8 @@ impl Trainer {
 
     /// What is stated as text.
     fn notes(&self, progress: Progress) -> Vec<(String, String)> {
-        let mut notes = vec![("shape".to_owned(), self.shape_text()), ("inputs".into(), self.model.shape.input_names().join(" "))];
-        if let Some([first, last]) = self.times.starts {
-            notes.push(("start_range".into(), format!("{first} {last}")));
-        }
+        let mut notes: Vec<(String, String)> = self.fixed().into_iter().map(|(key, text)| (key.into(), text)).collect();
+        notes.push(("inputs".into(), self.model.shape.input_names().join(" ")));
         let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
         let rate = self.rate * stall * caution;
         let numbers = [
@@ -104,16 +102,26 @@ impl Trainer {
         notes
     }
 
-    /// What must agree for a checkpoint to fit.
-    fn shape_text(&self) -> String {
+    /// What must agree to the letter for a checkpoint to fit: the shape and the loss in JSON, the loss without its quotes.
+    fn fixed(&self) -> Vec<(&'static str, String)> {
         let shape = serde_json::to_string(&self.model.shape).unwrap_or_default();
-        let starts = self.times.starts.map_or_else(String::new, |[first, last]| format!(" starts {first} to {last}"));
-        format!("{shape} loss {:?} tau {} extent {:?}{starts}", self.objective.loss, self.objective.tau, self.objective.extent)
+        let loss = serde_json::to_string(&self.objective.loss).unwrap_or_default();
+        let [x, y, z] = self.objective.extent;
+        let mut fixed = vec![("shape", shape), ("loss", loss.trim_matches('"').to_owned()), ("extent", format!("{x} {y} {z}"))];
+        fixed.extend(self.times.starts.map(|[first, last]| ("start_range", format!("{first} {last}"))));
+        fixed
     }
 
     /// Reads everything, and only then changes anything.
     pub(in crate::surrogate) fn restored(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
-        checkpoint.expect_note("network.shape", &self.shape_text())?;
+        for (key, text) in self.fixed() {
+            checkpoint.expect_note(&format!("network.{key}"), &text)?;
+        }
+        let tau: f64 = checkpoint.number("network.tau")?;
+        // As the loss has it: starts of windows round.
+        if tau as f32 != self.objective.tau {
+            return Err(checkpoint.mismatch(format!("network.tau {tau}"), format!("network.tau {}", self.times.tau)));
+        }
         let progress = Progress {
             drawn: checkpoint.number("network.drawn")?,
             averaged: checkpoint.number("network.averaged")?,
