@@ -202,7 +202,7 @@ impl Relay {
 
     /// Answers each time that the follower asks with the next thing that happens.
     fn send_steps(&self, mut stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
-        let mut rings = RingFollower::begin(&self.ring, Limits { step_bytes: u64::MAX })?;
+        let mut rings = RingFollower::begin(&self.ring, Limits::default())?;
         let (mut values, mut asked) = (Vec::new(), false);
         let (mut sent, mut heard) = (Instant::now(), Instant::now());
         let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
@@ -274,6 +274,10 @@ pub struct RelayFollower {
     /// Buffers on their way back.
     spare: SyncSender<Vec<f32>>,
     stop: Arc<AtomicBool>,
+    /// Generations of the blocks that were opened and have not ended.
+    open: BTreeMap<u32, u64>,
+    /// The thread is gone, and that was told.
+    broken: bool,
 }
 
 impl RelayFollower {
@@ -293,22 +297,39 @@ impl RelayFollower {
         let work = move || drop(receiving.run());
         let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
         started.map_err(|e| WireError::io(Path::new("thread"), "could not be started", e))?;
-        Ok(Self { events, spare, stop })
+        Ok(Self { events, spare, stop, open: BTreeMap::new(), broken: false })
     }
 
-    /// The next thing that happened, or none within the limit. A step's values are in `values`.
+    /// The next thing that happened, or none within the limit. A step's values are in `values`. Should the thread that receives have panicked, that is
+    /// told once, and all of its blocks end.
     pub fn poll(&mut self, values: &mut Vec<f32>, limit: Duration) -> Option<Event> {
         match self.events.recv_timeout(limit) {
             Ok((event, mut came)) => {
                 std::mem::swap(values, &mut came);
                 let _ = self.spare.try_send(came);
+                match &event {
+                    Event::Opened { description, generation } => {
+                        self.open.insert(description.block.index, *generation);
+                    }
+                    Event::Ended { block, .. } => {
+                        self.open.remove(block);
+                    }
+                    Event::Step { .. } | Event::Refused(_) => {}
+                }
                 Some(event)
             }
             Err(RecvTimeoutError::Timeout) => None,
-            Err(RecvTimeoutError::Disconnected) => {
-                std::thread::sleep(limit);
-                None
+            Err(RecvTimeoutError::Disconnected) if !std::mem::replace(&mut self.broken, true) => {
+                let gone = ErrorKind::BrokenPipe.into();
+                Some(Event::Refused(WireError::io(Path::new("thread that receives from a relay"), "has panicked", gone)))
             }
+            Err(RecvTimeoutError::Disconnected) => match self.open.pop_first() {
+                Some((block, generation)) => Some(Event::Ended { block, generation, closed: false }),
+                None => {
+                    std::thread::sleep(limit);
+                    None
+                }
+            },
         }
     }
 }
