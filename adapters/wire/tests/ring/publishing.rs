@@ -86,22 +86,6 @@ fn followers_that_come_and_go_stand_in_no_producers_way_and_nothing_stays() {
 }
 
 #[test]
-fn steps_are_published_one_after_the_other_also_by_the_clock() {
-    let folder = Folder::new("clock");
-    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 4096, Policy::NewestWins).unwrap();
-    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
-    for n in 0..4096 {
-        publish(&producer, n, n as f64).unwrap();
-    }
-    let (mut buffer, mut last) = (Vec::new(), 0);
-    for _ in 0..4096 {
-        let published = step(&mut reader, &mut buffer).unwrap().published;
-        assert!(published > last);
-        last = published;
-    }
-}
-
-#[test]
 fn a_sweeper_that_was_stopped_is_not_waited_for_without_end() {
     let folder = Folder::new("stopped");
     std::fs::create_dir_all(&folder.0).unwrap();
