@@ -140,7 +140,7 @@ impl Producer {
         &self.header.description
     }
 
-    /// Publishes a step. Takes no memory, and with [`Policy::NewestWins`] waits for nobody but another thread that is publishing.
+    /// Publishes a step. Takes no memory, even where it fails, and with [`Policy::NewestWins`] waits for nobody but another thread that is publishing.
     ///
     /// # Errors
     /// Nothing was published: a time that is not finite, another number of components, a null or misaligned pointer, or this process is a fork of
@@ -154,7 +154,7 @@ impl Producer {
             return Err(WireError::Forked { opened: self.process, here });
         }
         if !time.is_finite() {
-            return Err(WireError::field("time", time, "a finite number"));
+            return Err(WireError::Time { time });
         }
         field.check(self.header.description.components())?;
         let mut writer = self.writer.lock().unwrap_or_else(|broken| broken.into_inner());
