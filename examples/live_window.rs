@@ -27,7 +27,7 @@ fn main() -> anyhow::Result<()> {
     for slide in 0.. {
         let taken = loop {
             match window.next_within(Duration::from_secs(1)) {
-                Ok(Some(taken)) => break taken,
+                Ok(Some(taken)) => break taken?,
                 Ok(None) => return Ok(()),
                 // Nothing new within the second.
                 Err(_) => {}

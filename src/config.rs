@@ -234,6 +234,12 @@ impl SceneFile {
         }
     }
 
+    /// What the output is told.
+    pub fn publish_settings(&self) -> PublishSettings {
+        let publish = self.publish.clone();
+        if self.source.kind == SourceKind::Live { publish.of_live_run() } else { publish }
+    }
+
     /// Notes that a key was set by an option of the command line, which is named in its faults (`--spp 0`).
     pub fn set_by(&mut self, key: &str, option: impl Into<String>) {
         self.origin.elsewhere.push((key.to_owned(), option.into()));

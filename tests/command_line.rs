@@ -47,9 +47,29 @@ fn bad_usage_is_status_2() {
     refused(&["replay"], 2, &["CONFIG | FILES"]);
     refused(&["dance"], 2, &["dance"]);
     refused(&["replay", &config("saddle.toml"), "--threads", "99999999999"], 2, &["--threads", "0 to 1024"]);
+    for rate in ["1e-300", "0", "-1", "nan", "inf"] {
+        refused(&["publish", &config("turbulence_easy.toml"), &format!("--rate={rate}")], 2, &["--rate", "from 0.000001"]);
+    }
     refused(&["render", &config("saddle.toml"), "--device", "tpu"], 2, &["--device tpu", "auto, cpu"]);
     refused(&["render", &config("saddle.toml"), "--method", "magic"], 2, &["reference, surrogate, neural, gated"]);
     refused(&["render", &config("saddle.toml"), "--out", "picture.tiff"], 2, &[".exr or .png"]);
+}
+
+/// A full disk behind standard error: exit statuses stay what they are, and a run goes to its end.
+#[test]
+fn what_cannot_be_said_ends_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let status = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_ridgewatch"));
+        // Where there is no GPU, the log says so too.
+        command.args(arguments).current_dir(folder.path()).env("RIDGEWATCH_LOG", "ridgewatch=trace");
+        command.stdout(std::process::Stdio::null()).stderr(full()).status().unwrap().code()
+    };
+    assert_eq!(status(&["replay", "nowhere.toml"]), Some(2));
+    assert_eq!(status(&["replay", &scene, "--publish", "tcp://127.0.0.1:0", "--out", "run"]), Some(0));
+    assert!(folder.path().join("run/summary.json").exists());
 }
 
 #[test]

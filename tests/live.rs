@@ -218,11 +218,16 @@ fn niceness(process: u32) -> Vec<i32> {
     tasks.filter_map(stat).filter_map(nice).collect()
 }
 
+/// How readily the kernel ends a process when memory is out: -1000 (never) to 1000 (before all others).
+fn offered(process: u32) -> i32 {
+    std::fs::read_to_string(format!("/proc/{process}/oom_score_adj")).unwrap().trim().parse().unwrap()
+}
+
 #[test]
 fn all_threads_step_back_for_the_simulation() {
     let place = Place::new("nice");
     let (archive, live, ring) = (place.archive(), place.live(), text(&place.ring).to_owned());
-    let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
+    let solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
     // SAFETY: asks for this process's own.
     let own = unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) };
     for (name, arguments, expected) in [("default", &[][..], 10), ("asked", &["--nice", "17"], 17), ("none", &["--nice", "0"], own)] {
@@ -232,6 +237,8 @@ fn all_threads_step_back_for_the_simulation() {
         let found = niceness(sidecar.0.id());
         // Those that read, convert, write and make frames.
         assert!(found.len() > 4 && found.iter().all(|nice| *nice == expected.max(own)), "{name}: {found:?}");
+        // Where memory is out, the kernel ends the sidecar and not the simulation.
+        assert_eq!(offered(sidecar.0.id()), 1000, "{name}");
         let connection = place.files.join(format!("{name}.connection"));
         let relay =
             start(Command::new(env!("CARGO_BIN_EXE_ridgewatch")).args(["relay", &ring, "--connection", text(&connection)]).args(arguments));
@@ -240,6 +247,50 @@ fn all_threads_step_back_for_the_simulation() {
             let found = niceness(relay.0.id());
             found.len() > 1 && found.iter().all(|nice| *nice == expected.max(own))
         });
+        assert_eq!(offered(relay.0.id()), 1000, "{name}");
+    }
+    assert_eq!(offered(solver.0.id()), offered(std::process::id()));
+}
+
+/// A solver that waits for as long as two minutes publishes beside a follower that is killed and one that is stopped: it waits until the follower has been silent
+/// for five seconds (`SILENCE` of the ring), and then not again.
+#[test]
+fn a_solver_that_waits_gives_up_a_follower_that_is_gone() {
+    use ridgewatch_wire::{AxisDescription, Description, Element, Field, Geometry, Policy, Producer};
+    const SLOTS: u64 = 3;
+    let place = Place::new("silent");
+    let (live, plane) = (place.live(), vec![0.1f32; 8 * 6 * 4]);
+    let axes = [("x", 8), ("y", 6), ("z", 4)].map(|(name, nodes)| AxisDescription::uniform(name, "", 0.0, 1.0, nodes));
+    let description = Description::whole(Geometry::Cartesian, axes.into(), "");
+    let producer = Producer::open(&place.ring, description, SLOTS as u32, Policy::Wait(Duration::from_secs(120))).unwrap();
+    let components = [plane.as_ptr().cast(); 3];
+    let mut step = 0;
+    // How long the solver was held, and whether a step was lost.
+    let mut publish = || {
+        let field = Field::packed(&components, Element::F32, [8, 6, 4]);
+        let begin = Instant::now();
+        // SAFETY: three components of as many values as the grid has nodes.
+        let published = unsafe { producer.publish(step, step as f64, &field) }.unwrap();
+        step += 1;
+        (begin.elapsed(), published.overwrote)
+    };
+    for (signal, run) in [(libc::SIGKILL, "killed"), (libc::SIGSTOP, "stopped")] {
+        let run = place.files.join(run);
+        let sidecar = start(&mut ridgewatch(&["attach", text(&live), text(&place.ring), "--out", text(&run)]));
+        // It follows: steps are taken as fast as they come.
+        until("the first frame", || {
+            std::thread::sleep(Duration::from_millis(20));
+            publish();
+            !records(&run).is_empty()
+        });
+        assert!((0..2 * SLOTS).all(|_| !publish().1), "a step is waited for while the follower lives");
+        // SAFETY: a signal to a child of this test.
+        assert_eq!(unsafe { libc::kill(sidecar.0.id() as i32, signal) }, 0);
+        let held: Vec<(Duration, bool)> = (0..4 * SLOTS).map(|_| publish()).collect();
+        let longest = held.iter().map(|(held, _)| *held).max().unwrap();
+        assert!((Duration::from_secs(3)..Duration::from_secs(6)).contains(&longest), "{signal}: {held:?}");
+        let waits = held.iter().filter(|(held, _)| *held > Duration::from_secs(1)).count();
+        assert!(waits == 1 && held.iter().filter(|(_, lost)| *lost).count() as u64 >= 2 * SLOTS, "{signal}: {held:?}");
     }
 }
 

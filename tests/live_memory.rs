@@ -73,7 +73,7 @@ fn windows_waiting_steps_and_buffers_stay_below_the_limit() {
         // A frame takes as long as a window of steps and more; then its window goes.
         if step % 12 == 11 {
             frame = None;
-            if let Ok(Some(taken)) = window.next_within(Duration::from_millis(200)) {
+            if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_millis(200)) {
                 incomplete = taken.live.incomplete;
                 frame = Some(taken);
             }

@@ -58,7 +58,7 @@ fn take(window: &LiveWindow, wanted: impl Fn(&Taken) -> bool) -> (Taken, Vec<Str
     let (mut warnings, begin) = (Vec::new(), Instant::now());
     loop {
         assert!(begin.elapsed() < Duration::from_secs(10), "it never came; warnings: {warnings:?}");
-        if let Ok(Some(taken)) = window.next_within(Duration::from_millis(50)) {
+        if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_millis(50)) {
             warnings.extend(taken.warnings.clone());
             if wanted(&taken) {
                 return (taken, warnings);
@@ -112,7 +112,7 @@ fn a_listener_hears_of_each_snapshot_before_the_window_has_it() {
     for n in 0..8 {
         publish(&solver, n, n as f64 * 0.5, 1.0);
         // In the window: whatever its newest snapshots are, they were announced, and as the very same ones.
-        if let Ok(Some(taken)) = window.next_within(Duration::from_secs(u64::from(n >= 4))) {
+        if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_secs(u64::from(n >= 4))) {
             let heard = heard.lock().unwrap();
             assert!(taken.window.snapshots().all(|s| heard.iter().any(|h| std::sync::Arc::ptr_eq(h, s))));
         }
@@ -259,6 +259,65 @@ fn odd_times_and_missing_values_are_told() {
 }
 
 #[test]
+fn times_that_fall_take_no_more_memory_than_times_that_rise() {
+    let folder = Folder::new("falling");
+    let solver = producer(&folder, plane(32));
+    // As many bytes as 12 snapshots need, see above.
+    let settings = LiveSettings { memory_gib: (12.25 * 2.0 + 2.0 + 5.0 / 2.0) * 16_384.0 / f64::from(1 << 30), ..settings(&folder) };
+    let window = follow(&settings, 10.0);
+    let mut step = 0;
+    let mut publish = |time: f64| {
+        publish(&solver, step, time, time as f32);
+        step += 1;
+    };
+    // The window fills from behind,
+    (0..=195).for_each(|n| publish(10.0 - 0.05 * f64::from(n)));
+    publish(11.0);
+    let (taken, _) = take(&window, |taken| newest(taken) == 11.0);
+    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.thinned > 150, "{:?}", taken.live);
+    // and times come between those that it holds.
+    (1..100).for_each(|n| publish(11.0 - 0.07 * f64::from(n)));
+    publish(12.0);
+    let (taken, _) = take(&window, |taken| newest(taken) == 12.0);
+    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.thinned > 250, "{:?}", taken.live);
+}
+
+#[test]
+fn a_simulation_whose_numbers_fall_or_stay_is_followed_on() {
+    let folder = Folder::new("numbers");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    (0..10).for_each(|n| publish(&solver, 100 + n, n as f64, 1.0));
+    take(&window, |taken| newest(taken) == 9.0);
+    // Set back by its own checkpoint: numbers and times.
+    (0..10).for_each(|n| publish(&solver, 50 + n, n as f64 - 20.0, 2.0));
+    let (taken, warnings) = take(&window, |taken| newest(taken) == -11.0);
+    assert!(has(&warnings, "was set back") && taken.live.restarts == 1, "{warnings:?}");
+    assert!(taken.window.snapshots().all(|s| s.nodes[0][0] == 2.0));
+    // All of one number.
+    (0..10).for_each(|n| publish(&solver, 0, n as f64 - 10.0, 3.0));
+    let (taken, _) = take(&window, |taken| newest(taken) == -1.0);
+    assert_eq!((taken.live.steps, taken.live.incomplete), (30, 0));
+}
+
+#[test]
+fn a_reading_thread_that_panicked_is_an_error_and_no_end() {
+    let folder = Folder::new("panicked");
+    let solver = producer(&folder, plane(8));
+    let window = follow(&settings(&folder), 2.0);
+    window.tell(Box::new(|snapshot| assert!(snapshot.time < 1.0, "this panic is the test's")));
+    (0..2).for_each(|n| publish(&solver, n, n as f64, 1.0));
+    let begin = Instant::now();
+    let error = loop {
+        assert!(begin.elapsed() < Duration::from_secs(10), "it is waited for");
+        if let Ok(next) = window.next_within(Duration::from_millis(50)) {
+            break next.expect("no end").unwrap_err().to_string();
+        }
+    };
+    assert_eq!(error, "the thread that follows the simulation ended after 2 steps: it panicked");
+}
+
+#[test]
 fn blocks_meet_and_incomplete_steps_are_recorded() {
     let folder = Folder::new("blocks");
     let half = |index: u32| {
@@ -299,6 +358,7 @@ fn every_step_is_taken_when_asked_for_and_the_end_ends() {
         match window.next_within(Duration::from_millis(50)) {
             // Slower than the simulation would be by itself.
             Ok(Some(taken)) => {
+                let taken = taken.unwrap();
                 times.push(newest(&taken));
                 assert_eq!(taken.live.missed_blocks, 0);
                 std::thread::sleep(Duration::from_millis(5));

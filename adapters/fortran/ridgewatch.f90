@@ -154,15 +154,19 @@ module ridgewatch
 
 contains
 
-  !> Why the last call of this thread failed.
+  !> Why the last call of this thread failed; empty where there is no memory for it.
   function rw_message() result(message)
     character(:), allocatable :: message
     character(c_char), pointer :: letters(:)
     type(c_ptr) :: text
-    integer :: i
+    integer :: i, failed
     text = c_error()
     call c_f_pointer(text, letters, [c_strlen(text)])
-    allocate (character(size(letters)) :: message)
+    allocate (character(size(letters)) :: message, stat=failed)
+    if (failed /= 0) then
+      allocate (character(0) :: message, stat=failed)
+      return
+    end if
     do i = 1, size(letters)
       message(i:i) = letters(i)
     end do
@@ -179,7 +183,12 @@ contains
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: dimensions
     integer, intent(out), optional :: status
-    call publisher_close(self)
+    integer :: found
+    call publisher_close(self, found)
+    if (c_associated(self%field)) then
+      call give(found, status)
+      return
+    end if
     self%description = c_describe(int(dimensions, c_int32_t))
     self%dimensions = dimensions
     call give(merge(rw_ok, rw_argument, c_associated(self%description)), status)
@@ -208,9 +217,15 @@ contains
     integer, intent(out), optional :: status
     real(real64) :: repeats
     real(real64), allocatable :: packed(:)
+    integer :: failed
     repeats = 0
     if (present(period)) repeats = period
-    allocate (packed, source=coordinates)
+    allocate (packed(size(coordinates)), stat=failed)
+    if (failed /= 0) then
+      call give(rw_system, status)
+      return
+    end if
+    packed(:) = coordinates
     call give(c_rectilinear(self%description, int(axis - 1, c_int32_t), packed, size(packed, kind=c_int64_t), repeats), status)
     if (axis >= 1 .and. axis <= 3) self%extent(axis) = size(packed)
   end subroutine
@@ -286,15 +301,27 @@ contains
     call give(c_wait(self%description, int(milliseconds, c_int32_t)), status)
   end subroutine
 
-  !> Opens the ring in a folder; without one, where RIDGEWATCH_RING says, and rw_off where it is not set.
+  !> Opens the ring in a folder; without one, where RIDGEWATCH_RING says, and rw_off where it is not set. A ring that is open is closed before.
   subroutine publisher_open(self, status, ring)
     class(rw_publisher), intent(inout) :: self
     integer, intent(out), optional :: status
     character(*), intent(in), optional :: ring
     character(kind=c_char), allocatable, target :: path(:)
     integer :: i, found
+    if (c_associated(self%field)) then
+      found = c_close(self%field)
+      if (found /= rw_ok) then
+        call give(found, status)
+        return
+      end if
+      self%field = c_null_ptr
+    end if
     if (present(ring)) then
-      allocate (path(len_trim(ring) + 1))
+      allocate (path(len_trim(ring) + 1), stat=found)
+      if (found /= 0) then
+        call give(rw_system, status)
+        return
+      end if
       do i = 1, len_trim(ring)
         path(i) = ring(i:i)
       end do
@@ -306,15 +333,15 @@ contains
     call give(found, status)
   end subroutine
 
-  !> Ends the ring; harmless where there is none.
+  !> Ends the ring; harmless where there is none. Where memory is out (rw_system) it stays open and may be closed later.
   subroutine publisher_close(self, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(out), optional :: status
     integer :: found
     found = rw_off
     if (c_associated(self%field)) found = c_close(self%field)
+    if (found == rw_ok) self%field = c_null_ptr
     call c_free(self%description)
-    self%field = c_null_ptr
     self%description = c_null_ptr
     call give(found, status)
   end subroutine

@@ -64,6 +64,9 @@ program test
   call publisher%rectilinear(2, [-60d0, 0d0, 60d0])
   call publisher%open(status, trim(ring) // "/globe")
   call want(status == rw_ok, 10)
+  ! Open again: the first ring ends, its name is free.
+  call publisher%open(status, trim(ring) // "/globe")
+  call want(status == rw_ok, 34)
   east = reshape([(real(i, real32), i=1, 12)], [4, 3])
   call publisher%publish(7, 2d0, east, east + 12, status)
   call want(status == rw_ok, 11)

@@ -4,7 +4,8 @@
     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/fluidsim python follow.py 2d
     ridgewatch attach examples/fluidsim/live.toml /dev/shm/ridgewatch-$USER/fluidsim
 
-Only the lines between the marks are ours: a solver publishes by calling one function after each step.
+Only the lines between the marks are ours: a solver publishes by calling one function after each step. A ring that cannot be had is a warning, and the
+simulation goes on without.
 """
 
 import argparse

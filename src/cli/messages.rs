@@ -1,7 +1,7 @@
 //! What is said on standard error.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressStyle};
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write, stderr};
 use tracing_subscriber::EnvFilter;
 
 /// Sends log lines to standard error; `RIDGEWATCH_LOG` overrides the level.
@@ -12,11 +12,12 @@ pub fn start(verbose: u8) {
         _ => "ridgewatch=debug",
     };
     let filter = EnvFilter::try_from_env("RIDGEWATCH_LOG").unwrap_or_else(|_| EnvFilter::new(level));
-    tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).without_time().with_target(false).compact().init();
+    let lines = tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr).without_time().with_target(false).compact();
+    // It would say so on standard error, which panics where nothing can be written there.
+    lines.log_internal_errors(false).init();
 }
 
 /// The one line that says why a command failed.
-#[allow(clippy::print_stderr)]
 pub fn fail(error: &anyhow::Error) {
     let mut message = error.to_string();
     for cause in error.chain().skip(1) {
@@ -26,18 +27,18 @@ pub fn fail(error: &anyhow::Error) {
             message = format!("{message}: {cause}");
         }
     }
-    eprintln!("ridgewatch: {message}");
+    note(message);
 }
 
 /// A line of information.
-#[allow(clippy::print_stderr)]
 pub fn note(text: impl std::fmt::Display) {
-    eprintln!("ridgewatch: {text}");
+    // A full disk or a reader that has gone away ends no run.
+    let _ = writeln!(stderr(), "ridgewatch: {text}");
 }
 
 /// A progress bar over `length` steps (a spinner where unknown), drawn only when standard error is a terminal.
 pub fn progress(length: Option<u64>) -> ProgressBar {
-    let target = if std::io::stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
+    let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let (bar, style) = match length {
         Some(n) => (ProgressBar::new(n), "{bar:30} {pos}/{len} {elapsed_precise} eta {eta} {msg}"),
         None => (ProgressBar::new_spinner(), "{spinner} {pos} {elapsed_precise} {msg}"),

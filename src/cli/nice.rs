@@ -1,4 +1,4 @@
-//! `--nice`: whoever runs beside a simulation steps back for it.
+//! Whoever runs beside a simulation steps back for it: `--nice` where both want a core, and always where memory is out.
 
 use super::messages;
 
@@ -11,8 +11,12 @@ pub struct Nice {
 }
 
 impl Nice {
-    /// Lowers the priority of all threads that are there; those that they start later have it too. Where the system refuses, that is said.
+    /// Lowers the priority of all threads that are there; those that they start later have it too. Where the machine or the job runs out of memory, the
+    /// kernel is to end this process and none of the simulation's. Where the system refuses, that is said.
     pub fn step_back(&self) {
+        if let Err(error) = std::fs::write(OUT_OF_MEMORY, OFFERED) {
+            messages::note(format_args!("{OUT_OF_MEMORY} stays as it is: {error}"));
+        }
         if self.nice > 0
             && let Err(error) = lower(self.nice)
         {
@@ -20,6 +24,11 @@ impl Nice {
         }
     }
 }
+
+/// Where a process says how readily the kernel may end it when memory is out (proc(5)); raising it takes no rights.
+const OUT_OF_MEMORY: &str = "/proc/self/oom_score_adj";
+/// Before all others.
+const OFFERED: &str = "1000";
 
 fn lower(nice: i32) -> std::io::Result<()> {
     for task in std::fs::read_dir("/proc/self/task")? {

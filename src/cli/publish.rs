@@ -21,7 +21,7 @@ pub struct Options {
     #[arg(long, value_name = "FOLDER")]
     ring: Option<PathBuf>,
     /// Steps a second; without it as fast as they can be read.
-    #[arg(long, value_name = "STEPS", value_parser = super::seconds)]
+    #[arg(long, value_name = "STEPS", value_parser = rate)]
     rate: Option<f64>,
     /// Ends after so many steps; an archive that is shorter begins again, its times going on.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
@@ -35,6 +35,11 @@ pub struct Options {
     /// Waits for ridgewatch to take a step, so many milliseconds at most; 0: never.
     #[arg(long, default_value_t = 0, value_name = "MILLISECONDS")]
     wait: u64,
+}
+
+/// Steps a second, of which each comes within a time that clocks can count to.
+fn rate(word: &str) -> Result<f64, String> {
+    word.parse().ok().filter(|rate: &f64| rate.is_finite() && *rate >= 1e-6).ok_or_else(|| "accepted: a number from 0.000001".to_owned())
 }
 
 fn blocks(text: &str) -> Result<[u64; 3], String> {
@@ -124,7 +129,7 @@ fn play(
             }
         };
         if let Some(rate) = rate {
-            let due = Duration::from_secs_f64(step as f64 / rate);
+            let due = Duration::try_from_secs_f64(step as f64 / rate).unwrap_or(Duration::MAX);
             while begin.elapsed() < due && !stop.load(Ordering::Relaxed) {
                 std::thread::sleep((due - begin.elapsed().min(due)).min(Duration::from_millis(50)));
             }

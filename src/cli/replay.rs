@@ -119,8 +119,9 @@ async fn frames(
     // Before anything is written: from here on a signal leaves a complete folder.
     let signals = early.or_else(|| watch_signals(stop.clone()).map(tokio::spawn));
     // The socket first: a port in use must not cost the run that the folder holds.
-    let mut output = Output::start(&scene.publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
-    output.write_to(RunFolder::create(&options.out, options.overwrite)?, &scene.publish)?;
+    let publish = scene.publish_settings();
+    let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
+    output.write_to(RunFolder::create(&options.out, options.overwrite)?, &publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }

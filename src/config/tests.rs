@@ -195,3 +195,18 @@ fn a_name_cut_short_is_recognised() {
     assert!(error(GYRE, &["render.samples_per_pixel=4"]).contains("Did you mean `samples`?"));
     assert!(!error(GYRE, &["trust.banana=0.1"]).contains("Did you mean"));
 }
+
+#[test]
+fn a_live_run_neither_waits_for_the_disk_nor_fills_it_unless_told() {
+    use crate::publish::WhenFull::{Drop, Wait};
+    let told = |overrides: &[&str]| {
+        let overrides: Vec<String> = overrides.iter().chain(&["time.tau=1"]).map(|s| (*s).to_owned()).collect();
+        let publish = SceneFile::for_live(&overrides).unwrap().publish_settings();
+        (publish.keep, publish.keep_bytes, publish.when_full)
+    };
+    assert_eq!(told(&[]), (Some(100), None, Some(Drop)));
+    assert_eq!(told(&["publish.keep=7", "publish.when_full=wait"]), (Some(7), None, Some(Wait)));
+    assert_eq!(told(&["publish.keep_bytes=1000000"]), (None, Some(1_000_000), Some(Drop)));
+    let replayed = SceneFile::parse(Path::new("scene.toml"), GYRE, &[]).unwrap();
+    assert_eq!(replayed.publish_settings(), replayed.publish);
+}

@@ -257,7 +257,7 @@ impl Feed {
                         return Ok(None);
                     }
                     match window.next_within(LOOK_UP) {
-                        Ok(Some(taken)) => break taken,
+                        Ok(Some(taken)) => break taken?,
                         Ok(None) => return Ok(None),
                         Err(StillReading) => {}
                     }

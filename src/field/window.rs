@@ -98,8 +98,7 @@ impl Window {
             if !Arc::ptr_eq(&front.grid, &snapshot.grid) && *front.grid != *snapshot.grid {
                 return Err(WindowFault::GridChanged { time, found: snapshot.grid.shape(), expected: front.grid.shape() });
             }
-            // A full window never moves back in time.
-            if time < front.time && self.is_full() {
+            if self.is_late(time) {
                 return Err(WindowFault::Late { time, oldest: front.time });
             }
         }
@@ -118,6 +117,19 @@ impl Window {
         }
         self.snapshots.insert(place, snapshot);
         Ok(Pushed { dropped: self.release(), warning })
+    }
+
+    /// Whether a snapshot of this time would be refused as late: a full window never moves back in time.
+    pub fn is_late(&self, time: f64) -> bool {
+        self.oldest().is_some_and(|oldest| time < oldest) && self.is_full()
+    }
+
+    /// Time between a snapshot that would be put in and the nearest one held; none where there is none, or where it would take the place of one.
+    pub fn distance(&self, time: f64) -> Option<f64> {
+        let place = self.snapshots.partition_point(|s| s.time < time);
+        let before = place.checked_sub(1).map(|before| time - self.snapshots[before].time);
+        let behind = self.snapshots.get(place).map(|s| s.time - time);
+        if behind == Some(0.0) { None } else { before.into_iter().chain(behind).reduce(f64::min) }
     }
 
     /// Drops what lies wholly before `newest - span`.

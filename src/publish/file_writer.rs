@@ -69,7 +69,7 @@ impl FileWriter {
 
     fn start_with_limit(folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
         let shared = Arc::new(Shared::default());
-        let (theirs, when_full) = (Arc::clone(&shared), settings.when_full);
+        let (theirs, when_full) = (Arc::clone(&shared), settings.when_full.unwrap_or(WhenFull::Wait));
         let name = "ridgewatch-files";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
@@ -230,7 +230,7 @@ mod tests {
 
     fn run(when_full: WhenFull, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
         let folder = tempfile::tempdir().unwrap();
-        let settings = PublishSettings { when_full, ..Default::default() };
+        let settings = PublishSettings { when_full: Some(when_full), ..Default::default() };
         let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), settings).unwrap();
         for n in 0..frames {
             writer.frame(frame(n, edge));

@@ -67,7 +67,7 @@ pub struct PublishSettings {
     pub frames_in_flight: usize,
     /// Seconds after which a subscriber that still holds a picture is cut off.
     pub stall_seconds: f64,
-    /// Newest frames whose pictures stay in the run folder; None keeps all.
+    /// Newest frames whose pictures stay in the run folder; None keeps all, but of a live run see [`PublishSettings::of_live_run`].
     pub keep: Option<usize>,
     /// Bytes that the pictures in the run folder may take; None sets no cap. The newest frame always stays.
     pub keep_bytes: Option<u64>,
@@ -75,8 +75,8 @@ pub struct PublishSettings {
     pub preview: bool,
     /// Of which frames an EXR is written.
     pub exr: ExrFrames,
-    /// What happens when the disk is slower than the cycle.
-    pub when_full: WhenFull,
+    /// What happens when the disk is slower than the cycle; None waits, but of a live run see [`PublishSettings::of_live_run`].
+    pub when_full: Option<WhenFull>,
 }
 
 impl Default for PublishSettings {
@@ -90,12 +90,22 @@ impl Default for PublishSettings {
             keep_bytes: None,
             preview: true,
             exr: ExrFrames::Slide,
-            when_full: WhenFull::Wait,
+            when_full: None,
         }
     }
 }
 
+/// Newest frames whose pictures stay of a live run, which may go on for weeks, unless told otherwise.
+const LIVE_FRAMES: usize = 100;
+
 impl PublishSettings {
+    /// These of a run that follows a simulation: what is not set neither waits for the disk nor fills it.
+    pub fn of_live_run(self) -> Self {
+        // Who caps the bytes has set a bound.
+        let bounded = self.keep.is_some() || self.keep_bytes.is_some();
+        Self { keep: if bounded { self.keep } else { Some(LIVE_FRAMES) }, when_full: self.when_full.or(Some(WhenFull::Drop)), ..self }
+    }
+
     /// Checks ranges that the types do not.
     pub fn check(&self) -> Result<(), Refused> {
         count("publish.frames_in_flight", self.frames_in_flight, 1, 64)?;

@@ -239,6 +239,14 @@ pub enum SourceError {
         /// What is known about it.
         what: String,
     },
+    /// The thread that follows a simulation is gone; the simulation may run on.
+    #[error("the thread that follows the simulation ended after {steps} steps: {what}")]
+    LiveStopped {
+        /// Whole steps that came.
+        steps: u64,
+        /// What is known about it.
+        what: String,
+    },
 }
 
 impl SourceError {

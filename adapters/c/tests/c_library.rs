@@ -271,6 +271,9 @@ int main(int argc, char **argv) {
     unsigned long before = atomic_load(&requests);
     for (int n = 0; n < 1000; n++) WANT(rw_publish_f32(field, n, n, plane, plane, NULL) == RW_OK);
     WANT(rw_statistics(field, &published, NULL) == RW_OK);
+    WANT(rw_publish_f32(field, 0, NAN, plane, plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "NaN; accepted: a finite number"));
+    WANT(rw_publish_f32(field, 0, 0, NULL, plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "not null"));
+    WANT(rw_publish_f32(field, 0, 0, (float *)((char *)plane + 2), plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "divisible by 4"));
     WANT(atomic_load(&requests) == before);
     WANT(rw_open(argv[1], d, &second) == RW_IN_USE && atomic_load(&requests) > before);
     pthread_t threads[4];
@@ -314,6 +317,7 @@ fn where_memory_is_out_calls_fail_and_nothing_is_aborted() {
 
 const OUT_OF_MEMORY: &str = r#"
 #define _DEFAULT_SOURCE
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -324,6 +328,38 @@ const OUT_OF_MEMORY: &str = r#"
 enum { NODES = 1 << 18, PIECES = 1 << 14, DESCRIBED = 10, AXIS = 11, OPENED = 12, CLOSED = 13, ODD = 20 };
 static double coordinates[NODES];
 static void *pieces[PIECES];
+
+static void limit_to(long room) {
+    long pages = 0;
+    FILE *about = fopen("/proc/self/statm", "r");
+    if (!about || fscanf(about, "%ld", &pages) != 1) _exit(ODD);
+    fclose(about);
+    const rlim_t most = pages * 4096 + room;
+    const struct rlimit limit = {most, most};
+    if (setrlimit(RLIMIT_AS, &limit)) _exit(ODD);
+}
+
+/* All of the memory is taken, in pieces and crumbs. */
+static void fill(void) {
+    for (int i = 0; i < PIECES; i++) pieces[i] = malloc(8000);
+    for (int crumb = 4096; crumb >= 16; crumb /= 2) while (malloc(crumb)) {}
+}
+
+/* A step that cannot be, published where no memory is left at all. */
+static int refused(const char *ring) {
+    static float plane[9];
+    rw_description *d = rw_describe(2);
+    rw_field *field;
+    if (!d || rw_describe_uniform(d, 0, 0, 1, 2, 0) || rw_describe_uniform(d, 1, 0, 1, 4, 0) || rw_open(ring, d, &field)) return ODD;
+    limit_to(32 << 20);
+    fill();
+    if (malloc(16)) return ODD + 1;
+    if (rw_publish_f32(field, 0, NAN, plane, plane, NULL) != RW_ARGUMENT || !strstr(rw_error(), "finite")) return ODD + 2;
+    if (rw_publish_f32(field, 0, 0, (float *)((char *)plane + 1), plane, NULL) != RW_ARGUMENT || !strstr(rw_error(), "divisible")) return ODD + 3;
+    if (rw_publish_f32(field, 0, 0, plane, plane, NULL) != RW_OK) return ODD + 4;
+    for (int i = 0; i < PIECES; i++) free(pieces[i]);
+    return rw_close(field) == RW_OK ? 0 : ODD + 5;
+}
 
 /* A description of 4 MiB, a block of 8 nodes. */
 static int attempt(const char *ring) {
@@ -344,22 +380,21 @@ static int attempt(const char *ring) {
 int main(int argc, char **argv) {
     if (argc != 2) return 1;
     for (long i = 0; i < NODES; i++) coordinates[i] = i;
-    int ends[64] = {0};
+    int ends[64] = {0}, end;
+    const pid_t first = fork();
+    if (!first) _exit(refused(argv[1]));
+    if (first < 0 || waitpid(first, &end, 0) != first || end) {
+        fprintf(stderr, "a step that was refused without memory: status %x\n", end);
+        return 5;
+    }
     for (int filled = 0; filled < 2; filled++)
         for (long room = 0; room < 24L << 20; room += filled ? (room < 1 << 20 ? 8 << 10 : 1 << 20) : 128 << 10) {
             const pid_t child = fork();
             if (!child) {
-                long pages = 0;
-                FILE *about = fopen("/proc/self/statm", "r");
-                if (!about || fscanf(about, "%ld", &pages) != 1) _exit(ODD);
-                fclose(about);
-                const rlim_t most = pages * 4096 + (filled ? 32 << 20 : room);
-                const struct rlimit limit = {most, most};
-                if (setrlimit(RLIMIT_AS, &limit)) _exit(ODD);
+                limit_to(filled ? 32 << 20 : room);
                 if (filled) {
-                    /* All of it is taken, in pieces and crumbs, then so much given back. */
-                    for (int i = 0; i < PIECES; i++) pieces[i] = malloc(8000);
-                    for (int crumb = 4096; crumb >= 16; crumb /= 2) while (malloc(crumb)) {}
+                    /* So much is given back. */
+                    fill();
                     for (long i = 0; i < room / 8000; i++) free(pieces[i]);
                 }
                 _exit(attempt(argv[1]));

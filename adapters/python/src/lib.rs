@@ -1,9 +1,13 @@
 //! The Python module over [`ridgewatch_wire::Producer`]: arrays come in by the buffer protocol, without a copy.
+//!
+//! What the wire refuses (a name in use, no room, another user's folder, a time that is not finite) must not end the solver: it is a warning, and
+//! an exception only where that was asked for (`strict`). A call that cannot be right whatever the system says (a wrong shape or type) is one always.
 
 use pyo3::buffer::{Element as BufferElement, PyBuffer};
-use pyo3::exceptions::{PyException, PyTypeError, PyValueError};
+use pyo3::exceptions::{PyException, PyRuntimeWarning, PyTypeError, PyValueError};
 use pyo3::prelude::*;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE};
+use std::ffi::CString;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard};
@@ -11,8 +15,15 @@ use std::time::Duration;
 
 pyo3::create_exception!(_core, RidgewatchError, PyException, "The ring could not be opened, or a step was refused.");
 
-fn refused(error: ridgewatch_wire::WireError) -> PyErr {
-    RidgewatchError::new_err(error.to_string())
+/// What the wire refused: an exception where `strict`, a `RuntimeWarning` otherwise (which the program's own filters may make an exception).
+fn refused<T>(py: Python<'_>, strict: bool, what: &str, error: &ridgewatch_wire::WireError) -> PyResult<Option<T>> {
+    if strict {
+        return Err(RidgewatchError::new_err(error.to_string()));
+    }
+    // No zero byte in it: paths that are opened have none.
+    let words = CString::new(format!("ridgewatch: {what}: {error}").replace('\0', "?"))?;
+    PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &words, 1)?;
+    Ok(None)
 }
 
 /// Publishes into a ring. Frozen: while one thread copies a step, others may call anything here.
@@ -22,6 +33,7 @@ struct Publisher {
     producer: Mutex<Option<Arc<Producer>>>,
     dimensions: usize,
     reversed: bool,
+    strict: bool,
     published: AtomicU64,
     overwrote: AtomicU64,
 }
@@ -92,9 +104,10 @@ fn coordinates(given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
 #[pymethods]
 impl Publisher {
     #[new]
-    #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, start=0, slots=4, wait_ms=0, time_unit="s", order="zyx"))]
+    #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, start=0, slots=4, wait_ms=0, time_unit="s", order="zyx", strict=false))]
     #[allow(clippy::too_many_arguments)]
     fn new(
+        py: Python<'_>,
         x: &Bound<'_, PyAny>,
         y: &Bound<'_, PyAny>,
         z: Option<&Bound<'_, PyAny>>,
@@ -107,6 +120,7 @@ impl Publisher {
         wait_ms: u64,
         time_unit: &str,
         order: &str,
+        strict: bool,
     ) -> PyResult<Self> {
         let reversed = match order {
             "zyx" => true,
@@ -137,11 +151,14 @@ impl Publisher {
         let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
         let policy = if wait_ms == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(wait_ms)) };
         let producer = match ring.or_else(named) {
-            Some(ring) => Some(Arc::new(Producer::open(&ring, description, slots, policy).map_err(refused)?)),
+            Some(ring) => match Producer::open(&ring, description, slots, policy) {
+                Ok(producer) => Some(Arc::new(producer)),
+                Err(error) => refused(py, strict, "nothing will be published", &error)?,
+            },
             None => None,
         };
         let (published, overwrote) = (AtomicU64::new(0), AtomicU64::new(0));
-        Ok(Self { producer: Mutex::new(producer), dimensions, reversed, published, overwrote })
+        Ok(Self { producer: Mutex::new(producer), dimensions, reversed, strict, published, overwrote })
     }
 
     #[pyo3(signature = (step, time, u, v, w=None))]
@@ -179,7 +196,10 @@ impl Publisher {
             drop(producer);
             published
         });
-        let published = published.map_err(refused)?;
+        let published = match published {
+            Ok(published) => published,
+            Err(error) => return refused::<()>(py, self.strict, "a step was not published", &error).map(|_| false),
+        };
         self.published.fetch_max(published.count, Ordering::Relaxed);
         self.overwrote.fetch_add(u64::from(published.overwrote), Ordering::Relaxed);
         Ok(true)

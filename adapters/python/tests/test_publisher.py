@@ -6,6 +6,7 @@ import struct
 import tempfile
 import threading
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_longitude_and_latitude(ring):
         step, time, values = newest(ring, (3, 4))
         assert (step, time) == (4, 2.5) and np.array_equal(values, field.astype(np.float32))
     with pytest.raises(RidgewatchError, match="radius"):
-        Publisher(longitude, latitude, radius=-1.0)
+        Publisher(longitude, latitude, radius=-1.0, strict=True)
 
 
 def test_other_threads_run_and_publish_meanwhile(ring):
@@ -136,12 +137,12 @@ def test_refusals(ring):
     x = np.arange(4.0)
     good = np.zeros((4, 4), np.float32)
     with pytest.raises(RidgewatchError, match="ascending"):
-        Publisher(x[::-1].copy(), x)
+        Publisher(x[::-1].copy(), x, strict=True)
     with pytest.raises(ValueError, match="order"):
         Publisher(x, x, order="yx")
-    with Publisher(x, x) as publisher:
+    with Publisher(x, x, strict=True) as publisher:
         with pytest.raises(RidgewatchError, match="another producer"):
-            Publisher(x, x)
+            Publisher(x, x, strict=True)
         with pytest.raises(ValueError, match="components"):
             publisher.publish(0, 0.0, good, good, good)
         with pytest.raises(ValueError, match="accepted"):
@@ -153,6 +154,41 @@ def test_refusals(ring):
         with pytest.raises(RidgewatchError, match="finite"):
             publisher.publish(0, float("nan"), good, good)
         assert publisher.published == 0
+
+
+def test_a_ring_that_cannot_be_had_is_a_warning(ring):
+    """The solver goes on: what is refused warns once, and the publisher is closed and inert."""
+    x = np.arange(4.0)
+    good = np.zeros((4, 4), np.float32)
+
+    def inert(match, *axes, **options):
+        with pytest.warns(RuntimeWarning, match=match) as told:
+            publisher = Publisher(*axes, **options)
+            assert not publisher.is_open and publisher.publish(0, 0.0, good, good) is False
+            publisher.close()
+        assert len(told) == 1 and publisher.published == 0
+
+    with Publisher(x, x) as publisher:
+        inert("nothing will be published: .*another producer", x, x)
+        # A step that cannot be is left out, and the next one is taken.
+        with pytest.warns(RuntimeWarning, match="a step was not published: .*finite"):
+            assert publisher.publish(0, float("nan"), good, good) is False
+        assert publisher.publish(1, 1.0, good, good) and publisher.published == 1
+        # Misuse is not the system's doing.
+        with pytest.raises(ValueError, match="accepted"):
+            publisher.publish(2, 2.0, good[:3], good[:3])
+    # 5 TB.
+    many = np.linspace(0.0, 1.0, 1 << 18)
+    inert("no room", many, many, slots=10)
+    inert("ascending", x[::-1].copy(), x)
+    inert("nothing will be published", x, x, ring="/proc/nowhere")
+    os.mkdir(ring)
+    os.chmod(ring, 0o777)
+    inert("others may write into", x, x)
+    # Whoever wants it otherwise says so to Python.
+    with warnings.catch_warnings(), pytest.raises(RuntimeWarning):
+        warnings.simplefilter("error")
+        Publisher(x, x)
 
 
 def test_off_without_a_ring(monkeypatch):

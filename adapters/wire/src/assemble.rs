@@ -3,6 +3,9 @@
 //! The blocks of one start of a simulation name the same start (0 where they name none) and the same number of blocks. One start is followed; blocks
 //! of another gather beside it, and its first whole step takes over. So a simulation may come back in other blocks, and what two starts
 //! have published is never put together.
+//!
+//! Within a start the step's number says which blocks belong together, and must rise. Where a solver is set back within its run, each of its blocks comes
+//! to a number that is not above its last one: there a new round begins, and only what is of one round is put together.
 
 use crate::{BlockExtent, Description, WireError};
 use std::collections::VecDeque;
@@ -10,6 +13,8 @@ use std::time::{Duration, Instant};
 
 /// Starts that are known at once: the one that is followed, and those that gather.
 const STARTS: usize = 4;
+/// Steps in a row that a block may be behind the others' round. It was set back too, then, and what would have shown it was overwritten unread.
+const BEHIND: u32 = 3;
 
 /// A step of the global field.
 #[derive(Debug, Clone, PartialEq)]
@@ -60,13 +65,18 @@ pub struct Assembler {
 /// The number that its blocks name, and how many they are.
 type StartKey = (u64, u32);
 
+/// Where a step stands in its start: how often the solver was set back before it, and its number.
+type Place = (u64, u64);
+
 #[derive(Debug)]
 struct Start {
     key: StartKey,
     /// By index, once known.
     blocks: Vec<Option<Block>>,
     /// Newest step that was finished or given up.
-    newest: Option<u64>,
+    newest: Option<Place>,
+    /// The highest round of a block, now or before.
+    round: u64,
     /// A block was opened since the last whole step.
     anew: bool,
 }
@@ -76,20 +86,49 @@ struct Block {
     generation: u64,
     extent: BlockExtent,
     ended: bool,
+    round: u64,
+    /// Number of its last step, and when that was published.
+    last: Option<(u64, u64)>,
+    /// Steps of a round before the newest, in a row.
+    behind: u32,
 }
 
 #[derive(Debug)]
 struct Pending {
     start: StartKey,
+    round: u64,
     step: Step,
     came: Vec<bool>,
     missing: u32,
     since: Instant,
 }
 
+impl Pending {
+    fn place(&self) -> Place {
+        (self.round, self.step.step)
+    }
+}
+
+impl Block {
+    /// Whether a step is the block's next, and not one that came before its connection broke: a producer publishes none at the time of another.
+    /// `newest` is the round that the start has come to.
+    fn goes_on(&mut self, step: u64, published: u64, newest: u64) -> bool {
+        if self.last.is_some_and(|(_, last)| published <= last) {
+            return false;
+        }
+        self.round += u64::from(self.last.is_some_and(|(last, _)| step <= last));
+        self.last = Some((step, published));
+        self.behind = if self.round < newest { self.behind + 1 } else { 0 };
+        if self.behind > BEHIND {
+            (self.round, self.behind) = (newest, 0);
+        }
+        true
+    }
+}
+
 impl Start {
     fn new(key: StartKey) -> Self {
-        Self { key, blocks: (0..key.1).map(|_| None).collect(), newest: None, anew: true }
+        Self { key, blocks: (0..key.1).map(|_| None).collect(), newest: None, round: 0, anew: true }
     }
 
     fn block(&self, index: u32, generation: u64) -> Option<&Block> {
@@ -158,7 +197,7 @@ impl Assembler {
         };
         let displaced: Vec<(usize, bool)> = start.blocks.iter().enumerate().filter_map(displaced).collect();
         displaced.iter().for_each(|(index, _)| start.blocks[*index] = None);
-        start.blocks[place] = Some(Block { generation, extent, ended: false });
+        start.blocks[place] = Some(Block { generation, extent, ended: false, round: start.round, last: None, behind: 0 });
         self.give_up_if(|p| p.start == key && displaced.iter().any(|(index, _)| p.came[*index]), "the simulation was started anew");
         let start = &mut self.starts[at];
         // Its steps may count from 0 again.
@@ -180,7 +219,8 @@ impl Assembler {
     }
 
     /// Takes one block of a step in; the whole step when it was the last that was missing. Where one block is the whole field, its values are
-    /// taken out of `values`, which gets another buffer, and not copied. Blocks that were not introduced, or are followed no more, give nothing.
+    /// taken out of `values`, which gets another buffer, and not copied. Blocks that were not introduced, or are followed no more, give nothing; nor
+    /// does what a block published at the same moment as one of its steps that came, or before.
     ///
     /// # Errors
     /// Another number of values, or another time than the step's other blocks have.
@@ -194,22 +234,30 @@ impl Assembler {
         values: &mut Vec<f32>,
     ) -> Result<Option<Step>, WireError> {
         let refuse = |found: String, accepted: &str| Err(WireError::Block { block, found, accepted: accepted.into() });
-        let found = self.starts.iter().enumerate().find_map(|(at, start)| Some((at, start, start.block(block, generation)?.extent)));
-        let Some((at, start, extent)) = found else { return Ok(None) };
-        let (key, shape, components) = (start.key, self.global.shape(), self.global.components());
+        let found = self.starts.iter().enumerate().find_map(|(at, start)| Some((at, start.block(block, generation)?.extent)));
+        let Some((at, extent)) = found else { return Ok(None) };
+        let (shape, components) = (self.global.shape(), self.global.components());
         let nodes = extent.extent.iter().product::<u64>() as usize;
         if values.len() != nodes * components {
             return refuse(format!("{} values", values.len()), &format!("{} values", nodes * components));
         }
-        // The newest: what came before it and is not whole by now will not be asked for.
-        if start.newest.is_some_and(|newest| step <= newest) {
+        let start = &mut self.starts[at];
+        let (key, newest) = (start.key, start.newest);
+        let Some(known) = start.blocks[block as usize].as_mut() else { return Ok(None) };
+        if !known.goes_on(step, published, newest.map_or(0, |(round, _)| round)) {
+            return Ok(None);
+        }
+        let round = known.round;
+        start.round = start.round.max(round);
+        // What came before the newest and is not whole by now will not be asked for.
+        if newest.is_some_and(|newest| (round, step) <= newest) {
             return Ok(None);
         }
         if key.1 == 1 {
             let values = std::mem::replace(values, self.spare.pop().unwrap_or_default());
-            return Ok(Some(self.whole(at, Step { step, time, published, anew: false, values })));
+            return Ok(Some(self.whole(at, round, Step { step, time, published, anew: false, values })));
         }
-        let place = match self.steps.iter().position(|p| p.start == key && p.step.step == step) {
+        let place = match self.steps.iter().position(|p| p.start == key && p.place() == (round, step)) {
             Some(place) => place,
             None => {
                 if self.steps.len() >= self.pending
@@ -221,6 +269,7 @@ impl Assembler {
                 whole.resize(shape.iter().product::<u64>() as usize * components, f32::NAN);
                 self.steps.push_back(Pending {
                     start: key,
+                    round,
                     step: Step { step, time, published, anew: false, values: whole },
                     came: vec![false; key.1 as usize],
                     missing: key.1,
@@ -249,18 +298,19 @@ impl Assembler {
             self.give_up(pending, "its blocks do not cover the grid");
             return Ok(None);
         }
-        Ok(Some(self.whole(at, pending.step)))
+        Ok(Some(self.whole(at, round, pending.step)))
     }
 
     /// A step of the start at a place is whole: what came before it is given up.
-    fn whole(&mut self, at: usize, mut step: Step) -> Step {
+    fn whole(&mut self, at: usize, round: u64, mut step: Step) -> Step {
         let left: Vec<StartKey> = self.starts.drain(..at).map(|start| start.key).collect();
         self.give_up_if(|p| left.contains(&p.start), "the simulation was started anew");
         // Older ones would come out of order.
         let key = self.starts[0].key;
-        self.give_up_if(|p| p.start == key && p.step.step < step.step, "a newer step was whole before it");
+        let place = (round, step.step);
+        self.give_up_if(|p| p.start == key && p.place() < place, "a newer step was whole before it");
         let start = &mut self.starts[0];
-        start.newest = start.newest.max(Some(step.step));
+        start.newest = start.newest.max(Some(place));
         step.anew = std::mem::take(&mut start.anew);
         step
     }
@@ -302,7 +352,7 @@ impl Assembler {
         let wanted = old.start.1;
         // Its other blocks come too late.
         if let Some(start) = self.starts.iter_mut().find(|start| start.key == old.start) {
-            start.newest = start.newest.max(Some(old.step.step));
+            start.newest = start.newest.max(Some(old.place()));
         }
         self.given_up.push(Incomplete { step: old.step.step, time: old.step.time, blocks: wanted - old.missing, wanted, why });
         self.recycle(old.step.values);

@@ -40,21 +40,13 @@ impl<'a> Field<'a> {
     /// What can be checked of pointers.
     pub(crate) fn check(&self, components: usize) -> Result<(), WireError> {
         if self.components.len() != components {
-            return Err(WireError::field("components", self.components.len(), format!("{components}, as many as axes")));
+            return Err(WireError::Components { found: self.components.len(), accepted: components });
         }
-        for pointer in self.components {
-            if pointer.is_null() {
-                return Err(WireError::field("component", "null", "the address of the first value"));
-            }
-            if pointer.align_offset(self.element.bytes()) != 0 {
-                return Err(WireError::field(
-                    "component",
-                    format_args!("{pointer:?}"),
-                    format!("an address divisible by {}", self.element.bytes()),
-                ));
-            }
+        let divisor = self.element.bytes();
+        match self.components.iter().map(|pointer| pointer.addr()).find(|address| *address == 0 || !address.is_multiple_of(divisor)) {
+            Some(address) => Err(WireError::Address { address, divisor }),
+            None => Ok(()),
         }
-        Ok(())
     }
 
     /// Copies all components to `to`, one behind the other, x fastest.

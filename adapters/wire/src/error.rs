@@ -75,6 +75,28 @@ pub enum WireError {
         /// What is accepted.
         accepted: String,
     },
+    /// A step's time. These three are told apart from [`WireError::Field`] since publishing takes no memory, not even for its errors.
+    #[error("`time` is {time}; accepted: a finite number")]
+    Time {
+        /// What was given.
+        time: f64,
+    },
+    /// Another number of components than axes.
+    #[error("`components` is {found}; accepted: {accepted}, as many as axes")]
+    Components {
+        /// How many were given.
+        found: usize,
+        /// How many there are.
+        accepted: usize,
+    },
+    /// A component's address, null with them.
+    #[error("`component` is at {address:#x}; accepted: an address divisible by {divisor}, not null")]
+    Address {
+        /// What was given.
+        address: usize,
+        /// Bytes of a value.
+        divisor: usize,
+    },
     /// It ends before it should.
     #[error("{what} ends after {found} bytes; {needed} are needed")]
     Short {

@@ -8,6 +8,10 @@ use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// How long somebody is waited for who sweeps a ring's folder up.
+const SWEEPING: Duration = Duration::from_secs(5);
 
 /// A locked file.
 #[derive(Debug)]
@@ -81,13 +85,13 @@ impl FileLock {
     }
 }
 
-/// Whether somebody's lock stands in the way of `kind`. False also where that cannot be told.
-fn locked(path: &Path, kind: libc::c_int) -> bool {
-    let Ok(file) = system::open_private(path, kind == libc::F_WRLCK) else { return false };
+/// The kind of somebody's lock that stands in the way of `kind`. None also where that cannot be told.
+fn in_the_way(path: &Path, kind: libc::c_int) -> Option<libc::c_int> {
+    let file = system::open_private(path, kind == libc::F_WRLCK).ok()?;
     let mut lock = whole(kind);
     // SAFETY: the descriptor is open, and the lock outlives the call.
     let asked = unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_GETLK, &mut lock) };
-    asked == 0 && lock.l_type != libc::F_UNLCK as libc::c_short
+    Some(libc::c_int::from(lock.l_type)).filter(|found| asked == 0 && *found != libc::F_UNLCK)
 }
 
 /// A block's name, which is this producer's until it is dropped.
@@ -108,12 +112,41 @@ impl NameLock {
 
 /// Whether a block's producer lives (its process runs, and has not closed the ring). False also where that cannot be told.
 pub fn producer_lives(ring: &Path, block: u32) -> bool {
-    locked(&lock_path(ring, block), libc::F_RDLCK)
+    in_the_way(&lock_path(ring, block), libc::F_RDLCK).is_some()
 }
 
 /// Whether anybody follows the ring.
 pub(crate) fn is_followed(ring: &Path) -> bool {
-    locked(&followers_path(ring), libc::F_WRLCK)
+    in_the_way(&followers_path(ring), libc::F_WRLCK).is_some()
+}
+
+/// Removes the rings of producers that have ended, and the folder when it is empty, where nobody follows. Somebody else who does so is waited for, so
+/// long at most: what was still taken when it looked would stay.
+pub(crate) fn sweep(ring: &Path, limit: Duration) {
+    let (path, begin) = (followers_path(ring), Instant::now());
+    let last = loop {
+        match FileLock::take(path.clone(), libc::F_WRLCK) {
+            Ok(Some(last)) => break last,
+            Ok(None) => {
+                // Who follows will do it.
+                if in_the_way(&path, libc::F_WRLCK) == Some(libc::F_RDLCK) || begin.elapsed() > limit {
+                    return;
+                }
+                std::thread::sleep(Duration::from_millis(1));
+            }
+            // The folder is gone.
+            Err(_) => return,
+        }
+    };
+    for block in blocks(ring) {
+        // Whoever has the name publishes, and looks for followers once more when it has ended.
+        if let Ok(Some(name)) = NameLock::take(ring, block) {
+            let _ = std::fs::remove_file(block_path(ring, block));
+            name.remove();
+        }
+    }
+    last.remove();
+    let _ = std::fs::remove_dir(ring);
 }
 
 /// Says that somebody follows the ring: a producer that ends leaves its last steps there. Dropping it removes the rings of producers that
@@ -128,13 +161,16 @@ impl Following {
     /// Makes the ring's folder where it is not there.
     ///
     /// # Errors
-    /// A folder or file that is not this user's alone.
+    /// A folder or file that is not this user's alone; somebody who sweeps the folder up and does not come to an end (a process that was stopped).
     pub fn begin(ring: &Path) -> Result<Self, WireError> {
-        // Nobody ever locks it against followers for longer than a look.
+        let (path, begin) = (followers_path(ring), Instant::now());
         let lock = loop {
-            match FileLock::take_in(ring, followers_path(ring), libc::F_RDLCK)? {
+            match FileLock::take_in(ring, path.clone(), libc::F_RDLCK)? {
                 Some(lock) => break lock,
-                None => std::thread::sleep(std::time::Duration::from_millis(1)),
+                None if begin.elapsed() > SWEEPING => {
+                    return Err(WireError::io(&path, "is locked by a follower that leaves", io::ErrorKind::TimedOut.into()));
+                }
+                None => std::thread::sleep(Duration::from_millis(1)),
             }
         };
         Ok(Self { ring: ring.to_owned(), lock: Some(lock) })
@@ -164,17 +200,7 @@ impl Following {
 impl Drop for Following {
     fn drop(&mut self) {
         drop(self.lock.take());
-        // The last follower sweeps up.
-        let Ok(Some(last)) = FileLock::take(followers_path(&self.ring), libc::F_WRLCK) else { return };
-        for block in blocks(&self.ring) {
-            // Whoever has the name publishes.
-            if let Ok(Some(name)) = NameLock::take(&self.ring, block) {
-                let _ = std::fs::remove_file(block_path(&self.ring, block));
-                name.remove();
-            }
-        }
-        last.remove();
-        let _ = std::fs::remove_dir(&self.ring);
+        sweep(&self.ring, SWEEPING);
     }
 }
 

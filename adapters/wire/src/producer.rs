@@ -2,15 +2,17 @@
 
 use crate::copy::Field;
 use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, SLOTS, STATE};
-use crate::lock::{NameLock, is_followed};
+use crate::lock::{NameLock, is_followed, sweep};
 use crate::system::{self, Map, create_private, open_private};
 use crate::{Description, Limits, WireError, block_path};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering, fence};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+/// How long a name that is taken is waited for: a follower that leaves takes each for a moment, to see whether anybody has it.
+const TAKEN: Duration = Duration::from_secs(1);
 /// How long a follower may be silent before nobody waits for it.
 const SILENCE: Duration = Duration::from_secs(5);
 
@@ -51,6 +53,8 @@ pub struct Producer {
 #[derive(Debug)]
 struct Writer {
     count: u64,
+    /// When the last step was published.
+    published: u64,
     /// The follower's count when it was given up waiting for.
     given_up_at: Option<u64>,
 }
@@ -69,7 +73,8 @@ impl Producer {
     /// killed run left is replaced. All memory is taken here.
     ///
     /// # Errors
-    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name; no room; no memory.
+    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name (after a second); no room; no
+    /// memory.
     pub fn open(ring: &Path, description: Description, slots: u32, policy: Policy) -> Result<Self, WireError> {
         description.check(&Limits { step_bytes: u64::MAX })?;
         if !(2..=SLOTS).contains(&slots) {
@@ -77,8 +82,13 @@ impl Producer {
         }
         let block = description.block.index;
         let path = block_path(ring, block);
-        let Some(lock) = NameLock::take(ring, block)? else {
-            return Err(WireError::InUse { pid: holder(&path), path });
+        let begin = Instant::now();
+        let lock = loop {
+            match NameLock::take(ring, block)? {
+                Some(lock) => break lock,
+                None if begin.elapsed() > TAKEN => return Err(WireError::InUse { pid: holder(&path), path }),
+                None => std::thread::sleep(Duration::from_millis(1)),
+            }
         };
         let random = system::random().map_err(|e| WireError::io(&path, "no random numbers", e))?;
         let header = Header {
@@ -101,7 +111,7 @@ impl Producer {
                 map,
                 policy,
                 process: std::process::id(),
-                writer: Mutex::new(Writer { count: 0, given_up_at: None }),
+                writer: Mutex::new(Writer { count: 0, published: 0, given_up_at: None }),
                 lock: None,
             };
             producer.put(0, &fixed);
@@ -130,7 +140,7 @@ impl Producer {
         &self.header.description
     }
 
-    /// Publishes a step. Takes no memory, and with [`Policy::NewestWins`] waits for nobody but another thread that is publishing.
+    /// Publishes a step. Takes no memory, even where it fails, and with [`Policy::NewestWins`] waits for nobody but another thread that is publishing.
     ///
     /// # Errors
     /// Nothing was published: a time that is not finite, another number of components, a null or misaligned pointer, or this process is a fork of
@@ -144,7 +154,7 @@ impl Producer {
             return Err(WireError::Forked { opened: self.process, here });
         }
         if !time.is_finite() {
-            return Err(WireError::field("time", time, "a finite number"));
+            return Err(WireError::Time { time });
         }
         field.check(self.header.description.components())?;
         let mut writer = self.writer.lock().unwrap_or_else(|broken| broken.into_inner());
@@ -160,7 +170,9 @@ impl Producer {
         // SAFETY: the caller vouches for the values; the slot has room for the block's values behind its header, and only the holder of
         // `writer` writes there.
         unsafe { field.copy_to(self.header.description.block.extent, self.map.start().add(slot + SLOT_HEADER).cast()) };
-        self.word(slot + 24).store(system::since_1970(), Ordering::Relaxed);
+        // By these times a follower tells a step from one that came already, also where the clock is set back.
+        writer.published = system::since_1970().max(writer.published + 1);
+        self.word(slot + 24).store(writer.published, Ordering::Relaxed);
         sequence.store(2 * count + 2, Ordering::Release);
         writer.count += 1;
         if overwrote {
@@ -231,7 +243,7 @@ impl Producer {
 }
 
 impl Drop for Producer {
-    /// Ends the ring. Its files go when no follower is there to take the last steps; a follower that is, removes them.
+    /// Ends the ring. Its files go when no follower is there to take the last steps; a follower that is, removes them when it leaves.
     fn drop(&mut self) {
         if std::process::id() != self.process {
             return;
@@ -240,7 +252,9 @@ impl Drop for Producer {
         let block = self.header.description.block.index;
         self.word(STATE).store(ENDED, Ordering::Release);
         if is_followed(&self.ring) {
-            return;
+            drop(lock);
+            // One that was about to leave may have found the name taken.
+            return sweep(&self.ring, TAKEN);
         }
         let _ = std::fs::remove_file(block_path(&self.ring, block));
         lock.remove();

@@ -13,7 +13,7 @@ use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
-use std::sync::{Arc, Mutex};
+use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
 /// Longest that a peer may take for a piece of a message.
@@ -112,12 +112,65 @@ impl Strangers {
     }
 }
 
+/// How often it is said that connections were sent away, at most: whoever reaches the port can make it happen.
+const REFUSALS: Duration = Duration::from_secs(1);
+
+/// Connections that were sent away, as far as that was said.
+#[derive(Default)]
+struct Refusals {
+    said: Option<Instant>,
+    /// Since then, not said yet.
+    more: u64,
+}
+
+impl Refusals {
+    /// Whether one more is to be said now; otherwise it is counted.
+    fn come(&mut self) -> bool {
+        let now = self.said.is_none_or(|said| said.elapsed() >= REFUSALS);
+        if now {
+            self.said = Some(Instant::now())
+        } else {
+            self.more += 1
+        }
+        now
+    }
+
+    /// How many are to be said together now.
+    fn due(&mut self) -> Option<u64> {
+        if self.more == 0 || self.said.is_some_and(|said| said.elapsed() < REFUSALS) {
+            return None;
+        }
+        self.said = Some(Instant::now());
+        Some(std::mem::take(&mut self.more))
+    }
+}
+
+/// One of the [`FOLLOWERS`] places, which its follower leaves however its thread ends.
+struct Seat<'a> {
+    followers: &'a AtomicUsize,
+    /// How many had one before.
+    before: usize,
+}
+
+impl<'a> Seat<'a> {
+    fn take(followers: &'a AtomicUsize) -> Self {
+        Self { followers, before: followers.fetch_add(1, Ordering::Relaxed) }
+    }
+}
+
+impl Drop for Seat<'_> {
+    fn drop(&mut self) {
+        self.followers.fetch_sub(1, Ordering::Relaxed);
+    }
+}
+
 /// What the connections of a relay share.
 struct Relay {
     ring: PathBuf,
     key: Key,
     counts: Arc<RelayCounts>,
     strangers: Strangers,
+    refusals: Mutex<Refusals>,
     stop: Arc<AtomicBool>,
     tell: Arc<dyn Fn(String) + Send + Sync>,
 }
@@ -139,10 +192,12 @@ pub fn serve(
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
     let (ring, key, counts, strangers) = (ring.to_owned(), key.clone(), counts.clone(), Strangers::default());
-    let relay = Arc::new(Relay { ring, key, counts, strangers, stop: stop.clone(), tell });
+    let refusals = Mutex::default();
+    let relay = Arc::new(Relay { ring, key, counts, strangers, refusals, stop: stop.clone(), tell });
     let mut threads: Vec<std::thread::JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
+        relay.say_refusals();
         let (stream, peer) = match listener.accept() {
             // Whoever was cut off is about to end its thread.
             Ok((_, peer)) if threads.len() > FOLLOWERS + 2 * STRANGERS => {
@@ -175,7 +230,21 @@ pub fn serve(
 impl Relay {
     fn refuse(&self, peer: SocketAddr, why: String) {
         self.counts.refused.fetch_add(1, Ordering::Relaxed);
-        (self.tell)(format!("{peer} was sent away: {why}"));
+        if self.refusals().come() {
+            (self.tell)(format!("{peer} was sent away: {why}"));
+        }
+    }
+
+    /// Says together what came too fast to be said one by one.
+    fn say_refusals(&self) {
+        let due = self.refusals().due();
+        if let Some(more) = due {
+            (self.tell)(format!("{more} more were sent away"));
+        }
+    }
+
+    fn refusals(&self) -> MutexGuard<'_, Refusals> {
+        self.refusals.lock().unwrap_or_else(|broken| broken.into_inner())
     }
 
     /// One that came, until it goes.
@@ -188,8 +257,8 @@ impl Relay {
             Ok(session) => session,
             Err(error) => return self.refuse(peer, error.to_string()),
         };
-        let followers = &self.counts.followers;
-        if followers.fetch_add(1, Ordering::Relaxed) < FOLLOWERS {
+        let seat = Seat::take(&self.counts.followers);
+        if seat.before < FOLLOWERS {
             self.counts.accepted.fetch_add(1, Ordering::Relaxed);
             if let Err(error) = self.send_steps(stream, session) {
                 (self.tell)(format!("follower {peer}: {error}"));
@@ -197,12 +266,11 @@ impl Relay {
         } else {
             self.refuse(peer, format!("{FOLLOWERS} followers are there"));
         }
-        followers.fetch_sub(1, Ordering::Relaxed);
     }
 
     /// Answers each time that the follower asks with the next thing that happens.
     fn send_steps(&self, mut stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
-        let mut rings = RingFollower::begin(&self.ring, Limits { step_bytes: u64::MAX })?;
+        let mut rings = RingFollower::begin(&self.ring, Limits::default())?;
         let (mut values, mut asked) = (Vec::new(), false);
         let (mut sent, mut heard) = (Instant::now(), Instant::now());
         let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
@@ -274,6 +342,10 @@ pub struct RelayFollower {
     /// Buffers on their way back.
     spare: SyncSender<Vec<f32>>,
     stop: Arc<AtomicBool>,
+    /// Generations of the blocks that were opened and have not ended.
+    open: BTreeMap<u32, u64>,
+    /// The thread is gone, and that was told.
+    broken: bool,
 }
 
 impl RelayFollower {
@@ -293,22 +365,39 @@ impl RelayFollower {
         let work = move || drop(receiving.run());
         let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
         started.map_err(|e| WireError::io(Path::new("thread"), "could not be started", e))?;
-        Ok(Self { events, spare, stop })
+        Ok(Self { events, spare, stop, open: BTreeMap::new(), broken: false })
     }
 
-    /// The next thing that happened, or none within the limit. A step's values are in `values`.
+    /// The next thing that happened, or none within the limit. A step's values are in `values`. Should the thread that receives have panicked, that is
+    /// told once, and all of its blocks end.
     pub fn poll(&mut self, values: &mut Vec<f32>, limit: Duration) -> Option<Event> {
         match self.events.recv_timeout(limit) {
             Ok((event, mut came)) => {
                 std::mem::swap(values, &mut came);
                 let _ = self.spare.try_send(came);
+                match &event {
+                    Event::Opened { description, generation } => {
+                        self.open.insert(description.block.index, *generation);
+                    }
+                    Event::Ended { block, .. } => {
+                        self.open.remove(block);
+                    }
+                    Event::Step { .. } | Event::Refused(_) => {}
+                }
                 Some(event)
             }
             Err(RecvTimeoutError::Timeout) => None,
-            Err(RecvTimeoutError::Disconnected) => {
-                std::thread::sleep(limit);
-                None
+            Err(RecvTimeoutError::Disconnected) if !std::mem::replace(&mut self.broken, true) => {
+                let gone = ErrorKind::BrokenPipe.into();
+                Some(Event::Refused(WireError::io(Path::new("thread that receives from a relay"), "has panicked", gone)))
             }
+            Err(RecvTimeoutError::Disconnected) => match self.open.pop_first() {
+                Some((block, generation)) => Some(Event::Ended { block, generation, closed: false }),
+                None => {
+                    std::thread::sleep(limit);
+                    None
+                }
+            },
         }
     }
 }
@@ -514,6 +603,28 @@ mod tests {
         assert_eq!(reach(&[closed, open]).unwrap().peer_addr().unwrap(), open);
         assert_eq!(reach(&[closed, closed]).unwrap_err().kind(), ErrorKind::ConnectionRefused);
         assert_eq!(reach(&[]).unwrap_err().kind(), ErrorKind::AddrNotAvailable);
+    }
+
+    #[test]
+    fn refusals_are_said_once_a_second_and_none_is_lost() {
+        let mut refusals = Refusals::default();
+        assert!(refusals.come() && refusals.due().is_none());
+        assert!((0..1000).all(|_| !refusals.come()) && refusals.due().is_none());
+        refusals.said = Some(Instant::now() - REFUSALS);
+        assert_eq!(refusals.due(), Some(1000));
+        assert!(refusals.due().is_none() && !refusals.come());
+    }
+
+    #[test]
+    fn a_follower_whose_thread_panics_leaves_its_place() {
+        let followers = AtomicUsize::new(3);
+        let panicked = std::panic::catch_unwind(|| {
+            let seat = Seat::take(&followers);
+            assert_eq!((seat.before, followers.load(Ordering::Relaxed)), (3, 4));
+            panic!("as a follower's thread may");
+        });
+        assert!(panicked.is_err());
+        assert_eq!(followers.load(Ordering::Relaxed), 3);
     }
 
     #[test]

@@ -273,6 +273,55 @@ fn two_followers_of_a_relay_lose_nothing_of_a_solver_that_waits() {
 }
 
 #[test]
+fn a_receiving_thread_that_panicked_is_told_and_its_blocks_end() {
+    let folder = Folder::new("panicked");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let file = ConnectionFile { address: relay.address.to_string(), key: relay.key.clone() };
+    let asked = AtomicBool::new(false);
+    let place = move || {
+        assert!(!asked.swap(true, Ordering::Relaxed), "asked for a second time: this panic is the test's");
+        Ok(file.clone())
+    };
+    let mut follower = RelayFollower::begin(Box::new(place), Limits::default(), LONG).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    assert_eq!(events(&mut poll, "step 0"), ["opened 4", "step 0 missed 0"]);
+    drop(relay);
+    let seen = events(&mut poll, "ended");
+    assert!(seen.len() == 3 && seen[1].contains("has panicked") && seen[2] == "ended false", "{seen:?}");
+    assert!(poll(&mut Vec::new()).is_none());
+}
+
+#[test]
+fn a_relay_takes_no_memory_without_bound() {
+    let folder = Folder::new("large");
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let file = ConnectionFile { address: listener.local_addr().unwrap().to_string(), key: Key::random().unwrap() };
+    let (heard, stop) = (Arc::new(std::sync::Mutex::new(String::new())), Arc::new(AtomicBool::new(false)));
+    let relay = {
+        let (ring, key, hears, stop) = (folder.0.clone(), file.key.clone(), heard.clone(), stop.clone());
+        let tell = Arc::new(move |words: String| hears.lock().unwrap().push_str(&words));
+        std::thread::spawn(move || serve(&ring, &listener, &key, &Arc::default(), &stop, tell).unwrap())
+    };
+    // A small block of 2000^3 nodes.
+    let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, 2000);
+    let mut large = Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y"), axis("z")], "s");
+    large.block = ridgewatch_wire::BlockExtent { index: 0, count: 8, offset: [0; 3], extent: [2; 3] };
+    let producer = Producer::open(&folder.0, large, 2, Policy::NewestWins).unwrap();
+    let limits = Limits { step_bytes: u64::MAX };
+    let mut follower = RelayFollower::begin(Box::new(move || Ok(file.clone())), limits, LONG).unwrap();
+    let begin = Instant::now();
+    while !heard.lock().unwrap().contains("96000000000 bytes; at most 17179869184 are allowed") {
+        assert!(follower.poll(&mut Vec::new(), Duration::from_millis(10)).is_none(), "it was let through");
+        assert!(begin.elapsed() < LONG, "{}", heard.lock().unwrap());
+    }
+    stop.store(true, Ordering::Relaxed);
+    relay.join().unwrap();
+    drop(producer);
+}
+
+#[test]
 fn a_follower_that_holds_is_not_cut_off_and_holds_the_solver() {
     let folder = Folder::new("holds");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());

@@ -236,7 +236,7 @@ fn blocks_of_any_decomposition_meet_exactly() {
             }
             let (offset, extent) = run.blocks[block];
             let mut values = run.values(step, offset, extent);
-            whole.extend(assembler.block(block as u32, 1 + block as u64, step, step as f64, 0, &mut values).unwrap());
+            whole.extend(assembler.block(block as u32, 1 + block as u64, step, step as f64, 1 + step, &mut values).unwrap());
         }
         std::thread::sleep(Duration::from_nanos(1));
         run.judge(&whole, assembler.incomplete())?;

@@ -1,6 +1,6 @@
 //! Which steps the window keeps when memory does not hold all of them, and what that costs.
 
-use crate::field::Snapshot;
+use crate::field::{Snapshot, Window};
 use std::sync::Arc;
 
 /// Nodes at which the interpolation is measured.
@@ -31,20 +31,21 @@ impl Thinning {
         self.spacing
     }
 
-    /// Whether a step of this time is kept. If not, `build` may be called for it.
-    pub fn keeps(&mut self, time: f64, build: impl FnOnce() -> Arc<Snapshot>) -> bool {
-        let Some(kept) = &self.kept else { return true };
-        // What does not move forward is the window's to judge.
-        if time <= kept.time || time >= kept.time + self.spacing * (1.0 - 1e-9) {
-            return true;
-        }
+    /// Whether a step of this time is kept: the window has none of another time that is too near, before or behind. What repeats a time, or is late, is the
+    /// window's to judge.
+    pub fn keeps(&self, time: f64, window: &Window) -> bool {
+        window.is_late(time) || window.distance(time).is_none_or(|distance| distance >= self.spacing * (1.0 - 1e-9))
+    }
+
+    /// Tells of a step that is not kept; `build` may be called for it.
+    pub fn left_out(&mut self, time: f64, build: impl FnOnce() -> Arc<Snapshot>) {
         self.count += 1;
+        let Some(kept) = self.kept.as_ref().filter(|kept| kept.time < time) else { return };
         // The first beyond the middle, where the error of the interpolation is largest; until then the newest.
         let middle = kept.time + self.spacing / 2.0;
         if self.left_out.as_ref().is_none_or(|last| last.time < middle) {
             self.left_out = Some(build());
         }
-        false
     }
 
     /// Tells of a step that was kept.
@@ -55,7 +56,8 @@ impl Thinning {
         {
             self.error = interpolation_error(before, &between, snapshot).or(self.error);
         }
-        if self.kept.as_ref().is_none_or(|kept| kept.time < snapshot.time) {
+        // One that repeats its time takes its place here as in the window.
+        if self.kept.as_ref().is_none_or(|kept| kept.time <= snapshot.time) {
             self.kept = Some(snapshot.clone());
         }
     }
@@ -103,13 +105,16 @@ mod tests {
     fn what_thinning_costs_is_measured() {
         let mut thinning = Thinning::new(6.0, 14);
         assert_eq!(thinning.spacing(), 0.5);
-        let mut kept = Vec::new();
+        let (mut window, mut kept) = (Window::new(6.0), Vec::new());
         for n in 0..101 {
             let time = f64::from(n) * 0.05;
-            if thinning.keeps(time, || Arc::new(at(time))) {
+            if thinning.keeps(time, &window) {
                 let snapshot = Arc::new(at(time));
                 thinning.kept(&snapshot);
+                window.push(snapshot).unwrap();
                 kept.push(time);
+            } else {
+                thinning.left_out(time, || Arc::new(at(time)));
             }
         }
         assert_eq!(kept.len(), 11, "{kept:?}");
@@ -121,13 +126,44 @@ mod tests {
 
     #[test]
     fn steps_far_apart_are_all_kept() {
-        let mut thinning = Thinning::new(6.0, 14);
+        let (mut thinning, mut window) = (Thinning::new(6.0, 14), Window::new(6.0));
         for n in 0..10 {
             let time = f64::from(n) * 0.7;
-            assert!(thinning.keeps(time, || Arc::new(at(time))));
-            thinning.kept(&Arc::new(at(time)));
+            assert!(thinning.keeps(time, &window));
+            let snapshot = Arc::new(at(time));
+            thinning.kept(&snapshot);
+            window.push(snapshot).unwrap();
         }
         assert_eq!((thinning.count, thinning.error), (0, None));
-        assert!(thinning.keeps(-1.0, || Arc::new(at(-1.0))), "what goes back in time is the window's to judge");
+        assert!(thinning.keeps(-1.0, &window) && thinning.keeps(6.3, &window), "what is late, or repeats a time, is the window's to judge");
+    }
+
+    #[test]
+    fn however_times_come_the_window_has_room_for_what_is_kept() {
+        // Falling, to and fro over one place, and at random (a linear congruential generator).
+        let mut state = 1u64;
+        let mut random = move || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 40) as f64 / f64::from(1 << 24)
+        };
+        let random: Vec<f64> = (0..400).map(|n| 20.0 * random() + 0.1 * f64::from(n)).collect();
+        let falling = (0..400).map(|n| -0.05 * f64::from(n)).collect();
+        let to_and_fro = (0..400).map(|n| 0.1 * f64::from(n) - f64::from(n % 7)).collect();
+        for times in [falling, to_and_fro, random] {
+            let (mut thinning, mut window) = (Thinning::new(6.0, 14), Window::new(6.0));
+            let mut most = 0;
+            for time in times {
+                if !thinning.keeps(time, &window) {
+                    thinning.left_out(time, || Arc::new(at(time)));
+                    continue;
+                }
+                let snapshot = Arc::new(at(time));
+                thinning.kept(&snapshot);
+                let _ = window.push(snapshot);
+                most = most.max(window.snapshots().len());
+            }
+            assert!((8..=14).contains(&most), "{most}");
+            assert!(thinning.count > 0);
+        }
     }
 }

@@ -180,18 +180,23 @@ impl LiveWindow {
         let _ = self.shared.listener.set(listener);
     }
 
-    /// The window as it is once it is full and has moved by the stride; none when the simulation has ended and it will not.
+    /// The window as it is once it is full and has moved by the stride; none when the simulation has ended and it will not; an error when the thread that
+    /// reads has ended.
     ///
     /// # Errors
     /// Not within the limit: ask again.
-    pub fn next_within(&self, limit: Duration) -> Result<Option<Taken>, StillReading> {
+    pub fn next_within(&self, limit: Duration) -> Result<Option<Result<Taken, SourceError>>, StillReading> {
         let until = Instant::now() + limit;
         let mut state = self.shared.lock();
         loop {
             if state.due(self.stride) {
                 break;
             }
-            if state.ended || self.thread.as_ref().is_none_or(JoinHandle::is_finished) {
+            // It ends by itself in no other way.
+            if self.thread.as_ref().is_none_or(JoinHandle::is_finished) {
+                return Ok(Some(Err(SourceError::LiveStopped { steps: state.live.steps, what: "it panicked".into() })));
+            }
+            if state.ended {
                 return Ok(None);
             }
             let now = Instant::now();
@@ -211,7 +216,7 @@ impl LiveWindow {
         let window = state.window.clone();
         drop(state);
         self.shared.changed.notify_all();
-        Ok(Some(Taken { window, warnings, live }))
+        Ok(Some(Ok(Taken { window, warnings, live })))
     }
 
     /// Whether [`Self::next_within`] would have to wait: nothing new is there yet, and something may come.
@@ -314,10 +319,13 @@ impl Reader {
             }
         }
         state.live.steps += 1;
+        let keep = self.thinning.keeps(time, &state.window);
         // Conversion and the measurement take their time: frames are made meanwhile.
         drop(state);
-        let keep = self.thinning.keeps(time, || self.conversion.snapshot(time, &values));
         let kept = keep.then(|| self.conversion.snapshot(time, &values));
+        if !keep {
+            self.thinning.left_out(time, || self.conversion.snapshot(time, &values));
+        }
         self.assembler.recycle(values);
         if let Some(kept) = &kept {
             self.thinning.kept(kept);

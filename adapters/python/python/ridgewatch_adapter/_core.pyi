@@ -8,7 +8,7 @@ import numpy.typing as npt
 Field = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 class RidgewatchError(Exception):
-    """The ring could not be opened, or a step was refused."""
+    """The ring could not be opened, or a step was refused; raised with strict=True only."""
 
 class Publisher:
     def __init__(
@@ -26,6 +26,7 @@ class Publisher:
         wait_ms: int = 0,
         time_unit: str = "s",
         order: Literal["zyx", "xyz"] = "zyx",
+        strict: bool = False,
     ) -> None:
         """Opens a ring for the global grid of these coordinates (ascending; uneven ones are welcome).
 
@@ -37,10 +38,13 @@ class Publisher:
         (comm.bcast(time.time_ns()) with mpi4py); 0: none.
         slots: steps that the ring holds. wait_ms: how long to wait for ridgewatch; 0: never.
         order: of the arrays' axes: "zyx" is [z, y, x], "xyz" is [x, y, z].
+        strict: a ring that cannot be had (in use, no room, another user's folder, a grid that cannot be) raises RidgewatchError, and so
+        does a step with a time that is not finite. Otherwise each of them is a RuntimeWarning and the program goes on: without a ring
+        nothing is published, and such a step is left out. Arguments of a wrong shape or type raise ValueError or TypeError in any case.
         """
 
     def publish(self, step: int, time: float, u: Field, v: Field, w: Field | None = None) -> bool:
-        """Copies a step into the ring; False where publishing is off. The arrays have one shape, dtype and strides.
+        """Copies a step into the ring; False where publishing is off or the step was refused. The arrays have one shape, dtype and strides.
 
         Threads may publish at once, and other threads of Python run meanwhile: let none of them write into the arrays.
         """

@@ -63,6 +63,58 @@ fn producers_that_come_and_go_at_once_do_not_take_each_others_folder() {
 }
 
 #[test]
+fn followers_that_come_and_go_stand_in_no_producers_way_and_nothing_stays() {
+    let folder = Folder::new("sweeping");
+    let ring = &folder.0;
+    for round in 0..20 {
+        std::thread::scope(|scope| {
+            for index in 0..3 {
+                scope.spawn(move || {
+                    let mut description = cube([6, 2, 2]);
+                    description.block = BlockExtent { index, count: 3, offset: [2 * u64::from(index), 0, 0], extent: [2, 2, 2] };
+                    for _ in 0..40 {
+                        drop(Producer::open(ring, description.clone(), 2, Policy::NewestWins).unwrap());
+                    }
+                });
+            }
+            for _ in 0..2 {
+                scope.spawn(move || (0..80).for_each(|_| drop(Following::begin(ring).unwrap())));
+            }
+        });
+        assert!(!ring.exists(), "round {round}: {:?}", std::fs::read_dir(ring).unwrap().flatten().collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn a_sweeper_that_was_stopped_is_not_waited_for_without_end() {
+    let folder = Folder::new("stopped");
+    std::fs::create_dir_all(&folder.0).unwrap();
+    std::fs::set_permissions(&folder.0, std::os::unix::fs::PermissionsExt::from_mode(0o700)).unwrap();
+    let mut options = std::fs::OpenOptions::new();
+    std::os::unix::fs::OpenOptionsExt::mode(options.read(true).write(true).create(true), 0o600);
+    let file = options.open(folder.0.join("followers.lock")).unwrap();
+    // SAFETY: all of its fields are integers; the descriptor is open, and the lock outlives the call.
+    let locked = unsafe {
+        let mut lock: libc::flock = std::mem::zeroed();
+        (lock.l_type, lock.l_len) = (libc::F_WRLCK as libc::c_short, 1);
+        libc::fcntl(std::os::fd::AsRawFd::as_raw_fd(&file), libc::F_OFD_SETLK, &lock)
+    };
+    assert_eq!(locked, 0);
+    let begin = std::time::Instant::now();
+    let error = Following::begin(&folder.0).unwrap_err().to_string();
+    assert!(error.contains("followers.lock") && error.contains("follower that leaves"), "{error}");
+    // A producer beside it publishes, and ends.
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    publish(&producer, 0, 0.0).unwrap();
+    drop(producer);
+    assert!(begin.elapsed() < Duration::from_secs(20), "{:?}", begin.elapsed());
+    // Whoever was stopped goes on and goes; the next one cleans up.
+    drop(file);
+    drop(Following::begin(&folder.0).unwrap());
+    assert!(!folder.0.exists());
+}
+
+#[test]
 fn waiting_is_bounded_and_happens_once() {
     let folder = Folder::new("wait");
     let limit = Duration::from_millis(80);
