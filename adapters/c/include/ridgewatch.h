@@ -102,7 +102,15 @@ rw_status rw_describe_wait(rw_description *description, uint32_t milliseconds);
 rw_status rw_open(const char *ring, const rw_description *description, rw_field **field);
 
 // Publishes a step whose components are arrays of their own, packed, x fastest. `w` is not read in two dimensions.
-rw_status rw_publish_f32(rw_field *field, uint64_t step, double time, const float *u, const float *v, const float *w);
+// `step` must rise from call to call: it tells which blocks of a decomposed domain belong together. Where it does not, the solver counts as set
+// back: all blocks must be, at the same step, and none of the steps after it is put together with one from before. Steps that are one block are
+// followed by `time` alone, whatever their numbers.
+rw_status rw_publish_f32(rw_field *field,
+                         uint64_t step,
+                         double time,
+                         const float *u,
+                         const float *v,
+                         const float *w);
 
 // The same of doubles, which are rounded to floats.
 rw_status rw_publish_f64(rw_field *field, uint64_t step, double time, const double *u, const double *v, const double *w);

@@ -463,6 +463,9 @@ unsafe fn publish(
 }
 
 /// Publishes a step whose components are arrays of their own, packed, x fastest. `w` is not read in two dimensions.
+/// `step` must rise from call to call: it tells which blocks of a decomposed domain belong together. Where it does not, the solver counts as set
+/// back: all blocks must be, at the same step, and none of the steps after it is put together with one from before. Steps that are one block are
+/// followed by `time` alone, whatever their numbers.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_f32(field: *mut RwField, step: u64, time: f64, u: *const f32, v: *const f32, w: *const f32) -> Status {
     // SAFETY: the caller's promise.
