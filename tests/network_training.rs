@@ -212,7 +212,7 @@ fn a_resumed_run_goes_on_bit_for_bit() {
     // The range of an input is part of what must fit.
     let other = NetworkSettings { start_range: Some([0.0, 4.0]), ..of_start };
     let fault = surrogate(Kind::Network, &other, &tracer).load(&folder.path().join("4")).unwrap_err().to_string();
-    assert!(fault.contains("starts 0 to 3") && fault.contains("starts 0 to 4"), "{fault}");
+    assert!(fault.contains("start_range 0 3") && fault.contains("start_range 0 4"), "{fault}");
 }
 
 #[test]
