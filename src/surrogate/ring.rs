@@ -67,11 +67,16 @@ impl SampleRing {
         RingMark { epoch: self.epoch, pushed: self.pushed }
     }
 
+    /// Whether samples still lie where they lay at `mark`.
+    pub fn continues(&self, mark: RingMark) -> bool {
+        mark.epoch == self.epoch
+    }
+
     /// Places in [`SampleRing::samples`] that have been written since `mark`: all of them where samples have been moved since, or without a mark.
     pub fn written_since(&self, mark: Option<RingMark>) -> [Range<usize>; 2] {
         let len = self.len();
         let fresh = match mark {
-            Some(mark) if mark.epoch == self.epoch => usize::try_from(self.pushed - mark.pushed).map_or(len, |fresh| fresh.min(len)),
+            Some(mark) if self.continues(mark) => usize::try_from(self.pushed - mark.pushed).map_or(len, |fresh| fresh.min(len)),
             _ => len,
         };
         // The newest sample lies before `end`, and after the last place comes the first one again.

@@ -187,8 +187,8 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         let [our_loss, their_loss] =
             [&found, &expected].map(|frames| frames[frames.len() - 1].record.training.as_ref().unwrap().loss.unwrap());
         measured!("{name}: what the network knows, dB: GPU {ours:.1?}, CPU {theirs:.1?}; last losses {our_loss:.2e} and {their_loss:.2e}");
-        // Labels of windows that have passed would not be fitted together with this one's.
-        assert!(name != "flow map in space" || our_loss < 3.0 * their_loss, "{name}: losses {our_loss} and {their_loss}");
+        // Labels of windows that have passed would not be fitted together with this one's: losses were 60 and 190 times the CPU's.
+        assert!(our_loss < 10.0 * their_loss, "{name}: losses {our_loss} and {their_loss}");
         let last = frames_of_a_slide(&found) - 1;
         // The first frame is answered by what the run began with.
         assert!(ours[last] > ours[0] + 5.0 && theirs[last] > theirs[0] + 5.0, "{name}: both learn: {ours:?} and {theirs:?}");

@@ -1,7 +1,7 @@
 //! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` is generated from this file (`make header`), its words are the comments here.
 //!
 //! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`]. Rust aborts
-//! where memory is out, so what is large is asked for ([`copied`]), and whoever describes or opens asks first for what all that is small may take ([`SMALL`]).
+//! where memory is out, so what is large is asked for (`copied`), and whoever describes or opens asks first for what all that is small may take (`SMALL`).
 //!
 //! What C promises with each pointer that it gives: it is null, or from this library and not yet freed, or points to as many values as the
 //! function's comment says; texts end with a zero. A description and `rw_close` are for one thread at a time.

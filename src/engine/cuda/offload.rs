@@ -147,7 +147,8 @@ impl CudaTraining {
         let pool = self.pool(ring.capacity())?;
         let stamp = base.map(Table::stamp);
         let held = self.held.take().filter(|held| held.capacity == ring.capacity());
-        let known = held.as_ref().filter(|held| held.base == stamp).map(|held| held.mark);
+        // Where samples were moved, those of the window before lie behind what the ring holds now.
+        let known = held.as_ref().filter(|held| held.base == stamp && ring.continues(held.mark)).map(|held| held.mark);
         let ranges = ring.written_since(known);
         let mut samples = match held {
             Some(held) => held.samples,
