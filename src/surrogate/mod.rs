@@ -22,7 +22,7 @@ mod table;
 mod trainer;
 
 pub use draft::Draft;
-pub use offload::{Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
+pub use offload::{Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
 pub use residual::Residual;
 pub use ring::{KEEP_STALE, RingMark, SampleRing};
 pub use sizing::{Resize, Sizing};
@@ -92,6 +92,9 @@ pub struct Learned {
     /// Of them, seconds of a device that took the steps; none where the CPU took them.
     #[serde(default)]
     pub device_seconds: Option<f64>,
+    /// Why a device that works did not take the network over, in the call where that was found.
+    #[serde(skip)]
+    pub not_taken: Option<String>,
 }
 
 impl Learned {
@@ -109,6 +112,7 @@ impl Learned {
             rollbacks: self.rollbacks + other.rollbacks,
             seconds: self.seconds + other.seconds,
             device_seconds: self.device_seconds.map(|mine| mine + other.device_seconds.unwrap_or(0.0)).or(other.device_seconds),
+            not_taken: self.not_taken.or(other.not_taken),
         }
     }
 }

@@ -14,8 +14,28 @@ pub trait Offload: Send + Sync {
     /// Whether networks of this shape can be trained there.
     fn takes(&self, shape: &Architecture, objective: &Objective) -> bool;
 
-    /// Takes a network over: parameters, moments and their running mean. None where the device is lost.
-    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>>;
+    /// Takes a network over, parameters, moments and their running mean, with room for a ring of so many samples.
+    ///
+    /// # Errors
+    /// [`NotTaken`]; nothing is left there then.
+    fn training(
+        &self,
+        model: &Model,
+        objective: &Objective,
+        average: &Average,
+        ring: usize,
+    ) -> Result<Box<dyn OffloadedTraining>, NotTaken>;
+}
+
+/// Why a device does not take a network over.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NotTaken {
+    /// It is lost.
+    #[error(transparent)]
+    Lost(#[from] DeviceLost),
+    /// It works, but has no memory for the network or its samples; which, in words.
+    #[error("{0}")]
+    NoRoom(String),
 }
 
 /// The device is lost, for a reason that was told where it happened.

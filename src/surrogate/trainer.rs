@@ -9,8 +9,8 @@ use super::network::{
     Architecture, Average, Encoding, Field, Fused, Model, NetworkSettings, Objective, PlannedStep, Predictor, Step, Times,
 };
 use super::{
-    Brought, Copied, DeviceLost, Learned, NetworkState, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing, Samples,
-    SurrogateError, Table, fresh_stamp,
+    Brought, Copied, DeviceLost, Learned, NetworkState, NotTaken, Offload, OffloadedNetwork, OffloadedTraining, Predict, SampleRing,
+    Samples, SurrogateError, Table, fresh_stamp,
 };
 use crate::flow::Tracer;
 use progress::Progress;
@@ -310,7 +310,7 @@ impl Trainer {
             self.objective.standardise(&self.model.shape, samples, labels.base);
             self.standardised = true;
         }
-        self.go_away();
+        self.go_away(ring.capacity(), learned);
         let sieved;
         let Brought { usable, dropped } = if let Some(away) = &mut self.away {
             away.training.bring(ring, base)?
@@ -371,15 +371,20 @@ impl Trainer {
         self.settle()
     }
 
-    /// Brings the network to the device that is to train it, once.
-    fn go_away(&mut self) {
+    /// Brings the network to the device that is to train it, once; where that does not take it, training stays here.
+    fn go_away(&mut self, ring: usize, learned: &mut Learned) {
         if self.away.is_some() {
             return;
         }
         let Some(offload) = &self.offload else { return };
-        let Some(training) = offload.training(&self.model, &self.objective, &self.average) else {
-            self.offload = None;
-            return;
+        let training = match offload.training(&self.model, &self.objective, &self.average, ring) {
+            Ok(training) => training,
+            Err(why) => {
+                self.offload = None;
+                // What is lost is told where it happened.
+                learned.not_taken = Some(why).filter(|why| matches!(why, NotTaken::NoRoom(_))).map(|why| why.to_string());
+                return;
+            }
         };
         self.kept = None;
         self.away = Some(Away {

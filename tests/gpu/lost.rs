@@ -10,13 +10,13 @@ use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
 
-/// What the process of its own is told by: `cpu` or `stop`.
+/// What the process of its own is told by: `cpu` or `stop`, or `network` for a gated run that learns.
 const WHEN_LOST: &str = "RIDGEWATCH_TEST_WHEN_LOST";
 
 #[test]
 #[ignore = "needs a GPU"]
 fn the_run_goes_on_on_the_cpu_or_ends_as_configured() {
-    for when_lost in ["cpu", "stop"] {
+    for when_lost in ["cpu", "stop", "network"] {
         let output = Command::new(std::env::current_exe().unwrap())
             .args(["--ignored", "--exact", "lost::in_a_process_of_its_own", "--nocapture"])
             .env(WHEN_LOST, when_lost)
@@ -69,6 +69,9 @@ fn trap() {
 #[ignore = "needs a GPU; started by the test above"]
 fn in_a_process_of_its_own() {
     let Ok(when_lost) = std::env::var(WHEN_LOST) else { return };
+    if when_lost == "network" {
+        return a_gated_run_learns_on();
+    }
     let scene = scene(&when_lost);
     let (expected, error) = frames(&scene, Device::CPU, false);
     assert!(error.is_none() && expected.len() == 4);
@@ -92,4 +95,34 @@ fn in_a_process_of_its_own() {
             println!("ended with: {}", error.unwrap());
         }
     }
+}
+
+/// Traced, answered and trained on the device until it is lost; then all of that goes on here, with what had come back of the network.
+fn a_gated_run_learns_on() {
+    const STEPS: u64 = 60;
+    let text = format!(
+        "[source]\nkind = \"turbulence\"\nnodes = [48, 24, 24]\n[time]\ntau = 8\nslides = 1\nframes_per_slide = 6\n[flow]\nsteps = 16\n\
+         [surrogate]\nkind = \"network\"\n[network]\nlevels = 4\nlog2_table = 14\nbase_resolution = 8\nwidth = 16\nbatch = 4096\n\
+         [training]\nsteps_per_frame = {STEPS}\n[device]\nwhen_lost = \"cpu\"\n[render]\nmethod = \"gated\"\nwidth = 96\nheight = 64\nsamples = 16\n"
+    );
+    let scene = SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap();
+    let (found, error) = frames(&scene, device(GpuSettings { when_lost: scene.device.when_lost, ..GpuSettings::default() }), true);
+    assert!(error.is_none() && found.len() == 6, "{error:?} after {} frames", found.len());
+    let mut lost_steps = 0;
+    for (i, Frame { record, film, .. }) in found.iter().enumerate() {
+        let (learned, ended) =
+            (record.training.as_ref().unwrap(), record.warnings.iter().filter(|w| w.contains("work on the GPU has ended")));
+        println!("network, frame {i}: {}, {learned:?}, {:?} dB, {:?}", record.device, record.surrogate_psnr, record.warnings);
+        assert_eq!(ended.count(), usize::from(i == 2), "frame {i}: {:?}", record.warnings);
+        assert_eq!(record.device.starts_with("cuda:0"), i < 2, "frame {i}: {}", record.device);
+        assert!(film.rgba.iter().flatten().all(|value| value.is_finite()), "frame {i}");
+        if i != 2 {
+            assert_eq!((learned.steps, learned.device_seconds.is_some()), (STEPS, i < 2), "frame {i}");
+        }
+        lost_steps += learned.lost_steps;
+    }
+    // At most what the two frames before and a part of this one had taken.
+    assert!(lost_steps <= 3 * STEPS, "{lost_steps} steps lost");
+    let [lost, last] = [3, 5].map(|i| found[i].record.surrogate_psnr.unwrap());
+    assert!(last > lost, "it learns on: {lost} dB, then {last}");
 }

@@ -136,7 +136,7 @@ fn predictions_are_the_references() {
         let (model, objective, _) = prepare(&case);
         let network = DeviceNetwork::upload(&gpu(), &model.shape, &objective, &model.tables(), &model.layers()).unwrap();
         // Not a multiple of any tile, with corners, and points outside, which are moved to the edge.
-        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 5003);
+        let mut points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), if small() { 203 } else { 5003 });
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 1.0], [-0.5, 0.3, 2.0]]);
         let found = predict(&network, &points);
         let inside = |p: &[f32; 3]| p.map(|x| x.clamp(0.0, 1.0));
@@ -412,7 +412,7 @@ fn a_ring_is_followed_wherever_it_writes() {
     let average = Average { tables: model.tables(), layers: model.layers() };
     let offload = CudaOffload::new(&gpu());
     assert!(offload.takes(&model.shape, &objective));
-    let mut device = offload.training(&model, &objective, &average).unwrap();
+    let mut device = offload.training(&model, &objective, &average, 1 << 16).unwrap();
     let mut ring = SampleRing::new(1000);
     let mut follow = |ring: &SampleRing, broken: usize| {
         assert_eq!(device.bring(ring, None).unwrap(), Brought { usable: ring.len() - broken, dropped: broken });

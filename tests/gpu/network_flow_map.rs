@@ -5,6 +5,7 @@ use super::network::{check_gradients, few_entries, is_plain, predict, prepare, s
 use super::network_support::reference::{Reference, norm};
 use super::network_support::{self, Case};
 use super::scenes::*;
+use super::small;
 use nalgebra::DMatrix;
 use ridgewatch::engine::cuda::{DeviceNetwork, GpuSettings};
 use ridgewatch::engine::{Device, Frame, RunOptions};
@@ -169,8 +170,9 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         ("plane and both times", GYRE, &["network.inputs=[\"start\", \"duration\"]"]),
         ("published loss", GYRE, &["network.loss=\"published\"", "network.mean_penalty=1.0"]),
     ];
+    let few: &[&str] = if small() { &["training.steps_per_frame=10", "time.frames_per_slide=2", "network.batch=512"] } else { &[] };
     for (name, scene, keys) in runs {
-        let keys: Vec<String> = keys.iter().map(ToString::to_string).collect();
+        let keys: Vec<String> = keys.iter().chain(few).map(ToString::to_string).collect();
         let made = |device: &Device| frames(scene, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
         let (found, expected) = (made(&gpu), made(&Device::CPU));
         for (frames, there) in [(&found, true), (&expected, false)] {
@@ -181,6 +183,10 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
                 // A GPU that walks answers points ahead of their flights; one that only traces does not.
                 assert_eq!(record.traced_ahead > 0, there, "{name}");
             }
+        }
+        if small() {
+            println!("{name}: not held against the CPU's: so few steps say nothing");
+            continue;
         }
         let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
         let (ours, theirs) = (psnr(&found), psnr(&expected));

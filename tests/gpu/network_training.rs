@@ -232,7 +232,7 @@ fn a_loss_that_is_no_number_is_rolled_back() {
         network.predict(&points, &mut values);
         (learned, values)
     };
-    let (learned, before) = predictions(&SampleRing::holding(&samples), 60.0, 100);
+    let (learned, before) = predictions(&SampleRing::holding(&samples), 600.0, 100);
     assert_eq!((learned.steps, learned.rollbacks, learned.lost_steps), (100, 0, 0));
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples };
     let (learned, after) = predictions(&SampleRing::holding(&poison), 2.0, 20);

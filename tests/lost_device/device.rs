@@ -13,7 +13,8 @@ use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_trac
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
 use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
 use ridgewatch::surrogate::{
-    Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing, Samples, Table,
+    Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing,
+    Samples, Table,
 };
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -31,6 +32,8 @@ pub struct Line {
     /// How long a copied network takes to come back, and whether there is room for a copy.
     pub slowness: Mutex<Duration>,
     pub room: AtomicBool,
+    /// Whether there is memory to train a network.
+    pub takes: AtomicBool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -70,7 +73,7 @@ impl Breaking {
     /// Breaks behind so many calls.
     pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
         let (broke_in, slowness, room) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true));
-        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in, slowness, room };
+        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in, slowness, room, takes: AtomicBool::new(true) };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -168,9 +171,12 @@ impl Offload for Training {
     fn takes(&self, _: &Architecture, _: &Objective) -> bool {
         true
     }
-    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>> {
-        self.call("taking a network over").ok()?;
-        Some(Box::new(Network {
+    fn training(&self, model: &Model, objective: &Objective, average: &Average, _: usize) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
+        self.call("taking a network over")?;
+        if !self.line.takes.load(Ordering::Relaxed) {
+            return Err(NotTaken::NoRoom("no room, by the test".into()));
+        }
+        Ok(Box::new(Network {
             there: Training { line: self.line.clone(), health: self.health.clone() },
             fused: Fused::new(model, objective, BATCH),
             model: model.clone(),

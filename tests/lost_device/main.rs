@@ -58,7 +58,7 @@ fn on(device: &Arc<Breaking>, scene: &SceneFile) -> Made {
 
 /// What a record says of the work, whoever did it.
 fn figures(record: &FrameRecord) -> FrameRecord {
-    let training = record.training.clone().map(|learned| Learned { seconds: 0.0, device_seconds: None, ..learned });
+    let training = record.training.clone().map(|learned| Learned { seconds: 0.0, device_seconds: None, not_taken: None, ..learned });
     FrameRecord { device: String::new(), warnings: Vec::new(), seconds: StageSeconds::default(), training, ..record.clone() }
 }
 
@@ -284,6 +284,26 @@ samples = 2
         keys,
     )
     .unwrap()
+}
+
+/// A device that works, without memory to train on: the network is trained on the CPU from the first step, which is told once, and frames stay on
+/// the device.
+#[test]
+fn without_memory_for_training_frames_stay_on_the_device() {
+    let scene = residual(&[]);
+    let expected = made(&scene, Device::CPU);
+    let full = Breaking::new(usize::MAX, How::Fault, WhenLost::Stop);
+    full.line.takes.store(false, std::sync::atomic::Ordering::Relaxed);
+    let found = made(&scene, Device::Gpu { gpu: full.clone(), may_fall_back: false });
+    assert!(found.error.is_none() && found.films == expected.films && expected.films.len() >= 4);
+    for (found, expected) in found.records.iter().zip(&expected.records) {
+        assert_eq!(figures(found), figures(expected));
+        assert_eq!(found.device, NAME);
+        assert!(found.training.as_ref().is_some_and(|learned| learned.device_seconds.is_none() && learned.steps == STEPS));
+    }
+    let told = |i: usize| found.records[i].warnings.iter().filter(|told| told.contains("trained on the CPU: no room")).count();
+    assert!(told(0) == 1 && (1..found.records.len()).all(|i| told(i) == 0));
+    assert_eq!(some(&full.line.calls.lock().unwrap(), "taking a network over").len(), 1, "asked once");
 }
 
 /// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.

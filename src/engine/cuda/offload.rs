@@ -9,7 +9,7 @@ use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraini
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep, Target};
 use crate::surrogate::{
-    Brought, Copied, DeviceLost, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table,
+    Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table,
 };
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -36,16 +36,20 @@ impl Offload for CudaOffload {
         DeviceTraining::takes(&self.0, shape, objective)
     }
 
-    fn training(&self, model: &Model, objective: &Objective, average: &Average) -> Option<Box<dyn OffloadedTraining>> {
-        let gpu = &self.0;
-        let training = gpu.health().ask(|| {
-            let mut training = DeviceTraining::new(gpu, model, objective)?;
-            training.set_average(average)?;
-            Ok(training)
-        })?;
-        let (gpu, below) = (gpu.clone(), TableCopy::default());
-        let (held, pool, pool_base) = (None, None, None);
-        Some(Box::new(CudaTraining { gpu, training, held, pool, pool_base, below, seconds: 0.0, room: Arc::default() }))
+    fn training(
+        &self,
+        model: &Model,
+        objective: &Objective,
+        average: &Average,
+        ring: usize,
+    ) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
+        let taken = self.0.health().ask(|| match CudaTraining::new(&self.0, model, objective, average, ring) {
+            Ok(training) => Ok(Ok(training)),
+            // Frames need less and may go on here.
+            Err(error @ DeviceError::OutOfMemory { .. }) => Ok(Err(NotTaken::NoRoom(error.to_string()))),
+            Err(error) => Err(error),
+        });
+        Ok(Box::new(taken.ok_or(DeviceLost)??))
     }
 }
 
@@ -54,7 +58,8 @@ impl Offload for CudaOffload {
 struct Held {
     samples: DeviceSamples,
     capacity: usize,
-    mark: RingMark,
+    /// None before the first.
+    mark: Option<RingMark>,
     /// The table that targets are relative to.
     base: Option<u64>,
     usable: usize,
@@ -136,6 +141,20 @@ impl OffloadedCopy for CudaCopy {
 }
 
 impl CudaTraining {
+    /// With all that training needs for good, so that what does not fit is refused before it begins.
+    fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective, average: &Average, ring: usize) -> Result<Self, DeviceError> {
+        let mut training = DeviceTraining::new(gpu, model, objective)?;
+        training.set_average(average)?;
+        // To come back to; overwritten with the first step.
+        training.keep()?;
+        let samples = training.ring(ring)?;
+        let held = Some(Held { samples, capacity: ring, mark: None, base: None, usable: 0, more_usable: 0 });
+        let (gpu, below) = (gpu.clone(), TableCopy::default());
+        let mut taken = Self { gpu, training, held, pool: None, pool_base: None, below, seconds: 0.0, room: Arc::default() };
+        taken.pool(ring)?;
+        Ok(taken)
+    }
+
     /// What the device says; nothing more is asked of it once it has failed.
     fn ask<T>(&mut self, call: impl FnOnce(&mut Self) -> Result<T, DeviceError>) -> Result<T, DeviceLost> {
         let gpu = self.gpu.clone();
@@ -148,7 +167,7 @@ impl CudaTraining {
         let stamp = base.map(Table::stamp);
         let held = self.held.take().filter(|held| held.capacity == ring.capacity());
         // Where samples were moved, those of the window before lie behind what the ring holds now.
-        let known = held.as_ref().filter(|held| held.base == stamp && ring.continues(held.mark)).map(|held| held.mark);
+        let known = held.as_ref().filter(|held| held.base == stamp).and_then(|held| held.mark).filter(|&mark| ring.continues(mark));
         let ranges = ring.written_since(known);
         let mut samples = match held {
             Some(held) => held.samples,
@@ -174,7 +193,7 @@ impl CudaTraining {
         }
         let usable = self.training.usable(&samples)?;
         let more_usable = self.training.usable(&pool.samples())?;
-        self.held = Some(Held { samples, capacity: ring.capacity(), mark: ring.mark(), base: stamp, usable, more_usable });
+        self.held = Some(Held { samples, capacity: ring.capacity(), mark: Some(ring.mark()), base: stamp, usable, more_usable });
         Ok(Brought { usable: usable + more_usable, dropped: ring.len() - usable })
     }
 

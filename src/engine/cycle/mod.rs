@@ -308,7 +308,7 @@ impl<'a> Cycle<'a> {
         }
         let offered = self.options.device.offload().is_some();
         if offered && self.live.as_ref().is_some_and(|live| live.learns() && !live.is_offloaded()) {
-            let what = "the network is trained on the CPU: a GPU takes no network.jacobian_weight above 0, and layers that its shared memory holds";
+            let what = "the network is trained on the CPU: a GPU takes no network.jacobian_weight above 0, layers that its shared memory holds, and what its memory has room for";
             slide.warnings.push(what.into());
         }
         slide.warnings.extend(self.beyond_the_range(slide.time));
