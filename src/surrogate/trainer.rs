@@ -46,6 +46,8 @@ struct Kept {
     progress: Progress,
     /// Weights, moments and mean; none where a device keeps them.
     here: Option<([[Vec<f32>; 3]; 2], Average)>,
+    /// Not to be come back to any more; the next copy takes its place, in the same memory.
+    is_stale: bool,
 }
 
 /// A network that a device trains.
@@ -255,7 +257,7 @@ impl Trainer {
         if self.times.tells(tracer.start()) {
             return;
         }
-        self.kept = None;
+        self.disown_kept();
         self.progress.window_slid();
         if let Some(away) = &mut self.away {
             away.training.forget_labels();
@@ -264,7 +266,7 @@ impl Trainer {
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
-        self.kept = None;
+        self.disown_kept();
         let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
         let output = head.weights..head.biases + head.outputs;
         if let Some(away) = &mut self.away {
@@ -335,7 +337,7 @@ impl Trainer {
             // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
             let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
             let may_keep = learned.steps == 0 || (steps as u64).is_multiple_of(KEEP_EVERY);
-            if may_keep && self.kept.as_ref().is_none_or(|kept| steps as u64 >= kept.steps as u64 + apart) {
+            if may_keep && self.kept.as_ref().is_none_or(|kept| kept.is_stale || steps as u64 >= kept.steps as u64 + apart) {
                 self.keep()?;
             }
             let most = (KEEP_EVERY - steps as u64 % KEEP_EVERY).min(max_steps - learned.steps);
@@ -542,25 +544,34 @@ impl Trainer {
         let (steps, progress) = (self.steps(), self.progress);
         if let Some(away) = &mut self.away {
             away.training.keep()?;
-            self.kept = Some(Kept { steps, progress, here: None });
+            self.kept = Some(Kept { steps, progress, here: None, is_stale: false });
             return Ok(());
         }
-        match &mut self.kept {
-            Some(Kept { here: Some((state, average)), steps: kept_steps, progress: kept_progress }) => {
-                self.model.copy_state(state);
+        let here = match self.kept.take().and_then(|kept| kept.here) {
+            Some((mut state, mut average)) => {
+                self.model.copy_state(&mut state);
                 average.tables.copy_from_slice(&self.average.tables);
                 average.layers.copy_from_slice(&self.average.layers);
-                (*kept_steps, *kept_progress) = (steps, progress);
+                (state, average)
             }
-            kept => *kept = Some(Kept { steps, progress, here: Some((self.model.state(), Average::clone(&self.average))) }),
-        }
+            None => (self.model.state(), Average::clone(&self.average)),
+        };
+        self.kept = Some(Kept { steps, progress, here: Some(here), is_stale: false });
         Ok(())
+    }
+
+    /// The copy is not to be come back to any more. Its memory, four times that of the network, stays for the next one: to give it back and to take it
+    /// anew would cost each slide of a window its page faults.
+    fn disown_kept(&mut self) {
+        if let Some(kept) = &mut self.kept {
+            kept.is_stale = true;
+        }
     }
 
     /// Back to the last good weights, at half the rate. The generator moves on, so that the same batches are not drawn again.
     fn roll_back(&mut self) -> Result<(), DeviceLost> {
         let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
-        let Some(kept) = &self.kept else { return Ok(()) };
+        let Some(kept) = self.kept.as_ref().filter(|kept| !kept.is_stale) else { return Ok(()) };
         match (&mut self.away, &kept.here) {
             (Some(away), _) => {
                 away.training.roll_back()?;
@@ -587,6 +598,44 @@ impl Trainer {
             (Ok(()), _) => (model, Arc::new(average), self.progress),
             (Err(DeviceLost), Some((progress, Ok(numbers)))) => (numbers.model.clone(), numbers.average.clone(), progress),
             (Err(DeviceLost), _) => (self.model.clone(), last, away.fetched),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::Domain;
+    use crate::field::analytic::Analytic;
+    use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
+
+    #[test]
+    fn a_slide_keeps_the_memory_of_the_copy_but_nothing_comes_back_from_before_it() {
+        let flow = VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, Domain::slab([-1.0; 2], [1.0; 2], (0.0, 1.0)));
+        let tracer = cpu_tracer(flow, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
+        let settings = NetworkSettings { levels: 2, log2_table: 8, width: 16, batch: 256, ..NetworkSettings::default() };
+        let mut trainer = Trainer::new(&settings, &*tracer, 1, false).unwrap();
+        let mut ring = SampleRing::new(1000);
+        let points: Vec<[f32; 3]> = (0..1000).map(|i| [i as f32 / 1000.0, (i % 7) as f32 / 7.0, 0.5]).collect();
+        ring.push(&Samples { log_stretch: vec![0.7; points.len()], points, ..Samples::default() });
+        let learn = |trainer: &mut Trainer| assert_eq!(trainer.learn(&ring, None, f64::INFINITY, 10).steps, 10);
+        learn(&mut trainer);
+        // So much is asked for nowhere else.
+        let ([[tables, ..], _], _) = trainer.kept.as_mut().unwrap().here.as_mut().unwrap();
+        tables.reserve_exact(12_345);
+        let room = tables.capacity();
+        let forgets: [fn(&mut Trainer, &dyn Tracer); 2] = [Trainer::window_slid, |trainer, _| trainer.forget_output()];
+        for forget in forgets {
+            let before = trainer.steps();
+            forget(&mut trainer, &*tracer);
+            let weights = trainer.model.tables();
+            trainer.roll_back().unwrap_or_else(|_| unreachable!("no device is there"));
+            assert_eq!((trainer.steps(), trainer.model.tables()), (before, weights.clone()), "there is nothing to come back to");
+            learn(&mut trainer);
+            let kept = trainer.kept.as_ref().unwrap();
+            let ([[tables, ..], _], _) = kept.here.as_ref().unwrap();
+            assert_eq!((kept.steps, tables), (before, &weights), "the first step of the new window is taken from a copy");
+            assert_eq!(tables.capacity(), room, "in the same memory");
         }
     }
 }
