@@ -324,7 +324,7 @@ fn main() {
         lines.push(format!("{name}: {}.", checkpoints(&records, &report)));
         let (length, record) = lengths(&records).into_iter().zip(&records[1..]).max_by(|a, b| a.0.total_cmp(&b.0)).unwrap();
         lines.push(format!(
-            "{name}, longest of all {} frames after the warm-up, from record to record, slides apart: {length:.1} ms (frame {} of slide {}).",
+            "{name}, longest of all {} frames after the warm-up, from record to record, slides apart, while the CPU makes the next snapshot: {length:.1} ms (frame {} of slide {}).",
             records.len(),
             record.frame,
             record.slide + 1

@@ -104,7 +104,10 @@ mod bench {
             ("hash 8x2, growth 2, T = 2^19, 2x64", hash(8, 2, 2.0, 19, 64)),
             ("hash 8x2, growth 2, T = 2^22, 2x64", hash(8, 2, 2.0, 22, 64)),
             ("hash 6x4, growth 1.6, T = 2^21, 2x64 (the default)", NetworkSettings::default()),
-            ("hash 8x2, growth 2, T = 2^19, 2x64, start time", NetworkSettings { inputs: vec![Input::Start], ..hash(8, 2, 2.0, 19, 64) }),
+            (
+                "hash 8x2, growth 2, T = 2^19, 2x64, a start time, of one window",
+                NetworkSettings { inputs: vec![Input::Start], ..hash(8, 2, 2.0, 19, 64) },
+            ),
             ("hash 8x2, growth 2, T = 2^19, 2x64, flow map", NetworkSettings { target: Target::FlowMap, ..hash(8, 2, 2.0, 19, 64) }),
             ("hash 8x2, growth 2, T = 2^19, 2x128", hash(8, 2, 2.0, 19, 128)),
             ("hash 8x2, growth 2, T = 2^19, 2x16", hash(8, 2, 2.0, 19, 16)),
@@ -496,7 +499,8 @@ mod bench {
         let KnownPoints { seeds, tested, truth } = KnownPoints::new(&gpu, &space_time, &tracer, &exact)?;
 
         println!("<!-- block network-double-gyre -->");
-        let batch = Batch::new(&gpu, CHUNK)?;
+        let mut batch = Batch::new(&gpu, CHUNK)?;
+        drawer(&gpu, &space_time)?.draw_points(&space_time, 3, 0, &mut batch.points)?;
         let milliseconds = time(&gpu, || batch.trace(&tracer))?;
         println!(
             "Labels, traced with {LABEL_STEPS} steps, {:.0} M/s: {:.1} dB. Tables over x, y and start, by their nodes:\n",

@@ -153,6 +153,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     if let Some(failure) = device.failure() {
         messages::note(format!("work on the GPU has ended, the CPU went on: {failure}"));
     }
+    device.shortages().into_iter().for_each(messages::note);
     let seconds = begun.elapsed().as_secs_f64();
     let tau = tracer.tau();
     let ftle: Vec<f64> =

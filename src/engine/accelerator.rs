@@ -11,6 +11,7 @@ use crate::field::{Domain, Snapshot};
 use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, VelocitySource};
 use crate::render::{Film, RenderStats, Renderer};
 use crate::surrogate::{Offload, Predict, Table};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError, Weak};
@@ -76,10 +77,12 @@ pub trait DeviceRenderer: Send + Sync {
     }
 }
 
-/// Whether a device works. The first failure ends all work on it.
+/// Whether a device works. The first failure ends all work on it; memory that it lacks is none, and costs what wanted it alone.
 #[derive(Debug, Default)]
 pub struct Health {
     failure: Mutex<Option<DeviceError>>,
+    /// What was done instead where memory lacked, and the warning for the first time that it was, until that is told.
+    shortages: Mutex<BTreeMap<&'static str, Option<String>>>,
     /// Whether it has taken work.
     in_use: AtomicBool,
     when_lost: WhenLost,
@@ -106,6 +109,21 @@ impl Health {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
     }
 
+    /// Takes in why a call came to nothing: for want of memory the device goes on, and the caller does `instead`, in words; all else is a
+    /// failure.
+    pub fn fail_unless_full(&self, error: DeviceError, instead: &'static str) {
+        if !error.is_out_of_memory() {
+            return self.fail(error);
+        }
+        let mut shortages = self.shortages.lock().unwrap_or_else(PoisonError::into_inner);
+        shortages.entry(instead).or_insert_with(|| Some(format!("{instead}, this time and whenever the GPU's memory is short: {error}")));
+    }
+
+    /// Warnings of what was done instead where memory lacked, each once.
+    pub fn shortages(&self) -> Vec<String> {
+        self.shortages.lock().unwrap_or_else(PoisonError::into_inner).values_mut().filter_map(Option::take).collect()
+    }
+
     /// The first failure.
     pub fn failure(&self) -> Option<DeviceError> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
@@ -123,6 +141,14 @@ impl Health {
             return None;
         }
         call().map_err(|error| self.fail(error)).ok()
+    }
+
+    /// The same; none also for want of memory, and then the caller does `instead`, in words.
+    pub fn ask_or<T>(&self, instead: &'static str, call: impl FnOnce() -> Result<T, DeviceError>) -> Option<T> {
+        if !self.works() {
+            return None;
+        }
+        call().map_err(|error| self.fail_unless_full(error, instead)).ok()
     }
 
     /// Whether the run is to go on without the device.
@@ -211,7 +237,7 @@ impl TracedNodes for BackedNodes {
         })
     }
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool {
-        self.health.ask(|| self.device.interpolate(points, out)).is_some()
+        self.health.ask_or("the CPU looked points up in a table of the GPU's", || self.device.interpolate(points, out)).is_some()
     }
     fn as_any(&self) -> &dyn std::any::Any {
         self.device.as_any()
@@ -262,22 +288,20 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
     }
 
     fn trace_nodes(&self, nodes: [usize; 3]) -> Option<Arc<dyn TracedNodes>> {
-        let traced = self.health.works().then(|| self.device.trace_nodes(self.domain(), nodes))?;
-        let device = traced.unwrap_or_else(|error| {
-            self.health.fail(error);
-            None
-        })?;
+        // In parts, with memory for seeds and results of one alone.
+        let instead = "a table was traced in parts and is kept on the CPU";
+        let device = self.health.ask_or(instead, || self.device.trace_nodes(self.domain(), nodes))??;
         Some(Arc::new(BackedNodes { device, nodes, host: Arc::downgrade(&self.host), health: self.health.clone() }))
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
-        if self.health.works() {
+        let on_device = || {
             out.set_len(seeds.len(), extras, self.device.double());
-            match self.device.trace(seeds, extras, out) {
-                Ok(()) => return,
-                // The cycle asks for the failure after each frame and records it.
-                Err(error) => self.health.fail(error),
-            }
+            self.device.trace(seeds, extras, out)
+        };
+        // The cycle asks for failures and warnings after each frame and records them.
+        if self.health.ask_or("the CPU traced seeds", on_device).is_some() {
+            return;
         }
         if self.health.check().is_ok() {
             self.host.trace(seeds, extras, out);

@@ -114,7 +114,8 @@ pub struct DeviceSettings {
     pub storage: Storage,
     /// Most device memory that is taken, MiB; none: nine tenths of what is free at start.
     pub memory_mib: Option<u64>,
-    /// What happens when work on the device fails, for whatever reason: it is not tried again in this run.
+    /// What happens when work on the device fails, for whatever reason: it is not tried again in this run. Memory that it lacks once it is at
+    /// work is no failure: the CPU does what wanted it, with a warning. Only a window that no longer fits is one.
     pub when_lost: WhenLost,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
@@ -214,6 +215,15 @@ impl Device {
             Self::Cpu { .. } => None,
             #[cfg(feature = "cuda")]
             Self::Gpu { gpu, .. } => gpu.health().failure().map(|error| error.to_string()),
+        }
+    }
+
+    /// Warnings of what the CPU did for want of the device's memory, each once.
+    pub fn shortages(&self) -> Vec<String> {
+        match self {
+            Self::Cpu { .. } => Vec::new(),
+            #[cfg(feature = "cuda")]
+            Self::Gpu { gpu, .. } => gpu.health().shortages(),
         }
     }
 

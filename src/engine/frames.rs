@@ -76,7 +76,7 @@ impl FrameRenderer for OnCpu {
     }
 }
 
-/// Makes films on the GPU where it can do so alone; otherwise, and once it fails, as on the CPU.
+/// Makes films on the GPU where it can do so alone; otherwise, where its memory lacks, and once it fails, as on the CPU.
 #[cfg(feature = "cuda")]
 struct OnGpu {
     device: Box<dyn DeviceRenderer>,
@@ -99,8 +99,8 @@ impl FrameRenderer for OnGpu {
             match self.device.render(renderer, picture, samples, tracer, answers, progress, stop) {
                 Ok(Some(done)) => return Ok(done),
                 Ok(None) => {}
-                // The same frame on the CPU: same majorants, same random numbers. The cycle hears of the failure after it.
-                Err(EngineError::Device(error)) => self.health.fail(*error),
+                // The same frame on the CPU: same majorants, same random numbers. The cycle hears why after it.
+                Err(EngineError::Device(error)) => self.health.fail_unless_full(*error, "the CPU walked a frame"),
                 Err(error) => return Err(error),
             }
         }
@@ -118,7 +118,7 @@ impl FrameRenderer for OnGpu {
             match self.device.audit(&request, tracer, surrogate) {
                 Ok(Some(done)) => return Ok(done),
                 Ok(None) => {}
-                Err(error) => self.health.fail(error),
+                Err(error) => self.health.fail_unless_full(error, "the CPU drew the points of an audit"),
             }
         }
         self.health.check()?;

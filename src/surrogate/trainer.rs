@@ -120,6 +120,8 @@ pub(super) struct Trainer {
     /// Ranges of the times that are inputs, and the times that are predicted for, in them.
     times: Times,
     asked: [f32; 2],
+    /// Of the latest window.
+    start: f64,
     standardised: bool,
     fused: Option<Fused>,
     kept: Option<Kept>,
@@ -201,6 +203,7 @@ impl Trainer {
             seed,
             times,
             asked: times.unit(tracer.start(), tau),
+            start: tracer.start(),
             standardised: false,
             fused: None,
             kept: None,
@@ -249,10 +252,11 @@ impl Trainer {
     }
 
     /// The window slid: weights carry over, but the average forgets what it has seen, and the rate is the first one again. Where the start
-    /// time is an input, all that was learned stays right, and training goes on as it was.
+    /// time is an input, of this window and the one before, all that was learned stays right, and training goes on as it was.
     pub(super) fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.asked = self.times.unit(tracer.start(), tracer.tau());
-        if self.times.tells(tracer.start()) {
+        let before = std::mem::replace(&mut self.start, tracer.start());
+        if self.times.hold(before, self.start) {
             return;
         }
         self.kept = None;
@@ -310,7 +314,10 @@ impl Trainer {
             self.objective.standardise(&self.model.shape, samples, labels.base);
             self.standardised = true;
         }
-        self.go_away(ring.capacity(), learned);
+        // Its mean and deviation go with it for good, so not before there are any.
+        if self.standardised {
+            self.go_away(ring.capacity(), learned);
+        }
         let sieved;
         let Brought { usable, dropped } = if let Some(away) = &mut self.away {
             away.training.bring(ring, base)?

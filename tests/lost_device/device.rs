@@ -42,19 +42,22 @@ pub enum How {
     Fault,
     /// There is no memory left.
     Refusal,
+    /// There is no memory left for this one kind of call.
+    RefusalOf(&'static str),
 }
 
 impl Line {
     fn call(&self, what: &'static str) -> Result<(), DeviceError> {
         let mut calls = self.calls.lock().unwrap();
         calls.push(what);
-        if calls.len() <= self.breaks_at {
+        let is_other = matches!(self.how, How::RefusalOf(kind) if kind != what);
+        if calls.len() <= self.breaks_at || is_other {
             return Ok(());
         }
         self.broke_in.get_or_init(|| what);
         Err(match self.how {
             How::Fault => DeviceError::Driver { doing: what, reason: "broken by the test".into() },
-            How::Refusal => {
+            How::Refusal | How::RefusalOf(_) => {
                 DeviceError::OutOfMemory { what: what.into(), needed: 1 << 20, used: 0, cap: 0, cap_from: "broken by the test" }
             }
         })
@@ -99,7 +102,10 @@ impl Accelerator for Breaking {
         Some(Arc::new(Training { line: self.line.clone(), health: self.health.clone() }))
     }
     fn expect(&self, _: &Arc<Snapshot>) {
-        if let Err(error) = self.line.call("bringing a snapshot over") {
+        // The window that wants it brings it, where there is no memory to have it early.
+        if let Err(error) = self.line.call("bringing a snapshot over")
+            && error.is_fault()
+        {
             self.health.fail(error);
         }
     }
@@ -343,7 +349,7 @@ impl DeviceRenderer for Render {
         self.line.call("an audit")?;
         let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
         let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref::<Table>()) else { return Ok(None) };
-        let nodes = table.on_device().unwrap().as_any().downcast_ref::<Nodes>().unwrap();
+        let Some(nodes) = table.on_device().and_then(|there| there.as_any().downcast_ref::<Nodes>()) else { return Ok(None) };
         Ok(Some(audit(request.clone(), &*traces.on_device().host, Some(&nodes.table))))
     }
 

@@ -66,6 +66,31 @@ fn has_ended(record: &FrameRecord) -> usize {
     record.warnings.iter().filter(|w| w.contains("work on the GPU has ended") && w.contains("broken by the test")).count()
 }
 
+/// Warnings of memory that a device lacks, and works on.
+fn shortages(record: &FrameRecord) -> usize {
+    record.warnings.iter().filter(|w| w.contains("whenever the GPU's memory is short") && w.contains("broken by the test")).count()
+}
+
+/// A device that has no memory for one kind of call works on, even where a run is to end with it: the CPU does what those calls were for, which is
+/// told once.
+fn refuse_each(scene: &SceneFile, kinds: &[&'static str]) {
+    let expected = made(scene, Device::CPU);
+    for &kind in kinds {
+        let device = Breaking::new(0, How::RefusalOf(kind), WhenLost::Stop);
+        let found = on(&device, scene);
+        assert!(found.error.is_none() && device.line.broke_in.get() == Some(&kind), "{kind}: {:?}", found.error);
+        assert!(found.films == expected.films, "{kind}: the films are the CPU's");
+        for (found, expected) in found.records.iter().zip(&expected.records) {
+            assert_eq!(figures(found), figures(expected), "{kind}: nothing is counted twice or not at all");
+            assert_eq!((found.device.as_str(), has_ended(found)), (NAME, 0), "{kind}");
+        }
+        assert_eq!(found.records.iter().map(shortages).collect::<Vec<_>>()[..2], [1, 0], "{kind}: told once, by the first frame");
+        assert_eq!(found.records.iter().map(shortages).sum::<usize>(), 1, "{kind}: told once");
+        let calls = device.line.calls.lock().unwrap();
+        assert!(calls.iter().filter(|call| **call == kind).count() > 1, "{kind}: asked again");
+    }
+}
+
 /// Breaks the device at every call of a run in turn.
 fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
     let expected = made(scene, Device::CPU);
@@ -93,7 +118,7 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
         let Some(what) = device.line.broke_in.get() else { continue };
         broke_in.insert(*what);
         let case = format!("{how:?} at call {breaks_at} of {calls}, {what}");
-        if how == How::Refusal && *what == "making a tracer" && found.films.is_empty() {
+        if how == How::Refusal && ["making a tracer", "bringing a snapshot over"].contains(what) && found.films.is_empty() {
             // What a device that was asked for by name refuses from the start is an error of the request.
             assert!(matches!(found.error, Some(EngineError::Device(_))), "{case}: {:?}", found.error);
             continue;
@@ -105,6 +130,10 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
         }
         let told: Vec<usize> = (0..found.records.len()).filter(|&i| has_ended(&found.records[i]) > 0).collect();
         assert!(found.records.iter().map(has_ended).sum::<usize>() <= 1, "{case}: told once");
+        let is_short = found.records.iter().any(|record| shortages(record) > 0);
+        // Behind those three it may be lost, or short, or neither.
+        let may_be = how == How::Refusal && ["making a tracer", "making a renderer", "bringing a snapshot over"].contains(what);
+        assert!(may_be || is_short == (how == How::Refusal), "{case}: {is_short}");
         for (i, record) in found.records.iter().enumerate() {
             match told.first() {
                 Some(&told) if i > told => assert_eq!(record.device, "cpu", "{case}, frame {i}"),
@@ -179,6 +208,7 @@ samples = 2
     let kinds =
         ["making a tracer", "making a renderer", "starting a trace", "reading a trace back", "a wave of a frame", "reading a film back"];
     break_everywhere(&scene, &kinds);
+    refuse_each(&scene, &kinds[2..]);
 }
 
 #[test]
@@ -219,6 +249,7 @@ samples = 2
             "bringing a snapshot over",
         ],
     );
+    refuse_each(&scene, &["tracing a table", "looking up in a table", "starting a trace", "reading a trace back", "an audit"]);
 }
 
 /// What `--device auto` may do without from the start, and not once it was taken up.

@@ -1,7 +1,8 @@
 /* How long a solver's step takes, publishing with it: a seven-point diffusion of three components, the part of a solver that memory bounds.
  *
  * Arguments: nodes along each axis (96), steps, microseconds of rest after each, which are not counted (0). Prints the median and 99th percentile of a
- * whole step and the median of publishing alone, in ms. Without steps it reads commands and answers each with a line: "open RING" ("-": none), "run STEPS", "close". */
+ * whole step and the median of publishing alone, in ms. Without steps it reads commands and answers each with a line: "open RING" ("-": none), "run STEPS", "close", and
+ * "spin MILLISECONDS": rounds of pure arithmetic a microsecond, by which threads of one core are told from cores. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -67,6 +68,19 @@ static void run(const char *word, long steps, long rest) {
     free(publishing);
 }
 
+/* Sums that do not wait for each other and stay in registers: what another thread of the same core takes from, and nothing else does. */
+static void spin(long milliseconds) {
+    double sums[8] = {1, 2, 3, 4, 5, 6, 7, 8}, rounds = 0;
+    const double begin = now();
+    do {
+        for (long i = 0; i < 10000; i++)
+            for (int k = 0; k < 8; k++) sums[k] = sums[k] * 0.999 + 1e-3;
+        rounds += 1e4;
+    } while (now() - begin < milliseconds);
+    for (int k = 1; k < 8; k++) sums[0] += sums[k];
+    printf("spin %.3f %g\n", rounds / (now() - begin) * 1e-3, sums[0]);
+}
+
 static void close_ring(void) {
     rw_close(field);
     field = NULL;
@@ -99,6 +113,10 @@ int main(int argc, char **argv) {
             const long count = strtol(line + 4, NULL, 10);
             if (count < 1 || count > 1000000) return 2;
             run("run", count, 0);
+        } else if (!strncmp(line, "spin ", 5)) {
+            const long milliseconds = strtol(line + 5, NULL, 10);
+            if (milliseconds < 1 || milliseconds > 60000) return 2;
+            spin(milliseconds);
         } else if (!strcmp(line, "close")) {
             close_ring();
             puts("close");

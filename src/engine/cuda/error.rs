@@ -122,4 +122,9 @@ impl DeviceError {
     pub fn is_fault(&self) -> bool {
         matches!(self, Self::Driver { .. })
     }
+
+    /// Whether memory was wanted that is not there now. It may be later: frames, slides and other programs give theirs back.
+    pub fn is_out_of_memory(&self) -> bool {
+        matches!(self, Self::OutOfMemory { .. })
+    }
 }

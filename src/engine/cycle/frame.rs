@@ -93,6 +93,7 @@ impl Cycle<'_> {
         if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
             record.warnings.push(format!("work on the GPU has ended, the CPU goes on: {failure}"));
         }
+        record.warnings.extend(self.options.device.shortages());
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {
             self.report.train_steps += learned.steps;

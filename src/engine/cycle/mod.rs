@@ -105,9 +105,9 @@ struct Cycle<'a> {
     renderer: Renderer,
     trust: TrustMap,
     ring: SampleRing,
-    /// The times that are inputs of the network, and whether it tells the window of the ring's labels from others.
+    /// The times that are inputs of the network, and where the window of the ring's labels begins.
     times: Times,
-    told: bool,
+    start: f64,
     live: Option<Box<dyn Surrogate>>,
     /// What it is built from, with the data's own nodes.
     surrogate: SurrogateSettings,
@@ -261,7 +261,7 @@ impl<'a> Cycle<'a> {
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring,
             times,
-            told: times.tells(tracer.start()),
+            start: tracer.start(),
             surrogate,
             sizing,
             resize: None,

@@ -47,8 +47,8 @@ impl Cycle<'_> {
                 heed(self.stop)?;
             }
             self.trust.window_slid();
-            let told = self.times.tells(tracer.start());
-            if !(std::mem::replace(&mut self.told, told) && told) {
+            let before = std::mem::replace(&mut self.start, tracer.start());
+            if !self.times.hold(before, self.start) {
                 self.ring.mark_stale();
                 let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
                 heed(self.stop)?;

@@ -49,7 +49,13 @@ impl Times {
         [start, duration / self.tau].map(|time| time.clamp(0.0, 1.0) as f32)
     }
 
-    /// Whether the network tells this start from others: then labels of other windows stay right.
+    /// Whether labels of a window that begins at `before` stay right beside those of one that begins at `now`: the network tells both starts
+    /// apart. One beyond its range is answered as the end is, which labels of that end contradict.
+    pub fn hold(&self, before: f64, now: f64) -> bool {
+        self.tells(before) && self.tells(now)
+    }
+
+    /// Whether the network tells this start from others.
     pub fn tells(&self, start: f64) -> bool {
         // The last of many slides may end beside the range by rounding.
         self.starts.is_some_and(|[first, last]| {
@@ -70,6 +76,8 @@ mod tests {
         assert_eq!(times.unit(0.0, 1.0), [0.25, 0.25]);
         assert_eq!(times.unit(9.0, 4.0), [1.0, 1.0]);
         assert!(times.tells(-2.0) && times.tells(6.0) && !times.tells(6.1));
+        // A window before the range leaves labels that contradict those of its begin.
+        assert!(times.hold(-2.0, 6.0) && !times.hold(-3.0, -2.0) && !times.hold(6.0, 6.1));
         let blind = Times::new(&NetworkSettings { inputs: Vec::new(), ..settings }, 4.0);
         assert!(!blind.tells(0.0) && blind.unit(3.0, 4.0) == UNTIMED);
     }
