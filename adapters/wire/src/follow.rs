@@ -9,6 +9,8 @@ use std::time::{Duration, Instant};
 
 /// How often new rings are looked for.
 const LOOK: Duration = Duration::from_millis(100);
+/// How often producers are told that somebody follows, at least while [`RingFollower::poll`] or [`RingFollower::beat`] is called.
+const BEAT: Duration = Duration::from_secs(1);
 
 /// What happened to a block.
 #[derive(Debug)]
@@ -56,6 +58,16 @@ struct Followed {
     /// Its end was told.
     ended: bool,
     looked: Instant,
+    /// When its producer was last told that somebody follows.
+    told: Instant,
+}
+
+impl Followed {
+    /// Tells the producer how far its steps were taken. A ring that cannot be written to is one that nobody waits for.
+    fn acknowledge(&mut self, mark: u32) {
+        self.told = Instant::now();
+        let _ = self.reader.acknowledge(mark);
+    }
 }
 
 /// Follows all rings of a folder, each from its oldest step on.
@@ -87,6 +99,7 @@ impl RingFollower {
 
     /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
     pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
+        self.beat();
         if self.looked.is_none_or(|looked| looked.elapsed() > LOOK) {
             if let Some(event) = self.look() {
                 return Some(event);
@@ -100,8 +113,7 @@ impl RingFollower {
             let event = match if followed.refused { Ok(Read::Nothing) } else { followed.reader.read(values) } {
                 Ok(Read::Step(info)) => {
                     self.turn = block + 1;
-                    // A ring that cannot be written to is one that nobody waits for.
-                    let _ = followed.reader.acknowledge(self.mark);
+                    followed.acknowledge(self.mark);
                     let StepInfo { step, time, published, missed, .. } = info;
                     Some(Event::Step { block, generation, step, time, published, missed })
                 }
@@ -132,10 +144,16 @@ impl RingFollower {
     }
 
     /// Tells producers that somebody follows, without taking anything: they wait as long as their policy lets them.
-    pub fn hold(&self) {
-        for followed in self.rings.values().filter(|followed| !followed.refused) {
-            let _ = followed.reader.acknowledge(self.mark);
-        }
+    pub fn hold(&mut self) {
+        let mark = self.mark;
+        self.rings.values_mut().filter(|followed| !followed.refused).for_each(|followed| followed.acknowledge(mark));
+    }
+
+    /// [`Self::hold`] for those producers that have heard nothing for a second: costs nothing in between.
+    pub fn beat(&mut self) {
+        let (mark, now) = (self.mark, Instant::now());
+        let quiet = |followed: &&mut Followed| !followed.refused && now.duration_since(followed.told) > BEAT;
+        self.rings.values_mut().filter(quiet).for_each(|followed| followed.acknowledge(mark));
     }
 
     /// Looks for rings that are new, or that a new producer put in the place of an old one.
@@ -156,10 +174,12 @@ impl RingFollower {
                         continue;
                     }
                     self.refused.remove(&block);
-                    let _ = reader.acknowledge(self.mark);
                     let header = reader.header();
                     let event = Event::Opened { description: Box::new(header.description.clone()), generation: header.generation };
-                    self.rings.insert(block, Followed { reader, refused: false, ended: false, looked: Instant::now() });
+                    let now = Instant::now();
+                    let mut followed = Followed { reader, refused: false, ended: false, looked: now, told: now };
+                    followed.acknowledge(self.mark);
+                    self.rings.insert(block, followed);
                     return Some(event);
                 }
                 Err(WireError::Io { .. }) => {}

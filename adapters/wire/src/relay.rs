@@ -80,6 +80,23 @@ impl Write for Within<'_> {
     }
 }
 
+/// A stream between whose pieces producers are told that somebody follows, however long a step takes on its way.
+struct Beating<'a> {
+    stream: &'a TcpStream,
+    rings: &'a mut RingFollower,
+}
+
+impl Write for Beating<'_> {
+    fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
+        self.rings.beat();
+        (&mut &*self.stream).write(from)
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
 /// Both sides' greetings take [`PATIENCE`] in all; afterwards each piece of a message may.
 fn greet(stream: &TcpStream, greeting: impl FnOnce(&mut Within) -> Result<Session, WireError>) -> Result<Session, WireError> {
     let broken = |e| WireError::io(Path::new("connection"), "broke", e);
@@ -269,7 +286,7 @@ impl Relay {
     }
 
     /// Answers each time that the follower asks with the next thing that happens.
-    fn send_steps(&self, mut stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
+    fn send_steps(&self, stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
         let mut rings = RingFollower::begin(&self.ring, Limits::default())?;
         let (mut values, mut asked) = (Vec::new(), false);
         let (mut sent, mut heard) = (Instant::now(), Instant::now());
@@ -313,7 +330,7 @@ impl Relay {
                 None => continue,
             };
             let step: &[f32] = if facts.kind == Kind::Step { &values } else { &[] };
-            session.send(&mut stream, &facts, description.as_deref(), step)?;
+            session.send(&mut Beating { stream, rings: &mut rings }, &facts, description.as_deref(), step)?;
             // A pulse is no answer. And what takes long to send is taken.
             asked = facts.kind == Kind::Pulse;
             (sent, heard) = (Instant::now(), if asked { heard } else { Instant::now() });
@@ -603,6 +620,33 @@ mod tests {
         assert_eq!(reach(&[closed, open]).unwrap().peer_addr().unwrap(), open);
         assert_eq!(reach(&[closed, closed]).unwrap_err().kind(), ErrorKind::ConnectionRefused);
         assert_eq!(reach(&[]).unwrap_err().kind(), ErrorKind::AddrNotAvailable);
+    }
+
+    #[test]
+    fn producers_hear_of_a_follower_while_a_step_is_sent() {
+        let ring = PathBuf::from("/dev/shm").join(format!("rw-beating-{}", std::process::id()));
+        let axis = |name| crate::AxisDescription::uniform(name, "m", 0.0, 1.0, 2);
+        let description = Description::whole(crate::Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
+        let producer = crate::Producer::open(&ring, description, 2, crate::Policy::NewestWins).unwrap();
+        let mut rings = RingFollower::begin(&ring, Limits::default()).unwrap();
+        assert!(matches!(rings.poll(&mut Vec::new()), Some(Event::Opened { .. })));
+        // The first follower's mark.
+        let heartbeat = || {
+            let (file, mut bytes) = (std::fs::File::open(crate::block_path(&ring, 0)).unwrap(), [0; 8]);
+            std::os::unix::fs::FileExt::read_exact_at(&file, &mut bytes, crate::header::MARK as u64 + 8).unwrap();
+            u64::from_ne_bytes(bytes)
+        };
+        let opened = heartbeat();
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let mut beating = Beating { stream: &stream, rings: &mut rings };
+        beating.write_all(&[0]).unwrap();
+        assert_eq!(heartbeat(), opened, "a second is not over");
+        std::thread::sleep(Duration::from_millis(1100));
+        beating.write_all(&[0]).unwrap();
+        assert!(heartbeat() > opened);
+        drop((rings, producer));
+        assert!(!ring.exists());
     }
 
     #[test]

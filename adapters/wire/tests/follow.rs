@@ -2,42 +2,31 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
+#[path = "support/folder.rs"]
+mod folder;
+
+use folder::Folder;
 use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::relay::{RelayCounts, RelayFollower, serve};
-use ridgewatch_wire::{AxisDescription, Description, Element, Event, Field, Geometry, Limits, Policy, Producer, RingFollower, WireError};
+use ridgewatch_wire::{
+    AxisDescription, Description, Element, Event, Field, Geometry, Limits, Policy, Producer, Published, RingFollower, WireError,
+};
 use std::io::Read;
 use std::net::{TcpListener, TcpStream};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
-
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = PathBuf::from("/dev/shm").join(format!("rw-follow-{name}-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
 
 fn description(nodes: u64) -> Description {
     let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, nodes);
     Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s")
 }
 
-fn publish(producer: &Producer, step: u64) {
+fn publish(producer: &Producer, step: u64) -> Published {
     let plane = vec![step as f32; producer.description().block_nodes() as usize];
     let pointers = [plane.as_ptr().cast::<u8>(); 2];
     // SAFETY: a value a node.
-    unsafe { producer.publish(step, step as f64, &Field::packed(&pointers, Element::F32, producer.description().block.extent)).unwrap() };
+    unsafe { producer.publish(step, step as f64, &Field::packed(&pointers, Element::F32, producer.description().block.extent)).unwrap() }
 }
 
 /// Events in words, until `enough` or five seconds went by.
@@ -72,7 +61,7 @@ fn a_solver_that_ends_and_one_that_starts_anew_are_followed() {
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
-    (0..3).for_each(|n| publish(&producer, n));
+    (0..3).for_each(|n| _ = publish(&producer, n));
     assert_eq!(events(&mut poll, "step 2"), ["opened 4", "step 0 missed 0", "step 1 missed 0", "step 2 missed 0"]);
     publish(&producer, 3);
     drop(producer);
@@ -111,7 +100,7 @@ fn kill(child: libc::pid_t) {
 
 #[test]
 fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
-    let folder = Folder::new("killed");
+    let folder = Folder::alone("killed");
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     let killed = || {
@@ -144,7 +133,7 @@ fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
 
 #[test]
 fn a_solver_that_is_killed_and_replaced_at_once_is_followed() {
-    let folder = Folder::new("replaced");
+    let folder = Folder::alone("replaced");
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     for round in 0..5 {
@@ -210,7 +199,7 @@ fn a_ring_that_lies_is_left_until_a_new_one_comes() {
     std::os::unix::fs::FileExt::write_all_at(&ring, &f64::NAN.to_ne_bytes(), 12288 + 4096 + 16).unwrap();
     assert_eq!(events(&mut poll, "refused"), ["refused `time` is NaN; accepted: a finite number"]);
     // Neither opened nor refused again; its end is told.
-    (3..6).for_each(|n| publish(&producer, n));
+    (3..6).for_each(|n| _ = publish(&producer, n));
     let begin = Instant::now();
     while begin.elapsed() < Duration::from_millis(500) {
         assert!(poll(&mut Vec::new()).is_none());
@@ -265,11 +254,45 @@ fn two_followers_of_a_relay_lose_nothing_of_a_solver_that_waits() {
     }
     publish(&producer, 0);
     std::thread::sleep(Duration::from_millis(300));
-    (1..200).for_each(|n| publish(&producer, n));
+    (1..200).for_each(|n| _ = publish(&producer, n));
     let expected: Vec<String> = ["opened 64".to_owned()].into_iter().chain((0..200).map(|n| format!("step {n} missed 0"))).collect();
     for follower in followers {
         assert_eq!(follower.join().unwrap(), expected);
     }
+}
+
+/// Steps of a burst that overwrote one that was not taken. The solver waits; whoever follows it has found nothing new for longer than a silent
+/// follower is waited for, and then takes its time for each step.
+fn overwritten_after_a_quiet_time(folder: &Folder, poll: &mut dyn FnMut(&mut Vec<f32>) -> Option<Event>) -> usize {
+    let producer = Producer::open(&folder.0, description(4), 2, Policy::Wait(LONG)).unwrap();
+    publish(&producer, 0);
+    assert_eq!(events(poll, "step 0"), ["opened 4", "step 0 missed 0"]);
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(6) {
+        assert!(poll(&mut Vec::new()).is_none());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let burst = std::thread::spawn(move || (1..=8).filter(|n| publish(&producer, *n).overwrote).count());
+    for n in 1..=8 {
+        std::thread::sleep(Duration::from_millis(100));
+        assert_eq!(events(poll, "step"), [format!("step {n} missed 0")]);
+    }
+    burst.join().unwrap()
+}
+
+#[test]
+fn a_follower_that_found_nothing_new_for_long_is_waited_for() {
+    let folder = Folder::new("idle");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    assert_eq!(overwritten_after_a_quiet_time(&folder, &mut |values| follower.poll(values)), 0);
+}
+
+#[test]
+fn a_relay_that_found_nothing_new_for_long_is_waited_for() {
+    let folder = Folder::new("idlerelay");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let mut follower = relay.follow(LONG);
+    assert_eq!(overwritten_after_a_quiet_time(&folder, &mut |values| follower.poll(values, Duration::from_millis(10))), 0);
 }
 
 #[test]
@@ -384,7 +407,7 @@ fn a_pulse_is_no_answer_and_what_was_asked_is_not_asked_again() {
 
 #[test]
 fn a_relay_tells_a_killed_solver_from_one_that_ended() {
-    let folder = Folder::new("lost");
+    let folder = Folder::alone("lost");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
     let mut follower = relay.follow(LONG);
     let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
@@ -454,7 +477,7 @@ fn a_relay_ships_steps_to_those_who_have_the_key() {
         assert_eq!(events(&mut poll, "step"), [format!("step {n} missed 0")]);
     }
     // Far more than the ring and the wire hold: each step is seen or counted, and the newest comes.
-    (20..2000).for_each(|n| publish(&producer, n));
+    (20..2000).for_each(|n| _ = publish(&producer, n));
     let seen = events(&mut poll, "step 1999");
     let missed: usize = seen.iter().map(|words| words.rsplit(' ').next().unwrap().parse::<usize>().unwrap()).sum();
     assert_eq!(seen.len() + missed, 1980);

@@ -63,7 +63,7 @@ impl Link {
     }
 
     /// Says that somebody is there, without taking anything.
-    pub fn hold(&self) {
+    pub fn hold(&mut self) {
         if let Link::Ring(ring) = self {
             ring.hold();
         }
