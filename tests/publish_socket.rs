@@ -138,7 +138,8 @@ async fn strangers_from(own: &str) {
     }
     // They have some seconds to subscribe.
     let mut last = strangers.pop().unwrap();
-    let gone = tokio::io::AsyncReadExt::read_to_end(&mut last, &mut Vec::new());
+    let mut sent = Vec::new();
+    let gone = tokio::io::AsyncReadExt::read_to_end(&mut last, &mut sent);
     tokio::time::timeout(LIMIT, gone).await.expect("whoever does not subscribe is cut off").ok();
     publisher.frame(frame(5001));
     receive(&mut early).await;

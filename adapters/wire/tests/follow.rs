@@ -488,6 +488,31 @@ fn a_relay_may_take_longer_for_a_large_step() {
 }
 
 #[test]
+#[ignore = "takes 12 GB of memory"]
+fn steps_of_two_gigabytes_arrive_over_one_connection() {
+    let folder = Folder::new("gigabytes");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let producer = Producer::open(&folder.0, description(16384), 2, Policy::Wait(4 * LONG)).unwrap();
+    let mut follower = relay.follow(LONG);
+    let solver = std::thread::spawn(move || (0..4).for_each(|n| _ = publish(&producer, n)));
+    let (mut values, mut steps, begin) = (Vec::new(), 0, Instant::now());
+    while steps < 4 {
+        assert!(begin.elapsed() < 4 * LONG, "{steps} steps came");
+        match follower.poll(&mut values, Duration::from_millis(10)) {
+            Some(Event::Step { step, missed, .. }) => {
+                assert!(step == steps && missed == 0 && values.len() == 1 << 29 && values.iter().all(|v| *v == step as f32));
+                steps += 1;
+                println!("step {step} after {:?}", begin.elapsed());
+            }
+            Some(Event::Refused(error)) => panic!("{error}"),
+            _ => {}
+        }
+    }
+    assert_eq!(relay.counts.accepted.load(Ordering::Relaxed), 1);
+    solver.join().unwrap();
+}
+
+#[test]
 fn a_relay_tells_a_killed_solver_from_one_that_ended() {
     let folder = Folder::alone("lost");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
