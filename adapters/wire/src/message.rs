@@ -15,7 +15,7 @@ use crate::system::{self, create_private, open_private};
 use crate::{Description, Limits, WireError};
 use hmac::{Hmac, Mac};
 use sha2::Sha256;
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -221,7 +221,10 @@ impl Session {
         stream.write_all(&greeting(&mine)).map_err(failed)?;
         stream.write_all(&key.signature(&[b"follower", &theirs, &mine])).map_err(failed)?;
         let mut signature = [0; SIGNATURE];
-        stream.read_exact(&mut signature).map_err(failed)?;
+        stream.read_exact(&mut signature).map_err(|e| match e.kind() {
+            ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => WireError::SentAway,
+            _ => failed(e),
+        })?;
         key.verify(&[b"relay", &theirs, &mine], &signature)?;
         Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0, asked: 0 })
     }
