@@ -148,7 +148,7 @@ impl Feed {
         match (closed_form(&scene.source), snapshots) {
             (Some(flow), _) => {
                 let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
-                let domain = Domain { min: box_.min, max: box_.max, dimensions: flow.dimensions() };
+                let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
                 Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
             }
             (None, Some(source)) => {

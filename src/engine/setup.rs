@@ -119,7 +119,7 @@ impl Setup {
             interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
         };
         let domain = match (&closed, &scene.domain, &grid) {
-            (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },
+            (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
             (_, _, Some(grid)) => grid.domain(),
             _ => return Err(no_domain()),
         };
