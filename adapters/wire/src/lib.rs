@@ -8,6 +8,7 @@
 
 mod assemble;
 mod bytes;
+mod choice;
 mod copy;
 #[cfg(test)]
 #[path = "../tests/support/counting.rs"]
@@ -19,6 +20,7 @@ mod header;
 mod lock;
 #[cfg(feature = "messages")]
 pub mod message;
+mod place;
 mod producer;
 mod reader;
 #[cfg(feature = "messages")]
