@@ -41,9 +41,10 @@ define install
   fi
 endef
 
-# Only what is missing is installed.
+# Only what is missing is installed: nothing where pkg-config finds the libraries, or where modules say where they are.
 packages:
-	@missing=""; for p in $(PACKAGES); do dpkg -s $$p >/dev/null 2>&1 || missing="$$missing $$p"; done; \
+	@command -v c++ >/dev/null && command -v pkg-config >/dev/null && { pkg-config --exists hdf5 netcdf || [ -n "$$HDF5_DIR" -a -n "$$NETCDF_DIR" ]; } && exit 0; \
+	missing=""; for p in $(PACKAGES); do dpkg -s $$p >/dev/null 2>&1 || missing="$$missing $$p"; done; \
 	if [ -n "$$missing" ]; then $(call install,$$missing,"(or: make vendored)"); fi
 
 # What fetches Python packages into target/ and .venv. Debian's python3 comes without pip and venv; others' have them.

@@ -165,8 +165,9 @@ fn a_killed_simulation_and_a_killed_sidecar_are_survived() {
     until("frames of the new run", || records(&run).last().is_some_and(|r| r["live"]["restarts"] == 1));
     assert!(records(&run).len() > before);
     drop(sidecar);
-    let again = place.files.join("again");
-    let sidecar = attach(&again);
+    // The same command once more: beside what it made before.
+    let again = place.files.join("run-2");
+    let sidecar = attach(&run);
     until("frames of the new sidecar", || records(&again).len() >= 2);
     drop(solver);
     drop(sidecar);

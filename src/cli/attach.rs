@@ -6,6 +6,7 @@ use super::{Common, Usage, located, messages};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{EngineError, Setup};
+use ridgewatch::publish::RunFolder;
 use ridgewatch::source::live::Live;
 use ridgewatch::source::{SourceError, SourceKind};
 use ridgewatch::surrogate::network::Size;
@@ -49,6 +50,13 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         }
     }
     options.run.apply(&mut scene)?;
+    if !options.run.overwrite {
+        let out = RunFolder::vacant(&options.run.out)?;
+        if out != options.run.out {
+            messages::note(format_args!("{} holds an earlier run: this one goes to {}", options.run.out.display(), out.display()));
+            options.run.out = out;
+        }
+    }
     options.nice.step_back();
     let open = |scene: &SceneFile, stop: &AtomicBool| {
         let refused = |error| located(scene, error, SourceError::refused);
@@ -80,7 +88,14 @@ fn scene(common: &Common, options: &Options) -> Result<SceneFile> {
     }
     match places.as_slice() {
         [] => {}
-        [ring] if is_ring(ring) => overrides.push(format!("live.ring={:?}", ring.display().to_string())),
+        [ring] if is_ring(ring) => {
+            let whole = std::path::absolute(ring)?;
+            // A name that is mistyped would be waited for in silence.
+            if !whole.exists() && whole.extension().is_some() {
+                messages::note(format_args!("{} is not there: taken for a ring's folder, not for a connection file", whole.display()));
+            }
+            overrides.push(format!("live.ring={:?}", whole.display().to_string()));
+        }
         files => {
             if let Some(ring) = files.iter().find(|path| is_ring(path)) {
                 bail!(Usage(format!("{} is a ring beside other paths: give one ring, or connection files", ring.display())));

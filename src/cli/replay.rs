@@ -23,12 +23,12 @@ pub struct Options {
 /// What `replay` and `attach` have in common.
 #[derive(Debug, clap::Args)]
 pub struct RunArguments {
-    /// Run folder.
-    #[arg(long, short, default_value = "out/run")]
-    out: PathBuf,
+    /// Run folder. `replay` refuses one that holds a run; `attach` takes the first of FOLDER, FOLDER-2, FOLDER-3 that does not.
+    #[arg(long, short, value_name = "FOLDER", default_value = "out/run")]
+    pub(super) out: PathBuf,
     /// Replaces an earlier run in that folder.
     #[arg(long)]
-    overwrite: bool,
+    pub(super) overwrite: bool,
     /// Keeps only the newest N frames on disk.
     #[arg(long, value_name = "N")]
     keep: Option<usize>,
@@ -44,7 +44,7 @@ pub struct RunArguments {
     /// Begins no further frame after N seconds of wall clock.
     #[arg(long, value_name = "N", value_parser = super::seconds)]
     seconds: Option<f64>,
-    /// Writes the trained surrogate here at the end.
+    /// Writes the trained surrogate here at the end; `attach` every 30 seconds too, and goes on from it when it is started again.
     #[arg(long, value_name = "FILE")]
     pub(super) checkpoint: Option<PathBuf>,
     /// Starts from a surrogate written by --checkpoint.
@@ -105,6 +105,10 @@ async fn frames(
     checkpoint_seconds: Option<f64>,
     open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
 ) -> Result<()> {
+    // Before anything is waited for or read; what another run makes of the folder meanwhile is refused below.
+    if !options.overwrite {
+        RunFolder::refuse_occupied(&options.out)?;
+    }
     let stop = Arc::new(AtomicBool::new(false));
     // A source that is waited for must be left by a signal; one that is there is opened before signals are caught, so that they end it at once.
     let early = if checkpoint_seconds.is_some() { watch_signals(stop.clone()).map(tokio::spawn) } else { None };

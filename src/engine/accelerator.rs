@@ -10,7 +10,7 @@ use super::device::WhenLost;
 use crate::field::{Domain, Snapshot};
 use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, VelocitySource};
 use crate::render::{Film, RenderStats, Renderer};
-use crate::surrogate::{Offload, Predict, Table};
+use crate::surrogate::{DeviceLost, NotTaken, Offload, Predict, Table};
 use std::collections::BTreeMap;
 use std::fmt;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -149,6 +149,17 @@ impl Health {
             return None;
         }
         call().map_err(|error| self.fail_unless_full(error, instead)).ok()
+    }
+
+    /// The same; for want of memory the reason, and the caller says what is done instead.
+    ///
+    /// # Errors
+    /// Once the device has failed, and for want of memory.
+    pub fn ask_for_room<T>(&self, call: impl FnOnce() -> Result<T, DeviceError>) -> Result<T, NotTaken> {
+        let full = |error: DeviceError| {
+            if error.is_out_of_memory() { Ok(Err(NotTaken::NoRoom(error.to_string()))) } else { Err(error) }
+        };
+        self.ask(|| call().map(Ok).or_else(full)).ok_or(DeviceLost)?
     }
 
     /// Whether the run is to go on without the device.

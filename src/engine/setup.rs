@@ -79,6 +79,9 @@ impl Setup {
                 notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
                 tau
             }
+            (None, None) if scene.source.kind == SourceKind::Live => {
+                return Err(Refused::new("time.tau", "is missing", "a duration in the simulation's time (attach --tau TIME)").into());
+            }
             (None, None) => return Err(Refused::new("time.tau", "is missing", "a number above 0").into()),
         };
         if archive

@@ -128,7 +128,7 @@ pub(super) fn train(
         sum.rollbacks += slice.rollbacks;
         sum.lost_steps += slice.lost_steps;
         sum.device_seconds = slice.device_seconds.map(|seconds| seconds + sum.device_seconds.unwrap_or(0.0)).or(sum.device_seconds);
-        sum.not_taken = sum.not_taken.or(slice.not_taken);
+        sum.warnings.extend(slice.warnings);
         if slice.steps == 0 {
             break;
         }

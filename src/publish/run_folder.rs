@@ -70,32 +70,51 @@ pub struct Written {
 }
 
 impl RunFolder {
+    /// `path`, or where that holds a run the first of `path-2`, `path-3` and so on that does not: a run that is started again goes on beside
+    /// what it made before.
+    ///
+    /// # Errors
+    /// A folder that cannot be read.
+    pub fn vacant(path: &Path) -> Result<PathBuf, PublishError> {
+        let numbered = (2_u32..).map(|n| {
+            let mut name = path.as_os_str().to_owned();
+            name.push(format!("-{n}"));
+            PathBuf::from(name)
+        });
+        for place in std::iter::once(path.to_owned()).chain(numbered) {
+            if occupied(&place).map_err(|source| PublishError::Folder { path: place.clone(), source })?.is_none() {
+                return Ok(place);
+            }
+        }
+        unreachable!("a folder holds fewer than 2^32 others")
+    }
+
+    /// Refuses a folder that holds a run, and changes nothing.
+    ///
+    /// # Errors
+    /// It holds one, or cannot be read.
+    pub fn refuse_occupied(path: &Path) -> Result<(), PublishError> {
+        match occupied(path).map_err(|source| PublishError::Folder { path: path.to_owned(), source })? {
+            Some(found) => Err(PublishError::Occupied { path: path.to_owned(), found }),
+            None => Ok(()),
+        }
+    }
+
     /// Makes the folder ready and proves that it can be written, before any work starts. A folder that already holds a run is
     /// refused, unless `overwrite`: then the files that a run writes are removed, and no others.
     pub fn create(path: &Path, overwrite: bool) -> Result<Self, PublishError> {
         let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
         let frames = path.join(FRAMES);
         fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
-        let old = run_files(path).map_err(|e| refuse(path, e))?;
-        let aside = path.join(PREVIOUS);
-        // A run that failed before its first frame left nothing that anybody could miss.
-        let empty = old.iter().all(|file| match file.file_name().and_then(|name| name.to_str()) {
-            Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
-            Some(name) => !is_picture(name),
-            None => false,
-        });
-        // `.previous` beside a run without a frame was left by a process that was killed: it holds the run that counts.
-        if aside.exists() && !overwrite {
-            return Err(PublishError::Occupied { path: path.to_owned(), found: PREVIOUS.into() });
+        if !overwrite {
+            Self::refuse_occupied(path)?;
         }
+        let old = run_files(path).map_err(|e| refuse(path, e))?;
+        let (aside, empty) = (path.join(PREVIOUS), old.iter().all(|file| is_empty(file)));
         if aside.exists() && !empty {
             fs::remove_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
         }
         for old in old {
-            if !overwrite && !empty {
-                let found = old.strip_prefix(path).unwrap_or(&old).display().to_string();
-                return Err(PublishError::Occupied { path: path.to_owned(), found });
-            }
             if empty {
                 fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
                 continue;
@@ -267,6 +286,29 @@ fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
+/// What of a run is in a folder, which need not be there.
+fn occupied(path: &Path) -> io::Result<Option<String>> {
+    // Beside a run without a frame it was left by a process that was killed: it holds the run that counts.
+    if path.join(PREVIOUS).exists() {
+        return Ok(Some(PREVIOUS.into()));
+    }
+    let files = match run_files(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        files => files?,
+    };
+    let holds = !files.iter().all(|file| is_empty(file));
+    Ok(files.first().filter(|_| holds).map(|file| file.strip_prefix(path).unwrap_or(file).display().to_string()))
+}
+
+/// Whether a file of a run is one that nobody could miss: of a run that failed before its first frame.
+fn is_empty(file: &Path) -> bool {
+    match file.file_name().and_then(|name| name.to_str()) {
+        Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
+        Some(name) => !is_picture(name),
+        None => false,
+    }
+}
+
 /// Whether a run gives a picture this name, finished or in the making.
 fn is_picture(name: &str) -> bool {
     let name = name.strip_prefix('.').and_then(|n| n.strip_suffix(".part")).unwrap_or(name);
@@ -384,6 +426,16 @@ mod tests {
         }
         let refused = RunFolder::create(folder.path(), false).unwrap_err().to_string();
         assert!(refused.contains("--overwrite") && refused.contains("records.jsonl"), "{refused}");
+        let inner = folder.path().join("run");
+        for expected in ["run", "run-2", "run-3"] {
+            let vacant = RunFolder::vacant(&inner).unwrap();
+            assert_eq!(vacant, folder.path().join(expected));
+            RunFolder::create(&vacant, false).unwrap().append_record(&frame(0).record).unwrap();
+        }
+        // A run without a frame is no run.
+        fs::write(inner.join(RECORDS), "").unwrap();
+        assert_eq!(RunFolder::vacant(&inner).unwrap(), inner);
+        fs::remove_dir_all(&inner).unwrap();
 
         fs::write(folder.path().join("frames/.frame_000007.exr.part"), "half").unwrap();
         let run = RunFolder::create(folder.path(), true).unwrap();

@@ -43,7 +43,11 @@ impl Draft {
     ///
     /// # Errors
     /// What the system says, and a device that was lost before its copy had come back.
-    pub fn write(&self, path: &Path) -> Result<u64, CheckpointError> {
+    pub fn write(mut self, path: &Path) -> Result<u64, CheckpointError> {
+        // First, since the next slide wants the memory of what a device holds, and the network and the disk take their time.
+        if let Some(table) = &mut self.table {
+            table.leave_device();
+        }
         let mut checkpoint = Checkpoint::new(self.kind);
         for (key, text) in &self.notes {
             checkpoint.note(key, text.clone());

@@ -92,9 +92,9 @@ pub struct Learned {
     /// Of them, seconds of a device that took the steps; none where the CPU took them.
     #[serde(default)]
     pub device_seconds: Option<f64>,
-    /// Why a device that works did not take the network over, in the call where that was found.
+    /// What should be told of a device that works but lacks memory, in words, once each.
     #[serde(skip)]
-    pub not_taken: Option<String>,
+    pub warnings: Vec<String>,
 }
 
 impl Learned {
@@ -112,7 +112,7 @@ impl Learned {
             rollbacks: self.rollbacks + other.rollbacks,
             seconds: self.seconds + other.seconds,
             device_seconds: self.device_seconds.map(|mine| mine + other.device_seconds.unwrap_or(0.0)).or(other.device_seconds),
-            not_taken: self.not_taken.or(other.not_taken),
+            warnings: [self.warnings, other.warnings].concat(),
         }
     }
 }
@@ -173,6 +173,8 @@ pub trait Surrogate: Predict {
     /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over; a network with the start time as an input
     /// goes on learning as before, and predicts for the new start.
     fn window_slid(&mut self, tracer: &dyn Tracer);
+    /// Lets go of the table that a device holds, its values coming over: another surrogate is about to take this one's place.
+    fn leave_device(&mut self) {}
     /// Everything needed to go on (weights, optimizer state, base table) as it is now. Where a device trains, its numbers are waited for.
     fn draft(&self) -> Draft;
     /// The same without waiting, to be written by another thread: where a device trains, it copies its numbers, which come back as they are

@@ -14,7 +14,7 @@ pub trait Offload: Send + Sync {
     /// Whether networks of this shape can be trained there.
     fn takes(&self, shape: &Architecture, objective: &Objective) -> bool;
 
-    /// Takes a network over, parameters, moments and their running mean, with room for a ring of so many samples.
+    /// Takes a network over, parameters, moments and their running mean, with room for a ring of so many samples, and for steps of at most so many.
     ///
     /// # Errors
     /// [`NotTaken`]; nothing is left there then.
@@ -24,16 +24,17 @@ pub trait Offload: Send + Sync {
         objective: &Objective,
         average: &Average,
         ring: usize,
+        batch: usize,
     ) -> Result<Box<dyn OffloadedTraining>, NotTaken>;
 }
 
-/// Why a device does not take a network over.
+/// Why a device does not take a network over, or samples and steps of one that it has.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 pub enum NotTaken {
     /// It is lost.
     #[error(transparent)]
     Lost(#[from] DeviceLost),
-    /// It works, but has no memory for the network or its samples; which, in words.
+    /// It works, but has no memory for it; for what, in words. What it has of the network is as it was, and can be brought back.
     #[error("{0}")]
     NoRoom(String),
 }
@@ -52,20 +53,21 @@ pub struct Brought {
     pub dropped: usize,
 }
 
-/// A network in training on a device, where any call may be the last: every one of them may fail with [`DeviceLost`].
+/// A network in training on a device, where any call may be the last: every one of them may fail with [`DeviceLost`], and those that take memory with
+/// [`NotTaken`].
 #[allow(clippy::missing_errors_doc)] // said above
 pub trait OffloadedTraining: Send + Sync {
     /// Brings over what `ring` has got since the last call, with what the labels have beyond `base` as targets.
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost>;
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken>;
 
     /// What was traced on the device so far is wrong from now on: the window has slid.
     fn forget_labels(&mut self);
 
-    /// Takes steps on the samples that were brought over; the loss of each, before it.
-    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost>;
+    /// Takes steps on the samples that were brought over; the loss of each, before it. Where there is no memory for one, those before it are taken.
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken>;
 
     /// Remembers parameters, moments and mean as what to come back to.
-    fn keep(&mut self) -> Result<(), DeviceLost>;
+    fn keep(&mut self) -> Result<(), NotTaken>;
 
     /// Comes back to what was kept last.
     fn roll_back(&mut self) -> Result<(), DeviceLost>;
@@ -77,9 +79,9 @@ pub trait OffloadedTraining: Send + Sync {
     fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost>;
 
     /// What the running mean predicts, for good.
-    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost>;
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken>;
 
-    /// Brings parameters, moments and mean back, and waits for them.
+    /// Brings parameters, moments and mean back, and waits for them. Takes no memory there.
     fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost>;
 
     /// Copies parameters, moments and mean where they are, to be brought back by another thread while training goes on. Not asked for while the

@@ -169,6 +169,10 @@ impl Surrogate for Residual {
         (self.slid, self.shrinkage) = (true, 0.0);
     }
 
+    fn leave_device(&mut self) {
+        self.table.leave_device();
+    }
+
     fn draft(&self) -> Draft {
         self.drafted(self.trainer.draft())
     }

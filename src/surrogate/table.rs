@@ -29,7 +29,7 @@ enum Values {
     /// On the host.
     Here(Arc<Vec<f32>>),
     /// With the device that traced them, and on the host once somebody there asked for them.
-    There(Arc<dyn TracedNodes>, Arc<OnceLock<Vec<f32>>>),
+    There(Arc<dyn TracedNodes>, Arc<OnceLock<Arc<Vec<f32>>>>),
 }
 
 impl Table {
@@ -90,7 +90,14 @@ impl Table {
     pub fn values(&self) -> &[f32] {
         match &self.values {
             Values::Here(values) => values,
-            Values::There(there, copy) => copy.get_or_init(|| there.values()),
+            Values::There(there, copy) => copy.get_or_init(|| Arc::new(there.values())),
+        }
+    }
+
+    /// Brings values over that a device holds, and lets go of that: its memory is free once nobody else holds it.
+    pub(super) fn leave_device(&mut self) {
+        if let Values::There(there, copy) = &self.values {
+            self.values = Values::Here(copy.get_or_init(|| Arc::new(there.values())).clone());
         }
     }
 
@@ -215,6 +222,10 @@ impl Surrogate for Table {
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.retrace(tracer);
+    }
+
+    fn leave_device(&mut self) {
+        Self::leave_device(self);
     }
 
     fn draft(&self) -> Draft {

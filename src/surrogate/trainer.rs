@@ -22,6 +22,8 @@ use std::time::{Duration, Instant};
 mod progress;
 mod restart;
 mod returning;
+#[cfg(test)]
+mod tests;
 
 pub(super) use restart::NetworkDraft;
 
@@ -67,6 +69,10 @@ struct Away {
     step_seconds: f64,
     /// What it predicts since the latest step.
     frozen: OnceLock<Arc<dyn OffloadedNetwork>>,
+    /// Why there is no memory for that; then training comes back with the next call.
+    full: OnceLock<String>,
+    /// Whether it was told that training waits for it to come back.
+    told_of_waiting: bool,
 }
 
 impl Drop for Away {
@@ -89,12 +95,17 @@ enum Sent {
 }
 
 impl Away {
-    fn frozen(&self) -> Option<Arc<dyn OffloadedNetwork>> {
+    /// Seconds after which it comes back again.
+    fn apart(&self) -> f64 {
+        FETCH_EVERY.max(FETCH_APART * self.fetch_seconds)
+    }
+
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
         if let Some(frozen) = self.frozen.get() {
-            return Some(frozen.clone());
+            return Ok(frozen.clone());
         }
-        let frozen = self.training.frozen().ok()?;
-        Some(self.frozen.get_or_init(|| frozen).clone())
+        let frozen = self.training.frozen()?;
+        Ok(self.frozen.get_or_init(|| frozen).clone())
     }
 }
 
@@ -141,26 +152,17 @@ pub(super) struct FrozenNetwork {
     stamp: u64,
 }
 
-/// By the device where it is there, otherwise here.
-fn predict(
-    on_device: Option<&dyn OffloadedNetwork>,
-    (shape, objective, average, predictor): (&Architecture, &Objective, &Average, &Predictor),
-    points: &[[f32; 3]],
-    times: [f32; 2],
-    out: &mut [f32],
-) {
-    if on_device.is_none_or(|network| network.predict(points, times, out).is_err()) {
-        predictor.log_stretch(shape, objective, &average.tables, points, times, out);
-    }
-}
-
 impl Predict for FrozenNetwork {
     fn name(&self) -> &'static str {
         "network"
     }
 
+    /// By the device where it is there, otherwise here.
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        predict(self.on_device.as_deref(), (&self.shape, &self.objective, &self.average, &self.predictor), points, self.asked, out);
+        let Self { shape, objective, average, predictor, on_device, asked, .. } = self;
+        if on_device.as_ref().is_none_or(|network| network.predict(points, *asked, out).is_err()) {
+            predictor.log_stretch(shape, objective, &average.tables, points, *asked, out);
+        }
     }
 
     fn bytes(&self) -> usize {
@@ -172,6 +174,11 @@ impl Predict for FrozenNetwork {
         let (on_device, tables, layers) = (self.on_device.as_deref(), &average.tables, &average.layers);
         Some(NetworkState { stamp: *stamp, shape, objective, tables, layers, times: *asked, on_device, base: None })
     }
+}
+
+/// The warning of a device that works, but not for training.
+fn trained_here(why: &str) -> String {
+    format!("the network is trained on the CPU: {why}")
 }
 
 impl Trainer {
@@ -229,21 +236,26 @@ impl Trainer {
 
     /// Writes the log-stretch (or the residual's part of it) at each point.
     pub(super) fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        let frozen = self.away.as_ref().and_then(Away::frozen);
-        predict(frozen.as_deref(), (&self.model.shape, &self.objective, &self.average, &self.predictor), points, self.asked, out);
+        self.frozen().predict(points, out);
     }
 
     /// What predicts now, for good.
     pub(super) fn frozen(&self) -> FrozenNetwork {
-        FrozenNetwork {
-            shape: self.model.shape.clone(),
-            objective: self.objective.clone(),
-            average: self.average.clone(),
-            predictor: self.predictor.clone(),
-            on_device: self.away.as_ref().and_then(Away::frozen),
-            asked: self.asked,
-            stamp: fresh_stamp(),
+        let (mut average, mut predictor, mut on_device) = (self.average.clone(), self.predictor.clone(), None);
+        if let Some(away) = &self.away {
+            match away.frozen() {
+                Ok(frozen) => on_device = Some(frozen),
+                // What it predicts then is here already: what came back last.
+                Err(NotTaken::Lost(_)) => {}
+                Err(NotTaken::NoRoom(why)) => {
+                    away.full.get_or_init(|| why);
+                    average = self.present().1;
+                    predictor = Arc::new(Predictor::new(&self.model.shape, &average.layers));
+                }
+            }
         }
+        let (shape, objective) = (self.model.shape.clone(), self.objective.clone());
+        FrozenNetwork { shape, objective, average, predictor, on_device, asked: self.asked, stamp: fresh_stamp() }
     }
 
     /// Parameters that prediction reads, in bytes.
@@ -288,7 +300,17 @@ impl Trainer {
         let start = Instant::now();
         let began = self.steps();
         let mut learned = Learned::default();
-        if self.train(ring, base, start, seconds, max_steps, &mut learned).is_err() {
+        let mut trained = self.train(ring, base, start, seconds, max_steps, &mut learned);
+        if let Err(NotTaken::NoRoom(why)) = &trained
+            && self.come_back().is_ok()
+        {
+            learned.steps = self.steps().saturating_sub(began) as u64;
+            learned.warnings.push(trained_here(why));
+            let there = std::mem::take(&mut learned);
+            trained = self.train(ring, base, start, seconds, max_steps.saturating_sub(there.steps), &mut learned);
+            learned = there.and(learned);
+        }
+        if trained.is_err() {
             let reached = self.steps();
             self.lose_device();
             learned.steps = self.steps().saturating_sub(began) as u64;
@@ -307,7 +329,7 @@ impl Trainer {
         seconds: f64,
         max_steps: u64,
         learned: &mut Learned,
-    ) -> Result<(), DeviceLost> {
+    ) -> Result<(), NotTaken> {
         let samples = ring.samples();
         let mut labels = Labels { samples, among: None, base: base.map(|base| base as &dyn Field) };
         if !self.standardised && (0..samples.len()).any(|index| self.objective.usable(samples, index)) {
@@ -320,6 +342,9 @@ impl Trainer {
         }
         let sieved;
         let Brought { usable, dropped } = if let Some(away) = &mut self.away {
+            if let Some(why) = away.full.get() {
+                return Err(NotTaken::NoRoom(why.clone()));
+            }
             away.training.bring(ring, base)?
         } else {
             // Training reads the table in pieces by many threads: it had better be here before they start.
@@ -347,8 +372,10 @@ impl Trainer {
             }
             let most = (KEEP_EVERY - steps as u64 % KEEP_EVERY).min(max_steps - learned.steps);
             let group = most.min(self.group(seconds - start.elapsed().as_secs_f64()));
+            let before = self.progress;
             let planned: Vec<(PlannedStep, u64)> = (0..group).map(|_| self.plan(count, base.is_some())).collect();
-            let found = self.take(&planned, labels)?;
+            // What could not be taken is planned anew.
+            let found = self.take(&planned, labels).inspect_err(|_| self.progress = before)?;
             learned.samples += (found.len() * count) as u64;
             let mut diverged = false;
             for (loss, (_, averaged)) in found.into_iter().zip(&planned) {
@@ -360,6 +387,7 @@ impl Trainer {
                 losses += loss;
                 self.progress.observe(loss, *averaged);
             }
+            learned.loss = (counted > 0).then(|| losses / counted as f64);
             if diverged {
                 learned.rollbacks += 1;
                 // The moments are part of what diverged; so the steps since the last copy are lost.
@@ -374,8 +402,7 @@ impl Trainer {
             }
             learned.steps = self.steps().saturating_sub(began) as u64;
         }
-        learned.loss = (counted > 0).then(|| losses / counted as f64);
-        self.settle()
+        Ok(self.settle(learned)?)
     }
 
     /// Brings the network to the device that is to train it, once; where that does not take it, training stays here.
@@ -384,12 +411,14 @@ impl Trainer {
             return;
         }
         let Some(offload) = &self.offload else { return };
-        let training = match offload.training(&self.model, &self.objective, &self.average, ring) {
+        let training = match offload.training(&self.model, &self.objective, &self.average, ring, self.settings.batch) {
             Ok(training) => training,
             Err(why) => {
                 self.offload = None;
                 // What is lost is told where it happened.
-                learned.not_taken = Some(why).filter(|why| matches!(why, NotTaken::NoRoom(_))).map(|why| why.to_string());
+                if let NotTaken::NoRoom(why) = why {
+                    learned.warnings.push(trained_here(&why));
+                }
                 return;
             }
         };
@@ -405,7 +434,25 @@ impl Trainer {
             brings: None,
             step_seconds: 0.0,
             frozen: OnceLock::new(),
+            full: OnceLock::new(),
+            told_of_waiting: false,
         });
+    }
+
+    /// Goes on here, with all that was learned: the device works, but lacks memory.
+    fn come_back(&mut self) -> Result<(), DeviceLost> {
+        self.fetch_now()?;
+        (self.offload, self.kept, self.away) = (None, None, None);
+        Ok(())
+    }
+
+    /// Brings back what a device has learned, and waits for it.
+    fn fetch_now(&mut self) -> Result<(), DeviceLost> {
+        let Some(away) = &mut self.away else { return Ok(()) };
+        away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
+        away.fetched = self.progress;
+        self.pack();
+        Ok(())
     }
 
     /// Goes on here, from what came back last. The generator moves on, so that the same batches are not drawn again.
@@ -419,24 +466,33 @@ impl Trainer {
     }
 
     /// Brings back what a device has learned, behind the back of training; where there is no memory for that, training waits.
-    fn fetch(&mut self) -> Result<(), DeviceLost> {
+    fn fetch(&mut self, learned: &mut Learned) -> Result<(), DeviceLost> {
         let begin = Instant::now();
-        let sent = self.send_for()?;
-        let Some(away) = &mut self.away else { return Ok(()) };
-        match sent {
+        let mut waited_for = None;
+        match self.send_for()? {
             Sent::For(returning) => {
                 let name = "ridgewatch-fetch".to_owned();
                 // What fails there is told where it happens. Without a thread nothing comes back this time.
-                away.brings = std::thread::Builder::new().name(name).spawn(move || drop(returning.bring().cloned())).ok();
+                let brings = std::thread::Builder::new().name(name).spawn(move || drop(returning.bring().cloned())).ok();
+                if let Some(away) = &mut self.away {
+                    away.brings = brings;
+                }
             }
             Sent::Before => return Ok(()),
-            Sent::NoRoom(_) => {
-                away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
-                away.fetched = self.progress;
-                self.predictor = Arc::new(Predictor::new(&self.model.shape, &self.average.layers));
+            Sent::NoRoom(why) => {
+                self.fetch_now()?;
+                waited_for = Some(why);
             }
         }
+        let Some(away) = &mut self.away else { return Ok(()) };
         (away.fetched_at, away.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
+        if let Some(why) = waited_for.filter(|_| !std::mem::replace(&mut away.told_of_waiting, true)) {
+            learned.warnings.push(format!(
+                "training waited {:.2} s for the network to come back from the GPU, this time and every {:.0} s or so: {why}",
+                away.fetch_seconds,
+                away.apart()
+            ));
+        }
         Ok(())
     }
 
@@ -505,7 +561,7 @@ impl Trainer {
     }
 
     /// Takes the steps, wherever the network is; the loss of each, before it.
-    fn take(&mut self, planned: &[(PlannedStep, u64)], labels: Labels<'_>) -> Result<Vec<f64>, DeviceLost> {
+    fn take(&mut self, planned: &[(PlannedStep, u64)], labels: Labels<'_>) -> Result<Vec<f64>, NotTaken> {
         if let Some(away) = &mut self.away {
             let begin = Instant::now();
             let steps: Vec<PlannedStep> = planned.iter().map(|(step, _)| *step).collect();
@@ -526,7 +582,7 @@ impl Trainer {
     }
 
     /// After the last step of a call: what predicts is up to date, and every minute or so it comes back from where it is trained.
-    fn settle(&mut self) -> Result<(), DeviceLost> {
+    fn settle(&mut self, learned: &mut Learned) -> Result<(), DeviceLost> {
         let restart = self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY;
         if let Some(away) = &mut self.away {
             if restart {
@@ -534,8 +590,8 @@ impl Trainer {
             }
             self.take_in();
             let Some(away) = &self.away else { return Ok(()) };
-            let due = away.fetched_at.elapsed().as_secs_f64() >= FETCH_EVERY.max(FETCH_APART * away.fetch_seconds);
-            return if due { self.fetch() } else { Ok(()) };
+            let due = away.fetched_at.elapsed().as_secs_f64() >= away.apart();
+            return if due { self.fetch(learned) } else { Ok(()) };
         }
         if restart {
             self.average = Arc::new(Average { tables: self.model.tables(), layers: self.model.layers() });
@@ -545,7 +601,7 @@ impl Trainer {
     }
 
     /// Copies the present weights as what to come back to.
-    fn keep(&mut self) -> Result<(), DeviceLost> {
+    fn keep(&mut self) -> Result<(), NotTaken> {
         let (steps, progress) = (self.steps(), self.progress);
         if let Some(away) = &mut self.away {
             away.training.keep()?;

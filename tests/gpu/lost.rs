@@ -97,6 +97,30 @@ fn in_a_process_of_its_own() {
     }
 }
 
+/// A table of 8 MiB under a cap of 12, part of which the window has: the device traces it in parts, the CPU keeps it and walks, which is told once; and the
+/// run goes on, though it was to end with the device.
+#[test]
+#[ignore = "needs a GPU"]
+fn memory_that_lacks_is_no_loss() {
+    let text = "[source]\nkind = \"turbulence\"\nnodes = [48, 32, 32]\nsnapshots = 8\n[time]\ntau = 4\n[flow]\nsteps = 8\n[surrogate]\nkind = \"table\"\n\
+         table_nodes = [128, 128, 128]\n[device]\nwhen_lost = \"stop\"\n[render]\nmethod = \"surrogate\"\nwidth = 96\nheight = 64\nsamples = 16\n";
+    let scene = SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap();
+    let (expected, error) = frames(&scene, Device::CPU, false);
+    assert!(error.is_none() && expected.len() == 4);
+    let settings = GpuSettings { memory_cap: Some(12 << 20), when_lost: scene.device.when_lost, ..GpuSettings::default() };
+    let (found, error) = frames(&scene, device(settings), false);
+    assert!(error.is_none() && found.len() == 4, "{error:?} after {} frames", found.len());
+    for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {
+        let record = &found.record;
+        let psnr = compare_films(&found.film, &expected.film, [1.0, 0.0, 1.0]).unwrap().psnr.unwrap_or(f64::INFINITY);
+        println!("frame {i}: {}, {psnr:.1} dB, {:?}", record.device, record.warnings);
+        let told = record.warnings.iter().filter(|told| told.contains("a table was traced in parts and is kept on the CPU"));
+        assert_eq!((record.device.starts_with("cuda:0"), told.count()), (true, usize::from(i == 0)), "frame {i}: {:?}", record.warnings);
+        // As in render.rs: answers that differ in their last places.
+        assert!(psnr > 50.0, "frame {i}: {psnr} dB");
+    }
+}
+
 /// Traced, answered and trained on the device until it is lost; then all of that goes on here, from the weights that the network had before it went there.
 fn a_gated_run_learns_on() {
     const STEPS: u64 = 60;

@@ -412,7 +412,7 @@ fn a_ring_is_followed_wherever_it_writes() {
     let average = Average { tables: model.tables(), layers: model.layers() };
     let offload = CudaOffload::new(&gpu());
     assert!(offload.takes(&model.shape, &objective));
-    let mut device = offload.training(&model, &objective, &average, 1 << 16).unwrap();
+    let mut device = offload.training(&model, &objective, &average, 1 << 16, 1 << 10).unwrap();
     let mut ring = SampleRing::new(1000);
     let mut follow = |ring: &SampleRing, broken: usize| {
         assert_eq!(device.bring(ring, None).unwrap(), Brought { usable: ring.len() - broken, dropped: broken });

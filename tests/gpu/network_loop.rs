@@ -264,15 +264,20 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
     (sum / count as f64, count)
 }
 
-/// A cap that frames keep to and training does not, for its ring or for the network itself: the network is trained on the CPU, which is told
-/// once, and frames stay on the device, even where a run is to end with it.
+/// A cap that frames keep to and training does not, for its ring, for the network itself, or for what its steps need beside both: the network is
+/// trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it.
 #[test]
 #[ignore = "needs a GPU"]
 fn without_memory_for_training_frames_stay_on_the_device() {
     // A ring of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
-    let cases: [(u64, &str, &[&str]); 2] =
-        [(512, "samples", &["training.ring=67108864"]), (192, "network", &["network.levels=8", "network.log2_table=21"])];
-    for (mib, what, more) in cases.into_iter().take(if small() { 1 } else { 2 }) {
+    // And the published 16x512, whose layers' values and their gradients for 65,536 samples are 1 GiB each.
+    let published = ["network.encoding=\"frequency\"", "network.hidden_layers=16", "network.width=512", "network.batch=1024"];
+    let cases: [(u64, &str, &[&str]); 3] = [
+        (512, "samples", &["training.ring=67108864"]),
+        (192, "network", &["network.levels=8", "network.log2_table=21"]),
+        (2048, "the layers' values", &published),
+    ];
+    for (mib, what, more) in cases.into_iter().take(if small() { 1 } else { 3 }) {
         let settings = GpuSettings { memory_cap: Some(mib << 20), when_lost: WhenLost::Stop, ..GpuSettings::default() };
         let keys = ["surrogate.kind=\"network\"", "training.steps_per_frame=5"].iter().chain(more).map(ToString::to_string);
         let options = RunOptions { device: device(settings), ..RunOptions::default() };

@@ -225,6 +225,13 @@ fn schedule_and_memory_leave_every_bit_alone() {
     for memory in [4 << 20, 8 << 20] {
         assert!(render(GpuRenderer::new(&gpu).unwrap().with_memory(memory)) == reference, "{memory} bytes");
     }
+    // What was left when rendering began is others' by the first frame.
+    let capped = opened(GpuSettings { memory_cap: Some(64 << 20), ..GpuSettings::default() });
+    let mut device = GpuRenderer::new(&capped).unwrap();
+    let others = capped.alloc::<u8>("what others have", 48 << 20).unwrap();
+    let mut renderer = Renderer::new(scene(200, 90, false), &domain(), 1.0).unwrap();
+    assert!(bits(&on_gpu(&mut device, &capped, &mut renderer, 0, 0..5).0) == reference[0], "in what others left");
+    drop(others);
 }
 
 #[test]

@@ -17,9 +17,9 @@ use ridgewatch::surrogate::{
     Samples, Table,
 };
 use std::ops::Range;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, OnceLock};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 /// The way to the device, which breaks at one of the calls and stays broken.
 #[derive(Debug)]
@@ -34,7 +34,13 @@ pub struct Line {
     pub room: AtomicBool,
     /// Whether there is memory to train a network.
     pub takes: AtomicBool,
+    /// Tables that are there, and the most that were when another one was traced, and did not go within [`SOON`].
+    tables: AtomicUsize,
+    pub tables_before: AtomicUsize,
 }
+
+/// How long a table may be held that a slide is about to trace anew.
+pub const SOON: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum How {
@@ -75,8 +81,9 @@ pub const NAME: &str = "a device that breaks";
 impl Breaking {
     /// Breaks behind so many calls.
     pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
-        let (broke_in, slowness, room) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true));
-        let line = Line { calls: Mutex::default(), breaks_at, how, broke_in, slowness, room, takes: AtomicBool::new(true) };
+        let (broke_in, slowness, room, takes) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true), AtomicBool::new(true));
+        let (calls, tables, tables_before) = (Mutex::default(), AtomicUsize::new(0), AtomicUsize::new(0));
+        let line = Line { calls, breaks_at, how, broke_in, slowness, room, takes, tables, tables_before };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -122,6 +129,11 @@ impl DeviceTrace for Trace {
     }
     fn trace_nodes(&self, _: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
         self.line.call("tracing a table")?;
+        let begin = Instant::now();
+        while self.line.tables.load(Ordering::Relaxed) > 0 && begin.elapsed() < SOON {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        self.line.tables_before.fetch_max(self.line.tables.fetch_add(1, Ordering::Relaxed), Ordering::Relaxed);
         Ok(Some(Box::new(Nodes { line: self.line.clone(), table: Table::trace(&*self.host, nodes) })))
     }
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
@@ -140,6 +152,12 @@ impl DeviceTrace for Trace {
 struct Nodes {
     line: Arc<Line>,
     table: Table,
+}
+
+impl Drop for Nodes {
+    fn drop(&mut self) {
+        self.line.tables.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 impl DeviceNodes for Nodes {
@@ -171,14 +189,27 @@ impl Training {
     fn call(&self, what: &'static str) -> Result<(), DeviceLost> {
         self.health.ask(|| self.line.call(what)).ok_or(DeviceLost)
     }
+
+    /// The same for what takes memory.
+    fn call_for_room(&self, what: &'static str) -> Result<(), NotTaken> {
+        self.health.ask_for_room(|| self.line.call(what))
+    }
 }
 
 impl Offload for Training {
     fn takes(&self, _: &Architecture, _: &Objective) -> bool {
         true
     }
-    fn training(&self, model: &Model, objective: &Objective, average: &Average, _: usize) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
-        self.call("taking a network over")?;
+    fn training(
+        &self,
+        model: &Model,
+        objective: &Objective,
+        average: &Average,
+        _: usize,
+        batch: usize,
+    ) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
+        self.call_for_room("taking a network over")?;
+        assert_eq!(batch, BATCH);
         if !self.line.takes.load(Ordering::Relaxed) {
             return Err(NotTaken::NoRoom("no room, by the test".into()));
         }
@@ -215,20 +246,22 @@ struct Network {
 impl OffloadedTraining for Network {
     fn forget_labels(&mut self) {}
 
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
-        self.there.call("bringing samples over")?;
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken> {
+        self.there.call_for_room("bringing samples over")?;
         self.samples.points.resize(ring.len(), [f32::NAN; 3]);
         self.samples.log_stretch.resize(ring.len(), f32::NAN);
         for range in ring.written_since(self.mark) {
             self.samples.points[range.clone()].copy_from_slice(&ring.samples().points[range.clone()]);
             self.samples.log_stretch[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
         }
-        (self.mark, self.base) = (Some(ring.mark()), base.cloned());
+        // The values alone: a slide wants the memory of what the device holds.
+        let nodes = base.and_then(Table::on_device).and_then(|there| there.as_any().downcast_ref::<Nodes>());
+        (self.mark, self.base) = (Some(ring.mark()), nodes.map(|nodes| &nodes.table).or(base).cloned());
         let usable = self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len());
         Ok(Brought { usable, dropped: self.samples.len() - usable })
     }
-    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
-        self.there.call("taking steps")?;
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
+        self.there.call_for_room("taking steps")?;
         let Self { fused, model, objective, average, samples, base, .. } = self;
         let (among, base) = (objective.sieve(samples), base.as_ref().map(|base| base as &dyn Field));
         let mut losses = Vec::new();
@@ -238,8 +271,8 @@ impl OffloadedTraining for Network {
         });
         Ok(losses)
     }
-    fn keep(&mut self) -> Result<(), DeviceLost> {
-        self.there.call("keeping a network")?;
+    fn keep(&mut self) -> Result<(), NotTaken> {
+        self.there.call_for_room("keeping a network")?;
         self.kept = Some((self.model.clone(), self.average.clone()));
         Ok(())
     }
@@ -257,8 +290,8 @@ impl OffloadedTraining for Network {
         self.average.layers[range].fill(0.0);
         Ok(())
     }
-    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {
-        self.there.call("freezing a network")?;
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
+        self.there.call_for_room("freezing a network")?;
         let (mut model, average) = (self.model.clone(), &self.average);
         let tensor = |values: &Vec<f32>, shape: Vec<usize>| TensorData::new(values.clone(), shape);
         let tables = vec![model.shape.table_entries(), model.shape.features];

@@ -6,7 +6,7 @@
 
 mod device;
 
-use device::{BATCH, Breaking, How, NAME, STEPS};
+use device::{BATCH, Breaking, How, NAME, SOON, STEPS};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{Device, EngineError, Event, FrameRecord, RunOptions, Setup, StageSeconds, WhenLost, run};
 use ridgewatch::field::Domain;
@@ -58,7 +58,7 @@ fn on(device: &Arc<Breaking>, scene: &SceneFile) -> Made {
 
 /// What a record says of the work, whoever did it.
 fn figures(record: &FrameRecord) -> FrameRecord {
-    let training = record.training.clone().map(|learned| Learned { seconds: 0.0, device_seconds: None, not_taken: None, ..learned });
+    let training = record.training.clone().map(|learned| Learned { seconds: 0.0, device_seconds: None, warnings: Vec::new(), ..learned });
     FrameRecord { device: String::new(), warnings: Vec::new(), seconds: StageSeconds::default(), training, ..record.clone() }
 }
 
@@ -335,6 +335,84 @@ fn without_memory_for_training_frames_stay_on_the_device() {
     let told = |i: usize| found.records[i].warnings.iter().filter(|told| told.contains("trained on the CPU: no room")).count();
     assert!(told(0) == 1 && (1..found.records.len()).all(|i| told(i) == 0));
     assert_eq!(some(&full.line.calls.lock().unwrap(), "taking a network over").len(), 1, "asked once");
+}
+
+/// A device that has memory to train on, and then lacks it: training comes back with all that was learned, which is told once, and frames stay on the
+/// device, even where a run is to end with it.
+#[test]
+fn training_that_runs_out_of_memory_comes_back_with_what_it_has_learned() {
+    let scene = residual(&[]);
+    let expected = made(&scene, Device::CPU);
+    let whole = Breaking::new(usize::MAX, How::Fault, WhenLost::Stop);
+    assert!(on(&whole, &scene).error.is_none());
+    let asked = whole.line.calls.lock().unwrap().clone();
+    for kind in ["bringing samples over", "taking steps", "keeping a network", "freezing a network"] {
+        let places = some(&asked, kind);
+        assert!(places.len() > 1, "{kind}");
+        for breaks_at in places {
+            let case = format!("{kind} at call {breaks_at}");
+            let device = Breaking::new(breaks_at, How::RefusalOf(kind), WhenLost::Stop);
+            let found = on(&device, &scene);
+            assert!(found.error.is_none() && device.line.broke_in.get() == Some(&kind), "{case}: {:?}", found.error);
+            assert!(found.films == expected.films, "{case}: nothing learned is lost");
+            let told = |record: &FrameRecord| record.warnings.iter().filter(|told| told.contains("trained on the CPU")).count();
+            let mut there = true;
+            for (i, (found, expected)) in found.records.iter().zip(&expected.records).enumerate() {
+                assert_eq!((found.device.as_str(), has_ended(found)), (NAME, 0), "{case}, frame {i}");
+                let (mut found_figures, mut expected_figures) = (figures(found), figures(expected));
+                let [found_loss, expected_loss] =
+                    [&mut found_figures, &mut expected_figures].map(|record| record.training.as_mut().unwrap().loss.take().unwrap());
+                assert_eq!(found_figures, expected_figures, "{case}, frame {i}");
+                // A frame's mean may be that of two parts.
+                assert!((found_loss / expected_loss - 1.0).abs() < 1e-12, "{case}, frame {i}: {found_loss} {expected_loss}");
+                there &= told(found) == 0;
+                assert_eq!(found.training.as_ref().unwrap().device_seconds.is_some(), there, "{case}, frame {i}");
+            }
+            // What the last frame's training ran into is met by the next.
+            let all: usize = found.records.iter().map(told).sum();
+            assert!(all == 1 || all == 0 && kind == "freezing a network", "{case}: told {all} times");
+        }
+    }
+}
+
+/// Memory for a tracer of a shorter duration, which labels of networks with the duration as an input need: the device is lost, the run goes on.
+#[test]
+fn a_tracer_of_a_shorter_duration_may_be_refused() {
+    let keys = ["surrogate.kind=\"network\"", "network.inputs=[\"duration\"]", "network.hidden_layers=1"].map(String::from);
+    let scene = residual(&keys);
+    let tracers = |device: &Arc<Breaking>| device.line.calls.lock().unwrap().iter().filter(|call| **call == "making a tracer").count();
+    let whole = Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
+    let unbroken = on(&whole, &scene);
+    assert!(unbroken.error.is_none() && tracers(&whole) > 16 * unbroken.records.len(), "{:?}", unbroken.error);
+    let asked = whole.line.calls.lock().unwrap().clone();
+    // Behind the window's own.
+    for breaks_at in some(&asked, "making a tracer").into_iter().skip(1) {
+        let device = Breaking::new(breaks_at, How::RefusalOf("making a tracer"), WhenLost::Cpu);
+        let found = on(&device, &scene);
+        assert!(found.error.is_none() && found.films.len() == unbroken.films.len(), "call {breaks_at}: {:?}", found.error);
+        assert_eq!(found.records.iter().map(has_ended).sum::<usize>(), 1, "call {breaks_at}");
+    }
+}
+
+/// A checkpoint takes long to come back and to be written; the table that it has is the device's for a moment alone, since the next slide wants
+/// its memory.
+#[test]
+fn a_slide_under_a_checkpoint_finds_the_table_gone() {
+    let folder = tempfile::tempdir().unwrap();
+    let slow = Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
+    *slow.line.slowness.lock().unwrap() = 2 * SOON;
+    let options = RunOptions {
+        device: Device::Gpu { gpu: slow.clone(), may_fall_back: false },
+        threads: 2,
+        checkpoint: Some(folder.path().join("checkpoint")),
+        checkpoint_seconds: Some(0.0),
+        ..RunOptions::default()
+    };
+    let found = made_with(&residual(&[]), options);
+    assert!(found.error.is_none() && found.records.iter().any(|record| record.checkpoint.is_some()), "{:?}", found.error);
+    let asked = slow.line.calls.lock().unwrap().clone();
+    assert!(some(&asked, "tracing a table").len() >= 4 && asked.contains(&"reading a copy"));
+    assert_eq!(slow.line.tables_before.load(Ordering::Relaxed), 0, "tables that were there when another was traced");
 }
 
 /// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.

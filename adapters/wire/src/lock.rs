@@ -11,22 +11,24 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// How long somebody is waited for who sweeps a ring's folder up.
-const SWEEPING: Duration = Duration::from_secs(5);
+const SWEEP_PATIENCE: Duration = Duration::from_secs(5);
 
 /// A locked file.
 #[derive(Debug)]
 struct FileLock {
     path: PathBuf,
     file: File,
+    /// Whose lock it is: a fork has a copy of the descriptor, and with it the means to free its parent's.
+    process: u32,
 }
 
-/// A lock over a file's byte 0, which stands for the file.
-fn whole(kind: libc::c_int) -> libc::flock {
-    over(kind, 0)
+/// A lock over a file's byte 0, which stands for the presence of whoever has it.
+fn presence(kind: libc::c_int) -> libc::flock {
+    byte_lock(kind, 0)
 }
 
 /// A lock over one byte of a file; it need not be there.
-fn over(kind: libc::c_int, byte: u32) -> libc::flock {
+fn byte_lock(kind: libc::c_int, byte: u32) -> libc::flock {
     // SAFETY: all of its fields are integers.
     let mut lock: libc::flock = unsafe { std::mem::zeroed() };
     lock.l_type = kind as libc::c_short;
@@ -62,7 +64,7 @@ impl FileLock {
             let about = file.metadata().map_err(|e| WireError::io(&path, "cannot be looked at", e))?;
             system::check_private(&path, &about, system::user())?;
             // SAFETY: the descriptor is open, and the lock outlives the call.
-            if unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &whole(kind)) } != 0 {
+            if unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_SETLK, &presence(kind)) } != 0 {
                 return match io::Error::last_os_error() {
                     error if matches!(error.raw_os_error(), Some(libc::EAGAIN | libc::EACCES)) => Ok(None),
                     error => Err(WireError::io(&path, "cannot be locked", error)),
@@ -70,7 +72,9 @@ impl FileLock {
             }
             // Its last holder may have removed the file that was just locked.
             match std::fs::metadata(&path) {
-                Ok(now) if (now.dev(), now.ino()) == (about.dev(), about.ino()) => return Ok(Some(Self { path, file })),
+                Ok(now) if (now.dev(), now.ino()) == (about.dev(), about.ino()) => {
+                    return Ok(Some(Self { path, file, process: std::process::id() }));
+                }
                 Ok(_) => {}
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 Err(error) => return Err(WireError::io(&path, "cannot be looked at", error)),
@@ -81,14 +85,27 @@ impl FileLock {
     /// Removes the file while it is still locked: whoever opened it finds that it is not the one at the path.
     fn remove(self) {
         let _ = std::fs::remove_file(&self.path);
-        drop(self.file);
+    }
+}
+
+impl Drop for FileLock {
+    /// Frees it by name and not by closing the file: children that another thread has just made hold copies of the descriptor until they call `exec`, and
+    /// with them the lock.
+    fn drop(&mut self) {
+        if std::process::id() != self.process {
+            return;
+        }
+        // Its marks with it.
+        let all = libc::flock { l_len: 0, ..presence(libc::F_UNLCK) };
+        // SAFETY: the descriptor is open, and the lock outlives the call.
+        unsafe { libc::fcntl(self.file.as_raw_fd(), libc::F_OFD_SETLK, &all) };
     }
 }
 
 /// The kind of somebody's lock that stands in the way of `kind`. None also where that cannot be told.
 fn in_the_way(path: &Path, kind: libc::c_int) -> Option<libc::c_int> {
     let file = system::open_private(path, kind == libc::F_WRLCK).ok()?;
-    let mut lock = whole(kind);
+    let mut lock = presence(kind);
     // SAFETY: the descriptor is open, and the lock outlives the call.
     let asked = unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_GETLK, &mut lock) };
     Some(libc::c_int::from(lock.l_type)).filter(|found| asked == 0 && *found != libc::F_UNLCK)
@@ -167,7 +184,7 @@ impl Following {
         let lock = loop {
             match FileLock::take_in(ring, path.clone(), libc::F_RDLCK)? {
                 Some(lock) => break lock,
-                None if begin.elapsed() > SWEEPING => {
+                None if begin.elapsed() > SWEEP_PATIENCE => {
                     return Err(WireError::io(&path, "is locked by a follower that leaves", io::ErrorKind::TimedOut.into()));
                 }
                 None => std::thread::sleep(Duration::from_millis(1)),
@@ -185,7 +202,7 @@ impl Following {
         let Some(lock) = &self.lock else { unreachable!("taken only by drop") };
         for mark in 0..MARKS {
             // SAFETY: the descriptor is open, and the lock outlives the call. Byte 0 is the presence of all.
-            if unsafe { libc::fcntl(lock.file.as_raw_fd(), libc::F_OFD_SETLK, &over(libc::F_WRLCK, mark + 1)) } == 0 {
+            if unsafe { libc::fcntl(lock.file.as_raw_fd(), libc::F_OFD_SETLK, &byte_lock(libc::F_WRLCK, mark + 1)) } == 0 {
                 return Ok(mark);
             }
             let error = io::Error::last_os_error();
@@ -200,7 +217,7 @@ impl Following {
 impl Drop for Following {
     fn drop(&mut self) {
         drop(self.lock.take());
-        sweep(&self.ring, SWEEPING);
+        sweep(&self.ring, SWEEP_PATIENCE);
     }
 }
 

@@ -12,7 +12,7 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 use std::time::{Duration, Instant};
 
 /// How long a name that is taken is waited for: a follower that leaves takes each for a moment, to see whether anybody has it.
-const TAKEN: Duration = Duration::from_secs(1);
+const NAME_PATIENCE: Duration = Duration::from_secs(1);
 /// How long a follower may be silent before nobody waits for it.
 const SILENCE: Duration = Duration::from_secs(5);
 
@@ -86,7 +86,7 @@ impl Producer {
         let lock = loop {
             match NameLock::take(ring, block)? {
                 Some(lock) => break lock,
-                None if begin.elapsed() > TAKEN => return Err(WireError::InUse { pid: holder(&path), path }),
+                None if begin.elapsed() > NAME_PATIENCE => return Err(WireError::InUse { pid: holder(&path), path }),
                 None => std::thread::sleep(Duration::from_millis(1)),
             }
         };
@@ -254,7 +254,7 @@ impl Drop for Producer {
         if is_followed(&self.ring) {
             drop(lock);
             // One that was about to leave may have found the name taken.
-            return sweep(&self.ring, TAKEN);
+            return sweep(&self.ring, NAME_PATIENCE);
         }
         let _ = std::fs::remove_file(block_path(&self.ring, block));
         lock.remove();

@@ -2,6 +2,10 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
+#[path = "support/folder.rs"]
+mod folder;
+
+use folder::Folder;
 use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::relay::{RelayCounts, RelayFollower, serve};
 use ridgewatch_wire::{
@@ -10,26 +14,9 @@ use ridgewatch_wire::{
 };
 use std::io::Read;
 use std::net::{TcpListener, TcpStream};
-use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
-
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = PathBuf::from("/dev/shm").join(format!("rw-follow-{name}-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
 
 fn description(nodes: u64) -> Description {
     let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, nodes);
@@ -114,7 +101,7 @@ fn kill(child: libc::pid_t) {
 
 #[test]
 fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
-    let folder = Folder::new("killed");
+    let folder = Folder::alone("killed");
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     let killed = || {
@@ -147,7 +134,7 @@ fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
 
 #[test]
 fn a_solver_that_is_killed_and_replaced_at_once_is_followed() {
-    let folder = Folder::new("replaced");
+    let folder = Folder::alone("replaced");
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let mut poll = |values: &mut Vec<f32>| follower.poll(values);
     for round in 0..5 {
@@ -499,7 +486,7 @@ fn a_pulse_is_no_answer_and_what_was_asked_is_not_asked_again() {
 
 #[test]
 fn a_relay_tells_a_killed_solver_from_one_that_ended() {
-    let folder = Folder::new("lost");
+    let folder = Folder::alone("lost");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
     let mut follower = relay.follow(LONG);
     let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));

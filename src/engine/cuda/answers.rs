@@ -90,12 +90,10 @@ pub struct Panel<'a> {
     pub arrivals: bool,
 }
 
-/// Points that are answered together, at most and at least.
-const CHUNK: [u64; 2] = [1 << 12, 1 << 23];
+/// Points that are answered together, at most.
+const CHUNK: usize = 1 << 23;
 /// Bytes of a point in the lists.
 const POINT: u64 = 20;
-/// Of the memory that is left when a frame first needs it, the lists take at most one part in so many.
-const MEMORY_SHARE: u64 = 4;
 
 /// Divides waves between surrogate and RK4. Keeps its memory from frame to frame.
 pub struct Division {
@@ -119,8 +117,7 @@ struct Memory {
 
 impl Memory {
     fn new(gpu: &Gpu) -> Result<Self, DeviceError> {
-        let [least, most] = CHUNK;
-        let capacity = (gpu.memory_left() / MEMORY_SHARE / POINT).clamp(least, most) as usize;
+        let capacity = gpu.batch(CHUNK, POINT);
         let what = "the lists of a gated frame";
         Ok(Self {
             capacity,

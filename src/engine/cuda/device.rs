@@ -219,6 +219,14 @@ impl Gpu {
         self.budget.cap().saturating_sub(self.budget.used())
     }
 
+    /// Things that are best worked on together, at so many bytes each: `most`, or as many as a quarter of the memory that is left holds, but at
+    /// least 4096.
+    pub(super) fn batch(&self, most: usize, bytes: u64) -> usize {
+        const SHARE: u64 = 4;
+        const LEAST: usize = 1 << 12;
+        usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(LEAST).min(most)
+    }
+
     /// Memory for `len` values, unset, within the cap. Freed in the order of the work stream.
     ///
     /// # Errors

@@ -240,6 +240,15 @@ impl NetworkKernels {
         }
     }
 
+    /// Takes the memory that prediction and gradients need between their kernels, for good.
+    pub(super) fn reserve(&self) -> Result<(), DeviceError> {
+        match &self.way {
+            Way::Batched(batched) => batched.reserve(),
+            // All of it is in registers and shared memory.
+            Way::Fused { .. } => Ok(()),
+        }
+    }
+
     /// Rounds burn's tables into padded ones.
     pub(super) fn round(&self, tables: &Buffer<f32>, halves: &Buffer<u16>) -> Result<(), DeviceError> {
         if self.padded == 0 {

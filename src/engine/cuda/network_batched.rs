@@ -131,6 +131,14 @@ struct Rounded {
     biases: Buffer<f32>,
 }
 
+/// What is there, taken first where it is not.
+fn taken<T>(held: &mut Option<T>, take: impl FnOnce() -> Result<T, DeviceError>) -> Result<&T, DeviceError> {
+    Ok(match held {
+        Some(held) => held,
+        None => held.insert(take()?),
+    })
+}
+
 /// What the gradient kernel leaves behind of `rows` samples.
 #[derive(Debug)]
 struct Training {
@@ -181,17 +189,38 @@ impl Batched {
         })
     }
 
+    /// Takes the memory for predictions and for gradients, where it is not taken yet.
+    pub(super) fn reserve(&self) -> Result<(), DeviceError> {
+        let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
+        self.for_predictions(&mut memory)?;
+        self.for_gradients(&mut memory)?;
+        Ok(())
+    }
+
+    /// The memory for predictions, the last where a flow map is predicted.
+    fn for_predictions<'a>(&self, memory: &'a mut Memory) -> Result<(&'a Rounded, Option<&'a Buffer<u32>>), DeviceError> {
+        let Memory { rounded, passed, .. } = memory;
+        if self.flow_map && passed.is_none() {
+            *passed = Some(self.passed(&self.predict, self.hidden)?);
+        }
+        Ok((taken(rounded, || self.take_rounded())?, passed.as_ref()))
+    }
+
+    /// The memory for gradients.
+    fn for_gradients<'a>(&self, memory: &'a mut Memory) -> Result<(&'a Rounded, &'a Training), DeviceError> {
+        let Memory { rounded, training, .. } = memory;
+        Ok((taken(rounded, || self.take_rounded())?, taken(training, || self.take_training())?))
+    }
+
+    fn take_rounded(&self) -> Result<Rounded, DeviceError> {
+        let [_, all] = self.tiling.slices(self.hidden, self.tables);
+        let slices = self.gpu.alloc("a network's rounded layers", all)?;
+        let biases = self.gpu.alloc("a network's padded biases", self.hidden * self.tiling.width())?;
+        Ok(Rounded { slices, biases })
+    }
+
     /// Rounds the layers (device address of the flat vector): `count` values of the slices, and the biases. Addresses of both.
-    fn rounded(&self, held: &mut Option<Rounded>, layers: u64, count: usize) -> Result<(u64, u64), DeviceError> {
-        let rounded = match held {
-            Some(rounded) => rounded,
-            None => {
-                let [_, all] = self.tiling.slices(self.hidden, self.tables);
-                let slices = self.gpu.alloc("a network's rounded layers", all)?;
-                let biases = self.gpu.alloc("a network's padded biases", self.hidden * self.tiling.width())?;
-                held.insert(Rounded { slices, biases })
-            }
-        };
+    fn round(&self, rounded: &Rounded, layers: u64, count: usize) -> Result<(u64, u64), DeviceError> {
         let (n, slices, biases) = (count as u32, rounded.slices.address(), rounded.biases.address());
         let mut call = self.gpu.work().launch_builder(&self.round);
         call.arg(&layers).arg(&n).arg(&slices).arg(&biases);
@@ -215,11 +244,9 @@ impl Batched {
     ) -> Result<(), DeviceError> {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
         let [forward, _] = self.tiling.slices(self.hidden, self.tables);
-        let (slices, biases) = self.rounded(&mut memory.rounded, layers, forward)?;
-        if self.flow_map && memory.passed.is_none() {
-            memory.passed = Some(self.passed(&self.predict, self.hidden)?);
-        }
-        let (head, n, passed) = (layers + 4 * self.head as u64, count as u32, memory.passed.as_ref().map_or(0, Buffer::address));
+        let (rounded, passed) = self.for_predictions(&mut memory)?;
+        let (slices, biases) = self.round(rounded, layers, forward)?;
+        let (head, n, passed) = (layers + 4 * self.head as u64, count as u32, passed.map_or(0, Buffer::address));
         let mut call = self.gpu.work().launch_builder(&self.predict.function);
         call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(reading).arg(&points).arg(&n);
         call.arg(&passed).arg(&out);
@@ -233,14 +260,10 @@ impl Batched {
     /// Device addresses as for [`Self::predict`] and in [`GradientTo`]; the samples of `draw` are there.
     pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
-        let Memory { rounded, training, .. } = &mut *memory;
         let [_, all] = self.tiling.slices(self.hidden, self.tables);
-        let (slices, biases) = self.rounded(rounded, layers, all)?;
-        let training = match training {
-            Some(training) => training,
-            None => training.insert(self.training()?),
-        };
-        let Training { rows: most, encoded, values, deltas, passed } = &*training;
+        let (rounded, training) = self.for_gradients(&mut memory)?;
+        let (slices, biases) = self.round(rounded, layers, all)?;
+        let Training { rows: most, encoded, values, deltas, passed } = training;
         let (encoded, values, deltas, passed) = (encoded.address(), values.address(), deltas.address(), passed.address());
         let (head, held) = (layers + 4 * self.head as u64, *most as u32);
         for first in (0..draw.batch as usize).step_by(*most) {
@@ -266,7 +289,7 @@ impl Batched {
         Ok(())
     }
 
-    fn training(&self) -> Result<Training, DeviceError> {
+    fn take_training(&self) -> Result<Training, DeviceError> {
         let (width, tile) = (self.tiling.width(), self.tiling.rows);
         let rows = (TRAINED / (2 * width * self.hidden)).clamp(tile, TRAINED_ROWS) / tile * tile;
         Ok(Training {

@@ -36,7 +36,7 @@ pub(super) struct TracedPoints {
     pub(super) points: u64,
     /// Log-stretch (f32 each), or for the flow map arrivals (three f32 each, as points).
     pub(super) labels: u64,
-    /// Times that points have no place for (so many f32 each); 0: none.
+    /// Times that points have no place for, as many f32 each as the network has such; 0: they are of the unit times instead.
     further: u64,
 }
 
@@ -283,7 +283,7 @@ impl NetworkCopy {
 #[derive(Debug)]
 struct WholeBatch {
     points: Buffer<[f32; 3]>,
-    /// Times that points have no place for.
+    /// Times that points have no place for; most networks have none.
     further: Buffer<f32>,
     predicted: Buffer<f32>,
     /// `Means`.
@@ -306,7 +306,7 @@ impl WholeBatch {
         let SampleWriter { kernels, objective } = writer;
         let stream = kernels.gpu.work();
         let (points, predicted, means) = (self.points.address(), self.predicted.address(), self.means.address());
-        let further = if self.further.len() == 0 { 0 } else { self.further.address() };
+        let further = self.further.address();
         self.means.zero_front(2)?;
         let count = draw.batch as usize;
         // SAFETY: the arguments of `network_drawn`; there is room for the batch.
@@ -352,6 +352,18 @@ impl DeviceTraining {
         };
         training.writer.kernels.round(&training.tables.parameters, &training.halves)?;
         Ok(training)
+    }
+
+    /// Takes all the memory that steps of at most `batch` samples need beside the samples, so that none of them lacks it.
+    ///
+    /// # Errors
+    /// Memory that is not there.
+    pub fn reserve(&mut self, batch: usize) -> Result<(), DeviceError> {
+        let SampleWriter { kernels, objective } = &self.writer;
+        if has_penalty(objective) {
+            self.batch = Some(WholeBatch::new(&self.gpu, &kernels.shape, batch)?);
+        }
+        kernels.reserve()
     }
 
     /// What is stored where.
@@ -499,8 +511,7 @@ impl DeviceTraining {
             let (points, further) = self.writer.placed(samples, part.clone());
             let (points, further) = (self.gpu.upload("samples", &points)?, self.gpu.upload("samples", &further)?);
             let labels = self.gpu.upload("samples", &self.writer.labels(samples, part.clone()))?;
-            let further_address = if further.len() == 0 { 0 } else { further.address() };
-            let traced = TracedPoints { points: points.address(), labels: labels.address(), further: further_address };
+            let traced = TracedPoints { points: points.address(), labels: labels.address(), further: further.address() };
             // SAFETY: these buffers hold as many entries and are freed in the order of the work stream.
             unsafe { self.writer.place(ring, part, &unit, traced, base, None, 0) }?;
         }

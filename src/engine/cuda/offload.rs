@@ -42,14 +42,11 @@ impl Offload for CudaOffload {
         objective: &Objective,
         average: &Average,
         ring: usize,
+        batch: usize,
     ) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
-        let taken = self.0.health().ask(|| match CudaTraining::new(&self.0, model, objective, average, ring) {
-            Ok(training) => Ok(Ok(training)),
-            // Frames need less and may go on here.
-            Err(error @ DeviceError::OutOfMemory { .. }) => Ok(Err(NotTaken::NoRoom(error.to_string()))),
-            Err(error) => Err(error),
-        });
-        Ok(Box::new(taken.ok_or(DeviceLost)??))
+        // Frames need less, and may go on here where training has no memory.
+        let taken = self.0.health().ask_for_room(|| CudaTraining::new(&self.0, model, objective, average, ring, batch))?;
+        Ok(Box::new(taken))
     }
 }
 
@@ -141,10 +138,18 @@ impl OffloadedCopy for CudaCopy {
 }
 
 impl CudaTraining {
-    /// With all that training needs for good, so that what does not fit is refused before it begins.
-    fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective, average: &Average, ring: usize) -> Result<Self, DeviceError> {
+    /// With all that training needs for good, and room for what predicts of it, so that what does not fit is refused before it begins.
+    fn new(
+        gpu: &Arc<Gpu>,
+        model: &Model,
+        objective: &Objective,
+        average: &Average,
+        ring: usize,
+        batch: usize,
+    ) -> Result<Self, DeviceError> {
         let mut training = DeviceTraining::new(gpu, model, objective)?;
         training.set_average(average)?;
+        training.reserve(batch)?;
         // To come back to; overwritten with the first step.
         training.keep()?;
         let samples = training.ring(ring)?;
@@ -152,6 +157,8 @@ impl CudaTraining {
         let (gpu, below) = (gpu.clone(), TableCopy::default());
         let mut taken = Self { gpu, training, held, pool: None, pool_base: None, below, seconds: 0.0, room: Arc::default() };
         taken.pool(ring)?;
+        // What a frame is rendered with, and what has learned since.
+        let _tried = [taken.training.frozen()?, taken.training.frozen()?];
         Ok(taken)
     }
 
@@ -159,6 +166,12 @@ impl CudaTraining {
     fn ask<T>(&mut self, call: impl FnOnce(&mut Self) -> Result<T, DeviceError>) -> Result<T, DeviceLost> {
         let gpu = self.gpu.clone();
         gpu.health().ask(|| call(self)).ok_or(DeviceLost)
+    }
+
+    /// The same for what takes memory.
+    fn ask_for_room<T>(&mut self, call: impl FnOnce(&mut Self) -> Result<T, DeviceError>) -> Result<T, NotTaken> {
+        let gpu = self.gpu.clone();
+        gpu.health().ask_for_room(|| call(self))
     }
 
     /// The samples on the device are those of the ring.
@@ -212,8 +225,8 @@ impl CudaTraining {
 }
 
 impl OffloadedTraining for CudaTraining {
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceLost> {
-        self.ask(|training| training.follow(ring, base))
+    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken> {
+        self.ask_for_room(|training| training.follow(ring, base))
     }
 
     fn forget_labels(&mut self) {
@@ -223,8 +236,8 @@ impl OffloadedTraining for CudaTraining {
         self.pool_base = None;
     }
 
-    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceLost> {
-        self.ask(|Self { gpu, training, held, pool, seconds, .. }| {
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
+        self.ask_for_room(|Self { gpu, training, held, pool, seconds, .. }| {
             let (Some(Held { samples, usable, more_usable, .. }), Some(pool)) = (held, pool) else { return Ok(Vec::new()) };
             let more = pool.samples();
             let begin = gpu.mark()?;
@@ -237,8 +250,8 @@ impl OffloadedTraining for CudaTraining {
         })
     }
 
-    fn keep(&mut self) -> Result<(), DeviceLost> {
-        self.ask(|this| this.training.keep())
+    fn keep(&mut self) -> Result<(), NotTaken> {
+        self.ask_for_room(|this| this.training.keep())
     }
 
     fn roll_back(&mut self) -> Result<(), DeviceLost> {
@@ -253,8 +266,8 @@ impl OffloadedTraining for CudaTraining {
         self.ask(|this| this.training.zero_layers(range))
     }
 
-    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, DeviceLost> {
-        let network = self.gpu.health().ask(|| self.training.frozen()).ok_or(DeviceLost)?;
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
+        let network = self.gpu.health().ask_for_room(|| self.training.frozen())?;
         Ok(Arc::new(CudaNetwork { gpu: self.gpu.clone(), network, pool: self.pool.clone() }))
     }
 
@@ -281,7 +294,7 @@ impl OffloadedTraining for CudaTraining {
             match training.copy(taken) {
                 Ok(copy) => Ok(Copied::There(Box::new(CudaCopy { gpu: gpu.clone(), copy: Some(copy), room: room.clone() }))),
                 // Under the cap, but others hold the rest.
-                Err(error @ DeviceError::OutOfMemory { .. }) => Ok(Copied::NoRoom(error.to_string())),
+                Err(error) if error.is_out_of_memory() => Ok(Copied::NoRoom(error.to_string())),
                 Err(error) => Err(error),
             }
         })

@@ -7,12 +7,15 @@ use crate::flow::Tracer;
 use crate::surrogate::{NetworkState, Predict, Table};
 use std::sync::Arc;
 
-/// Points from the host that are predicted at once: bounds the memory of a call.
+/// Points from the host that are predicted at once, at most: bounds the memory of a call.
 const BATCH: usize = 1 << 22;
+/// Bytes of one, with what is predicted there.
+const POINT: u64 = 16;
 
 /// Predicts at unit points on the host.
 pub(super) fn predict_from_host(gpu: &Gpu, by: &dyn DevicePredict, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
-    for (points, out) in points.chunks(BATCH).zip(out.chunks_mut(BATCH)) {
+    let batch = gpu.batch(BATCH, POINT);
+    for (points, out) in points.chunks(batch).zip(out.chunks_mut(batch)) {
         let unit = gpu.upload("points to predict at", points)?;
         let values = gpu.alloc::<f32>("points to predict at", points.len())?;
         // SAFETY: both buffers hold as many entries as there are points, and reading waits for the stream.
@@ -94,7 +97,11 @@ impl Predictors {
         let Self { gpu, network, below } = self;
         let there = state.on_device.and_then(|there| there.as_any().downcast_ref::<CudaNetwork>());
         let network = match there {
-            Some(there) => there.network(),
+            Some(there) => {
+                // One that came from the host before that.
+                *network = None;
+                there.network()
+            }
             None => brought(gpu, network, &state)?,
         };
         let base = match state.base {

@@ -15,7 +15,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Collisions of a flight that are answered at once, at most: on its way from the camera, where the first real collision makes those
 /// behind it worthless, and on its way to the light, where most are used.
 const LOOK_AHEAD: LookAhead = LookAhead { camera: 4, shadow: 8 };
-/// Of the memory that is left when it begins, rendering takes at most one part in so many.
+/// Of the memory that is left when it begins, and of what is left beside its own when a frame wants more, rendering takes at most one part in so
+/// many.
 const MEMORY_SHARE: u64 = 2;
 
 /// How many collisions of a flight may be answered at once. The picture does not depend on it.
@@ -111,7 +112,7 @@ pub struct GpuRenderer {
     advance: CudaFunction,
     film: CudaFunction,
     memory: Option<Memory>,
-    /// Bytes of device memory that rendering may take.
+    /// Bytes of device memory that rendering may take, as far as others leave them.
     allowed: u64,
     look_ahead: LookAhead,
     timeline: Timeline,
@@ -198,7 +199,9 @@ impl GpuRenderer {
         let setup = renderer.set_up(frame, samples.clone())?;
         let count = samples.end - samples.start;
         self.timeline = Timeline::default();
-        let plan = Plan::new(pixels, count, setup.majorants.len(), self.allowed);
+        let own = self.memory.as_ref().map_or(0, |memory| memory.block.len() as u64);
+        let allowed = self.allowed.min(own + self.gpu.memory_left() / MEMORY_SHARE);
+        let plan = Plan::new(pixels, count, setup.majorants.len(), allowed);
         self.reserve(plan)?.begin_frame(setup.majorants, setup.may_miss)?;
         let parameters = setup.parameters;
         let mut stats = RenderStats::default();

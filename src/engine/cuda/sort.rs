@@ -6,8 +6,10 @@ use crate::field::{Domain, Grid};
 use cudarc::driver::{CudaFunction, PushKernelArg};
 use std::sync::Arc;
 
-/// Most points sorted at once: bounds the scratch memory (26 bytes a point).
+/// Most points sorted at once: bounds the scratch memory.
 pub const MOST: usize = 1 << 24;
+/// Bytes of a point in the scratch memory.
+const POINT: u64 = 26;
 /// `SCAN_TILE` of `sort.cu`.
 const TILE: usize = 4096;
 const BLOCK: u32 = 256;
@@ -109,6 +111,13 @@ impl Sorter {
             });
         }
         self.scratch.as_mut().ok_or_else(|| DeviceError::Unsupported { what: "sorting without scratch memory".into() })
+    }
+
+    /// Points that are best sorted together: as many as there is scratch memory for, or may be.
+    pub fn at_once(&self) -> usize {
+        // The scratch memory is for a power of two.
+        let may_be = 1 << self.gpu.batch(MOST, POINT).ilog2();
+        self.scratch.as_ref().map_or(0, |scratch| scratch.capacity).max(may_be)
     }
 
     /// Lets go of the scratch memory until it is needed again.

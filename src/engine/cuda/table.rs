@@ -2,7 +2,7 @@
 
 use super::layout::{Outputs, TableArgument, TableFrame};
 use super::predictor::predict_from_host;
-use super::sort::{MOST, Sorter};
+use super::sort::Sorter;
 use super::trace::DeviceTracer;
 use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
 use crate::engine::accelerator::DeviceNodes;
@@ -83,8 +83,9 @@ impl DeviceTable {
         let stream = self.gpu.work().clone();
         let out = Outputs { log_stretch: self.values.address(), ..Outputs::default() };
         let (x, y) = (bricks_x as u32, bricks_y as u32);
-        for first in (0..all).step_by(MOST) {
-            let count = (all - first).min(MOST);
+        let most = self.scratch.at_once();
+        for first in (0..all).step_by(most) {
+            let count = (all - first).min(most);
             let seeds = self.scratch.buffer(count)?;
             let (from, n) = (first as u64, count as u32);
             // SAFETY: arguments as declared in table.cu; `seeds` has room for `count` entries, and `values` for every node.

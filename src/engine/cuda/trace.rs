@@ -201,8 +201,9 @@ impl DeviceTracer {
             *sorter = Some(Sorter::new(&self.gpu)?);
         }
         let Some(sorter) = sorter.as_mut() else { return Err(DeviceError::Unsupported { what: "sorting".into() }) };
-        for first in (0..count).step_by(MOST) {
-            let part = (count - first).min(MOST);
+        let most = sorter.at_once();
+        for first in (0..count).step_by(most) {
+            let part = (count - first).min(most);
             // SAFETY: the caller's; the sorted points are read by the launch behind it on the same stream.
             unsafe {
                 let sorted = sorter.sort(seeds + 12 * first as u64, part, cells)?;

@@ -9,8 +9,10 @@ use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource,
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
 
-/// Seeds that go over at once: bounds the memory of a call.
+/// Seeds that go over at once, at most: bounds the memory of a call.
 const BATCH: usize = 1 << 22;
+/// Bytes of one, with all that comes back of it.
+const SEED: u64 = 76;
 
 /// Why no tracer was made.
 #[derive(Debug, Error)]
@@ -93,7 +95,8 @@ impl DeviceTrace for CudaTrace {
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         let gpu = self.device.gpu();
         let mut room = self.room.lock().unwrap_or_else(PoisonError::into_inner);
-        let most = seeds.len().min(BATCH);
+        let batch = gpu.batch(BATCH, SEED);
+        let most = seeds.len().min(batch);
         let fits = |r: &Room| r.capacity >= most && (r.extras.arrival || !extras.arrival) && (r.extras.jacobian || !extras.jacobian);
         if !room.as_ref().is_some_and(fits) {
             // The old one goes first, so that both never need memory together.
@@ -112,8 +115,8 @@ impl DeviceTrace for CudaTrace {
             });
         }
         let Some(room) = room.as_mut() else { return Ok(()) };
-        for start in (0..seeds.len()).step_by(BATCH) {
-            let part = start..(start + BATCH).min(seeds.len());
+        for start in (0..seeds.len()).step_by(room.capacity) {
+            let part = start..(start + room.capacity).min(seeds.len());
             room.seeds.write(&seeds[part.clone()])?;
             let arrival = room.arrival.as_ref().filter(|_| extras.arrival);
             let jacobian = room.jacobian.as_ref().filter(|_| extras.jacobian);

@@ -97,7 +97,7 @@ impl Cycle<'_> {
         let train_seconds = learned.as_ref().map_or(0.0, |l: &Learned| l.seconds);
         if let Some(learned) = &learned {
             self.report.train_steps += learned.steps;
-            record.warnings.extend(learned.not_taken.as_ref().map(|why| format!("the network is trained on the CPU: {why}")));
+            record.warnings.extend_from_slice(&learned.warnings);
             if learned.rollbacks > 0 {
                 record
                     .warnings

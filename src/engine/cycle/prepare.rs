@@ -25,6 +25,10 @@ impl Cycle<'_> {
     /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
     pub(super) fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
         let Some(resize) = self.resize.take() else { return Ok(false) };
+        // So that two tables never need a device's memory together; kept until then, since it is what a stop would write.
+        if let Some(live) = &mut self.live {
+            live.leave_device();
+        }
         let built = self.threads.render().install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer, &self.options.device));
         heed(self.stop)?;
         let live = built?;
@@ -162,7 +166,8 @@ impl Cycle<'_> {
             let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
             let unit = audit::stratified_points(&strata, seed, SHORTER_STREAM + draw);
             let extras = self.label_extras();
-            let (shorter, _) = self.threads.render().install(|| self.options.device.tracer(slide.velocity.clone(), &map, slide.time))?;
+            let (shorter, _) =
+                self.threads.render().install(|| self.options.device.next_tracer(slide.velocity.clone(), &map, slide.time))?;
             let interruptible = Interruptible::new(&*shorter, self.stop);
             let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
             found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];

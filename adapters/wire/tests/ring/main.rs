@@ -3,30 +3,16 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 mod assembling;
+#[path = "../support/folder.rs"]
+mod folder;
 mod following;
 mod opening;
 mod publishing;
 
+use folder::Folder;
 use ridgewatch_wire::{AxisDescription, Description, Element, Field, Geometry, Producer, Read, RingReader, WireError};
 use std::os::unix::fs::FileExt;
-use std::path::{Path, PathBuf};
-
-/// A folder of its own on the file system that rings live on, removed at the end.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let path = PathBuf::from("/dev/shm").join(format!("rw-test-{name}-{}", std::process::id()));
-        let _ = std::fs::remove_dir_all(&path);
-        Self(path)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
-    }
-}
+use std::path::Path;
 
 fn cube(nodes: [u64; 3]) -> Description {
     let axis = |name, n| AxisDescription::uniform(name, "m", 0.0, 1.0, n);

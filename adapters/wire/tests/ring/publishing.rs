@@ -159,7 +159,7 @@ fn waiting_is_bounded_and_happens_once() {
 
 #[test]
 fn threads_may_publish_at_once_and_a_fork_may_not() {
-    let folder = Folder::new("threads");
+    let folder = Folder::alone("threads");
     let producer = Producer::open(&folder.0, cube([8, 8, 8]), 64, Policy::NewestWins).unwrap();
     std::thread::scope(|scope| {
         for thread in 0..4 {
@@ -200,6 +200,41 @@ fn threads_may_publish_at_once_and_a_fork_may_not() {
     assert!(producer_lives(&folder.0, 0));
     publish(&producer, 40, 0.0).unwrap();
     assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 40);
+}
+
+#[test]
+fn a_child_that_another_thread_has_made_keeps_no_lock() {
+    let folder = Folder::alone("child");
+    let following = Following::begin(&folder.0).unwrap();
+    let mark = following.mark().unwrap();
+    let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    // As between the fork and the exec of `system()`: it holds a copy of every descriptor, until it is told to end.
+    let (from, to) = std::io::pipe().unwrap();
+    // SAFETY: the child reads from a pipe and leaves by _exit.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        drop(to);
+        let _ = std::io::Read::read(&mut &from, &mut [0]);
+        // In a fork none of them is freed.
+        drop((following, producer));
+        // SAFETY: ends the child.
+        unsafe { libc::_exit(0) };
+    }
+    drop(producer);
+    // The name is free at once, and nobody's mark is taken.
+    let next = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    drop(following);
+    let other = Following::begin(&folder.0).unwrap();
+    assert_eq!(other.mark().unwrap(), mark);
+    // The child lets go of its copies: the new locks, which are on the same files, stand.
+    drop((from, to));
+    // SAFETY: waits for the child made above.
+    unsafe { libc::waitpid(child, &mut 0, 0) };
+    assert!(producer_lives(&folder.0, 0));
+    drop(next);
+    assert!(folder.0.exists(), "its last steps wait for the follower");
+    drop(other);
+    assert!(!folder.0.exists(), "nothing stays behind");
 }
 
 #[test]

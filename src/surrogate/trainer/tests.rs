@@ -1,0 +1,80 @@
+//! What training tells of a device that has no memory for a copy of the network.
+
+use super::*;
+use crate::field::Domain;
+use crate::field::analytic::Analytic;
+use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
+use std::ops::Range;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+/// A device that takes steps, whatever they are, and has no memory for a copy; how often it was waited for.
+#[derive(Clone, Default)]
+struct Full(Arc<AtomicUsize>);
+
+impl Offload for Full {
+    fn takes(&self, _: &Architecture, _: &Objective) -> bool {
+        true
+    }
+    fn training(&self, _: &Model, _: &Objective, _: &Average, _: usize, _: usize) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
+        Ok(Box::new(self.clone()))
+    }
+}
+
+impl OffloadedTraining for Full {
+    fn bring(&mut self, ring: &SampleRing, _: Option<&Table>) -> Result<Brought, NotTaken> {
+        Ok(Brought { usable: ring.len(), dropped: 0 })
+    }
+    fn forget_labels(&mut self) {}
+    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
+        Ok(vec![0.5; steps.len()])
+    }
+    fn keep(&mut self) -> Result<(), NotTaken> {
+        Ok(())
+    }
+    fn roll_back(&mut self) -> Result<(), DeviceLost> {
+        Ok(())
+    }
+    fn restart_average(&mut self) -> Result<(), DeviceLost> {
+        Ok(())
+    }
+    fn zero_layers(&mut self, _: Range<usize>) -> Result<(), DeviceLost> {
+        Ok(())
+    }
+    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
+        Err(DeviceLost.into())
+    }
+    fn fetch(&self, _: &mut Model, _: &mut Average) -> Result<(), DeviceLost> {
+        self.0.fetch_add(1, Ordering::Relaxed);
+        Ok(())
+    }
+    fn copy(&mut self) -> Result<Copied, DeviceLost> {
+        Ok(Copied::NoRoom("no room, by the test".into()))
+    }
+    fn device_seconds(&mut self) -> f64 {
+        0.0
+    }
+}
+
+#[test]
+fn a_network_that_is_waited_for_every_minute_is_told_of_once() {
+    let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
+    let tracer = cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
+    let settings = NetworkSettings { levels: 2, log2_table: 4, width: 16, batch: 64, ..NetworkSettings::default() };
+    let mut trainer = Trainer::new(&settings, &*tracer, 1, false).unwrap();
+    let full = Full::default();
+    let offload: Arc<dyn Offload> = Arc::new(full.clone());
+    trainer.offload(&offload);
+    let points: Vec<[f32; 3]> = (0..64).map(|i| [i as f32 / 64.0, 0.5, 0.5]).collect();
+    let ring = SampleRing::holding(&Samples { log_stretch: vec![1.0; points.len()], points, ..Samples::default() });
+    let told: Vec<Vec<String>> = (0..4)
+        .map(|call| {
+            if call >= 2 {
+                trainer.away.as_mut().unwrap().fetched_at -= Duration::from_secs(61);
+            }
+            trainer.learn(&ring, None, f64::INFINITY, 3).warnings
+        })
+        .collect();
+    assert_eq!(full.0.load(Ordering::Relaxed), 2, "waited for when a minute had passed, and then again");
+    assert!(told[2].len() == 1 && told[2][0].contains("training waited") && told[2][0].contains("no room, by the test"), "{told:?}");
+    assert!([0, 1, 3].iter().all(|&call| told[call].is_empty()), "{told:?}");
+}
