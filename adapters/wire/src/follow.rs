@@ -6,6 +6,7 @@ use crate::place::Place;
 use crate::reader::{Read, RingReader, StepInfo};
 use crate::{Description, Limits, WireError};
 use std::collections::{BTreeMap, BTreeSet};
+use std::io::ErrorKind;
 use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -137,6 +138,8 @@ pub struct RingFollower {
     rings: BTreeMap<u32, Followed>,
     /// Rings that were refused, with their words, so that each is told once.
     refused: BTreeMap<u32, String>,
+    /// Why the folder could not be looked at last time, told once.
+    unseen: Option<String>,
     looked: Option<Instant>,
     /// The simulation that was asked last, so that none is starved.
     turn: Simulation,
@@ -161,6 +164,7 @@ impl RingFollower {
             limits,
             rings: BTreeMap::new(),
             refused: BTreeMap::new(),
+            unseen: None,
             looked: None,
             turn: (0, 0),
             current: None,
@@ -291,6 +295,17 @@ impl RingFollower {
 
     /// Looks for rings that are new, or that a new producer put in the place of an old one.
     fn look(&mut self) -> Option<Event> {
+        // What cannot be looked at, for want of a descriptor for instance, looks empty below.
+        if let Err(error) = std::fs::read_dir(&self.ring)
+            && error.kind() != ErrorKind::NotFound
+        {
+            let error = WireError::io(&self.ring, "cannot be looked at", error);
+            let words = Some(error.to_string());
+            let is_news = self.unseen != words;
+            self.unseen = words;
+            return is_news.then_some(Event::Refused(error));
+        }
+        self.unseen = None;
         for block in blocks(&self.ring) {
             // What the old one left is read first.
             if let Some(followed) = self.rings.get_mut(&block) {
@@ -317,7 +332,8 @@ impl RingFollower {
                     self.rings.insert(block, followed);
                     return Some(event);
                 }
-                Err(WireError::Io { .. }) => {}
+                // It went meanwhile.
+                Err(WireError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {}
                 Err(error) => {
                     let words = error.to_string();
                     if self.refused.get(&block) != Some(&words) {
