@@ -23,7 +23,10 @@ impl Link {
         if settings.connections.is_empty() {
             let ring = ring_of(settings)?;
             let follower = RingFollower::begin(&ring, limits).map_err(SourceError::Live)?;
-            return Ok((Self::Ring(Box::new(follower)), format!("waiting for a simulation: start it with {RING_VARIABLE}={}", ring.display())));
+            return Ok((
+                Self::Ring(Box::new(follower)),
+                format!("waiting for a simulation: start it with {RING_VARIABLE}={}", ring.display()),
+            ));
         }
         let mut relays = Vec::new();
         for path in &settings.connections {
