@@ -104,9 +104,13 @@ async fn every_record_arrives_though_pictures_are_superseded() {
     assert!(statistics.superseded > 0 && statistics.records_dropped == 0, "{statistics:?}");
 }
 
-/// More strangers than there are places, from an address of their own, all of whom greet as ZMTP 3 says and stay.
+/// More strangers than there are places, from the subscribers' own address or from another, all of whom greet as ZMTP 3 says and stay.
 #[tokio::test(flavor = "multi_thread")]
 async fn strangers_who_greet_and_stay_keep_nobody_out() {
+    tokio::join!(strangers_from("127.0.0.1:0"), strangers_from("127.0.0.2:0"));
+}
+
+async fn strangers_from(own: &str) {
     let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
     let mut early = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
     first_message(&publisher, &mut early).await;
@@ -114,7 +118,7 @@ async fn strangers_who_greet_and_stay_keep_nobody_out() {
     let mut strangers = Vec::new();
     for _ in 0..300 {
         let socket = tokio::net::TcpSocket::new_v4().unwrap();
-        socket.bind("127.0.0.2:0".parse().unwrap()).unwrap();
+        socket.bind(own.parse().unwrap()).unwrap();
         let mut stranger = socket.connect(address).await.unwrap();
         let mut greeting = [0; 64];
         (greeting[0], greeting[9], greeting[10]) = (0xff, 0x7f, 3);
@@ -132,7 +136,13 @@ async fn strangers_who_greet_and_stay_keep_nobody_out() {
             break;
         }
     }
-    drop(strangers);
+    // They have some seconds to subscribe.
+    let mut last = strangers.pop().unwrap();
+    let mut sent = Vec::new();
+    let gone = tokio::io::AsyncReadExt::read_to_end(&mut last, &mut sent);
+    tokio::time::timeout(LIMIT, gone).await.expect("whoever does not subscribe is cut off").ok();
+    publisher.frame(frame(5001));
+    receive(&mut early).await;
     let statistics = tokio::task::spawn_blocking(move || publisher.finish(Duration::from_millis(500))).await.unwrap();
     assert_eq!(statistics.cut_offs, 0, "{statistics:?}");
 }

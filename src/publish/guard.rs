@@ -2,16 +2,19 @@
 //!
 //! The crate takes memory for any length that a peer announces, and its PUB socket reads subscriptions from everybody: nine bytes of a stranger could end
 //! the run. So the socket itself listens where nobody else can reach it, connections over TCP end here, and a peer's bytes are handed on only as far as they
-//! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more is cut off, and nobody else notices. What the socket sends passes
-//! as it is. Who greets may stay, so that places are shared out by address: where none is left, the one that has most of them gives up its oldest.
+//! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more, or does not subscribe in time, is cut off, and nobody else
+//! notices. What the socket sends passes as it is. Who subscribes may stay, so that places are shared out by address and, on this machine, by user: where
+//! none is left, whoever has most of them gives up one, of those that have not subscribed yet if there are any, and of those the oldest.
 
 use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Result};
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixListener;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt, BufReader};
 use tokio::net::{TcpListener, TcpStream, UnixStream};
@@ -23,8 +26,9 @@ const CONNECTIONS: usize = 256;
 const FRAME_BYTES: u64 = 1 << 16;
 /// Most bytes of messages (subscriptions) that one peer may send: the socket keeps them.
 const MESSAGE_BYTES: u64 = 1 << 20;
-/// Bytes of a greeting, and how long a peer may take for them.
+/// Bytes of a greeting.
 const GREETING: usize = 64;
+/// How long a peer may take until it has subscribed to something.
 const PATIENCE: Duration = Duration::from_secs(5);
 /// How many bytes of the socket are passed on at once.
 const PIECE: usize = 1 << 18;
@@ -32,6 +36,8 @@ const PIECE: usize = 1 << 18;
 const MORE: u8 = 1;
 const LONG: u8 = 2;
 const COMMAND: u8 = 4;
+/// First byte of a message that subscribes (of ZMTP 3.0, which the socket speaks with all).
+const SUBSCRIBE: u8 = 1;
 
 /// A listener that nobody else can reach, and its place. The folder in which it was made is gone, so that nothing stays behind however this process ends.
 pub(super) fn private_listener() -> Result<(UnixListener, File)> {
@@ -42,62 +48,125 @@ pub(super) fn private_listener() -> Result<(UnixListener, File)> {
     Ok((listener, place))
 }
 
+/// Whom a connection counts against: an address, on this machine a user of it.
+type Owner = (IpAddr, Option<u32>);
+
+/// One connection.
+struct Guest {
+    owner: Owner,
+    has_subscribed: Arc<AtomicBool>,
+    connection: AbortHandle,
+}
+
 /// Lets subscribers in, until it is dropped. The socket listens at `place`.
 pub(super) async fn guard(listener: TcpListener, place: File) {
     let socket = PathBuf::from(format!("/proc/self/fd/{}", place.as_raw_fd()));
-    let mut guests: Vec<(IpAddr, AbortHandle)> = Vec::new();
+    let mut guests: Vec<Guest> = Vec::new();
     loop {
         let Ok((stream, peer)) = listener.accept().await else {
             // A peer that went before it was taken, or no descriptor left: later ones may fare better.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
-        guests.retain(|(_, connection)| !connection.is_finished());
+        let user = match stream.local_addr() {
+            // The system's table of connections may be long, and frames do not wait for it.
+            Ok(here) => tokio::task::spawn_blocking(move || user_of(peer, here)).await.unwrap_or_default(),
+            Err(_) => None,
+        };
+        guests.retain(|guest| !guest.connection.is_finished());
         if guests.len() >= CONNECTIONS {
-            let (address, oldest) = guests.remove(displaced(&guests));
-            tracing::debug!("a connection of {address} is cut off: {CONNECTIONS} are there, and most of them are its own");
-            oldest.abort();
+            let there: Vec<_> = guests.iter().map(|guest| (guest.owner, guest.has_subscribed.load(Ordering::Relaxed))).collect();
+            let Guest { owner: (address, _), connection, .. } = guests.remove(displaced(&there));
+            tracing::debug!("a connection of {address} is cut off: {CONNECTIONS} are there, and nobody has more of them");
+            connection.abort();
         }
-        let socket = socket.clone();
+        let (socket, has_subscribed) = (socket.clone(), Arc::new(AtomicBool::new(false)));
+        let subscribes = has_subscribed.clone();
         let connection = tokio::spawn(async move {
-            if let Err(error) = connection(stream, &socket).await {
+            if let Err(error) = connection(stream, &socket, &subscribes).await {
                 tracing::debug!("{peer} is cut off: {error}");
             }
         });
-        guests.push((peer.ip(), connection.abort_handle()));
+        guests.push(Guest { owner: (peer.ip().to_canonical(), user), has_subscribed, connection: connection.abort_handle() });
     }
 }
 
-/// Who goes, of guests as they came: of the address with most places the one that came first.
-fn displaced<T>(guests: &[(IpAddr, T)]) -> usize {
-    let places = |address: IpAddr| guests.iter().filter(|(one, _)| *one == address).count();
-    let most = guests.iter().map(|(address, _)| places(*address)).max().unwrap_or_default();
-    guests.iter().position(|(address, _)| places(*address) == most).unwrap_or_default()
+/// The user whose process of this machine holds the other end of a connection; none: it is of another machine, or not known.
+fn user_of(peer: SocketAddr, here: SocketAddr) -> Option<u32> {
+    let plain = |address: SocketAddr| SocketAddr::new(address.ip().to_canonical(), address.port());
+    let (peer, here) = (plain(peer), plain(here));
+    if !peer.ip().is_loopback() && peer.ip() != here.ip() {
+        return None;
+    }
+    let tables = [procfs::net::tcp, procfs::net::tcp6].into_iter().filter_map(|table| table().ok());
+    tables.flatten().find(|one| plain(one.local_address) == peer && plain(one.remote_address) == here).map(|one| one.uid)
+}
+
+/// Who goes, of guests as they came, each with whether it has subscribed: one of the owner with most places, rather one that has not, rather the
+/// first.
+fn displaced(guests: &[(Owner, bool)]) -> usize {
+    let places = |owner: Owner| guests.iter().filter(|(one, _)| *one == owner).count();
+    let weight = |(owner, has_subscribed): &(Owner, bool)| (places(*owner), !has_subscribed);
+    let most = guests.iter().map(weight).max();
+    guests.iter().position(|guest| Some(weight(guest)) == most).unwrap_or_default()
 }
 
 /// One subscriber, until either side ends it.
-async fn connection(mut outside: TcpStream, socket: &Path) -> Result<()> {
+async fn connection(mut outside: TcpStream, socket: &Path, has_subscribed: &AtomicBool) -> Result<()> {
     outside.set_nodelay(true)?;
     let mut inside = UnixStream::connect(socket).await?;
-    let ((mut from_peer, mut to_peer), (from_socket, mut to_socket)) = (outside.split(), inside.split());
+    let ((from_peer, mut to_peer), (from_socket, to_socket)) = (outside.split(), inside.split());
     let mut from_socket = BufReader::with_capacity(PIECE, from_socket);
     tokio::select! {
-        done = pass(&mut from_peer, &mut to_socket) => done,
+        done = pass(from_peer, to_socket, has_subscribed) => done,
         done = tokio::io::copy_buf(&mut from_socket, &mut to_peer) => done.map(|_| ()),
     }
 }
 
 /// Hands on what a peer sends, as long as it is what a subscriber may send.
-async fn pass(from: &mut (impl AsyncRead + Unpin), to: &mut (impl AsyncWrite + Unpin)) -> Result<()> {
-    let mut greeting = [0; GREETING];
-    tokio::time::timeout(PATIENCE, from.read_exact(&mut greeting)).await??;
-    if greeting[0] != 0xff || greeting[9] != 0x7f || greeting[10] < 3 {
-        return refuse("no greeting of ZMTP 3");
+async fn pass(from: impl AsyncRead + Unpin, to: impl AsyncWrite + Unpin, has_subscribed: &AtomicBool) -> Result<()> {
+    let mut frames = Frames { from: BufReader::new(from), to, left: MESSAGE_BYTES, body: Vec::new() };
+    let handshake = async {
+        frames.greeting().await?;
+        while let Some(subscribes) = frames.next().await? {
+            if subscribes {
+                return Ok(true);
+            }
+        }
+        Result::Ok(false)
+    };
+    if tokio::time::timeout(PATIENCE, handshake).await?? {
+        has_subscribed.store(true, Ordering::Relaxed);
+        while frames.next().await?.is_some() {}
     }
-    to.write_all(&greeting).await?;
-    let mut from = BufReader::new(from);
-    let (mut left, mut body) = (MESSAGE_BYTES, Vec::new());
-    while !from.fill_buf().await?.is_empty() {
+    Ok(())
+}
+
+/// What a peer sends, on its way to the socket.
+struct Frames<R, W> {
+    from: BufReader<R>,
+    to: W,
+    /// Bytes of messages that it may still send.
+    left: u64,
+    body: Vec<u8>,
+}
+
+impl<R: AsyncRead + Unpin, W: AsyncWrite + Unpin> Frames<R, W> {
+    async fn greeting(&mut self) -> Result<()> {
+        let mut greeting = [0; GREETING];
+        self.from.read_exact(&mut greeting).await?;
+        if greeting[0] != 0xff || greeting[9] != 0x7f || greeting[10] < 3 {
+            return refuse("no greeting of ZMTP 3");
+        }
+        self.to.write_all(&greeting).await
+    }
+
+    /// Hands the next frame on; whether it subscribes to something. None: the peer has ended.
+    async fn next(&mut self) -> Result<Option<bool>> {
+        let Self { from, to, left, body } = self;
+        if from.fill_buf().await?.is_empty() {
+            return Ok(None);
+        }
         let flags = from.read_u8().await?;
         if flags & !(MORE | LONG | COMMAND) != 0 || flags & COMMAND != 0 && flags & MORE != 0 {
             return refuse("no frame of ZMTP 3");
@@ -109,22 +178,22 @@ async fn pass(from: &mut (impl AsyncRead + Unpin), to: &mut (impl AsyncWrite + U
         if flags & COMMAND == 0 {
             // With a head that a short frame has, so that empty ones count too.
             let Some(rest) = left.checked_sub(length + 2) else { return refuse("more subscriptions than are kept") };
-            left = rest;
+            *left = rest;
         }
         body.resize(length as usize, 0);
-        from.read_exact(&mut body).await?;
+        from.read_exact(body).await?;
         if flags & LONG != 0 {
             to.write_u8(flags).await?;
             to.write_u64(length).await?;
         } else {
             to.write_all(&[flags, length as u8]).await?;
         }
-        to.write_all(&body).await?;
+        to.write_all(body).await?;
+        Ok(Some(flags & COMMAND == 0 && body.first() == Some(&SUBSCRIBE)))
     }
-    Ok(())
 }
 
-fn refuse(why: &'static str) -> Result<()> {
+fn refuse<T>(why: &'static str) -> Result<T> {
     Err(Error::new(ErrorKind::InvalidData, why))
 }
 
@@ -136,7 +205,7 @@ mod tests {
     fn passed(bytes: &[u8]) -> (Vec<u8>, Result<()>) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let mut out = Vec::new();
-        let done = runtime.block_on(pass(&mut { bytes }, &mut out));
+        let done = runtime.block_on(pass(bytes, &mut out, &AtomicBool::new(false)));
         (out, done)
     }
 
@@ -184,11 +253,52 @@ mod tests {
     }
 
     #[test]
-    fn whoever_has_most_places_gives_up_the_oldest() {
-        let guests = |last: &[u8]| last.iter().map(|n| (IpAddr::from([10, 0, 0, *n]), ())).collect::<Vec<_>>();
-        for (there, gone) in [(&[1, 2, 2, 3][..], 1), (&[1, 1, 2, 2], 0), (&[3, 1, 2, 2, 1, 2], 2), (&[5], 0)] {
-            assert_eq!(displaced(&guests(there)), gone, "{there:?}");
+    fn whoever_has_most_places_gives_up_one_that_has_not_subscribed_or_the_oldest() {
+        // Negative: has not subscribed.
+        let owner = |n: i32| ((IpAddr::from([127, 0, 0, 1]), Some(n.unsigned_abs())), n > 0);
+        for (there, gone) in [
+            (&[1, 2, 2, 3][..], 1),
+            (&[1, 1, 2, 2], 0),
+            (&[3, 1, 2, 2, 1, 2], 2),
+            (&[5], 0),
+            (&[1, 1, -1, -1, 2], 2),
+            (&[1, 2, -2, -1], 2),
+            // The newcomer of another is not driven out by somebody's many, whatever they do.
+            (&[1, 1, 1, -2], 0),
+        ] {
+            let guests: Vec<_> = there.iter().map(|n| owner(*n)).collect();
+            assert_eq!(displaced(&guests), gone, "{there:?}");
         }
+    }
+
+    #[test]
+    fn a_subscription_is_told_from_other_frames() {
+        let subscribes = |bytes: Vec<u8>| {
+            let has_subscribed = AtomicBool::new(false);
+            let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+            runtime.block_on(pass([greeting(), bytes].concat().as_slice(), Vec::new(), &has_subscribed)).unwrap();
+            has_subscribed.into_inner()
+        };
+        let ready = frame(COMMAND, 5, b"\x05READ");
+        assert!(!subscribes(ready.clone()) && !subscribes(frame(0, 6, b"\0frame")) && !subscribes(frame(0, 0, b"")));
+        assert!(!subscribes(frame(COMMAND, 1, b"\x01")));
+        assert!(subscribes([ready, frame(0, 6, b"\x01frame")].concat()) && subscribes(frame(0, 1, b"\x01")));
+    }
+
+    /// The test's own process, whichever address of this machine it comes by.
+    #[test]
+    fn a_peer_of_this_machine_is_known_by_its_user() {
+        // SAFETY: takes and touches nothing.
+        let own = unsafe { libc::geteuid() };
+        for address in ["127.0.0.1:0", "[::1]:0", "[::]:0"] {
+            let listener = std::net::TcpListener::bind(address).unwrap();
+            let reached = if address == "[::]:0" { IpAddr::from([127, 0, 0, 1]) } else { listener.local_addr().unwrap().ip() };
+            let peer = std::net::TcpStream::connect((reached, listener.local_addr().unwrap().port())).unwrap();
+            let (stream, address) = listener.accept().unwrap();
+            assert_eq!(user_of(address, stream.local_addr().unwrap()), Some(own), "{address}");
+            assert_eq!(user_of(peer.local_addr().unwrap(), "192.0.2.1:5577".parse().unwrap()), None, "no such connection");
+        }
+        assert_eq!(user_of("192.0.2.7:1000".parse().unwrap(), "192.0.2.1:5577".parse().unwrap()), None, "of another machine");
     }
 
     #[test]

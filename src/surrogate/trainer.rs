@@ -48,6 +48,8 @@ struct Kept {
     progress: Progress,
     /// Weights, moments and mean; none where a device keeps them.
     here: Option<([[Vec<f32>; 3]; 2], Average)>,
+    /// Not to be come back to any more; the next copy takes its place, in the same memory.
+    is_stale: bool,
 }
 
 /// A network that a device trains.
@@ -271,7 +273,7 @@ impl Trainer {
         if self.times.hold(before, self.start) {
             return;
         }
-        self.kept = None;
+        self.disown_kept();
         self.progress.window_slid();
         if let Some(away) = &mut self.away {
             away.training.forget_labels();
@@ -280,7 +282,7 @@ impl Trainer {
 
     /// Sets the output layer back to 0, in the weights, the moments and the average: what the hidden layers have learned stays.
     pub(super) fn forget_output(&mut self) {
-        self.kept = None;
+        self.disown_kept();
         let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
         let output = head.weights..head.biases + head.outputs;
         if let Some(away) = &mut self.away {
@@ -367,7 +369,7 @@ impl Trainer {
             // The first step of a call is the likeliest to meet something new; but a call of a few steps must not cost a copy.
             let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
             let may_keep = learned.steps == 0 || (steps as u64).is_multiple_of(KEEP_EVERY);
-            if may_keep && self.kept.as_ref().is_none_or(|kept| steps as u64 >= kept.steps as u64 + apart) {
+            if may_keep && self.kept.as_ref().is_none_or(|kept| kept.is_stale || steps as u64 >= kept.steps as u64 + apart) {
                 self.keep()?;
             }
             let most = (KEEP_EVERY - steps as u64 % KEEP_EVERY).min(max_steps - learned.steps);
@@ -605,25 +607,34 @@ impl Trainer {
         let (steps, progress) = (self.steps(), self.progress);
         if let Some(away) = &mut self.away {
             away.training.keep()?;
-            self.kept = Some(Kept { steps, progress, here: None });
+            self.kept = Some(Kept { steps, progress, here: None, is_stale: false });
             return Ok(());
         }
-        match &mut self.kept {
-            Some(Kept { here: Some((state, average)), steps: kept_steps, progress: kept_progress }) => {
-                self.model.copy_state(state);
+        let here = match self.kept.take().and_then(|kept| kept.here) {
+            Some((mut state, mut average)) => {
+                self.model.copy_state(&mut state);
                 average.tables.copy_from_slice(&self.average.tables);
                 average.layers.copy_from_slice(&self.average.layers);
-                (*kept_steps, *kept_progress) = (steps, progress);
+                (state, average)
             }
-            kept => *kept = Some(Kept { steps, progress, here: Some((self.model.state(), Average::clone(&self.average))) }),
-        }
+            None => (self.model.state(), Average::clone(&self.average)),
+        };
+        self.kept = Some(Kept { steps, progress, here: Some(here), is_stale: false });
         Ok(())
+    }
+
+    /// The copy is not to be come back to any more. Its memory, four times that of the network, stays for the next one: to give it back and to take it
+    /// anew would cost each slide of a window its page faults.
+    fn disown_kept(&mut self) {
+        if let Some(kept) = &mut self.kept {
+            kept.is_stale = true;
+        }
     }
 
     /// Back to the last good weights, at half the rate. The generator moves on, so that the same batches are not drawn again.
     fn roll_back(&mut self) -> Result<(), DeviceLost> {
         let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
-        let Some(kept) = &self.kept else { return Ok(()) };
+        let Some(kept) = self.kept.as_ref().filter(|kept| !kept.is_stale) else { return Ok(()) };
         match (&mut self.away, &kept.here) {
             (Some(away), _) => {
                 away.training.roll_back()?;

@@ -131,6 +131,9 @@ pub enum WireError {
         /// Who asks.
         here: u32,
     },
+    /// The relay hung up when it had seen what this follower signed.
+    #[error("the relay sent this follower away: another key, or more followers than it takes")]
+    SentAway,
     /// The signature is not that of the key.
     #[error("the signature does not fit: another key, or the message was changed on the way")]
     Signature,

@@ -15,7 +15,7 @@ use crate::system::{self, create_private, open_private};
 use crate::{Description, Limits, WireError};
 use hmac::{Hmac, Mac};
 use sha2::Sha256;
-use std::io::{Read, Write};
+use std::io::{ErrorKind, Read, Write};
 use std::path::Path;
 use std::str::FromStr;
 
@@ -37,7 +37,7 @@ const SIGNATURE: usize = 32;
 /// Longest connection file.
 const FILE_BYTES: u64 = 4096;
 /// Values go through the socket in pieces of so many bytes, so that a peer that stalls is noticed.
-const PIECE: usize = 1 << 20;
+pub(crate) const PIECE: usize = 1 << 20;
 
 /// What both sides know.
 #[derive(Clone, PartialEq, Eq)]
@@ -221,7 +221,10 @@ impl Session {
         stream.write_all(&greeting(&mine)).map_err(failed)?;
         stream.write_all(&key.signature(&[b"follower", &theirs, &mine])).map_err(failed)?;
         let mut signature = [0; SIGNATURE];
-        stream.read_exact(&mut signature).map_err(failed)?;
+        stream.read_exact(&mut signature).map_err(|e| match e.kind() {
+            ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => WireError::SentAway,
+            _ => failed(e),
+        })?;
         key.verify(&[b"relay", &theirs, &mine], &signature)?;
         Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0, asked: 0 })
     }
@@ -313,7 +316,7 @@ impl Session {
     /// a step's values are in `values` then, which keeps its memory from call to call.
     ///
     /// # Errors
-    /// Wrong key, a changed or replayed message, lengths that lie, a field larger than `limits`: the session is over.
+    /// Wrong key, a changed or replayed message, lengths that lie, a field larger than `limits`, no memory: the session is over.
     pub fn receive(
         &mut self,
         from: &mut impl Read,
@@ -343,11 +346,22 @@ impl Session {
             let accepted = expected.map_or("a description first".to_owned(), |bytes| format!("{bytes}, as described"));
             return Err(WireError::field("payload bytes", payload, accepted));
         }
-        values.resize(payload as usize / 4, 0.0);
-        // SAFETY: any bytes are f32s, and the length is that of the values.
-        let bytes = unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast::<u8>(), values.len() * 4) };
-        from.read_exact(bytes).map_err(failed)?;
-        hasher.update(bytes);
+        let count = payload as usize / 4;
+        values.truncate(count);
+        let missing = count - values.len();
+        values.try_reserve_exact(missing).map_err(|_| WireError::no_memory(4 * missing))?;
+        // Memory that was never touched, and the hash, take as long as the bytes' way: piece by piece the relay is kept waiting by neither.
+        for start in (0..count).step_by(PIECE / 4) {
+            let end = count.min(start + PIECE / 4);
+            if values.len() < end {
+                values.resize(end, 0.0);
+            }
+            let piece = &mut values[start..end];
+            // SAFETY: any bytes are f32s, and the length is that of the values.
+            let bytes = unsafe { std::slice::from_raw_parts_mut(piece.as_mut_ptr().cast::<u8>(), size_of_val(piece)) };
+            from.read_exact(bytes).map_err(failed)?;
+            hasher.update(bytes);
+        }
         if hasher.finalize().as_bytes()[..hash.len()] != hash {
             return Err(WireError::Hash);
         }

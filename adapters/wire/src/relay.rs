@@ -5,7 +5,7 @@
 //! [`PATIENCE`] is cut off.
 
 use crate::follow::{Event, RingFollower};
-use crate::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
+use crate::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, PIECE, Session};
 use crate::{Description, Limits, WireError, system};
 use std::collections::{BTreeMap, VecDeque};
 use std::io::{BufReader, ErrorKind, Read, Write};
@@ -16,7 +16,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync
 use std::sync::{Arc, Mutex, MutexGuard};
 use std::time::{Duration, Instant};
 
-/// Longest that a peer may take for a piece of a message.
+/// Longest that a peer may take for a piece of a message: 1 MiB, or what is left of it.
 pub const PATIENCE: Duration = Duration::from_secs(5);
 /// How often a relay with nothing to send says that it lives.
 const PULSE: Duration = Duration::from_secs(1);
@@ -49,30 +49,70 @@ pub struct RelayCounts {
     pub bytes: AtomicU64,
 }
 
-/// A stream of which a piece of work must be done by a certain time, however slowly the peer dribbles.
-struct Within<'a> {
+/// The longest that a wait lasts before it is looked whether to stop.
+const TICK: Duration = Duration::from_millis(200);
+
+/// How long a peer may take until the first bytes of a step are there: [`PATIENCE`], and a second for each 256 MB that it copies from its ring and signs
+/// before it sends them.
+fn patience(bytes: u64) -> Duration {
+    PATIENCE + Duration::from_micros(bytes / 256)
+}
+
+/// A stream of which each [`PIECE`] of a message must be through within [`PATIENCE`], however slowly the peer dribbles; a wait ends with `stop`.
+struct Paced<'a> {
     stream: &'a TcpStream,
-    until: Instant,
+    stop: &'a AtomicBool,
+    /// Until when the piece must be through; none before its first byte was tried.
+    until: Option<Instant>,
+    /// Bytes of the piece that are through.
+    through: usize,
 }
 
-impl Within<'_> {
-    fn left(&self) -> std::io::Result<Duration> {
-        let left = self.until.saturating_duration_since(Instant::now());
-        if left.is_zero() { Err(ErrorKind::TimedOut.into()) } else { Ok(left) }
+impl<'a> Paced<'a> {
+    fn new(stream: &'a TcpStream, stop: &'a AtomicBool) -> Self {
+        Self { stream, stop, until: None, through: 0 }
+    }
+
+    /// Begins a message, of which the first bytes may take so long.
+    fn begin(&mut self, first: Duration) -> &mut Self {
+        (self.until, self.through) = (Some(Instant::now() + first), 0);
+        self
+    }
+
+    /// One attempt to pass bytes on, at most a [`TICK`] long; the callers try again after an interruption.
+    fn attempt(&mut self, pass: impl FnOnce(&TcpStream) -> std::io::Result<usize>) -> std::io::Result<usize> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(std::io::Error::new(ErrorKind::ConnectionAborted, "told to stop"));
+        }
+        let until = *self.until.get_or_insert_with(|| Instant::now() + PATIENCE);
+        match pass(self.stream) {
+            Err(e) if e.kind() == ErrorKind::WouldBlock => {
+                let late = Instant::now() >= until;
+                Err(if late { ErrorKind::TimedOut } else { ErrorKind::Interrupted }.into())
+            }
+            Ok(bytes) => {
+                self.through += bytes;
+                if self.through >= PIECE {
+                    self.begin(PATIENCE);
+                } else if Instant::now() >= until {
+                    return Err(ErrorKind::TimedOut.into());
+                }
+                Ok(bytes)
+            }
+            Err(e) => Err(e),
+        }
     }
 }
 
-impl Read for Within<'_> {
+impl Read for Paced<'_> {
     fn read(&mut self, to: &mut [u8]) -> std::io::Result<usize> {
-        self.stream.set_read_timeout(Some(self.left()?))?;
-        (&mut &*self.stream).read(to)
+        self.attempt(|mut stream| stream.read(to))
     }
 }
 
-impl Write for Within<'_> {
+impl Write for Paced<'_> {
     fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
-        self.stream.set_write_timeout(Some(self.left()?))?;
-        (&mut &*self.stream).write(from)
+        self.attempt(|mut stream| stream.write(from))
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
@@ -82,14 +122,14 @@ impl Write for Within<'_> {
 
 /// A stream between whose pieces producers are told that somebody follows, however long a step takes on its way.
 struct Beating<'a> {
-    stream: &'a TcpStream,
+    stream: Paced<'a>,
     rings: &'a mut RingFollower,
 }
 
 impl Write for Beating<'_> {
     fn write(&mut self, from: &[u8]) -> std::io::Result<usize> {
         self.rings.beat();
-        (&mut &*self.stream).write(from)
+        self.stream.write(from)
     }
 
     fn flush(&mut self) -> std::io::Result<()> {
@@ -98,12 +138,15 @@ impl Write for Beating<'_> {
 }
 
 /// Both sides' greetings take [`PATIENCE`] in all; afterwards each piece of a message may.
-fn greet(stream: &TcpStream, greeting: impl FnOnce(&mut Within) -> Result<Session, WireError>) -> Result<Session, WireError> {
+fn greet(
+    stream: &TcpStream,
+    stop: &AtomicBool,
+    greeting: impl FnOnce(&mut Paced) -> Result<Session, WireError>,
+) -> Result<Session, WireError> {
     let broken = |e| WireError::io(Path::new("connection"), "broke", e);
-    stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true)).map_err(broken)?;
-    let session = greeting(&mut Within { stream, until: Instant::now() + PATIENCE })?;
-    stream.set_read_timeout(Some(PATIENCE)).and_then(|()| stream.set_write_timeout(Some(PATIENCE))).map_err(broken)?;
-    Ok(session)
+    let timeouts = || stream.set_read_timeout(Some(TICK)).and_then(|()| stream.set_write_timeout(Some(TICK)));
+    stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true)).and_then(|()| timeouts()).map_err(broken)?;
+    greeting(&mut Paced::new(stream, stop))
 }
 
 /// Connections that have not proved the key yet.
@@ -129,36 +172,45 @@ impl Strangers {
     }
 }
 
-/// How often it is said that connections were sent away, at most: whoever reaches the port can make it happen.
-const REFUSALS: Duration = Duration::from_secs(1);
+/// How often news of one kind is said, at most: whoever reaches the port can make some.
+const APART: Duration = Duration::from_secs(1);
 
-/// Connections that were sent away, as far as that was said.
-#[derive(Default)]
-struct Refusals {
-    said: Option<Instant>,
-    /// Since then, not said yet.
-    more: u64,
+/// News of one kind: said once in [`APART`], the rest counted and said together.
+struct News {
+    /// What befell those that were counted.
+    rest: &'static str,
+    /// When it was last said, and how often it happened since.
+    said: Mutex<(Option<Instant>, u64)>,
 }
 
-impl Refusals {
-    /// Whether one more is to be said now; otherwise it is counted.
-    fn come(&mut self) -> bool {
-        let now = self.said.is_none_or(|said| said.elapsed() >= REFUSALS);
-        if now {
-            self.said = Some(Instant::now())
-        } else {
-            self.more += 1
-        }
-        now
+impl News {
+    fn new(rest: &'static str) -> Self {
+        Self { rest, said: Mutex::default() }
     }
 
-    /// How many are to be said together now.
-    fn due(&mut self) -> Option<u64> {
-        if self.more == 0 || self.said.is_some_and(|said| said.elapsed() < REFUSALS) {
+    fn said(&self) -> MutexGuard<'_, (Option<Instant>, u64)> {
+        self.said.lock().unwrap_or_else(|broken| broken.into_inner())
+    }
+
+    /// What is to be said of one more now: that.
+    fn come(&self, words: impl FnOnce() -> String) -> Option<String> {
+        let mut said = self.said();
+        if said.0.is_some_and(|last| last.elapsed() < APART) {
+            said.1 += 1;
             return None;
         }
-        self.said = Some(Instant::now());
-        Some(std::mem::take(&mut self.more))
+        said.0 = Some(Instant::now());
+        Some(words())
+    }
+
+    /// What is to be said now of those that were counted.
+    fn due(&self) -> Option<String> {
+        let mut said = self.said();
+        if said.1 == 0 || said.0.is_some_and(|last| last.elapsed() < APART) {
+            return None;
+        }
+        let more = std::mem::replace(&mut *said, (Some(Instant::now()), 0)).1;
+        Some(format!("{more} more {}", self.rest))
     }
 }
 
@@ -187,9 +239,12 @@ struct Relay {
     key: Key,
     counts: Arc<RelayCounts>,
     strangers: Strangers,
-    refusals: Mutex<Refusals>,
     stop: Arc<AtomicBool>,
     tell: Arc<dyn Fn(String) + Send + Sync>,
+    sent_away: News,
+    lost: News,
+    left: News,
+    refused: News,
 }
 
 /// Serves the rings of a folder until `stop` is set. `tell` hears of followers that come and go, and why.
@@ -208,13 +263,22 @@ pub fn serve(
     // Steps are kept for followers that come later only as long as somebody follows: the relay itself does.
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
-    let (ring, key, counts, strangers) = (ring.to_owned(), key.clone(), counts.clone(), Strangers::default());
-    let refusals = Mutex::default();
-    let relay = Arc::new(Relay { ring, key, counts, strangers, refusals, stop: stop.clone(), tell });
+    let relay = Arc::new(Relay {
+        ring: ring.to_owned(),
+        key: key.clone(),
+        counts: counts.clone(),
+        strangers: Strangers::default(),
+        stop: stop.clone(),
+        tell,
+        sent_away: News::new("were sent away"),
+        lost: News::new("connections were lost"),
+        left: News::new("follower connections ended"),
+        refused: News::new("rings were refused"),
+    });
     let mut threads: Vec<std::thread::JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
-        relay.say_refusals();
+        relay.say_rest();
         let (stream, peer) = match listener.accept() {
             // Whoever was cut off is about to end its thread.
             Ok((_, peer)) if threads.len() > FOLLOWERS + 2 * STRANGERS => {
@@ -228,7 +292,7 @@ pub fn serve(
             }
             // A peer that went before it was taken, or no descriptor left: later ones may fare better.
             Err(e) => {
-                (relay.tell)(format!("a connection was lost: {e}"));
+                relay.say(&relay.lost, || format!("a connection was lost: {e}"));
                 std::thread::sleep(Duration::from_millis(100));
                 continue;
             }
@@ -247,28 +311,25 @@ pub fn serve(
 impl Relay {
     fn refuse(&self, peer: SocketAddr, why: String) {
         self.counts.refused.fetch_add(1, Ordering::Relaxed);
-        if self.refusals().come() {
-            (self.tell)(format!("{peer} was sent away: {why}"));
+        self.say(&self.sent_away, || format!("{peer} was sent away: {why}"));
+    }
+
+    fn say(&self, news: &News, words: impl FnOnce() -> String) {
+        if let Some(words) = news.come(words) {
+            (self.tell)(words);
         }
     }
 
     /// Says together what came too fast to be said one by one.
-    fn say_refusals(&self) {
-        let due = self.refusals().due();
-        if let Some(more) = due {
-            (self.tell)(format!("{more} more were sent away"));
-        }
-    }
-
-    fn refusals(&self) -> MutexGuard<'_, Refusals> {
-        self.refusals.lock().unwrap_or_else(|broken| broken.into_inner())
+    fn say_rest(&self) {
+        [&self.sent_away, &self.lost, &self.left, &self.refused].into_iter().filter_map(News::due).for_each(|words| (self.tell)(words));
     }
 
     /// One that came, until it goes.
     fn connection(&self, stream: &TcpStream, peer: SocketAddr) {
         let broken = |e| WireError::io(Path::new("connection"), "broke", e);
         let greeted = self.strangers.come(peer, stream).map_err(broken);
-        let greeted = greeted.and_then(|()| greet(stream, |within| Session::accept(within, &self.key)));
+        let greeted = greeted.and_then(|()| greet(stream, &self.stop, |paced| Session::accept(paced, &self.key)));
         self.strangers.go(peer);
         let session = match greeted {
             Ok(session) => session,
@@ -277,8 +338,10 @@ impl Relay {
         let seat = Seat::take(&self.counts.followers);
         if seat.before < FOLLOWERS {
             self.counts.accepted.fetch_add(1, Ordering::Relaxed);
-            if let Err(error) = self.send_steps(stream, session) {
-                (self.tell)(format!("follower {peer}: {error}"));
+            if let Err(error) = self.send_steps(stream, session)
+                && !self.stop.load(Ordering::Relaxed)
+            {
+                self.say(&self.left, || format!("follower {peer}: {error}"));
             }
         } else {
             self.refuse(peer, format!("{FOLLOWERS} followers are there"));
@@ -292,12 +355,15 @@ impl Relay {
         let (mut sent, mut heard) = (Instant::now(), Instant::now());
         let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
         while !self.stop.load(Ordering::Relaxed) {
+            let begin = Instant::now();
             let event = if asked { rings.poll(&mut values) } else { None };
+            // The follower is silent while it waits for what takes long to read.
+            heard += begin.elapsed();
             if event.is_none() {
                 if !asked {
                     rings.hold();
                 }
-                if let Some(ask) = hear(stream, &mut session, if asked { IDLE } else { HOLD })? {
+                if let Some(ask) = hear(&mut Paced::new(stream, &self.stop), &mut session, if asked { IDLE } else { HOLD })? {
                     asked |= ask == Ask::Next;
                     heard = Instant::now();
                 }
@@ -323,14 +389,19 @@ impl Relay {
                     (Facts { kind, block, generation, ..quiet }, None)
                 }
                 Some(Event::Refused(error)) => {
-                    (self.tell)(format!("refused: {error}"));
+                    self.say(&self.refused, || format!("refused: {error}"));
                     continue;
                 }
                 None if sent.elapsed() > PULSE => (quiet, None),
                 None => continue,
             };
             let step: &[f32] = if facts.kind == Kind::Step { &values } else { &[] };
-            session.send(&mut Beating { stream, rings: &mut rings }, &facts, description.as_deref(), step)?;
+            session.send(
+                &mut Beating { stream: Paced::new(stream, &self.stop), rings: &mut rings },
+                &facts,
+                description.as_deref(),
+                step,
+            )?;
             // A pulse is no answer. And what takes long to send is taken.
             asked = facts.kind == Kind::Pulse;
             (sent, heard) = (Instant::now(), if asked { heard } else { Instant::now() });
@@ -340,9 +411,9 @@ impl Relay {
 }
 
 /// What the follower asks, if it does so within the limit.
-fn hear(mut stream: &TcpStream, session: &mut Session, limit: Duration) -> Result<Option<Ask>, WireError> {
+fn hear(stream: &mut Paced, session: &mut Session, limit: Duration) -> Result<Option<Ask>, WireError> {
     let broken = |e| WireError::io(Path::new("connection"), "broke", e);
-    if !system::readable(stream, limit).map_err(broken)? {
+    if !system::readable(stream.stream, limit).map_err(broken)? {
         return Ok(None);
     }
     let mut bytes = [0; ASK_BYTES];
@@ -456,7 +527,7 @@ impl Receiving {
         let mut reached = Instant::now();
         while !self.stop.load(Ordering::Relaxed) {
             let found = (self.place)();
-            let connected = found.and_then(|found| connect(&found));
+            let connected = found.and_then(|found| connect(&found, &self.stop));
             let error = match connected {
                 Ok((stream, session)) => {
                     self.told.clear();
@@ -498,13 +569,16 @@ impl Receiving {
 
     /// Receives until the session breaks.
     fn session(&mut self, stream: &TcpStream, mut session: Session) -> Result<Result<(), WireError>, Left> {
-        let mut from = BufReader::with_capacity(1 << 16, stream);
+        let stop = self.stop.clone();
+        let (mut from, mut to) = (BufReader::with_capacity(1 << 16, Paced::new(stream, &stop)), Paced::new(stream, &stop));
         self.blocks.values_mut().for_each(|known| known.announced = false);
         let mut ask = Ask::Next;
         while !self.stop.load(Ordering::Relaxed) {
-            if let Err(error) = session.ask(&mut &*stream, ask) {
+            if let Err(error) = session.ask(to.begin(PATIENCE), ask) {
                 return Ok(Err(error));
             }
+            let largest = self.blocks.values().map(|known| known.description.block_bytes()).max();
+            from.get_mut().begin(patience(largest.unwrap_or_default()));
             let mut values = self.spare.try_recv().unwrap_or_default();
             let mut announced = None;
             let mut note = |block: u32, description: Option<Description>| {
@@ -543,7 +617,7 @@ impl Receiving {
                 }
                 (Kind::Pulse, _) => continue,
             };
-            if let Err(error) = self.hand_over(event, values, stream, &mut session)? {
+            if let Err(error) = self.hand_over(event, values, &mut to, &mut session)? {
                 return Ok(Err(error));
             }
         }
@@ -551,7 +625,7 @@ impl Receiving {
     }
 
     /// Waits until the event is taken, and says so to the relay, which would take the silence for an end.
-    fn hand_over(&self, event: Event, values: Vec<f32>, stream: &TcpStream, session: &mut Session) -> Result<Result<(), WireError>, Left> {
+    fn hand_over(&self, event: Event, values: Vec<f32>, to: &mut Paced, session: &mut Session) -> Result<Result<(), WireError>, Left> {
         let (mut said, mut item) = (Instant::now(), (event, values));
         loop {
             item = match self.to.try_send(item) {
@@ -563,7 +637,7 @@ impl Receiving {
                 return Err(Left);
             }
             if said.elapsed() > PULSE {
-                if let Err(error) = session.ask(&mut &*stream, Ask::Hold) {
+                if let Err(error) = session.ask(to.begin(PATIENCE), Ask::Hold) {
                     return Ok(Err(error));
                 }
                 said = Instant::now();
@@ -574,12 +648,12 @@ impl Receiving {
 }
 
 /// A session with the relay at a place.
-fn connect(place: &ConnectionFile) -> Result<(TcpStream, Session), WireError> {
+fn connect(place: &ConnectionFile, stop: &AtomicBool) -> Result<(TcpStream, Session), WireError> {
     let address = place.address.as_str();
     let broken = |e| WireError::io(Path::new(address), "cannot be reached", e);
     let found: Vec<SocketAddr> = address.to_socket_addrs().map_err(broken)?.collect();
     let stream = reach(&found).map_err(broken)?;
-    let session = greet(&stream, |within| Session::connect(within, &place.key))?;
+    let session = greet(&stream, stop, |paced| Session::connect(paced, &place.key))?;
     Ok((stream, session))
 }
 
@@ -639,7 +713,8 @@ mod tests {
         let opened = heartbeat();
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
-        let mut beating = Beating { stream: &stream, rings: &mut rings };
+        let stop = AtomicBool::new(false);
+        let mut beating = Beating { stream: Paced::new(&stream, &stop), rings: &mut rings };
         beating.write_all(&[0]).unwrap();
         assert_eq!(heartbeat(), opened, "a second is not over");
         std::thread::sleep(Duration::from_millis(1100));
@@ -650,13 +725,14 @@ mod tests {
     }
 
     #[test]
-    fn refusals_are_said_once_a_second_and_none_is_lost() {
-        let mut refusals = Refusals::default();
-        assert!(refusals.come() && refusals.due().is_none());
-        assert!((0..1000).all(|_| !refusals.come()) && refusals.due().is_none());
-        refusals.said = Some(Instant::now() - REFUSALS);
-        assert_eq!(refusals.due(), Some(1000));
-        assert!(refusals.due().is_none() && !refusals.come());
+    fn news_of_one_kind_are_said_once_a_second_and_none_is_lost() {
+        let news = News::new("were sent away");
+        let come = |n: usize| news.come(|| format!("{n} was sent away"));
+        assert_eq!((come(0).as_deref(), news.due()), (Some("0 was sent away"), None));
+        assert!((1..=1000).all(|n| come(n).is_none()) && news.due().is_none());
+        news.said().0 = Some(Instant::now() - APART);
+        assert_eq!(news.due().as_deref(), Some("1000 more were sent away"));
+        assert_eq!((news.due(), come(1001)), (None, None));
     }
 
     #[test]

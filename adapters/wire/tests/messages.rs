@@ -69,7 +69,7 @@ fn messages_arrive_once_and_in_order() {
 fn wrong_keys_are_refused_by_either_side() {
     let (server, client) = pair(&Key::random().unwrap(), &Key::random().unwrap());
     assert!(matches!(server, Err(WireError::Signature)));
-    assert!(client.is_err());
+    assert!(matches!(client, Err(WireError::SentAway)));
     // A relay that does not know the key cannot prove it, whatever it answers.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();

@@ -1,4 +1,4 @@
-//! What training tells of a device that has no memory for a copy of the network.
+//! What training tells of a device that has no memory for a copy of the network; what it comes back to.
 
 use super::*;
 use crate::field::Domain;
@@ -77,4 +77,34 @@ fn a_network_that_is_waited_for_every_minute_is_told_of_once() {
     assert_eq!(full.0.load(Ordering::Relaxed), 2, "waited for when a minute had passed, and then again");
     assert!(told[2].len() == 1 && told[2][0].contains("training waited") && told[2][0].contains("no room, by the test"), "{told:?}");
     assert!([0, 1, 3].iter().all(|&call| told[call].is_empty()), "{told:?}");
+}
+
+#[test]
+fn a_slide_keeps_the_memory_of_the_copy_but_nothing_comes_back_from_before_it() {
+    let flow = VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, Domain::slab([-1.0; 2], [1.0; 2], (0.0, 1.0)));
+    let tracer = cpu_tracer(flow, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
+    let settings = NetworkSettings { levels: 2, log2_table: 8, width: 16, batch: 256, ..NetworkSettings::default() };
+    let mut trainer = Trainer::new(&settings, &*tracer, 1, false).unwrap();
+    let mut ring = SampleRing::new(1000);
+    let points: Vec<[f32; 3]> = (0..1000).map(|i| [i as f32 / 1000.0, (i % 7) as f32 / 7.0, 0.5]).collect();
+    ring.push(&Samples { log_stretch: vec![0.7; points.len()], points, ..Samples::default() });
+    let learn = |trainer: &mut Trainer| assert_eq!(trainer.learn(&ring, None, f64::INFINITY, 10).steps, 10);
+    learn(&mut trainer);
+    // So much is asked for nowhere else.
+    let ([[tables, ..], _], _) = trainer.kept.as_mut().unwrap().here.as_mut().unwrap();
+    tables.reserve_exact(12_345);
+    let room = tables.capacity();
+    let forgets: [fn(&mut Trainer, &dyn Tracer); 2] = [Trainer::window_slid, |trainer, _| trainer.forget_output()];
+    for forget in forgets {
+        let before = trainer.steps();
+        forget(&mut trainer, &*tracer);
+        let weights = trainer.model.tables();
+        trainer.roll_back().unwrap_or_else(|_| unreachable!("no device is there"));
+        assert_eq!((trainer.steps(), trainer.model.tables()), (before, weights.clone()), "there is nothing to come back to");
+        learn(&mut trainer);
+        let kept = trainer.kept.as_ref().unwrap();
+        let ([[tables, ..], _], _) = kept.here.as_ref().unwrap();
+        assert_eq!((kept.steps, tables), (before, &weights), "the first step of the new window is taken from a copy");
+        assert_eq!(tables.capacity(), room, "in the same memory");
+    }
 }
