@@ -224,6 +224,14 @@ fn offered(process: u32) -> i32 {
     std::fs::read_to_string(format!("/proc/{process}/oom_score_adj")).unwrap().trim().parse().unwrap()
 }
 
+/// How many files a process may have open: the soft and the hard limit.
+fn open_files(process: u32) -> [u64; 2] {
+    let limits = std::fs::read_to_string(format!("/proc/{process}/limits")).unwrap();
+    let line = limits.lines().find_map(|line| line.strip_prefix("Max open files")).unwrap();
+    let mut numbers = line.split_whitespace().map(|limit| limit.parse().unwrap_or(u64::MAX));
+    [numbers.next().unwrap(), numbers.next().unwrap()]
+}
+
 #[test]
 fn all_threads_step_back_for_the_simulation() {
     let place = Place::new("nice");
@@ -241,14 +249,17 @@ fn all_threads_step_back_for_the_simulation() {
         // Where memory is out, the kernel ends the sidecar and not the simulation.
         assert_eq!(offered(sidecar.0.id()), 1000, "{name}");
         let connection = place.files.join(format!("{name}.connection"));
-        let relay =
-            start(Command::new(env!("CARGO_BIN_EXE_ridgewatch")).args(["relay", &ring, "--connection", text(&connection)]).args(arguments));
+        let few = ["-c", "ulimit -Sn 200 && exec \"$0\" \"$@\"", env!("CARGO_BIN_EXE_ridgewatch")];
+        let relay = start(Command::new("sh").args(few).args(["relay", &ring, "--connection", text(&connection)]).args(arguments));
         until("the connection file", || connection.exists());
         until("the relay's priority", || {
             let found = niceness(relay.0.id());
             found.len() > 1 && found.iter().all(|nice| *nice == expected.max(own))
         });
         assert_eq!(offered(relay.0.id()), 1000, "{name}");
+        // Rings take descriptors, those of a relay for each of its followers.
+        let [soft, hard] = open_files(relay.0.id());
+        assert_eq!(soft, hard.min(1 << 14), "{name}");
     }
     assert_eq!(offered(solver.0.id()), offered(std::process::id()));
 }

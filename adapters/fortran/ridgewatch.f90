@@ -6,13 +6,13 @@
 !>     call publisher%uniform(1, 0d0, 1d0, nx)             ! axis, first node, last node, nodes (and: period)
 !>     call publisher%uniform(2, 0d0, 1d0, ny)
 !>     call publisher%open(status)                         ! where RIDGEWATCH_RING says; rw_off where it is not set
-!>     call publisher%publish(step, time, u, v, status)    ! u(nx, ny), real32 or real64, any section of an array
+!>     call publisher%publish(step, time, u, v, status)    ! step: int32 or int64; u(nx, ny): real32 or real64, any section of an array
 !>     call publisher%close()
 !>
 !> Errors never stop the solver: a call without `status` passes over them, and rw_message() has the words.
 module ridgewatch
   use, intrinsic :: iso_c_binding
-  use, intrinsic :: iso_fortran_env, only: real32, real64, int64
+  use, intrinsic :: iso_fortran_env, only: real32, real64, int32, int64
   implicit none
   private
   public :: rw_publisher, rw_message, rw_ok, rw_off, rw_argument, rw_in_use, rw_no_space, rw_foreign, rw_system, &
@@ -41,7 +41,9 @@ module ridgewatch
     procedure :: statistics => publisher_statistics
     procedure :: close => publisher_close
     procedure, private :: publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
-    generic :: publish => publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
+    procedure, private :: publish_2_real32_int32, publish_2_real64_int32, publish_3_real32_int32, publish_3_real64_int32
+    generic :: publish => publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64, &
+      publish_2_real32_int32, publish_2_real64_int32, publish_3_real32_int32, publish_3_real64_int32
   end type
 
   interface
@@ -190,7 +192,8 @@ contains
       return
     end if
     self%description = c_describe(int(dimensions, c_int32_t))
-    self%dimensions = dimensions
+    ! Arrays are read as far as it says.
+    self%dimensions = merge(dimensions, 0, c_associated(self%description))
     call give(merge(rw_ok, rw_argument, c_associated(self%description)), status)
   end subroutine
 
@@ -244,7 +247,7 @@ contains
     integer, intent(in) :: index, count, first(:), extent(:)
     integer, intent(out), optional :: status
     integer(c_int64_t) :: offset(3), nodes(3)
-    if (size(first) < self%dimensions .or. size(extent) < self%dimensions) then
+    if (.not. c_associated(self%description) .or. size(first) < self%dimensions .or. size(extent) < self%dimensions) then
       call give(rw_argument, status)
       return
     end if
@@ -350,7 +353,7 @@ contains
 
   subroutine publish_2_real32(self, step, time, u, v, status)
     class(rw_publisher), intent(in) :: self
-    integer, intent(in) :: step
+    integer(int64), intent(in) :: step
     real(real64), intent(in) :: time
     real(real32), intent(in), target :: u(:,:), v(:,:)
     integer, intent(out), optional :: status
@@ -378,12 +381,12 @@ contains
         return
       end if
     end if
-    call give(c_strided_f32(self%field, int(step, c_int64_t), time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
   end subroutine
 
   subroutine publish_2_real64(self, step, time, u, v, status)
     class(rw_publisher), intent(in) :: self
-    integer, intent(in) :: step
+    integer(int64), intent(in) :: step
     real(real64), intent(in) :: time
     real(real64), intent(in), target :: u(:,:), v(:,:)
     integer, intent(out), optional :: status
@@ -411,12 +414,12 @@ contains
         return
       end if
     end if
-    call give(c_strided_f64(self%field, int(step, c_int64_t), time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
   end subroutine
 
   subroutine publish_3_real32(self, step, time, u, v, w, status)
     class(rw_publisher), intent(in) :: self
-    integer, intent(in) :: step
+    integer(int64), intent(in) :: step
     real(real64), intent(in) :: time
     real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
     integer, intent(out), optional :: status
@@ -470,13 +473,13 @@ contains
         return
       end if
     end if
-    call give(c_strided_f32(self%field, int(step, c_int64_t), time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
+    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
         1)), strides), status)
   end subroutine
 
   subroutine publish_3_real64(self, step, time, u, v, w, status)
     class(rw_publisher), intent(in) :: self
-    integer, intent(in) :: step
+    integer(int64), intent(in) :: step
     real(real64), intent(in) :: time
     real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
     integer, intent(out), optional :: status
@@ -530,8 +533,46 @@ contains
         return
       end if
     end if
-    call give(c_strided_f64(self%field, int(step, c_int64_t), time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
+    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
         1)), strides), status)
+  end subroutine
+
+  ! Steps that are counted in 32 bits.
+
+  subroutine publish_2_real32_int32(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:,:), v(:,:)
+    integer, intent(out), optional :: status
+    call publish_2_real32(self, int(step, int64), time, u, v, status)
+  end subroutine
+
+  subroutine publish_2_real64_int32(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:,:), v(:,:)
+    integer, intent(out), optional :: status
+    call publish_2_real64(self, int(step, int64), time, u, v, status)
+  end subroutine
+
+  subroutine publish_3_real32_int32(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
+    integer, intent(out), optional :: status
+    call publish_3_real32(self, int(step, int64), time, u, v, w, status)
+  end subroutine
+
+  subroutine publish_3_real64_int32(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
+    integer, intent(out), optional :: status
+    call publish_3_real64(self, int(step, int64), time, u, v, w, status)
   end subroutine
 
   pure function address(pointer)

@@ -35,7 +35,7 @@ program test
   w64 = 3 * u64
   call publisher%publish(1, 0.5d0, u32, v32, w32, status)
   call want(status == rw_ok, 2)
-  call publisher%publish(2, 1.5d0, u64(1:4, 2:6:2, :), v64(1:4, 2:6:2, :), w64(1:4, 2:6:2, :), status)
+  call publisher%publish(2_int64, 1.5d0, u64(1:4, 2:6:2, :), v64(1:4, 2:6:2, :), w64(1:4, 2:6:2, :), status)
   call want(status == rw_ok, 3)
   ! Wrong shapes, wrong rank, different strides: refused, and nothing is read.
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
@@ -45,6 +45,11 @@ program test
   call want(status == rw_argument, 5)
   call publisher%publish(3, 2d0, u64(1:4, 2:6:2, :), v64(1:4, 1:3, :), w64(1:4, 1:3, :), status)
   call want(status == rw_argument, 6)
+  ! No grid has five dimensions; whoever passes over that reads and writes nothing of five.
+  call second%begin(5, status)
+  call want(status == rw_argument, 35)
+  call second%block(0, 1, [1, 1, 1, 1, 1], [2, 2, 2, 2, 2], status)
+  call want(status == rw_argument, 36)
   call second%begin(2)
   call second%uniform(1, 0d0, 1d0, 4)
   call second%uniform(2, 0d0, 1d0, 4)
@@ -68,7 +73,7 @@ program test
   call publisher%open(status, trim(ring) // "/globe")
   call want(status == rw_ok, 34)
   east = reshape([(real(i, real32), i=1, 12)], [4, 3])
-  call publisher%publish(7, 2d0, east, east + 12, status)
+  call publisher%publish(7000000000_int64, 2d0, east, east + 12, status)
   call want(status == rw_ok, 11)
   call publisher%close(status)
   call want(status == rw_ok, 12)

@@ -58,6 +58,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         }
     }
     options.nice.step_back();
+    super::open_files::allow_many();
     let open = |scene: &SceneFile, stop: &AtomicBool| {
         let refused = |error| located(scene, error, SourceError::refused);
         let Some(live) = Live::connect(&scene.live, stop, &mut messages::note).map_err(refused)? else { return Ok(None) };

@@ -7,6 +7,7 @@ mod ftle;
 mod inspect;
 pub mod messages;
 mod nice;
+mod open_files;
 mod publish;
 mod relay;
 mod render;

@@ -51,6 +51,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         messages::note(warning);
     }
     options.nice.step_back();
+    super::open_files::allow_many();
     let key = Key::random()?;
     super::check_folder(&options.connection)?;
     ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;

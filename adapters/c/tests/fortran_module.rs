@@ -55,7 +55,7 @@ fn fortran_arrays_arrive_as_they_are() {
     assert_eq!((description.geometry, description.shape()), (Geometry::Sphere { radius: 6.371e6 }, [4, 3, 1]));
     assert_eq!((description.axes[0].period, description.axes[1].coordinates.as_slice()), (Some(360.0), &[-60.0, 0.0, 60.0][..]));
     let Read::Step(info) = reader.read(&mut values).unwrap() else { panic!("no step on the globe") };
-    assert_eq!((info.step, info.time, values.as_slice()), (7, 2.0, (1..=24).map(|n| n as f32).collect::<Vec<_>>().as_slice()));
+    assert_eq!((info.step, info.time, values.as_slice()), (7_000_000_000, 2.0, (1..=24).map(|n| n as f32).collect::<Vec<_>>().as_slice()));
     let blocks = ring.join("blocks");
     for block in 0..2u32 {
         let mut reader = RingReader::open(&blocks, block, &Limits::default()).unwrap();

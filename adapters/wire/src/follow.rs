@@ -4,6 +4,7 @@ use crate::lock::{Following, blocks, producer_lives};
 use crate::reader::{Read, RingReader, StepInfo};
 use crate::{Description, Limits, WireError};
 use std::collections::BTreeMap;
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -77,6 +78,8 @@ pub struct RingFollower {
     rings: BTreeMap<u32, Followed>,
     /// Rings that were refused, with their words, so that each is told once.
     refused: BTreeMap<u32, String>,
+    /// Why the folder could not be looked at last time, told once.
+    unseen: Option<String>,
     looked: Option<Instant>,
     /// The block to be asked next, so that none is starved.
     turn: u32,
@@ -94,7 +97,17 @@ impl RingFollower {
     pub fn begin(ring: &Path, limits: Limits) -> Result<Self, WireError> {
         let following = Following::begin(ring)?;
         let mark = following.mark()?;
-        Ok(Self { ring: ring.into(), limits, rings: BTreeMap::new(), refused: BTreeMap::new(), looked: None, turn: 0, mark, following })
+        Ok(Self {
+            ring: ring.into(),
+            limits,
+            rings: BTreeMap::new(),
+            refused: BTreeMap::new(),
+            unseen: None,
+            looked: None,
+            turn: 0,
+            mark,
+            following,
+        })
     }
 
     /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
@@ -158,6 +171,17 @@ impl RingFollower {
 
     /// Looks for rings that are new, or that a new producer put in the place of an old one.
     fn look(&mut self) -> Option<Event> {
+        // What cannot be looked at, for want of a descriptor for instance, looks empty below.
+        if let Err(error) = std::fs::read_dir(&self.ring)
+            && error.kind() != ErrorKind::NotFound
+        {
+            let error = WireError::io(&self.ring, "cannot be looked at", error);
+            let words = Some(error.to_string());
+            let is_news = self.unseen != words;
+            self.unseen = words;
+            return is_news.then_some(Event::Refused(error));
+        }
+        self.unseen = None;
         for block in blocks(&self.ring) {
             // What the old one left is read first.
             if self.rings.get(&block).is_some_and(|followed| followed.reader.is_current() || !followed.ended) {
@@ -182,7 +206,8 @@ impl RingFollower {
                     self.rings.insert(block, followed);
                     return Some(event);
                 }
-                Err(WireError::Io { .. }) => {}
+                // It went meanwhile.
+                Err(WireError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {}
                 Err(error) => {
                     let words = error.to_string();
                     if self.refused.get(&block) != Some(&words) {

@@ -405,6 +405,24 @@ fn a_pulse_is_no_answer_and_what_was_asked_is_not_asked_again() {
     assert_eq!(relay.join().unwrap(), expected.collect::<Vec<_>>());
 }
 
+#[test]
+fn a_ring_that_cannot_be_opened_is_told_of_once() {
+    let folder = Folder::new("unopened");
+    let producer = Producer::open(&folder.0, description(4), 2, Policy::NewestWins).unwrap();
+    let ring = folder.0.join("block-00000.ring");
+    std::fs::remove_file(&ring).unwrap();
+    std::fs::create_dir(&ring).unwrap();
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+    let told = events(&mut poll, "refused");
+    assert!(told.len() == 1 && told[0].contains("block-00000.ring: cannot be opened"), "{told:?}");
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_millis(300) {
+        assert!(poll(&mut Vec::new()).is_none(), "it is no news");
+    }
+    drop((follower, producer));
+}
+
 /// A step of 34 MB on its way to a follower that reads so many bytes each 50 milliseconds.
 fn dribble(relay: &Relay, folder: &Folder, bytes: usize) -> (Producer, std::thread::JoinHandle<()>) {
     let producer = Producer::open(&folder.0, description(2048), 2, Policy::NewestWins).unwrap();
