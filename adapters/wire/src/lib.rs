@@ -47,6 +47,11 @@ pub fn block_path(ring: &Path, block: u32) -> PathBuf {
     ring.join(format!("block-{block:05}.ring"))
 }
 
+/// A block's file until it is whole.
+fn part_path(ring: &Path, block: u32) -> PathBuf {
+    ring.join(format!(".block-{block:05}.part"))
+}
+
 /// Who follows the ring holds this file's lock.
 fn followers_path(ring: &Path) -> PathBuf {
     ring.join("followers.lock")
