@@ -3,9 +3,13 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::source::live::{AtEnd, Follow, Live, LiveSettings, LiveWindow, Taken};
+use ridgewatch_wire::message::{ConnectionFile, Key};
+use ridgewatch_wire::relay::serve;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer};
-use std::path::PathBuf;
-use std::sync::atomic::AtomicBool;
+use std::net::TcpListener;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 struct Folder(PathBuf);
@@ -45,7 +49,7 @@ fn publish(producer: &Producer, step: u64, time: f64, value: f32) {
 }
 
 fn settings(folder: &Folder) -> LiveSettings {
-    LiveSettings { ring: Some(folder.0.clone()), memory_gib: 0.01, incomplete_seconds: 0.2, ..LiveSettings::default() }
+    LiveSettings { ring: Some(folder.0.clone()), memory_gib: 0.01, ..LiveSettings::default() }
 }
 
 fn follow(settings: &LiveSettings, tau: f64) -> LiveWindow {
@@ -83,9 +87,12 @@ fn the_window_fills_and_moves_with_the_simulation() {
     for n in 0..4 {
         publish(&solver, n, n as f64 * 0.5, 1.0);
     }
-    std::thread::sleep(Duration::from_millis(50));
-    assert!(window.next_within(Duration::from_millis(20)).is_err(), "1.5 of 2 is not full");
-    assert!((window.filled() - 0.75).abs() < 1e-9);
+    let begin = Instant::now();
+    while (window.filled() - 0.75).abs() > 1e-9 {
+        assert!(begin.elapsed() < Duration::from_secs(10), "{}", window.filled());
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert!(window.next_within(Duration::from_millis(50)).is_err(), "1.5 of 2 is not full");
     publish(&solver, 4, 2.0, 1.0);
     let (taken, warnings) = take(&window, |_| true);
     assert_eq!((taken.live.step, newest(&taken), taken.live.snapshots, taken.live.steps, taken.live.missed_blocks), (4, 2.0, 5, 5, 0));
@@ -106,7 +113,7 @@ fn a_listener_hears_of_each_snapshot_before_the_window_has_it() {
     let folder = Folder::new("listener");
     let solver = producer(&folder, plane(8));
     let window = follow(&settings(&folder), 2.0);
-    let heard = std::sync::Arc::new(std::sync::Mutex::new(Vec::new()));
+    let heard = Arc::new(std::sync::Mutex::new(Vec::new()));
     let hears = heard.clone();
     window.tell(Box::new(move |snapshot| hears.lock().unwrap().push(snapshot.clone())));
     for n in 0..8 {
@@ -114,7 +121,7 @@ fn a_listener_hears_of_each_snapshot_before_the_window_has_it() {
         // In the window: whatever its newest snapshots are, they were announced, and as the very same ones.
         if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_secs(u64::from(n >= 4))) {
             let heard = heard.lock().unwrap();
-            assert!(taken.window.snapshots().all(|s| heard.iter().any(|h| std::sync::Arc::ptr_eq(h, s))));
+            assert!(taken.window.snapshots().all(|s| heard.iter().any(|h| Arc::ptr_eq(h, s))));
         }
     }
     assert_eq!(heard.lock().unwrap().iter().map(|s| s.time).collect::<Vec<_>>(), (0..8).map(|n| f64::from(n) * 0.5).collect::<Vec<_>>());
@@ -317,32 +324,110 @@ fn a_reading_thread_that_panicked_is_an_error_and_no_end() {
     assert_eq!(error, "the thread that follows the simulation ended after 2 steps: it panicked");
 }
 
+/// Columns of a plane, as many as told.
+fn columns(nodes: u64, count: u32) -> Vec<Description> {
+    let width = nodes / u64::from(count);
+    let block = |index: u32| BlockExtent { index, count, offset: [width * u64::from(index), 0, 0], extent: [width, nodes, 1] };
+    (0..count).map(|index| Description { start: 1, block: block(index), ..plane(nodes) }).collect()
+}
+
 #[test]
-fn blocks_meet_and_incomplete_steps_are_recorded() {
+fn blocks_meet() {
     let folder = Folder::new("blocks");
-    let half = |index: u32| {
-        let mut description = plane(8);
-        description.block = BlockExtent { index, count: 2, offset: [4 * u64::from(index), 0, 0], extent: [4, 8, 1] };
-        description
-    };
-    let solvers = [producer(&folder, half(0)), producer(&folder, half(1))];
+    let solvers: Vec<Producer> = columns(8, 2).into_iter().map(|block| producer(&folder, block)).collect();
     let window = follow(&settings(&folder), 2.0);
     for n in 0..3 {
         publish(&solvers[1], n, n as f64, 2.0);
         publish(&solvers[0], n, n as f64, 1.0);
     }
-    let (taken, _) = take(&window, |taken| newest(taken) == 2.0);
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 2.0);
     let nodes = &taken.window.snapshots().next().unwrap().nodes;
     assert!(nodes.iter().enumerate().all(|(i, node)| node[0] == if i % 8 < 4 { 1.0 } else { 2.0 }));
-    // One that lacks a block goes after its time, and later ones come.
+    assert_eq!((taken.live.incomplete, taken.live.steps), (0, 3), "{warnings:?}");
+}
+
+#[test]
+fn a_step_that_lacks_a_block_is_given_up_after_its_time_and_later_ones_come() {
+    let folder = Folder::new("lacks");
+    let solvers: Vec<Producer> = columns(8, 2).into_iter().map(|block| producer(&folder, block)).collect();
+    let window = follow(&LiveSettings { incomplete_seconds: 0.2, ..settings(&folder) }, 2.0);
     publish(&solvers[0], 3, 3.0, 1.0);
     std::thread::sleep(Duration::from_millis(400));
-    for solver in &solvers {
-        publish(solver, 4, 4.0, 1.0);
+    // On a busy machine one of these may come too late as well.
+    for n in 4..20 {
+        solvers.iter().for_each(|solver| publish(solver, n, n as f64, 1.0));
     }
-    let (taken, warnings) = take(&window, |taken| newest(taken) == 4.0);
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 19.0);
     assert!(has(&warnings, "step 3 (time 3) was given up with 1 of 2 blocks: blocks did not come in time"), "{warnings:?}");
-    assert_eq!((taken.live.incomplete, taken.live.steps), (1, 4));
+    assert!(taken.live.incomplete >= 1 && taken.live.steps + taken.live.incomplete == 17, "{:?}", taken.live);
+}
+
+#[test]
+fn a_step_that_waits_for_its_blocks_does_not_grow_older_while_no_step_is_taken() {
+    let folder = Folder::new("held");
+    let solvers: Vec<Producer> = columns(9, 3).into_iter().map(|block| producer(&folder, block)).collect();
+    let window = follow(&LiveSettings { follow: Follow::Every, incomplete_seconds: 1.0, ..settings(&folder) }, 2.0);
+    let publish = |block: usize, n: u64| publish(&solvers[block], n, n as f64, 1.0);
+    for n in 0..2 {
+        (0..3).for_each(|block| publish(block, n));
+    }
+    // The first block of step 3 is taken before the last one of step 2 is there, with which a slide is due.
+    [(0, 2), (0, 3), (1, 2)].iter().for_each(|(block, n)| publish(*block, *n));
+    std::thread::sleep(Duration::from_millis(200));
+    [(2, 2), (1, 3)].iter().for_each(|(block, n)| publish(*block, *n));
+    std::thread::sleep(Duration::from_millis(1500));
+    take(&window, |taken| newest(taken) == 2.0);
+    std::thread::sleep(Duration::from_millis(200));
+    publish(2, 3);
+    let (taken, warnings) = take(&window, |taken| newest(taken) == 3.0);
+    assert_eq!((taken.live.incomplete, taken.live.steps), (0, 4), "{warnings:?}");
+}
+
+/// A relay of a folder's rings.
+struct Relay {
+    stop: Arc<AtomicBool>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl Relay {
+    fn start(folder: &Folder, connection: &Path) -> Self {
+        let (listener, key) = (TcpListener::bind("127.0.0.1:0").unwrap(), Key::random().unwrap());
+        ConnectionFile { address: listener.local_addr().unwrap().to_string(), key: key.clone() }.write(connection).unwrap();
+        let (ring, stop) = (folder.0.clone(), Arc::new(AtomicBool::new(false)));
+        let flag = stop.clone();
+        let thread = std::thread::spawn(move || serve(&ring, &listener, &key, &Arc::default(), &flag, Arc::new(|_| {})).unwrap());
+        Self { stop, thread: Some(thread) }
+    }
+}
+
+impl Drop for Relay {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+#[test]
+fn a_relay_whose_blocks_come_late_is_waited_for() {
+    let folders = ["left", "right"].map(Folder::new);
+    let connections = folders.each_ref().map(|folder| folder.0.with_extension("connection"));
+    let relays = [0, 1].map(|k| Relay::start(&folders[k], &connections[k]));
+    let solvers: Vec<Producer> = columns(8, 2).into_iter().zip(&folders).map(|(block, folder)| producer(folder, block)).collect();
+    let settings = LiveSettings { connections: connections.to_vec(), memory_gib: 0.01, ..LiveSettings::default() };
+    let window = follow(&settings, 4.0);
+    std::thread::scope(|scope| {
+        for (n, solver) in solvers.iter().enumerate() {
+            scope.spawn(move || {
+                // More steps than wait on the way.
+                std::thread::sleep(Duration::from_millis(500) * n as u32);
+                (0..40).for_each(|n| publish(solver, n, n as f64, 1.0));
+            });
+        }
+        let (taken, warnings) = take(&window, |taken| newest(taken) == 39.0);
+        assert_eq!((taken.live.incomplete, taken.live.steps, taken.live.missed_blocks), (0, 40, 0), "{warnings:?}");
+    });
+    drop((window, relays));
+    connections.iter().for_each(|file| std::fs::remove_file(file).unwrap());
 }
 
 #[test]

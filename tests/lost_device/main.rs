@@ -415,6 +415,20 @@ fn a_slide_under_a_checkpoint_finds_the_table_gone() {
     assert_eq!(slow.line.tables_before.load(Ordering::Relaxed), 0, "tables that were there when another was traced");
 }
 
+/// A table of another size takes the place of one that the device holds, which goes before.
+#[test]
+fn another_size_finds_the_table_gone() {
+    let text = "[source]\nkind = \"turbulence\"\nnodes = [16, 8, 8]\n[time]\ntau = 4\nslides = 1\nframes_per_slide = 6\n[flow]\nsteps = 8\n[surrogate]\n\
+         kind = \"table\"\n[network]\nsize = \"auto\"\n[trust]\ncells = [2, 2, 2]\ntolerance = 0.001\n[render]\nwidth = 16\nheight = 8\nsamples = 2\n";
+    let scene = SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap();
+    let device = Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
+    let found = on(&device, &scene);
+    assert!(found.error.is_none() && found.films.len() == 6, "{:?}", found.error);
+    let tables = device.line.calls.lock().unwrap().iter().filter(|call| **call == "tracing a table").count();
+    assert!(tables >= 2, "another size was due");
+    assert_eq!(device.line.tables_before.load(Ordering::Relaxed), 0, "tables that were there when another was traced");
+}
+
 /// A network that a device trains: as long as it works all is as on the CPU; once it is lost, the CPU goes on from what came back last.
 #[test]
 fn training_of_a_residual_over_a_sliding_window() {

@@ -1,8 +1,9 @@
 /* Publishes a solver's velocity field to ridgewatch: a copy into shared memory, and nothing else.
  *
- * No threads, no sockets, no memory taken after rw_open (but for a moment by a call that fails, for its words), no abort: every call
- * returns a status. Handles may be used by several threads; a fork must open its own. All calls accept a null handle and do nothing then
- * (RW_OFF), so that a solver may be linked for good and publishes only where RIDGEWATCH_RING is set.
+ * No threads, no sockets, no memory taken between rw_open and rw_close (not even by a call that fails), no abort: every call returns a
+ * status. Handles may be used by several threads, but nothing here from a signal handler (threads exclude each other by a mutex); a fork
+ * must open its own. All calls accept a null handle and do nothing then (RW_OFF), so that a solver may be linked for good and publishes
+ * only where RIDGEWATCH_RING is set.
  *
  *     rw_field *field = NULL;
  *     rw_description *d = rw_describe(3);
@@ -35,7 +36,7 @@ typedef enum {
   RW_ARGUMENT = 2,
   // Another producer has this name.
   RW_IN_USE = 3,
-  // No room for the ring.
+  // No room for the ring, or it is a longer file than the process may make.
   RW_NO_SPACE = 4,
   // The folder or file belongs to somebody else.
   RW_FOREIGN = 5,
@@ -98,7 +99,8 @@ rw_status rw_describe_slots(rw_description *description, uint32_t slots);
 rw_status rw_describe_wait(rw_description *description, uint32_t milliseconds);
 
 // Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, and `RW_OFF` where it is not set. All memory is taken here.
-// `*field` is null unless `RW_OK` is returned.
+// `*field` is null unless `RW_OK` is returned. The ring of a run that is over is replaced: where there is room for
+// both, followers read the old one to its end; where there is not, it is given up for the new one.
 rw_status rw_open(const char *ring, const rw_description *description, rw_field **field);
 
 // Publishes a step whose components are arrays of their own, packed, x fastest. `w` is not read in two dimensions.

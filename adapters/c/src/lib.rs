@@ -33,7 +33,7 @@ pub enum Status {
     RwArgument = 2,
     /// Another producer has this name.
     RwInUse = 3,
-    /// No room for the ring.
+    /// No room for the ring, or it is a longer file than the process may make.
     RwNoSpace = 4,
     /// The folder or file belongs to somebody else.
     RwForeign = 5,
@@ -99,7 +99,7 @@ impl Failure {
             Failure::Argument(_) => Status::RwArgument,
             Failure::Wire(error) => match error {
                 WireError::InUse { .. } => Status::RwInUse,
-                WireError::NoSpace { .. } => Status::RwNoSpace,
+                WireError::NoSpace { .. } | WireError::FileSize { .. } => Status::RwNoSpace,
                 WireError::Foreign { .. } => Status::RwForeign,
                 WireError::Forked { .. } => Status::RwForked,
                 WireError::Io { .. } | WireError::NoMemory { .. } => Status::RwSystem,
@@ -395,7 +395,8 @@ pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milli
 }
 
 /// Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, and `RW_OFF` where it is not set. All memory is taken here.
-/// `*field` is null unless `RW_OK` is returned.
+/// `*field` is null unless `RW_OK` is returned. The ring of a run that is over is replaced: where there is room for
+/// both, followers read the old one to its end; where there is not, it is given up for the new one.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
     guarded_with_room(|| {

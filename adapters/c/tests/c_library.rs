@@ -207,6 +207,7 @@ const FAULTS: &str = r#"
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 #include <ridgewatch.h>
@@ -289,6 +290,17 @@ int main(int argc, char **argv) {
         _exit(good ? 0 : 1);
     }
     int status;
+    WANT(waitpid(child, &status, 0) == child && status == 0);
+    /* A file that the process may not make: no SIGXFSZ, and nothing stays of it. */
+    child = fork();
+    if (!child) {
+        const struct rlimit most = {10000, 10000};
+        const uint64_t offset[2] = {0, 0}, extent[2] = {8, 4};
+        const int limited = !setrlimit(RLIMIT_FSIZE, &most) && rw_describe_block(d, 1, 2, offset, extent) == RW_OK;
+        rw_field *long_one;
+        const int good = rw_open(argv[1], d, &long_one) == RW_NO_SPACE && strstr(rw_error(), "(10000 bytes: ulimit -f, RLIMIT_FSIZE)") && !long_one;
+        _exit(limited && good ? 0 : 1);
+    }
     WANT(waitpid(child, &status, 0) == child && status == 0);
     WANT(rw_publish_f32(field, 1, 1, plane, plane, NULL) == RW_OK);
     WANT(rw_close(field) == RW_OK);

@@ -151,7 +151,8 @@ impl Publisher {
         let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
         let policy = if wait_ms == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(wait_ms)) };
         let producer = match ring.or_else(named) {
-            Some(ring) => match Producer::open(&ring, description, slots, policy) {
+            // Which may wait, for a name or for room.
+            Some(ring) => match py.detach(|| Producer::open(&ring, description, slots, policy)) {
                 Ok(producer) => Some(Arc::new(producer)),
                 Err(error) => refused(py, strict, "nothing will be published", &error)?,
             },
@@ -205,9 +206,10 @@ impl Publisher {
         Ok(true)
     }
 
-    fn close(&self) {
+    fn close(&self, py: Python<'_>) {
         let producer = self.producer().take();
-        drop(producer);
+        // Which may wait for a follower that leaves.
+        py.detach(|| drop(producer));
     }
 
     #[getter]
@@ -229,9 +231,9 @@ impl Publisher {
         this
     }
 
-    #[pyo3(signature = (*_arguments))]
-    fn __exit__(&self, _arguments: &Bound<'_, pyo3::types::PyTuple>) {
-        self.close();
+    #[pyo3(signature = (*arguments))]
+    fn __exit__(&self, arguments: &Bound<'_, pyo3::types::PyTuple>) {
+        self.close(arguments.py());
     }
 }
 

@@ -1,5 +1,6 @@
 """The Python package, through the ring's bytes."""
 
+import fcntl
 import os
 import shutil
 import struct
@@ -131,6 +132,32 @@ def test_closing_while_another_thread_publishes(ring):
     # The fourth found it closed.
     assert answers == [True, True, True, False] and not os.path.exists(ring)
     assert publisher.publish(9, 9.0, good, good) is False
+
+
+def test_opening_and_closing_let_other_threads_run(ring):
+    """Each waits a second: for a name that is taken, and for a follower that was stopped while it left."""
+    x = np.arange(4.0)
+
+    def longest_pause(call):
+        worker = threading.Thread(target=call)
+        begin = time.monotonic()
+        worker.start()
+        # Which may itself be kept from returning.
+        pauses = [time.monotonic() - begin]
+        while worker.is_alive():
+            last = time.monotonic()
+            time.sleep(0.01)
+            pauses.append(time.monotonic() - last)
+        assert time.monotonic() - begin > 0.9
+        return max(pauses)
+
+    publisher = Publisher(x, x)
+    with pytest.warns(RuntimeWarning, match="another producer"):
+        assert longest_pause(lambda: Publisher(x, x)) < 0.5
+    with open(os.open(os.path.join(ring, "followers.lock"), os.O_RDWR | os.O_CREAT, 0o600), "r+") as lock:
+        # struct flock: kind, whence, start, length, process.
+        fcntl.fcntl(lock, fcntl.F_OFD_SETLK, struct.pack("hhqqixxxx", fcntl.F_WRLCK, os.SEEK_SET, 0, 1, 0))
+        assert longest_pause(publisher.close) < 0.5
 
 
 def test_refusals(ring):

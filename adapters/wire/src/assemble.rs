@@ -4,17 +4,15 @@
 //! of another gather beside it, and its first whole step takes over. So a simulation may come back in other blocks, and what two starts
 //! have published is never put together.
 //!
-//! Within a start the step's number says which blocks belong together, and must rise. Where a solver is set back within its run, each of its blocks comes
-//! to a number that is not above its last one: there a new round begins, and only what is of one round is put together.
+//! Within a start what is at one [`Place`] belongs together.
 
+use crate::place::{Place, Rounds};
 use crate::{BlockExtent, Description, WireError};
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 /// Starts that are known at once: the one that is followed, and those that gather.
 const STARTS: usize = 4;
-/// Steps in a row that a block may be behind the others' round. It was set back too, then, and what would have shown it was overwritten unread.
-const BEHIND: u32 = 3;
 
 /// A step of the global field.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,9 +63,6 @@ pub struct Assembler {
 /// The number that its blocks name, and how many they are.
 type StartKey = (u64, u32);
 
-/// Where a step stands in its start: how often the solver was set back before it, and its number.
-type Place = (u64, u64);
-
 #[derive(Debug)]
 struct Start {
     key: StartKey,
@@ -86,11 +81,9 @@ struct Block {
     generation: u64,
     extent: BlockExtent,
     ended: bool,
-    round: u64,
-    /// Number of its last step, and when that was published.
-    last: Option<(u64, u64)>,
-    /// Steps of a round before the newest, in a row.
-    behind: u32,
+    rounds: Rounds,
+    /// When its last step was published.
+    published: Option<u64>,
 }
 
 #[derive(Debug)]
@@ -110,19 +103,14 @@ impl Pending {
 }
 
 impl Block {
-    /// Whether a step is the block's next, and not one that came before its connection broke: a producer publishes none at the time of another.
-    /// `newest` is the round that the start has come to.
-    fn goes_on(&mut self, step: u64, published: u64, newest: u64) -> bool {
-        if self.last.is_some_and(|(_, last)| published <= last) {
-            return false;
+    /// The place of the block's next step; none where it came before its connection broke: a producer publishes none at the time of another. `newest` is
+    /// the round that the start has come to.
+    fn next(&mut self, step: u64, published: u64, newest: u64) -> Option<Place> {
+        if self.published.is_some_and(|last| published <= last) {
+            return None;
         }
-        self.round += u64::from(self.last.is_some_and(|(last, _)| step <= last));
-        self.last = Some((step, published));
-        self.behind = if self.round < newest { self.behind + 1 } else { 0 };
-        if self.behind > BEHIND {
-            (self.round, self.behind) = (newest, 0);
-        }
-        true
+        self.published = Some(published);
+        Some(self.rounds.next(step, newest))
     }
 }
 
@@ -197,7 +185,7 @@ impl Assembler {
         };
         let displaced: Vec<(usize, bool)> = start.blocks.iter().enumerate().filter_map(displaced).collect();
         displaced.iter().for_each(|(index, _)| start.blocks[*index] = None);
-        start.blocks[place] = Some(Block { generation, extent, ended: false, round: start.round, last: None, behind: 0 });
+        start.blocks[place] = Some(Block { generation, extent, ended: false, rounds: Rounds::begin(start.round), published: None });
         self.give_up_if(|p| p.start == key && displaced.iter().any(|(index, _)| p.came[*index]), "the simulation was started anew");
         let start = &mut self.starts[at];
         // Its steps may count from 0 again.
@@ -244,10 +232,7 @@ impl Assembler {
         let start = &mut self.starts[at];
         let (key, newest) = (start.key, start.newest);
         let Some(known) = start.blocks[block as usize].as_mut() else { return Ok(None) };
-        if !known.goes_on(step, published, newest.map_or(0, |(round, _)| round)) {
-            return Ok(None);
-        }
-        let round = known.round;
+        let Some((round, _)) = known.next(step, published, newest.map_or(0, |(round, _)| round)) else { return Ok(None) };
         start.round = start.round.max(round);
         // What came before the newest and is not whole by now will not be asked for.
         if newest.is_some_and(|newest| (round, step) <= newest) {
@@ -260,10 +245,9 @@ impl Assembler {
         let place = match self.steps.iter().position(|p| p.start == key && p.place() == (round, step)) {
             Some(place) => place,
             None => {
-                if self.steps.len() >= self.pending
-                    && let Some(old) = self.steps.pop_front()
-                {
-                    self.give_up(old, "newer steps came");
+                if self.steps.len() >= self.pending {
+                    let least = self.steps.iter().position(|p| self.is_hopeless(p)).unwrap_or(0);
+                    self.steps.remove(least).into_iter().for_each(|old| self.give_up(old, "newer steps came"));
                 }
                 let mut whole = self.spare.pop().unwrap_or_default();
                 whole.resize(shape.iter().product::<u64>() as usize * components, f32::NAN);
@@ -315,11 +299,38 @@ impl Assembler {
         step
     }
 
-    /// The steps that were given up since the last call, those that have waited longer than the limit with them.
+    /// Whether a block has come so far before others that its next step would take the place of one that may still be whole.
+    pub fn is_ahead(&self, block: u32, generation: u64) -> bool {
+        if self.steps.len() + 1 < self.pending {
+            return false;
+        }
+        let Some(start) = self.starts.iter().find(|start| start.block(block, generation).is_some()) else { return false };
+        let waits = |p: &&Pending| p.start == start.key && p.came[block as usize] && !self.is_hopeless(p);
+        self.steps.iter().filter(waits).count() + 1 >= self.pending
+    }
+
+    /// Whether one of the blocks that a step lacks has come to a later one.
+    fn is_hopeless(&self, pending: &Pending) -> bool {
+        let start = self.starts.iter().find(|start| start.key == pending.start);
+        let blocks = start.iter().flat_map(|start| &start.blocks);
+        let lacks = pending.came.iter().zip(blocks).filter(|(came, _)| !**came).filter_map(|(_, block)| block.as_ref());
+        lacks.filter_map(|block| block.rounds.last()).any(|last| last > pending.place())
+    }
+
+    /// The steps that were given up since the last call.
     pub fn incomplete(&mut self) -> Vec<Incomplete> {
+        std::mem::take(&mut self.given_up)
+    }
+
+    /// Gives up the steps that have waited longer than the limit: to be called when nothing has come that they may have waited for.
+    pub fn expire(&mut self) {
         let limit = self.limit;
         self.give_up_if(|p| p.since.elapsed() > limit, "blocks did not come in time");
-        std::mem::take(&mut self.given_up)
+    }
+
+    /// For so long nothing was taken on purpose, which does not count as waiting.
+    pub fn held(&mut self, time: Duration) {
+        self.steps.iter_mut().for_each(|pending| pending.since += time);
     }
 
     /// A producer has closed a block, or its process ended. Whether the simulation has: all blocks of the start that is followed are known, and none

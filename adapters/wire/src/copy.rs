@@ -121,6 +121,8 @@ unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
     let lines = (count - before) / 16;
     // SAFETY: all of it lies inside the `count` values; the target of the streaming stores is a multiple of 64.
     unsafe {
+        // Nor are they ordered by what came before: the odd sequence number is seen before any of them (x86 has no instruction for a fence of release).
+        _mm_sfence();
         std::ptr::copy_nonoverlapping(from, to, before);
         let (mut source, mut target) = (from.add(before).cast::<__m128i>(), to.add(before).cast::<__m128i>());
         for _ in 0..lines {

@@ -23,6 +23,16 @@ pub enum WireError {
         /// Its bytes.
         needed: u64,
     },
+    /// The process may not have a file so long.
+    #[error("{}: a ring of {needed} bytes is longer than this process may make a file ({limit} bytes: ulimit -f, RLIMIT_FSIZE)", path.display())]
+    FileSize {
+        /// The ring.
+        path: PathBuf,
+        /// Its bytes.
+        needed: u64,
+        /// The process's limit.
+        limit: u64,
+    },
     /// Another producer has it.
     #[error("{}: another producer publishes under this name (process {pid})", path.display())]
     InUse {

@@ -1,13 +1,18 @@
 //! Following blocks, wherever they come from: rings of this node, or relays of others.
 
+use crate::choice::{self, Ahead};
 use crate::lock::{Following, blocks, producer_lives};
+use crate::place::Place;
 use crate::reader::{Read, RingReader, StepInfo};
 use crate::{Description, Limits, WireError};
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
+use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+/// Steps that are begun to be read in one look, if a producer overtakes each of them.
+const ATTEMPTS: usize = 4;
 /// How often new rings are looked for.
 const LOOK: Duration = Duration::from_millis(100);
 /// How often producers are told that somebody follows, at least while [`RingFollower::poll`] or [`RingFollower::beat`] is called.
@@ -35,7 +40,7 @@ pub enum Event {
         time: f64,
         /// When it was published, nanoseconds since 1970.
         published: u64,
-        /// Steps of the block that were overwritten before this one could be read.
+        /// Steps of the block before this one that were overwritten before they could be read, or passed over since that had happened to another block.
         missed: u64,
     },
     /// The producer closed the block, or its process ended; all that it left was read.
@@ -51,11 +56,24 @@ pub enum Event {
     Refused(WireError),
 }
 
+/// Rings of one start of a simulation name the same start and the same number of blocks.
+type Simulation = (u64, u32);
+
 /// One block's ring.
 struct Followed {
     reader: RingReader,
+    /// Of one block among several: what is there.
+    ahead: Ahead,
     /// Nothing more is read, since what was read could not be: until a new producer takes its place.
     refused: bool,
+    /// There was nothing to be read when it was last looked at.
+    drained: bool,
+    /// The producer has closed it, as was seen before that look.
+    closed: bool,
+    /// The producer's process has ended, or another ring is in its place.
+    gone: bool,
+    /// Another ring is in its place.
+    replaced: bool,
     /// Its end was told.
     ended: bool,
     looked: Instant,
@@ -64,10 +82,52 @@ struct Followed {
 }
 
 impl Followed {
+    fn begin(reader: RingReader) -> Self {
+        let (ahead, now) = (Ahead::default(), Instant::now());
+        let (refused, drained, closed, gone, replaced, ended) = (false, false, false, false, false, false);
+        Self { reader, ahead, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
+    }
+
     /// Tells the producer how far its steps were taken. A ring that cannot be written to is one that nobody waits for.
     fn acknowledge(&mut self, mark: u32) {
         self.told = Instant::now();
         let _ = self.reader.acknowledge(mark);
+    }
+
+    fn simulation(&self) -> Simulation {
+        let description = &self.reader.header().description;
+        (description.start, description.block.count)
+    }
+
+    /// Looks whether the producer is still there. What it left is looked for once more then.
+    fn look_for_producer(&mut self, ring: &Path, block: u32) {
+        if self.gone || self.ended || !(self.drained || self.refused) || self.looked.elapsed() <= LOOK {
+            return;
+        }
+        self.looked = Instant::now();
+        // The lock may already be that of a producer that took the place of this one.
+        self.gone = !self.reader.is_current() || !producer_lives(ring, block);
+        self.drained &= !self.gone;
+    }
+
+    /// Its end, once: all that it left was read.
+    fn end(&mut self, block: u32) -> Option<Event> {
+        let over = if self.refused { self.gone } else { self.drained && (self.closed || self.gone) };
+        if !over || std::mem::replace(&mut self.ended, true) {
+            return None;
+        }
+        Some(Event::Ended { block, generation: self.reader.header().generation, closed: self.closed && !self.refused })
+    }
+
+    fn refuse(&mut self, error: WireError) -> Event {
+        self.refused = true;
+        Event::Refused(error)
+    }
+
+    fn step(&mut self, block: u32, info: StepInfo, mark: u32) -> Event {
+        self.acknowledge(mark);
+        let StepInfo { step, time, published, missed, .. } = info;
+        Event::Step { block, generation: self.reader.header().generation, step, time, published, missed }
     }
 }
 
@@ -81,8 +141,10 @@ pub struct RingFollower {
     /// Why the folder could not be looked at last time, told once.
     unseen: Option<String>,
     looked: Option<Instant>,
-    /// The block to be asked next, so that none is starved.
-    turn: u32,
+    /// The simulation that was asked last, so that none is starved.
+    turn: Simulation,
+    /// Of a simulation in several blocks, the step that is being read.
+    current: Option<(Simulation, Place)>,
     /// Which of the rings' marks is this follower's.
     mark: u32,
     #[allow(dead_code)]
@@ -104,7 +166,8 @@ impl RingFollower {
             refused: BTreeMap::new(),
             unseen: None,
             looked: None,
-            turn: 0,
+            turn: (0, 0),
+            current: None,
             mark,
             following,
         })
@@ -119,38 +182,99 @@ impl RingFollower {
             }
             self.looked = Some(Instant::now());
         }
-        let order: Vec<u32> = self.rings.range(self.turn..).chain(self.rings.range(..self.turn)).map(|(block, _)| *block).collect();
-        for block in order {
-            let Some(followed) = self.rings.get_mut(&block) else { continue };
-            let generation = followed.reader.header().generation;
-            let event = match if followed.refused { Ok(Read::Nothing) } else { followed.reader.read(values) } {
-                Ok(Read::Step(info)) => {
-                    self.turn = block + 1;
-                    followed.acknowledge(self.mark);
-                    let StepInfo { step, time, published, missed, .. } = info;
-                    Some(Event::Step { block, generation, step, time, published, missed })
-                }
-                Ok(Read::Ended) if !followed.ended => {
-                    followed.ended = true;
-                    Some(Event::Ended { block, generation, closed: true })
-                }
-                Ok(Read::Nothing) if !followed.ended && followed.looked.elapsed() > LOOK => {
-                    followed.looked = Instant::now();
-                    // The lock may already be that of a producer that took the place of this one.
-                    let gone = !followed.reader.is_current() || !producer_lives(&self.ring, block);
-                    gone.then(|| {
-                        followed.ended = true;
-                        Event::Ended { block, generation, closed: false }
-                    })
-                }
-                Ok(_) => None,
-                Err(error) => {
-                    followed.refused = true;
-                    Some(Event::Refused(error))
-                }
-            };
+        for (block, followed) in &mut self.rings {
+            followed.look_for_producer(&self.ring, *block);
+            if let Some(event) = followed.end(*block) {
+                return Some(event);
+            }
+        }
+        let simulations: BTreeSet<Simulation> = self.rings.values().filter(|f| !f.ended).map(Followed::simulation).collect();
+        let later = (Bound::Excluded(self.turn), Bound::Unbounded);
+        for simulation in simulations.range(later).chain(simulations.range(..=self.turn)) {
+            self.turn = *simulation;
+            let event = if simulation.1 == 1 { self.read_field(*simulation, values) } else { self.read_block(*simulation, values) };
             if event.is_some() {
                 return event;
+            }
+        }
+        None
+    }
+
+    /// Of a simulation in one block, its next step.
+    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>) -> Option<Event> {
+        let (block, followed) = self.rings.iter_mut().find(|(_, followed)| followed.simulation() == simulation && !followed.refused)?;
+        match followed.reader.read(values) {
+            Ok(Read::Step(info)) => {
+                followed.drained = false;
+                Some(followed.step(*block, info, self.mark))
+            }
+            Ok(end) => {
+                (followed.drained, followed.closed) = (true, followed.closed || end == Read::Ended);
+                None
+            }
+            Err(error) => Some(followed.refuse(error)),
+        }
+    }
+
+    /// Of a simulation in several blocks, the next block of the step that is being read, or the first one of another step.
+    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>) -> Option<Event> {
+        for _ in 0..ATTEMPTS {
+            // The step goes on from what is known. Before another is begun all rings are looked at.
+            let block = match self.next(simulation).filter(|(_, place)| self.current == Some((simulation, *place))) {
+                Some((block, _)) => block,
+                None => {
+                    if let Some(refused) = self.look_ahead(simulation) {
+                        return Some(refused);
+                    }
+                    let (block, place) = self.next(simulation)?;
+                    self.current = Some((simulation, place));
+                    block
+                }
+            };
+            let followed = self.rings.get_mut(&block)?;
+            let (number, _) = followed.ahead.first()?;
+            match followed.reader.take(number, values) {
+                Ok(Some(info)) => {
+                    followed.ahead.took();
+                    return Some(followed.step(block, info, self.mark));
+                }
+                Ok(None) => {
+                    followed.ahead.overwritten(&mut followed.reader, number + 1);
+                    self.current = None;
+                }
+                Err(error) => return Some(followed.refuse(error)),
+            }
+        }
+        None
+    }
+
+    /// The ring to be read next, and the place of its oldest step. What is in a ring that was replaced comes first: its block is not opened anew before.
+    fn next(&self, simulation: Simulation) -> Option<(u32, Place)> {
+        let rings = self.rings.iter().filter(|(_, f)| f.simulation() == simulation && !f.refused && !f.ended);
+        let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.ahead));
+        choice::next(of(true)).or_else(|| choice::next(of(false)))
+    }
+
+    /// Looks at all rings of a simulation in several blocks, and passes over what will not be whole.
+    fn look_ahead(&mut self, simulation: Simulation) -> Option<Event> {
+        let mut rings: Vec<&mut Followed> =
+            self.rings.values_mut().filter(|f| f.simulation() == simulation && !f.refused && !f.ended).collect();
+        let newest = rings.iter().filter_map(|followed| followed.ahead.last()).map(|(round, _)| round).max().unwrap_or(0);
+        for followed in &mut rings {
+            let looked = followed.reader.is_closed().and_then(|closed| {
+                followed.closed |= closed;
+                followed.ahead.look(&mut followed.reader, newest)
+            });
+            if let Err(error) = looked {
+                return Some(followed.refuse(error));
+            }
+            followed.drained = followed.ahead.is_empty();
+        }
+        rings.retain(|followed| !followed.replaced);
+        let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.ahead).collect())?;
+        for followed in rings {
+            if followed.ahead.pass(&mut followed.reader, place) {
+                followed.acknowledge(self.mark);
             }
         }
         None
@@ -184,8 +308,11 @@ impl RingFollower {
         self.unseen = None;
         for block in blocks(&self.ring) {
             // What the old one left is read first.
-            if self.rings.get(&block).is_some_and(|followed| followed.reader.is_current() || !followed.ended) {
-                continue;
+            if let Some(followed) = self.rings.get_mut(&block) {
+                followed.replaced = !followed.reader.is_current();
+                if !followed.replaced || !followed.ended {
+                    continue;
+                }
             }
             // A ring without a producer that was never followed is what a killed run left.
             if !producer_lives(&self.ring, block) && !self.closed_in_order(block) {
@@ -200,8 +327,7 @@ impl RingFollower {
                     self.refused.remove(&block);
                     let header = reader.header();
                     let event = Event::Opened { description: Box::new(header.description.clone()), generation: header.generation };
-                    let now = Instant::now();
-                    let mut followed = Followed { reader, refused: false, ended: false, looked: now, told: now };
+                    let mut followed = Followed::begin(reader);
                     followed.acknowledge(self.mark);
                     self.rings.insert(block, followed);
                     return Some(event);

@@ -8,6 +8,7 @@
 
 mod assemble;
 mod bytes;
+mod choice;
 mod copy;
 #[cfg(test)]
 #[path = "../tests/support/counting.rs"]
@@ -19,6 +20,7 @@ mod header;
 mod lock;
 #[cfg(feature = "messages")]
 pub mod message;
+mod place;
 mod producer;
 mod reader;
 #[cfg(feature = "messages")]
@@ -43,6 +45,11 @@ pub const RING_VARIABLE: &str = "RIDGEWATCH_RING";
 /// The file of one block in a ring's folder.
 pub fn block_path(ring: &Path, block: u32) -> PathBuf {
     ring.join(format!("block-{block:05}.ring"))
+}
+
+/// A block's file until it is whole.
+fn part_path(ring: &Path, block: u32) -> PathBuf {
+    ring.join(format!(".block-{block:05}.part"))
 }
 
 /// Who follows the ring holds this file's lock.

@@ -2,7 +2,7 @@
 
 use crate::header::MARKS;
 use crate::system::{create_private, foreign};
-use crate::{WireError, block_path, followers_path, lock_path, system};
+use crate::{WireError, block_path, followers_path, lock_path, part_path, system};
 use std::fs::File;
 use std::io;
 use std::os::fd::AsRawFd;
@@ -137,6 +137,17 @@ pub(crate) fn is_followed(ring: &Path) -> bool {
     in_the_way(&followers_path(ring), libc::F_WRLCK).is_some()
 }
 
+/// Removes what producers that have ended left, those with them that were killed while they opened; their rings by `remove`.
+pub(crate) fn remove_dead(ring: &Path, remove: impl Fn(&Path)) {
+    for block in blocks(ring) {
+        if let Ok(Some(name)) = NameLock::take(ring, block) {
+            remove(&block_path(ring, block));
+            let _ = std::fs::remove_file(part_path(ring, block));
+            name.remove();
+        }
+    }
+}
+
 /// Removes the rings of producers that have ended, and the folder when it is empty, where nobody follows. Somebody else who does so is waited for, so
 /// long at most: what was still taken when it looked would stay.
 pub(crate) fn sweep(ring: &Path, limit: Duration) {
@@ -155,13 +166,8 @@ pub(crate) fn sweep(ring: &Path, limit: Duration) {
             Err(_) => return,
         }
     };
-    for block in blocks(ring) {
-        // Whoever has the name publishes, and looks for followers once more when it has ended.
-        if let Ok(Some(name)) = NameLock::take(ring, block) {
-            let _ = std::fs::remove_file(block_path(ring, block));
-            name.remove();
-        }
-    }
+    // Whoever has a name publishes, and looks for followers once more when it has ended.
+    remove_dead(ring, |path| drop(std::fs::remove_file(path)));
     last.remove();
     let _ = std::fs::remove_dir(ring);
 }
@@ -221,12 +227,12 @@ impl Drop for Following {
     }
 }
 
-/// The blocks whose rings or locks are in the folder, ascending; at most 65536 are looked for.
+/// The blocks of which a ring, a part of one or a lock is in the folder, ascending; at most 65536 are looked for.
 pub fn blocks(ring: &Path) -> Vec<u32> {
     let Ok(entries) = std::fs::read_dir(ring) else { return Vec::new() };
     let number = |name: &str| {
-        let name = name.strip_prefix("block-")?;
-        let digits = name.strip_suffix(".ring").or(name.strip_suffix(".lock"))?;
+        let name = name.strip_prefix("block-").or(name.strip_prefix(".block-"))?;
+        let digits = [".ring", ".part", ".lock"].iter().find_map(|end| name.strip_suffix(end))?;
         (digits.len() == 5).then(|| digits.parse().ok()).flatten()
     };
     let names = entries.take(1 << 18).flatten().filter_map(|e| e.file_name().to_str().and_then(number));

@@ -2,9 +2,9 @@
 
 use crate::copy::Field;
 use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, SLOTS, STATE};
-use crate::lock::{NameLock, is_followed, sweep};
+use crate::lock::{NameLock, is_followed, remove_dead, sweep};
 use crate::system::{self, Map, create_private, open_private};
-use crate::{Description, Limits, WireError, block_path};
+use crate::{Description, Limits, WireError, block_path, part_path};
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -73,8 +73,8 @@ impl Producer {
     /// killed run left is replaced. All memory is taken here.
     ///
     /// # Errors
-    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name (after a second); no room; no
-    /// memory.
+    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name (after a second); no room; a file
+    /// that is longer than the process may make; no memory.
     pub fn open(ring: &Path, description: Description, slots: u32, policy: Policy) -> Result<Self, WireError> {
         description.check(&Limits { step_bytes: u64::MAX })?;
         if !(2..=SLOTS).contains(&slots) {
@@ -98,12 +98,9 @@ impl Producer {
             generation: system::since_1970(),
             pid: u64::from(std::process::id()),
         };
-        // Under another name until it is whole; a name that a killed run may have left is this producer's to remove, since it has the lock.
-        let part = ring.join(format!(".block-{block:05}.part"));
-        let _ = std::fs::remove_file(&part);
+        let part = part_path(ring, block);
         let made = header.encode().and_then(|(fixed, description, total, first_slot)| {
-            let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
-            let map = Map::create(&file, &path, total)?;
+            let map = Self::room(ring, block, total)?;
             let producer = Self {
                 ring: ring.to_owned(),
                 header,
@@ -133,6 +130,27 @@ impl Producer {
                 Err(error)
             }
         }
+    }
+
+    /// Memory for a ring, under another name until it is whole. Where there is none, that of rings whose producers have ended is taken, with what followers
+    /// had not read of them.
+    fn room(ring: &Path, block: u32, bytes: u64) -> Result<Map, WireError> {
+        let (part, path) = (part_path(ring, block), block_path(ring, block));
+        let attempt = || {
+            // A killed run may have left it, or the last attempt.
+            let _ = std::fs::remove_file(&part);
+            let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
+            Map::create(&file, &path, bytes)
+        };
+        attempt().or_else(|error| match error {
+            WireError::NoSpace { .. } => {
+                // The one of this name is nobody else's.
+                give_up(&path);
+                remove_dead(ring, give_up);
+                attempt()
+            }
+            error => Err(error),
+        })
     }
 
     /// What is published.
@@ -263,10 +281,31 @@ impl Drop for Producer {
     }
 }
 
-/// Makes the ring's folder, and refuses one that others may write into.
+/// Removes a ring and frees its memory, although followers may have it open: they read it through the file, and find that it was cut short.
+fn give_up(path: &Path) {
+    let _ = open_private(path, true).map(|file| file.set_len(0));
+    let _ = std::fs::remove_file(path);
+}
+
+/// Makes the ring's folder, and refuses one that others may write into, or put another in the place of.
 pub(crate) fn make_folder(ring: &Path) -> Result<(), WireError> {
     let made = std::fs::DirBuilder::new().mode(0o700).recursive(true).create(ring);
     made.map_err(|e| WireError::io(ring, "cannot be made", e))?;
+    let above = ring.parent().map(|above| if above.as_os_str().is_empty() { Path::new(".") } else { above });
+    if let Some(above) = above {
+        let about = std::fs::metadata(above).map_err(|e| WireError::io(above, "cannot be looked at", e))?;
+        // Who may write into a sticky folder may not rename what is another's in it.
+        let sticky = about.mode() & 0o1000 != 0;
+        if !sticky && ![0, system::user()].contains(&about.uid()) {
+            return Err(system::foreign(
+                above,
+                format!("is a folder of user {}, who may put another in the place of {}", about.uid(), ring.display()),
+            ));
+        }
+        if !sticky && about.mode() & 0o002 != 0 {
+            return Err(system::foreign(above, format!("is a folder that all may write into (mode {:04o})", about.mode() & 0o7777)));
+        }
+    }
     let about = std::fs::symlink_metadata(ring).map_err(|e| WireError::io(ring, "cannot be looked at", e))?;
     if !about.is_dir() {
         return Err(system::foreign(ring, "is no folder".into()));

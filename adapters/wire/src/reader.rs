@@ -73,6 +73,8 @@ pub struct RingReader<F = File> {
     first_slot: u64,
     /// The next step wanted.
     next: u64,
+    /// Steps before it that were passed over since the last that was read.
+    passed: u64,
     device_and_inode: (u64, u64),
 }
 
@@ -123,7 +125,7 @@ impl<F: ReadAt> RingReader<F> {
         let mut description = vec![0; bytes];
         file.read_at(&mut description, DESCRIPTION as u64).map_err(failed)?;
         let (header, first_slot) = Header::decode(&fixed, &description, length, limits)?;
-        let mut reader = Self { path, file, header, first_slot, next: 0, device_and_inode: (0, 0) };
+        let mut reader = Self { path, file, header, first_slot, next: 0, passed: 0, device_and_inode: (0, 0) };
         reader.next = reader.word(PUBLISHED)?.saturating_sub(u64::from(reader.header.slots));
         Ok(reader)
     }
@@ -146,8 +148,8 @@ impl<F: ReadAt> RingReader<F> {
     pub fn read(&mut self, values: &mut Vec<f32>) -> Result<Read, WireError> {
         let slots = u64::from(self.header.slots);
         let began = self.next;
-        // Ended before the count is read: no step can come after it.
-        let ended = self.word(STATE)? == ENDED;
+        // Before the count is read: no step can come after it.
+        let ended = self.is_closed()?;
         for _ in 0..ATTEMPTS {
             let published = self.word(PUBLISHED)?;
             if published < began {
@@ -171,6 +173,36 @@ impl<F: ReadAt> RingReader<F> {
         // The producer is faster than any reading; what else is to be done comes first.
         self.next = began;
         Ok(Read::Nothing)
+    }
+
+    /// Numbers of the steps that the ring holds; the first may be overwritten at this moment.
+    pub(crate) fn there(&self) -> Result<std::ops::Range<u64>, WireError> {
+        let published = self.word(PUBLISHED)?;
+        if published < self.next {
+            return Err(WireError::field("published", published, format!("at least {}, which was seen before", self.next)));
+        }
+        Ok(published.saturating_sub(u64::from(self.header.slots))..published)
+    }
+
+    /// The solver's number of a step; none: it was overwritten.
+    pub(crate) fn step_of(&self, number: u64) -> Result<Option<u64>, WireError> {
+        Ok(self.head(number)?.map(|head| head[1]))
+    }
+
+    /// Reads this step and no other, as [`Self::read`] does; none: it was overwritten. What is before it counts as missed.
+    pub(crate) fn take(&mut self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
+        let Some(mut info) = self.try_slot(number, values)? else { return Ok(None) };
+        self.pass(number);
+        info.missed = std::mem::take(&mut self.passed);
+        self.next = number + 1;
+        Ok(Some(info))
+    }
+
+    /// Wants nothing before a step any more; whether that changes anything.
+    pub(crate) fn pass(&mut self, number: u64) -> bool {
+        let passed = number.saturating_sub(self.next);
+        (self.next, self.passed) = (self.next + passed, self.passed + passed);
+        passed > 0
     }
 
     /// Tells the producer that this follower has taken all steps before the next, and lives. Which of the 64 marks is its own says
@@ -199,9 +231,11 @@ impl<F: ReadAt> RingReader<F> {
         self.file.write_at(&words, place as u64).map_err(|e| WireError::io(&self.path, "cannot be written", e))
     }
 
-    /// Whether the producer has closed the ring.
+    /// Whether the producer has closed the ring: what is read of it afterwards is all that it will ever hold.
     pub fn is_closed(&self) -> Result<bool, WireError> {
-        Ok(self.word(STATE)? == ENDED)
+        let closed = self.word(STATE)? == ENDED;
+        fence(Ordering::Acquire);
+        Ok(closed)
     }
 
     /// Steps published so far.
@@ -209,18 +243,24 @@ impl<F: ReadAt> RingReader<F> {
         self.word(PUBLISHED)
     }
 
+    fn slot(&self, number: u64) -> u64 {
+        self.first_slot + number % u64::from(self.header.slots) * self.header.stride()
+    }
+
+    /// The head of a step's slot in words; none: it holds another step, or is being written.
+    fn head(&self, number: u64) -> Result<Option<[u64; 4]>, WireError> {
+        let mut head = [0; 32];
+        self.read_bytes(&mut head, self.slot(number))?;
+        let words = [0, 1, 2, 3].map(|k| u64::from_ne_bytes(head.as_chunks::<8>().0[k]));
+        Ok((words[0] == sequence(number)).then_some(words))
+    }
+
     fn try_slot(&self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
-        let slot = self.first_slot + number % u64::from(self.header.slots) * self.header.stride();
+        let slot = self.slot(number);
         // At most what the limits allow: the header was checked.
         let count = (self.header.description.block_bytes() / 4) as usize;
-        let whole = number.wrapping_mul(2).wrapping_add(2);
-        let mut head = [0; 32];
-        self.read_bytes(&mut head, slot)?;
+        let Some(head) = self.head(number)? else { return Ok(None) };
         fence(Ordering::Acquire);
-        let word = |k: usize| u64::from_ne_bytes(head.as_chunks::<8>().0[k]);
-        if word(0) != whole {
-            return Ok(None);
-        }
         values.resize(count, 0.0);
         // SAFETY: any bytes are f32s, and the length is that of the values.
         let bytes = unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast::<u8>(), count * 4) };
@@ -229,14 +269,14 @@ impl<F: ReadAt> RingReader<F> {
         fence(Ordering::Acquire);
         let mut after = [0; 8];
         self.read_bytes(&mut after, slot)?;
-        if u64::from_ne_bytes(after) != whole {
+        if u64::from_ne_bytes(after) != sequence(number) {
             return Ok(None);
         }
-        let time = f64::from_bits(word(2));
+        let time = f64::from_bits(head[2]);
         if !time.is_finite() {
             return Err(WireError::field("time", time, "a finite number"));
         }
-        Ok(Some(StepInfo { number, step: word(1), time, published: word(3), missed: 0 }))
+        Ok(Some(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
     }
 
     fn word(&self, offset: usize) -> Result<u64, WireError> {
@@ -248,4 +288,9 @@ impl<F: ReadAt> RingReader<F> {
     fn read_bytes(&self, to: &mut [u8], offset: u64) -> Result<(), WireError> {
         self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, "cannot be read (was it cut short?)", e))
     }
+}
+
+/// What stands at the head of a slot that holds this step, whole.
+fn sequence(number: u64) -> u64 {
+    number.wrapping_mul(2).wrapping_add(2)
 }

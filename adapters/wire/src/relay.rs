@@ -456,6 +456,11 @@ impl RelayFollower {
         Ok(Self { events, spare, stop, open: BTreeMap::new(), broken: false })
     }
 
+    /// Blocks that were opened and have not ended, and their generations.
+    pub fn blocks(&self) -> impl Iterator<Item = (u32, u64)> {
+        self.open.iter().map(|(block, generation)| (*block, *generation))
+    }
+
     /// The next thing that happened, or none within the limit. A step's values are in `values`. Should the thread that receives have panicked, that is
     /// told once, and all of its blocks end.
     pub fn poll(&mut self, values: &mut Vec<f32>, limit: Duration) -> Option<Event> {

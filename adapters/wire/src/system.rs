@@ -108,6 +108,35 @@ pub(crate) fn foreign(path: &Path, found: String) -> WireError {
     WireError::Foreign { path: path.to_owned(), found, user: user() }
 }
 
+/// Bytes of the longest file that this process may make.
+fn file_size_limit() -> io::Result<u64> {
+    let mut limit = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+    // SAFETY: `limit` outlives the call.
+    match unsafe { libc::getrlimit(libc::RLIMIT_FSIZE, &mut limit) } {
+        0 => Ok(limit.rlim_cur),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+/// Signals that may interrupt the reservation of one piece; after some thirty a piece is a page.
+const INTERRUPTIONS: u32 = 1000;
+
+/// Reserves bytes 0 to `end` by calls of `allocate(from, bytes)`, whose status is returned. At once where the system can, so that it refuses what does not fit
+/// before it has taken anything; in smaller and smaller pieces where signals come, since older Linux undoes a call into which any signal falls: beside a timer
+/// that is faster than the call (a profiler's) the same call would be tried without end.
+fn reserve(end: libc::off_t, mut allocate: impl FnMut(libc::off_t, libc::off_t) -> libc::c_int) -> libc::c_int {
+    let (mut from, mut piece, mut interruptions) = (0, end, 0);
+    while from < end {
+        let bytes = piece.min(end - from);
+        match allocate(from, bytes) {
+            0 => (from, interruptions) = (from + bytes, 0),
+            libc::EINTR if interruptions < INTERRUPTIONS => (piece, interruptions) = ((piece / 2).max(4096), interruptions + 1),
+            code => return code,
+        }
+    }
+    0
+}
+
 /// A file mapped for reading and writing, all its pages there.
 #[derive(Debug)]
 pub(crate) struct Map {
@@ -127,16 +156,18 @@ impl Map {
     /// `NoSpace`: there is no room. Never leaves pages that could fail when they are written.
     pub fn create(file: &File, path: &Path, length: u64) -> Result<Self, WireError> {
         let no_space = || WireError::NoSpace { path: path.to_owned(), needed: length };
+        let most = file_size_limit().map_err(|e| WireError::io(path, "no limit of its length can be had", e))?;
+        if length > most {
+            // The system would end the process by SIGXFSZ.
+            return Err(WireError::FileSize { path: path.to_owned(), needed: length, limit: most });
+        }
         let size = libc::off_t::try_from(length).ok().zip(usize::try_from(length).ok());
-        let (offset, length) = size.ok_or_else(no_space)?;
-        loop {
-            // SAFETY: the descriptor is open. Unlike `ftruncate`, this reserves: a full file system answers here and not by SIGBUS later.
-            match unsafe { libc::posix_fallocate(file.as_raw_fd(), 0, offset) } {
-                0 => break,
-                libc::EINTR => {}
-                libc::ENOSPC | libc::EFBIG | libc::ENOMEM | libc::EDQUOT => return Err(no_space()),
-                code => return Err(WireError::io(path, "room cannot be reserved", io::Error::from_raw_os_error(code))),
-            }
+        let (end, length) = size.ok_or_else(no_space)?;
+        // SAFETY: the descriptor is open. Unlike `ftruncate`, this reserves: a full file system answers here and not by SIGBUS later.
+        match reserve(end, |from, bytes| unsafe { libc::posix_fallocate(file.as_raw_fd(), from, bytes) }) {
+            0 => {}
+            libc::ENOSPC | libc::EFBIG | libc::ENOMEM | libc::EDQUOT => return Err(no_space()),
+            code => return Err(WireError::io(path, "room cannot be reserved", io::Error::from_raw_os_error(code))),
         }
         let (rights, flags) = (libc::PROT_READ | libc::PROT_WRITE, libc::MAP_SHARED | libc::MAP_POPULATE);
         // SAFETY: a new mapping of an open file; the address is the system's choice.
@@ -166,5 +197,39 @@ impl Drop for Map {
     fn drop(&mut self) {
         // SAFETY: mapped by `create` and unmapped only here.
         unsafe { libc::munmap(self.start.cast(), self.length) };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn room_is_reserved_whole_although_a_timer_interrupts() {
+        // A signal each 300 pages, and a system that undoes the call into which it falls.
+        let (mut reserved, mut worked) = (0, 0u64);
+        let end = (100 << 20) + 5000;
+        let status = reserve(end, |from, bytes| {
+            assert!(from == reserved && bytes > 0 && from + bytes <= end, "{from} {bytes}");
+            let pages = (bytes as u64).div_ceil(4096);
+            let left = 300 - worked % 300;
+            worked += pages.min(left);
+            assert!(worked < 1 << 20, "without end");
+            if pages >= left {
+                return libc::EINTR;
+            }
+            reserved += bytes;
+            0
+        });
+        assert_eq!((status, reserved), (0, end));
+        // One that is always interrupted ends too, and so does any other fault, at once.
+        assert_eq!(reserve(end, |_, _| libc::EINTR), libc::EINTR);
+        let mut calls = 0;
+        let full = |_, bytes| {
+            calls += 1;
+            assert_eq!(bytes, end);
+            libc::ENOSPC
+        };
+        assert_eq!((reserve(end, full), calls), (libc::ENOSPC, 1));
     }
 }

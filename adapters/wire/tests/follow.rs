@@ -9,12 +9,13 @@ use folder::Folder;
 use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::relay::{RelayCounts, RelayFollower, serve};
 use ridgewatch_wire::{
-    AxisDescription, Description, Element, Event, Field, Geometry, Limits, Policy, Producer, Published, RingFollower, WireError,
+    Assembler, AxisDescription, BlockExtent, Description, Element, Event, Field, Geometry, Incomplete, Limits, Policy, Producer, Published,
+    RingFollower, WireError,
 };
 use std::io::Read;
 use std::net::{TcpListener, TcpStream};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 fn description(nodes: u64) -> Description {
@@ -234,31 +235,109 @@ fn two_followers_of_a_relay_lose_nothing_of_a_solver_that_waits() {
     let folder = Folder::new("two");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
     let producer = Producer::open(&folder.0, description(64), 4, Policy::Wait(LONG)).unwrap();
+    let took = Arc::new(AtomicU64::new(0));
     let followers: Vec<_> = [0, 2]
         .map(|pause| {
-            let mut follower = relay.follow(LONG);
+            let (mut follower, took) = (relay.follow(LONG), took.clone());
             std::thread::spawn(move || {
                 let mut poll = |values: &mut Vec<f32>| {
                     std::thread::sleep(Duration::from_millis(pause));
-                    follower.poll(values, Duration::from_millis(10))
+                    let event = follower.poll(values, Duration::from_millis(10));
+                    took.fetch_add(u64::from(matches!(event, Some(Event::Step { step: 0, .. }))), Ordering::Relaxed);
+                    event
                 };
                 events(&mut poll, "step 199")
             })
         })
         .into();
     // Both are there before the ring has turned once.
+    publish(&producer, 0);
     let begin = Instant::now();
-    while relay.counts.followers.load(Ordering::Relaxed) < 2 {
+    while took.load(Ordering::Relaxed) < 2 {
         assert!(begin.elapsed() < LONG);
         std::thread::sleep(Duration::from_millis(1));
     }
-    publish(&producer, 0);
-    std::thread::sleep(Duration::from_millis(300));
     (1..200).for_each(|n| _ = publish(&producer, n));
     let expected: Vec<String> = ["opened 64".to_owned()].into_iter().chain((0..200).map(|n| format!("step {n} missed 0"))).collect();
     for follower in followers {
         assert_eq!(follower.join().unwrap(), expected);
     }
+}
+
+/// Columns of a grid, as many as told.
+fn columns(nodes: u64, count: u32) -> Vec<Description> {
+    let width = nodes / u64::from(count);
+    let block = |index: u32| BlockExtent { index, count, offset: [width * u64::from(index), 0, 0], extent: [width, nodes, 1] };
+    (0..count).map(|index| Description { start: 1, block: block(index), ..description(nodes) }).collect()
+}
+
+/// Follows until `enough` says so of the whole steps, whose values are the step's number. A reader who is slow takes `pause` for each block.
+fn assemble(folder: &Folder, pause: Duration, enough: &dyn Fn(&[u64]) -> bool) -> (Vec<u64>, Vec<Incomplete>) {
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let (mut values, mut whole, mut assembler, begin) = (Vec::new(), Vec::new(), None::<Assembler>, Instant::now());
+    while !enough(&whole) {
+        assert!(begin.elapsed() < LONG, "{whole:?}");
+        match follower.poll(&mut values) {
+            Some(Event::Opened { description, generation }) => {
+                let assembler = assembler.get_or_insert_with(|| Assembler::new(&description, LONG, 4));
+                assembler.introduce(&description, generation).unwrap();
+            }
+            Some(Event::Step { block, generation, step, time, published, .. }) => {
+                std::thread::sleep(pause);
+                let came = assembler.as_mut().unwrap().block(block, generation, step, time, published, &mut values).unwrap();
+                if let Some(came) = came {
+                    assert!(came.values.iter().all(|v| *v == came.step as f32));
+                    whole.push(came.step);
+                }
+            }
+            Some(other) => panic!("{other:?}"),
+            None => std::thread::sleep(Duration::from_micros(100)),
+        }
+    }
+    (whole, assembler.unwrap().incomplete())
+}
+
+#[test]
+fn blocks_of_a_solver_that_is_too_fast_meet_about_as_often_as_one_block_comes() {
+    const STEPS: u64 = 400;
+    let [one, four] = [1, 4].map(|count| {
+        let folder = Folder::new(&format!("fast{count}"));
+        let producers: Vec<Producer> =
+            columns(64, count).into_iter().map(|block| Producer::open(&folder.0, block, 4, Policy::NewestWins).unwrap()).collect();
+        let over = AtomicBool::new(false);
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let begin = Instant::now();
+                for n in 0..STEPS {
+                    std::thread::sleep((Duration::from_millis(3) * n as u32).saturating_sub(begin.elapsed()));
+                    producers.iter().for_each(|producer| _ = publish(producer, n));
+                }
+                over.store(true, Ordering::Relaxed);
+            });
+            // While the solver runs: what is in the rings at last is no news.
+            assemble(&folder, Duration::from_millis(8) / count, &|_| over.load(Ordering::Relaxed)).0.len() as u64
+        })
+    });
+    assert!(one < STEPS / 2, "{one} of {STEPS}: the reader is not slow");
+    assert!(2 * four >= one, "{four} steps of four blocks, {one} of one block");
+}
+
+#[test]
+fn a_block_that_is_late_is_waited_for_and_no_step_is_lost() {
+    let folder = Folder::new("late");
+    let producers: Vec<Producer> =
+        columns(9, 3).into_iter().map(|block| Producer::open(&folder.0, block, 8, Policy::Wait(LONG)).unwrap()).collect();
+    std::thread::scope(|scope| {
+        // Each publishes as fast as it may, one after another.
+        for (n, producer) in producers.iter().enumerate() {
+            scope.spawn(move || {
+                std::thread::sleep(Duration::from_millis(200) * n as u32);
+                (0..40).for_each(|n| assert!(!publish(producer, n).overwrote));
+            });
+        }
+        let (whole, given_up) = assemble(&folder, Duration::ZERO, &|whole| whole.len() == 40);
+        assert_eq!((whole, given_up), ((0..40).collect(), Vec::new()));
+    });
 }
 
 /// Steps of a burst that overwrote one that was not taken. The solver waits; whoever follows it has found nothing new for longer than a silent
@@ -353,7 +432,7 @@ fn a_follower_that_holds_is_not_cut_off_and_holds_the_solver() {
     let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
     publish(&producer, 0);
     assert_eq!(events(&mut poll, "step 0"), ["opened 64", "step 0 missed 0"]);
-    let published = Arc::new(std::sync::atomic::AtomicU64::new(0));
+    let published = Arc::new(AtomicU64::new(0));
     let count = published.clone();
     let solver = std::thread::spawn(move || {
         for n in 1..30 {

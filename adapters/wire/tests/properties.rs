@@ -239,6 +239,7 @@ fn blocks_of_any_decomposition_meet_exactly() {
             whole.extend(assembler.block(block as u32, 1 + block as u64, step, step as f64, 1 + step, &mut values).unwrap());
         }
         std::thread::sleep(Duration::from_nanos(1));
+        assembler.expire();
         run.judge(&whole, assembler.incomplete())?;
     });
 }

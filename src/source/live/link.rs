@@ -13,7 +13,7 @@ const IDLE: Duration = Duration::from_millis(1);
 
 /// An open way to the simulation.
 pub(super) enum Link {
-    Ring(RingFollower),
+    Ring(Box<RingFollower>),
     Relays(Vec<RelayFollower>),
 }
 
@@ -23,7 +23,10 @@ impl Link {
         if settings.connections.is_empty() {
             let ring = ring_of(settings)?;
             let follower = RingFollower::begin(&ring, limits).map_err(SourceError::Live)?;
-            return Ok((Self::Ring(follower), format!("waiting for a simulation: start it with {RING_VARIABLE}={}", ring.display())));
+            return Ok((
+                Self::Ring(Box::new(follower)),
+                format!("waiting for a simulation: start it with {RING_VARIABLE}={}", ring.display()),
+            ));
         }
         let mut relays = Vec::new();
         for path in &settings.connections {
@@ -36,8 +39,9 @@ impl Link {
         Ok((Self::Relays(relays), format!("waiting for {} relay(s)", settings.connections.len())))
     }
 
-    /// The next thing that happened, after a short wait for it.
-    pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
+    /// The next thing that happened, after a short wait for it. A relay one of whose blocks (by index and generation) is ahead of the others' waits until
+    /// they have come; the rings of one node see to that themselves.
+    pub fn poll(&mut self, values: &mut Vec<f32>, is_ahead: &dyn Fn(u32, u64) -> bool) -> Option<Event> {
         match self {
             Link::Ring(ring) => {
                 let event = ring.poll(values);
@@ -49,7 +53,12 @@ impl Link {
             Link::Relays(relays) => {
                 // The first is waited for, the others just looked at; and each takes its turn as the first.
                 relays.rotate_left(1);
-                relays.iter_mut().enumerate().find_map(|(k, relay)| relay.poll(values, if k == 0 { IDLE } else { Duration::ZERO }))
+                let mut relays = relays.iter_mut().filter(|relay| !relay.blocks().any(|(block, generation)| is_ahead(block, generation)));
+                let Some(first) = relays.next() else {
+                    std::thread::sleep(IDLE);
+                    return None;
+                };
+                first.poll(values, IDLE).or_else(|| relays.find_map(|relay| relay.poll(values, Duration::ZERO)))
             }
         }
     }

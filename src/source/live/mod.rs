@@ -40,7 +40,7 @@ impl Live {
         tell(how);
         let mut values = Vec::new();
         while !stop.load(Ordering::Relaxed) {
-            match link.poll(&mut values) {
+            match link.poll(&mut values, &|_, _| false) {
                 Some(Event::Opened { description, generation }) => match grid(&description) {
                     Ok(grid) => {
                         return Ok(Some(Self {

@@ -36,7 +36,7 @@ pub struct LiveRecord {
     pub age: f64,
     /// Whole steps that came, in all.
     pub steps: u64,
-    /// Blocks of steps that were overwritten before they were read, in all.
+    /// Blocks of steps that were overwritten before they were read, or passed over since another block of the step was, in all.
     pub missed_blocks: u64,
     /// Steps left out for want of memory, in all.
     pub thinned: u64,
@@ -267,7 +267,8 @@ impl Reader {
             if self.live.settings.follow == Follow::Every && self.hold_back() {
                 continue;
             }
-            match self.live.link.poll(&mut values) {
+            let assembler = &self.assembler;
+            match self.live.link.poll(&mut values, &|block, generation| assembler.is_ahead(block, generation)) {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
                 Some(Event::Step { block, generation, step, time, published, missed }) => {
                     self.shared.lock().live.missed_blocks += missed;
@@ -281,7 +282,8 @@ impl Reader {
                 }
                 Some(Event::Ended { block, generation, closed }) => self.ended(block, generation, closed),
                 Some(Event::Refused(error)) => self.shared.lock().warn(format!("the simulation's data were refused: {error}")),
-                None => {}
+                // What lies there unread is not late.
+                None => self.assembler.expire(),
             }
             self.tell_incomplete();
         }
@@ -293,8 +295,10 @@ impl Reader {
         if !state.due(self.stride) {
             return false;
         }
+        let begin = Instant::now();
         self.live.link.hold();
         drop(self.shared.changed.wait_timeout(state, LOOK_UP));
+        self.assembler.held(begin.elapsed());
         true
     }
 

@@ -60,12 +60,31 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     assert_eq!(give(&mut assembler, &right, 2, 2), None, "too late");
     // when time is up,
     assert_eq!(give(&mut assembler, &left, 1, 4), None);
+    assembler.expire();
     assert!(assembler.incomplete().is_empty());
     std::thread::sleep(Duration::from_millis(40));
+    // Of which nothing counts in which none was taken.
+    assembler.held(Duration::from_secs(60));
+    assembler.expire();
+    assert!(assembler.incomplete().is_empty());
+    assert_eq!(give(&mut assembler, &right, 2, 4).unwrap().step, 4);
+    assert_eq!(give(&mut assembler, &left, 1, 5), None);
+    std::thread::sleep(Duration::from_millis(40));
+    assembler.expire();
     assert_eq!(assembler.incomplete()[0].why, "blocks did not come in time");
     // and when too many wait.
-    (5..9).for_each(|n| assert_eq!(give(&mut assembler, &left, 1, n), None));
-    assert_eq!(numbers(&assembler.incomplete()), [5, 6]);
+    let ahead = (6..10).map(|n| {
+        assert_eq!(give(&mut assembler, &left, 1, n), None);
+        assembler.is_ahead(0, 1)
+    });
+    assert_eq!(ahead.collect::<Vec<_>>(), [true; 4], "one more than this one is all that may wait");
+    assert!(!assembler.is_ahead(1, 2) && !assembler.is_ahead(1, 1));
+    assert_eq!(numbers(&assembler.incomplete()), [6, 7]);
+    // Those first that will not be whole, since the other block has come to a later one.
+    assert_eq!(give(&mut assembler, &right, 2, 10), None);
+    assert_eq!(numbers(&assembler.incomplete()), [8]);
+    assert_eq!(give(&mut assembler, &left, 1, 11), None);
+    assert_eq!(numbers(&assembler.incomplete()), [9], "step 10 may still be whole");
 }
 
 #[test]

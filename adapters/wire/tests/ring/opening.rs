@@ -1,9 +1,13 @@
 //! Rings that cannot be opened, and what opening leaves.
 
 use super::{Folder, cube, overwrite, publish, step, values};
-use ridgewatch_wire::{Description, Element, Field, Geometry, Limits, Policy, Producer, RingReader, WireError, block_path, producer_lives};
+use ridgewatch_wire::{
+    BlockExtent, Description, Element, Event, Field, Following, Geometry, Limits, Policy, Producer, RingFollower, RingReader, WireError,
+    block_path, blocks, producer_lives,
+};
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 #[test]
 fn every_unaligned_value_and_lie_of_the_caller_is_refused() {
@@ -90,7 +94,13 @@ fn open_rings_links_and_odd_files_are_refused() {
     std::fs::set_permissions(&open_to_all, PermissionsExt::from_mode(0o777)).unwrap();
     let error = Producer::open(&open_to_all, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
     assert!(error.contains("others may write into"), "{error}");
-    std::fs::remove_dir(&open_to_all).unwrap();
+    // Or in one, where whoever may write into it could put another in its place; but not where the sticky bit keeps them from that.
+    let within = open_to_all.join("ring");
+    let error = Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
+    assert!(error.contains("open: is a folder that all may write into (mode 0777)"), "{error}");
+    std::fs::set_permissions(&open_to_all, PermissionsExt::from_mode(0o1777)).unwrap();
+    drop(Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap());
+    std::fs::remove_dir_all(&open_to_all).unwrap();
     drop(producer);
 }
 
@@ -106,6 +116,23 @@ fn rings_and_folders_of_another_user_are_refused() {
     std::fs::create_dir_all(&folder.0).unwrap();
     std::os::unix::fs::chown(&folder.0, Some(12345), None).unwrap();
     assert!(theirs(Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err()));
+    // Nor one of this user's in it.
+    let error = Producer::open(&folder.0.join("ring"), cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
+    assert!(error.contains("is a folder of user 12345, who may put another in the place of"), "{error}");
+}
+
+#[test]
+fn what_a_producer_left_that_was_killed_while_it_opened_goes_with_the_last_follower() {
+    let folder = Folder::new("half");
+    let following = Following::begin(&folder.0).unwrap();
+    // The lock and the part are this one's; of the other the lock has gone.
+    for name in ["block-00003.lock", ".block-00003.part", ".block-00004.part"] {
+        std::fs::write(folder.0.join(name), "half").unwrap();
+        std::fs::set_permissions(folder.0.join(name), PermissionsExt::from_mode(0o600)).unwrap();
+    }
+    assert_eq!(blocks(&folder.0), [3, 4]);
+    drop(following);
+    assert!(!folder.0.exists(), "{:?}", std::fs::read_dir(&folder.0).unwrap().flatten().collect::<Vec<_>>());
 }
 
 /// A ring that is there whole, then changed.
@@ -154,8 +181,19 @@ fn no_room_is_an_error_and_leaves_nothing() {
     assert!(!folder.0.exists());
 }
 
-/// A file system of one megabyte that is gone when the test ends.
+/// A small file system that is gone when the test ends.
 struct SmallDisk(PathBuf);
+
+impl SmallDisk {
+    fn new(name: &str, size: &str) -> Self {
+        let disk = Self(std::env::temp_dir().join(format!("rw-test-{name}-{}", std::process::id())));
+        std::fs::create_dir_all(&disk.0).unwrap();
+        let options = format!("size={size},mode=0700");
+        let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", &options, "tmpfs"]).arg(&disk.0).status();
+        assert!(mounted.unwrap().success(), "mounting needs root");
+        disk
+    }
+}
 
 impl Drop for SmallDisk {
     fn drop(&mut self) {
@@ -167,10 +205,7 @@ impl Drop for SmallDisk {
 #[test]
 #[ignore = "mounts a small file system, which needs root"]
 fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
-    let disk = SmallDisk(std::env::temp_dir().join(format!("rw-test-full-{}", std::process::id())));
-    std::fs::create_dir_all(&disk.0).unwrap();
-    let mounted = std::process::Command::new("mount").args(["-t", "tmpfs", "-o", "size=1m,mode=0700", "tmpfs"]).arg(&disk.0).status();
-    assert!(mounted.unwrap().success(), "mounting needs root");
+    let disk = SmallDisk::new("full", "1m");
     let (first, second) = (disk.0.join("first"), disk.0.join("second"));
     // 2 slots of 24^3 x 3 f32: 332 kB.
     let producer = Producer::open(&first, cube([24, 24, 24]), 2, Policy::NewestWins).unwrap();
@@ -197,4 +232,68 @@ fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
     drop(ballast);
     std::fs::remove_file(disk.0.join("ballast")).unwrap();
     Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+}
+
+/// A solver in so many blocks, whose rings of 4 slots take 2.3 MB together, that is killed when it has published one step.
+fn killed(ring: &Path, count: u32) {
+    // SAFETY: the child makes producers and is killed; no other thread of it is needed.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        let producers = (0..count).map(|index| {
+            let mut description = cube([24, 24, 84]);
+            let part = 84 / u64::from(count);
+            description.block = BlockExtent { index, count, offset: [0, 0, u64::from(index) * part], extent: [24, 24, part] };
+            Producer::open(ring, description, 4, Policy::NewestWins).unwrap()
+        });
+        let producers: Vec<_> = producers.collect();
+        for producer in &producers {
+            publish(producer, 1, 1.0).unwrap();
+        }
+        // SAFETY: as a machine that runs out of memory does it.
+        unsafe { libc::kill(libc::getpid(), libc::SIGKILL) };
+    }
+    let mut status = 0;
+    // SAFETY: waits for that child.
+    unsafe { libc::waitpid(child, &mut status, 0) };
+    assert!(libc::WIFSIGNALED(status) && libc::WTERMSIG(status) == libc::SIGKILL);
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn what_a_killed_run_left_takes_no_room_from_the_next() {
+    let _alone = Folder::alone("again");
+    let disk = SmallDisk::new("again", "3m");
+    let ring = disk.0.join("ring");
+    let open = || Producer::open(&ring, cube([24, 24, 84]), 4, Policy::NewestWins);
+    // More than half of what is there, in as many blocks as the next or in more, with nobody who follows.
+    for count in [1, 3] {
+        killed(&ring, count);
+        assert_eq!(blocks(&ring).len() as u32, count);
+        drop(open().unwrap());
+    }
+    // And with somebody who has it open, and has not read it, as a sidecar that was stopped.
+    let mut follower = RingFollower::begin(&ring, Limits::default()).unwrap();
+    let mut told = |enough: &str| {
+        let (mut seen, mut values, begin) = (Vec::new(), Vec::new(), Instant::now());
+        while !seen.last().is_some_and(|last: &String| last.starts_with(enough)) && begin.elapsed() < Duration::from_secs(5) {
+            match follower.poll(&mut values) {
+                Some(Event::Opened { .. }) => seen.push("opened".to_owned()),
+                Some(Event::Step { step, .. }) => seen.push(format!("step {step}")),
+                Some(Event::Ended { closed, .. }) => seen.push(format!("ended {closed}")),
+                Some(Event::Refused(error)) => seen.push(error.to_string()),
+                None => std::thread::sleep(Duration::from_millis(1)),
+            }
+        }
+        seen
+    };
+    let producer = open().unwrap();
+    publish(&producer, 1, 1.0).unwrap();
+    assert_eq!(told("step"), ["opened", "step 1"]);
+    publish(&producer, 2, 2.0).unwrap();
+    drop(producer);
+    let next = open().unwrap();
+    publish(&next, 3, 3.0).unwrap();
+    let seen = told("step 3");
+    assert!(seen.len() == 4 && seen[0].contains("was it cut short?"), "{seen:?}");
+    assert_eq!(seen[1..], ["ended false", "opened", "step 3"]);
 }
