@@ -114,7 +114,7 @@ mod bench {
             ("frequency 10, 4x64", frequency(4, 64)),
             ("frequency 10, 2x128", frequency(2, 128)),
         ] {
-            let shape = Architecture::new(&settings, &[0, 1, 2], cube.extent())?;
+            let shape = Architecture::new(&settings, &[0, 1, 2], cube.lengths())?;
             let objective = Objective::new(&settings, &shape, cube.extent(), 1.0);
             let parameters = shape.parameters() as f64 * 1e-6;
             let mut training = DeviceTraining::new(&gpu, &Model::new(shape, 1, false), &objective)?;
@@ -215,7 +215,7 @@ mod bench {
     /// Something that draws points.
     fn drawer(gpu: &Arc<Gpu>, domain: &Domain) -> Outcome<DeviceTraining> {
         let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
-        let shape = Architecture::new(&any, &[0, 1, 2], domain.extent())?;
+        let shape = Architecture::new(&any, &[0, 1, 2], domain.lengths())?;
         let objective = Objective::new(&any, &shape, domain.extent(), 1.0);
         Ok(DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?)
     }
@@ -304,7 +304,7 @@ mod bench {
 
     fn rates(gpu: &Arc<Gpu>, settings: &NetworkSettings, rate: f64, batches: &[usize]) -> Outcome<Rates> {
         let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
-        let shape = Architecture::new(settings, &[0, 1, 2], cube.extent())?;
+        let shape = Architecture::new(settings, &[0, 1, 2], cube.lengths())?;
         let objective = Objective::new(settings, &shape, cube.extent(), 1.0);
         let mut training = DeviceTraining::new(gpu, &Model::new(shape, 1, false), &objective)?;
         let mut points = gpu.alloc("points", MANY)?;
@@ -577,12 +577,12 @@ mod bench {
         const SCOUTS: usize = 1 << 14;
         // The start time takes the third axis' place.
         let axes = if settings.inputs.is_empty() { &[0, 1, 2][..] } else { &[0, 1] };
-        let shape = Architecture::new(settings, axes, domain.extent())?;
+        let shape = Architecture::new(settings, axes, domain.lengths())?;
         let mut objective = Objective::new(settings, &shape, domain.extent(), 1.0);
         let (mut chunk, mut scouts) = (Batch::new(gpu, CHUNK)?, Batch::new(gpu, SCOUTS)?);
         // The least network of the same inputs draws the points that tell how large the labels are.
         let least = NetworkSettings { log2_table: 4, ..settings.clone() };
-        let least = Model::new(Architecture::new(&least, axes, domain.extent())?, 1, base.is_some());
+        let least = Model::new(Architecture::new(&least, axes, domain.lengths())?, 1, base.is_some());
         let scout = DeviceTraining::new(gpu, &least, &objective)?;
         let mut pool = scout.ring(SCOUTS)?;
         gpu.synchronize()?;

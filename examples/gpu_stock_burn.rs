@@ -62,7 +62,7 @@ fn main() -> Outcome<()> {
         ("hash 8x2, growth 2, T = 2^19, 2x64", hash(19)),
         ("hash 8x2, growth 2, T = 2^22, 2x64", hash(22)),
     ] {
-        let shape = Architecture::new(&settings, &[0, 1, 2], cube.extent())?;
+        let shape = Architecture::new(&settings, &[0, 1, 2], cube.lengths())?;
         let objective = Objective::new(&settings, &shape, cube.extent(), 1.0);
         let model = Model::new(shape.clone(), 1, false);
         let epsilon = model.epsilon;

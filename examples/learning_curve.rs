@@ -47,10 +47,10 @@ fn main() -> Result<(), Box<dyn Error>> {
     let scene = SceneFile::read(Path::new(&config), &settings)?;
     let bytes = curve(scene.clone(), Kind::Network, None, seconds)?;
     let setup = Setup::new(scene.settings())?;
-    let (extent, axes) = (setup.plan.domain.extent(), setup.plan.domain.dimensions);
-    let volume: f64 = extent[..axes].iter().product();
+    let (lengths, axes) = (setup.plan.domain.lengths(), setup.plan.domain.dimensions);
+    let volume: f64 = lengths[..axes].iter().product();
     let scale = (bytes as f64 / 4.0 / volume).powf(1.0 / axes as f64);
-    let nodes = std::array::from_fn(|axis| if axis < axes { ((extent[axis] * scale) as usize).max(2) } else { 2 });
+    let nodes = std::array::from_fn(|axis| if axis < axes { ((lengths[axis] * scale) as usize).max(2) } else { 2 });
     println!("table of {nodes:?} nodes");
     curve(scene.clone(), Kind::Table, Some(nodes), seconds)?;
     let base = scene.surrogate.table_nodes;

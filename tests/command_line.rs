@@ -216,7 +216,7 @@ fn a_signal_ends_the_run_after_the_current_frame() {
     }
     assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());
     let output = child.wait_with_output().unwrap();
-    assert!(output.status.success(), "{}", standard_error(&output));
+    assert_eq!(output.status.code(), Some(143), "{}", standard_error(&output));
     let summary: serde_json::Value = serde_json::from_slice(&std::fs::read(run.join("summary.json")).unwrap()).unwrap();
     assert_eq!(summary["run"]["interrupted"], true);
     let frames = summary["run"]["frames"].as_u64().unwrap() as usize;

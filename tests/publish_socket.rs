@@ -196,7 +196,7 @@ fn a_whole_run_leaves_its_folder_and_its_summary() {
     let mut extra = serde_json::Map::new();
     extra.insert("scene".into(), "double_gyre".into());
     let summary = output.finish(extra);
-    let files = summary.files.unwrap();
+    let files = summary.files.clone().unwrap();
     assert_eq!((summary.frames, files.records_written, files.pictures_written, files.pictures_removed), (10, 10, 10, 7));
     assert_eq!(summary.totals.warnings, 10);
     let written: Summary = serde_json::from_slice(&std::fs::read(path.join("summary.json")).unwrap()).unwrap();

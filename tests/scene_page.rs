@@ -40,7 +40,8 @@ fn back_quoted(cell: &str) -> Option<&str> {
 fn page() -> BTreeMap<String, String> {
     let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/scene.md")).unwrap();
     let (mut table, mut found) = (String::new(), BTreeMap::new());
-    for line in text.lines() {
+    // Variables of the environment are no keys.
+    for line in text.split("\n## Environment").next().unwrap().lines() {
         if line.starts_with('#') {
             table = back_quoted(line).unwrap_or_default().trim_matches(['[', ']']).to_owned();
         } else if line.starts_with("| `") {

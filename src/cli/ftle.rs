@@ -15,7 +15,8 @@ pub struct Options {
     /// A scene file (.toml), or data files and globs.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions.
+    /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions. Without NZ these get as many along z as the
+    /// source has levels, closed forms as many as the spacing along x asks for.
     #[arg(long, default_value = "201x101", value_parser = grid)]
     grid: Grid,
     /// Which slide of the window, from 0.
@@ -61,6 +62,11 @@ struct Report {
     integrator: Integrator,
     precision: Precision,
     steps: usize,
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it.
+    integration_difference: Option<f64>,
+    /// Unit of `time` and `tau`; empty where they have none.
+    time_unit: String,
+    source: String,
     minimum: f64,
     mean: f64,
     maximum: f64,
@@ -98,7 +104,7 @@ struct Convergence {
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
     let faulty = |error| located(&scene, error, EngineError::refused);
-    let Setup { plan, mut feed, notes, .. } = Setup::new(scene.settings()).map_err(faulty)?;
+    let Setup { plan, mut feed, notes, .. } = super::open(&scene)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
         super::check_folder(out)?;
@@ -134,9 +140,14 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         (2, 1) => {}
         (2, n) => bail!(Usage(format!("--grid has {n} seeds along z, but the flow does not vary along z; accepted: NXxNY"))),
         (_, 1) => {
-            // A grid given for two axes: as many along z as its spacing along x asks for.
-            let extent = plan.domain.extent();
-            grid[2] = (((grid[0] - 1) as f64 * extent[2] / extent[0]).round() as usize + 1).max(2);
+            let spaced = || {
+                let lengths = plan.domain.lengths();
+                (((grid[0] - 1) as f64 * lengths[2] / lengths[0]).round() as usize + 1).max(2)
+            };
+            grid[2] = match &slide.velocity {
+                VelocitySource::Window(window) => window.grid().and_then(|g| g.axes.get(2)).map_or_else(spaced, |z| z.cells() + 1),
+                VelocitySource::Analytic(..) => spaced(),
+            };
         }
         _ => {}
     }
@@ -177,6 +188,9 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         integrator: plan.map.integrator,
         precision: plan.map.precision,
         steps: tracer.steps(),
+        integration_difference: difference_of_steps(&*tracer),
+        time_unit: plan.time_unit.clone(),
+        source: plan.source.clone(),
         minimum: known.iter().copied().fold(f64::INFINITY, f64::min),
         mean: known.iter().sum::<f64>() / known.len().max(1) as f64,
         maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
@@ -190,6 +204,11 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         convergence,
         file: options.out.clone(),
     })
+}
+
+/// Difference of the log-stretch from twice as many steps, where the steps were chosen by it.
+fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
+    tracer.chosen().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
 }
 
 fn seeds(tracer: &dyn Tracer, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
@@ -307,25 +326,31 @@ fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usi
             variable.put_attribute("units", units)?;
         }
         let dimensions: Vec<&str> = axes.iter().rev().copied().collect();
-        let seconds = slide.date.is_some();
+        let unit = if plan.time_unit.is_empty() { "1" } else { &plan.time_unit };
         {
             let mut variable = file.add_variable::<f64>("ftle", &dimensions)?;
             variable.set_fill_value(f64::NAN)?;
             variable.put_values(ftle, ..)?;
             variable.put_attribute("long_name", "finite-time Lyapunov exponent")?;
-            variable.put_attribute("units", if seconds { "s-1" } else { "1" })?;
+            variable.put_attribute("units", if unit == "1" { unit.to_owned() } else { format!("{unit}-1") })?;
         }
         let mut variable = file.add_variable::<f32>("lived", &dimensions)?;
         variable.put_values(lived, ..)?;
         variable.put_attribute("long_name", "share of tau that the particle lived")?;
         variable.put_attribute("units", "1")?;
         file.add_attribute("title", plan.scene.title.as_str())?;
-        file.add_attribute("source", concat!("ridgewatch ", env!("CARGO_PKG_VERSION")))?;
+        file.add_attribute("source", format!("ridgewatch {} from {}", env!("CARGO_PKG_VERSION"), plan.source))?;
         file.add_attribute("seed_time", slide.time)?;
+        let counted_from = if unit == "s" && slide.date.is_some() { "s since 1970-01-01" } else { unit };
+        file.add_attribute("seed_time_units", counted_from)?;
         if let Some(date) = &slide.date {
             file.add_attribute("seed_date", date.as_str())?;
         }
         file.add_attribute("tau", tracer.tau())?;
+        file.add_attribute("tau_units", unit)?;
+        if let Some(difference) = difference_of_steps(tracer) {
+            file.add_attribute("integration_difference", difference)?;
+        }
         file.add_attribute("direction", plan.map.direction.name())?;
         file.add_attribute("integrator", format!("{}, {}, {} steps", word(plan.map.integrator), word(plan.map.precision), tracer.steps()))?;
     }
@@ -346,14 +371,18 @@ fn print_report(report: &Report) {
     let [nx, ny, nz] = report.grid;
     let when = report.date.clone().unwrap_or_else(|| format!("t0 = {}", report.time));
     print_text(format_args!(
-        "{when}, tau = {}: {}, {}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
+        "{when}, tau = {}{}: {}, {}, {} steps, {nx} x {ny} x {nz} seeds in {:.3} s ({:.0} samples/s)",
         report.tau,
+        if report.time_unit.is_empty() { String::new() } else { format!(" {}", report.time_unit) },
         word(report.integrator),
         word(report.precision),
         report.steps,
         report.seconds,
         report.samples_per_second
     ));
+    if let Some(difference) = report.integration_difference {
+        messages::note(super::steps_told(report.steps as u64, difference));
+    }
     print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
     if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {
         print_text(format_args!(

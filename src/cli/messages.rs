@@ -12,7 +12,13 @@ pub fn start(verbose: u8) {
         _ => "ridgewatch=debug",
     };
     let filter = EnvFilter::try_from_env("RIDGEWATCH_LOG").unwrap_or_else(|_| EnvFilter::new(level));
-    let lines = tracing_subscriber::fmt().with_env_filter(filter).with_writer(stderr).without_time().with_target(false).compact();
+    let lines = tracing_subscriber::fmt()
+        .with_env_filter(filter)
+        .with_writer(stderr)
+        .with_ansi(stderr().is_terminal())
+        .without_time()
+        .with_target(false)
+        .compact();
     // It would say so on standard error, which panics where nothing can be written there.
     lines.log_internal_errors(false).init();
 }
@@ -45,6 +51,8 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     };
     bar.set_draw_target(target);
     bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
+    // Its clock goes on while nothing is told.
+    bar.enable_steady_tick(std::time::Duration::from_millis(200));
     bar
 }
 
@@ -54,6 +62,5 @@ pub fn spinner(text: String) -> ProgressBar {
     let bar = progress(None).with_finish(ProgressFinish::AndClear);
     bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
     bar.set_message(text);
-    bar.enable_steady_tick(std::time::Duration::from_millis(200));
     bar
 }

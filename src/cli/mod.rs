@@ -17,7 +17,7 @@ mod synthesize;
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
 use ridgewatch::config::{ConfigError, SceneFile};
-use ridgewatch::engine::{Device, DeviceChoice, EngineError};
+use ridgewatch::engine::{Device, DeviceChoice, EngineError, Setup};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
 use ridgewatch::setting::Refused;
@@ -115,8 +115,11 @@ fn device(common: &Common, scene: &SceneFile) -> Result<Device> {
     Ok(device)
 }
 
-/// 2 for usage and config errors, 1 for everything else.
+/// 2 for usage and config errors, 128 and the signal's number where one ended the work, 1 for everything else.
 pub fn exit_status(error: &anyhow::Error) -> u8 {
+    if let Some(interrupted) = error.downcast_ref::<Interrupted>() {
+        return interrupted.status;
+    }
     let configuration = error.chain().any(|cause| {
         cause.is::<ConfigError>()
             || cause.is::<Usage>()
@@ -155,6 +158,33 @@ where
         Some(refused) => scene.locate(refused).into(),
         None => error.into(),
     }
+}
+
+/// The scene's source, opened; a synthetic archive is written first where there is none, which may take minutes.
+fn open(scene: &SceneFile) -> Result<Setup> {
+    let _spinner = opening(scene);
+    Setup::new(scene.settings()).map_err(|error| located(scene, error, EngineError::refused))
+}
+
+/// Turns while a source is opened.
+fn opening(scene: &SceneFile) -> indicatif::ProgressBar {
+    let writes = scene.archive.synthetic.is_some() && scene.archive.files.is_empty();
+    messages::spinner(
+        if writes { "opening a synthetic archive, which is written first where it is not there" } else { "opening the source" }.into(),
+    )
+}
+
+/// What is said of steps that were chosen by their error.
+fn steps_told(steps: u64, difference: f64) -> String {
+    format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many")
+}
+
+/// A command that a signal ended before its work was done; the exit status is that of a process which the signal ended.
+#[derive(Debug, thiserror::Error)]
+#[error("stopped by a signal; {done}")]
+pub struct Interrupted {
+    status: u8,
+    done: &'static str,
 }
 
 /// What a checkpoint option asks for must exist.

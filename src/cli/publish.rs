@@ -53,7 +53,9 @@ fn blocks(text: &str) -> Result<[u64; 3], String> {
 /// Publishes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
+    let spinner = super::opening(&scene);
     let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
+    drop(spinner);
     let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
     let Some(ring) = options.ring.clone().or_else(named) else {
         bail!(Usage(format!("no ring: --ring names its folder, or the environment variable {}", ridgewatch_wire::RING_VARIABLE)));
@@ -76,9 +78,10 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let stop = Arc::new(AtomicBool::new(false));
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
+    source.describe().notes.iter().for_each(messages::note);
     let (flag, rate, steps) = (stop.clone(), options.rate, options.steps.unwrap_or(source.times().len() as u64));
     let played = runtime.block_on(async move {
-        let signals = super::replay::watch_signals(stop).map(tokio::spawn);
+        let signals = super::replay::watch_signals(stop, Arc::default()).map(tokio::spawn);
         let played = tokio::task::spawn_blocking(move || play(&mut *source, &producers, rate, steps, &flag)).await;
         if let Some(signals) = signals {
             signals.abort();

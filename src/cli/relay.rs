@@ -64,7 +64,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
     let served = runtime.block_on(async {
-        let signals = super::replay::watch_signals(stop.clone()).map(tokio::spawn);
+        let signals = super::replay::watch_signals(stop.clone(), Arc::default()).map(tokio::spawn);
         let (flag, counts) = (stop.clone(), counts.clone());
         let work = move || serve(&ring, &listener, &key, &counts, &flag, Arc::new(messages::note));
         let served = tokio::task::spawn_blocking(work).await;

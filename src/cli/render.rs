@@ -2,7 +2,7 @@
 
 use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions, Setup};
+use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions};
 use ridgewatch::publish::write_exr;
 use ridgewatch::render::Method;
 use std::path::PathBuf;
@@ -66,17 +66,25 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         device: super::device(common, &scene)?,
         ..RunOptions::default()
     };
+    let setup = super::open(&scene)?;
     let bar = messages::progress(Some(100));
     let mut picture: Option<Frame> = None;
+    let (mut whole, mut warnings) = (0, Vec::new());
     let sink = &mut |event: Event| match event {
-        Event::Begin { notes, .. } => notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text))),
-        Event::Progress(share) => bar.set_position((share * 100.0) as u64),
-        Event::Frame(frame) => picture = Some(frame),
+        Event::Begin { notes, frames } => {
+            bar.set_length(100 * frames.unwrap_or(1));
+            notes.into_iter().for_each(|text| bar.suspend(|| messages::note(text)));
+        }
+        Event::Note(text) => bar.suspend(|| messages::note(text)),
+        Event::Progress(share) => bar.set_position(100 * whole + (share * 100.0) as u64),
+        Event::Frame(frame) => {
+            whole += 1;
+            // Those of warm-up frames too: some are told once a run.
+            warnings.extend(frame.record.warnings.iter().cloned());
+            picture = Some(frame);
+        }
     };
-    let setup = Setup::new(scene.settings());
-    setup
-        .and_then(|setup| engine::run(setup, &run_options, sink, &AtomicBool::new(false)))
-        .map_err(|error| located(&scene, error, EngineError::refused))?;
+    engine::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, EngineError::refused))?;
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {
@@ -86,8 +94,11 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     if common.json {
         return print_json(&*frame.record);
     }
-    for warning in &frame.record.warnings {
+    for warning in &warnings {
         messages::note(warning);
+    }
+    if let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference) {
+        messages::note(super::steps_told(steps, difference));
     }
     print_text(format_args!("{}: {}", options.out.display(), super::replay::line(&frame.record)));
     Ok(())

@@ -1,14 +1,14 @@
 //! `ridgewatch replay`.
 
-use super::{Common, Usage, check_learns, located, messages, print_json, print_text, scene};
+use super::{Common, Interrupted, Usage, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
-use ridgewatch::publish::{DEFAULT_ENDPOINT, Output, PublishError, RunFolder};
+use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
 
 /// Options of `replay`.
 #[derive(Debug, clap::Args)]
@@ -56,9 +56,7 @@ pub struct RunArguments {
 pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
     options.run.apply(&mut scene)?;
-    let open = |scene: &SceneFile, _: &AtomicBool| {
-        Setup::new(scene.settings()).map(Some).map_err(|error| located(scene, error, EngineError::refused))
-    };
+    let open = |scene: &SceneFile, _: &AtomicBool| super::open(scene).map(Some);
     conduct(common, &options.run, scene, None, open)
 }
 
@@ -109,9 +107,11 @@ async fn frames(
     if !options.overwrite {
         RunFolder::refuse_occupied(&options.out)?;
     }
-    let stop = Arc::new(AtomicBool::new(false));
+    let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
+    let watch = || watch_signals(stop.clone(), caught.clone()).map(tokio::spawn);
     // A source that is waited for must be left by a signal; one that is there is opened before signals are caught, so that they end it at once.
-    let early = if checkpoint_seconds.is_some() { watch_signals(stop.clone()).map(tokio::spawn) } else { None };
+    let follows = checkpoint_seconds.is_some();
+    let early = if follows { watch() } else { None };
     let Some(setup) = open(&scene, &stop)? else {
         messages::note("stopped before a simulation came");
         return Ok(());
@@ -121,7 +121,7 @@ async fn frames(
         super::check_folder(checkpoint)?;
     }
     // Before anything is written: from here on a signal leaves a complete folder.
-    let signals = early.or_else(|| watch_signals(stop.clone()).map(tokio::spawn));
+    let signals = early.or_else(watch);
     // The socket first: a port in use must not cost the run that the folder holds.
     let publish = scene.publish_settings();
     let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
@@ -138,6 +138,7 @@ async fn frames(
         device,
         ..RunOptions::default()
     };
+    let (source, time_unit) = (setup.plan.source.clone(), setup.plan.time_unit.clone());
     // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.
     let worker = tokio::task::spawn_blocking(move || {
         let mut bar = messages::progress(None);
@@ -152,6 +153,8 @@ async fn frames(
         run.insert("title".into(), scene.title.into());
         run.insert("seed".into(), scene.seed.into());
         run.insert("version".into(), env!("CARGO_PKG_VERSION").into());
+        run.insert("source".into(), source.into());
+        run.insert("time_unit".into(), time_unit.into());
         match &result {
             Ok(report) => run.extend(run_json(report)),
             Err(error) => drop(run.insert("failed".into(), error.to_string().into())),
@@ -164,34 +167,53 @@ async fn frames(
     }
     let report = result?;
     if common.json {
-        return print_json(&summary);
+        print_json(&summary)?;
+    } else {
+        print_report(&report, last.as_deref());
     }
-    if report.interrupted {
-        messages::note("stopped by a signal; the run folder is complete up to the last finished frame");
+    if let Some(lost) = summary.files.as_ref().and_then(FileStatistics::lost) {
+        bail!("{}: {lost}", options.out.join("frames").display());
     }
-    print_text(format_args!(
-        "{} frames of {} slides; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps",
-        report.frames,
-        report.slides,
-        report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
-        report.surrogate_bytes as f64 / 1e6,
-        report.train_steps
-    ));
+    if !common.json {
+        print_text(format_args!("frames in {}", options.out.join("frames").display()));
+    }
+    const DONE: &str = "the run folder is complete up to the last finished frame";
+    match (report.interrupted, follows) {
+        (false, _) => Ok(()),
+        // What follows a simulation without an end is ended so.
+        (true, true) => {
+            messages::note(format_args!("stopped by a signal; {DONE}"));
+            Ok(())
+        }
+        (true, false) => Err(Interrupted { status: caught.load(Ordering::Relaxed), done: DONE }.into()),
+    }
+}
+
+fn print_report(report: &RunReport, last: Option<&FrameRecord>) {
+    let mut text = format!("{} frames of {} slides", report.frames, report.slides);
+    // Before the first frame there is nothing else to tell.
     if let Some(last) = last {
-        print_text(format_args!("last frame: {}", line(&last)));
+        text += &format!(
+            "; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps\nlast frame: {}",
+            report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
+            report.surrogate_bytes as f64 / 1e6,
+            report.train_steps,
+            line(last)
+        );
     }
-    print_text(format_args!("frames in {}", options.out.join("frames").display()));
-    Ok(())
+    print_text(text);
 }
 
 fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<FrameRecord>>, output: &mut Output) {
     match event {
         Event::Begin { frames, notes } => {
             *bar = messages::progress(frames);
+            bar.set_message("filling the first window");
             for text in notes {
                 bar.suspend(|| messages::note(text));
             }
         }
+        Event::Note(text) => bar.suspend(|| messages::note(text)),
         Event::Progress(share) => bar.set_message(format!("frame {:3.0} %", share * 100.0)),
         Event::Frame(frame) => {
             for warning in &frame.record.warnings {
@@ -200,8 +222,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
             if last.is_none()
                 && let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference)
             {
-                let text = format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many");
-                bar.suspend(|| messages::note(text));
+                bar.suspend(|| messages::note(super::steps_told(steps, difference)));
             }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
             *last = Some(frame.record.clone());
@@ -217,7 +238,13 @@ pub(super) fn line(record: &FrameRecord) -> String {
         Some(date) => format!("{date}, "),
         None => format!("t = {}, ", record.time),
     };
-    text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries);
+    text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries - record.missing);
+    if record.missing > 0 {
+        text += &format!(", {} more on land", record.missing);
+    }
+    if record.audited > 0 && record.lived_share < 0.9995 {
+        text += &format!(", particles live {:.1} % of tau", 100.0 * record.lived_share);
+    }
     if let Some(error) = &record.trusted {
         text += &format!(
             ", error where trusted {:.4} [{:.4}, {:.4}] rms",
@@ -241,6 +268,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "optimizer_steps": report.train_steps,
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,
+        "transfer": report.transfer,
         "surrogate_bytes": report.surrogate_bytes,
         "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
@@ -252,8 +280,9 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
     map
 }
 
-/// The first SIGINT or SIGTERM ends the run after the current frame; the second ends the process. Both are caught from this call on.
-pub(super) fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output = ()>> {
+/// The first SIGINT or SIGTERM ends the run after the current frame, and leaves its exit status in `caught`; the second ends the process.
+/// Both are caught from this call on.
+pub(super) fn watch_signals(stop: Arc<AtomicBool>, caught: Arc<AtomicU8>) -> Option<impl Future<Output = ()>> {
     use tokio::signal::unix::{SignalKind, signal};
     let (Ok(mut interrupt), Ok(mut terminate)) = (signal(SignalKind::interrupt()), signal(SignalKind::terminate())) else {
         messages::note("cannot watch for signals: an interrupt will end the run at once");
@@ -261,12 +290,13 @@ pub(super) fn watch_signals(stop: Arc<AtomicBool>) -> Option<impl Future<Output 
     };
     Some(async move {
         loop {
-            let status = tokio::select! { _ = interrupt.recv() => 130, _ = terminate.recv() => 143 };
+            let status = tokio::select! { _ = interrupt.recv() => 130u8, _ = terminate.recv() => 143 };
+            caught.store(status, Ordering::Relaxed);
             if stop.swap(true, Ordering::Relaxed) {
                 messages::note("stopped at once; what was not written yet is lost");
                 // SAFETY: ends the process and touches no memory of ours. Not `exit`, whose handlers wait for libraries that may be
                 // waiting for a disk.
-                unsafe { libc::_exit(status) }
+                unsafe { libc::_exit(status.into()) }
             }
             messages::note("finishing the current frame; once more to stop at once");
         }

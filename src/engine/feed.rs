@@ -5,7 +5,7 @@ use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
-use crate::setting::Refused;
+use crate::setting::{Refused, shown};
 use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
     Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
@@ -111,26 +111,27 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
 /// A gridded source, opened.
 pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, EngineError> {
     let source = &scene.source;
-    if source.kind == SourceKind::Live {
-        return Err(
-            Refused::new("source.kind", "is \"live\"", "with `ridgewatch attach`: this command wants what it can read again").into()
-        );
-    }
-    if source.kind == SourceKind::Archive {
-        return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?));
+    match source.kind {
+        SourceKind::Archive => return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?)),
+        SourceKind::Live => {
+            let accepted = "with `ridgewatch attach`: this command wants what it can read again";
+            return Err(Refused::new("source.kind", "is \"live\"", accepted).into());
+        }
+        SourceKind::Turbulence => {}
+        SourceKind::DoubleGyre | SourceKind::Abc | SourceKind::Saddle | SourceKind::Rotation | SourceKind::Shear => {
+            let found = format_args!("is {}, a closed form, which has no snapshots", shown(source.kind));
+            return Err(Refused::new("source.kind", found, "\"archive\" or \"turbulence\"").into());
+        }
     }
     let nodes = source.nodes.unwrap_or([96, 48, 48]);
-    let turbulence = Turbulence::new(
-        nodes,
-        source.modes.unwrap_or(48),
-        source.k_max.unwrap_or(14.0),
-        source.amplitude.unwrap_or(3.0),
-        // The field is the scene's, not the run's: --seed changes the sampling of the picture only.
-        TURBULENCE_SEED,
-    );
+    let (modes, k_max, amplitude) = (source.modes.unwrap_or(48), source.k_max.unwrap_or(14.0), source.amplitude.unwrap_or(3.0));
+    // The field is the scene's, not the run's: --seed changes the sampling of the picture only.
+    let turbulence = Turbulence::new(nodes, modes, k_max, amplitude, TURBULENCE_SEED);
     let grid = Turbulence::grid(nodes)?;
     let times = (0..source.snapshots.unwrap_or(12)).map(|t| t as f64).collect();
-    Ok(Box::new(MemorySource::new("synthetic turbulence", grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?))
+    let [x, y, z] = nodes;
+    let source = MemorySource::new(format!("{x} x {y} x {z} nodes"), grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?;
+    Ok(Box::new(source.synthetic(Turbulence::described(modes, k_max, amplitude, TURBULENCE_SEED))))
 }
 
 /// A closed form without a box.
@@ -148,7 +149,7 @@ impl Feed {
         match (closed_form(&scene.source), snapshots) {
             (Some(flow), _) => {
                 let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
-                let domain = Domain { min: box_.min, max: box_.max, dimensions: flow.dimensions() };
+                let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
                 Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
             }
             (None, Some(source)) => {

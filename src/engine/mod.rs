@@ -14,6 +14,7 @@ mod device;
 mod error;
 mod feed;
 mod frames;
+mod memory;
 mod record;
 mod settings;
 mod setup;
@@ -30,7 +31,7 @@ pub use cycle::{Event, RunOptions, RunReport, run};
 pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 pub use error::EngineError;
 pub use feed::{Feed, Slide, open_snapshots};
-pub use record::{CheckpointRecord, FrameRecord, StageSeconds};
+pub use record::{CheckpointRecord, FrameRecord, StageSeconds, TransferRecord};
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
 

@@ -19,6 +19,15 @@ pub struct FrameRecord {
     pub live: Option<crate::source::live::LiveRecord>,
     /// |tau|.
     pub tau: f64,
+    /// Unit of `time` and `tau`, and with a minus of the FTLE: `s`, `snapshots`, a simulation's own; empty where they have none.
+    #[serde(default)]
+    pub time_unit: String,
+    /// What the velocities are, in words: what is made up says so.
+    #[serde(default)]
+    pub source: String,
+    /// What the picture's colours and densities stand for.
+    #[serde(default)]
+    pub transfer: TransferRecord,
     /// `forward` or `backward`.
     pub direction: String,
     /// `reference`, `surrogate` or `gated`.
@@ -81,6 +90,18 @@ pub struct FrameRecord {
     pub seconds: StageSeconds,
     /// Warnings that arose since the last frame, in words.
     pub warnings: Vec<String>,
+}
+
+/// The transfer function in force. Where the scene leaves them open, `low` and `high` are the median and the 99.5th percentile of the FTLE on
+/// stratified points of the whole domain at the first slide.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
+pub struct TransferRecord {
+    /// FTLE (1/time) at which extinction begins.
+    pub low: f64,
+    /// FTLE (1/time) from which extinction is full.
+    pub high: f64,
+    /// Full extinction, per unit of length of the scene.
+    pub extinction: f64,
 }
 
 /// One checkpoint. It stands in the record of every frame during which it was under way, the last time with its end.

@@ -1,13 +1,13 @@
 //! From a scene file to everything a run needs, checked before any work is done.
 
 use super::feed::{Feed, closed_form, no_domain, open_snapshots};
-use super::{EngineError, Settings, TimeSettings};
+use super::{EngineError, Settings, TimeSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
-use crate::setting::{Refused, require, shown};
+use crate::setting::{Refused, require, shown, word};
 use crate::source::live::Live;
-use crate::source::{Metric, SnapshotSource, SourceKind, Steady, VelocityUnit};
+use crate::source::{DEFAULT_READ_AHEAD, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, window_snapshots};
 use crate::surrogate::Kind;
 use crate::surrogate::network::Input;
 
@@ -20,6 +20,10 @@ pub struct Plan {
     pub map: FlowMap,
     /// Where seeds lie.
     pub domain: Domain,
+    /// What the velocities are, in words: what is made up says so.
+    pub source: String,
+    /// Unit of times: `s`, `snapshots`, a simulation's own; empty where they have none.
+    pub time_unit: String,
 }
 
 /// A plan and its opened source.
@@ -59,6 +63,11 @@ impl Setup {
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
         let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));
+        let source = match (&snapshots, &live) {
+            (Some(snapshots), _) => snapshots.describe().line(),
+            (None, Some(live)) => format!("a running simulation, {}", live.describe()),
+            (None, None) => format!("closed form: {}", word(scene.source.kind)),
+        };
         let flat = grid.as_ref().is_some_and(|grid| grid.dimensions() == 2);
         let archive = matches!(scene.source.kind, SourceKind::Archive | SourceKind::Live);
         let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
@@ -119,7 +128,7 @@ impl Setup {
             interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
         };
         let domain = match (&closed, &scene.domain, &grid) {
-            (Some(flow), Some(given), _) => Domain { min: given.min, max: given.max, dimensions: flow.dimensions() },
+            (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
             (_, _, Some(grid)) => grid.domain(),
             _ => return Err(no_domain()),
         };
@@ -141,9 +150,19 @@ impl Setup {
             None => Feed::open(&scene, snapshots, tau, direction)?,
         };
         let slides = feed.expected_slides(times.as_deref(), tau);
+        if let (Some(times), Some(grid)) = (&times, &grid) {
+            notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), memory::available()));
+        }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
-        Ok(Self { plan: Plan { scene, map, domain }, feed, slides, notes })
+        let time_unit = unit.unwrap_or_default();
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, feed, slides, notes })
     }
+}
+
+/// Bytes of the window, of what is read ahead, and of the snapshot that is being read.
+fn window_bytes(times: &[f64], tau: f64, nodes: usize) -> u64 {
+    let snapshots = (window_snapshots(times, tau) + DEFAULT_READ_AHEAD + 1).min(times.len());
+    (snapshots as u64).saturating_mul(nodes as u64).saturating_mul(size_of::<[f32; 4]>() as u64)
 }
 
 /// Settles over which seed times the network's input runs, where it has one and they are left open: those that the source can be asked for. Says

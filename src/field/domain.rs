@@ -11,22 +11,31 @@ pub struct Domain {
     pub max: [f64; 3],
     /// Number of axes along which the flow varies: 2 or 3. Axes at and beyond it are extruded.
     pub dimensions: usize,
+    /// Lengths per coordinate unit along each axis, in one unit for all: with it edges compare. 1 where the axes share a unit; see
+    /// [`super::Grid::domain`] for those that do not.
+    pub scale: [f64; 3],
 }
 
 impl Domain {
     /// A two-dimensional domain with a slab from `z.0` to `z.1`.
     pub fn slab(min: [f64; 2], max: [f64; 2], z: (f64, f64)) -> Self {
-        Self { min: [min[0], min[1], z.0], max: [max[0], max[1], z.1], dimensions: 2 }
+        Self { min: [min[0], min[1], z.0], max: [max[0], max[1], z.1], dimensions: 2, scale: [1.0; 3] }
     }
 
     /// A three-dimensional domain.
     pub fn cuboid(min: [f64; 3], max: [f64; 3]) -> Self {
-        Self { min, max, dimensions: 3 }
+        Self { min, max, dimensions: 3, scale: [1.0; 3] }
     }
 
-    /// Edge lengths.
+    /// Upper less lower corner, in coordinates; edges of different units do not compare (see [`Self::lengths`]).
     pub fn extent(&self) -> [f64; 3] {
         std::array::from_fn(|k| self.max[k] - self.min[k])
+    }
+
+    /// Edge lengths in one unit: what decides how many cells, nodes or seeds an axis gets beside the others.
+    pub fn lengths(&self) -> [f64; 3] {
+        let extent = self.extent();
+        std::array::from_fn(|k| extent[k] * self.scale[k])
     }
 
     /// Point of the domain at `unit` coordinates in [0, 1].

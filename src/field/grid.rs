@@ -17,6 +17,9 @@ pub enum Geometry {
     },
 }
 
+/// Edge of a third axis without a length, as a share of the longest other edge.
+pub const VERTICAL_EDGE: f64 = 0.25;
+
 /// Degrees from a pole within which a row of a grid is the pole.
 const ROW_AT_POLE: f64 = 1e-6;
 
@@ -52,13 +55,40 @@ impl Grid {
         self.shape().iter().product()
     }
 
-    /// The box that the grid covers.
+    /// The box that the grid covers. A third axis in another unit than the first (heights in metres over degrees) has no length beside the
+    /// others: its edge counts as a quarter of the longest, as pictures show it.
     pub fn domain(&self) -> Domain {
         let corner = |k: usize, slab: f64, end: fn(&Axis) -> f64| self.axes.get(k).map_or(slab, end);
-        Domain {
+        let mut domain = Domain {
             min: std::array::from_fn(|k| corner(k, self.slab.0, Axis::first)),
             max: std::array::from_fn(|k| corner(k, self.slab.1, Axis::last)),
             dimensions: self.dimensions(),
+            scale: [1.0; 3],
+        };
+        // Metres that count several times ("m x 20") are metres.
+        let unit = |axis: &Axis| axis.units().split(" x ").next().unwrap_or_default().to_owned();
+        if let [x, _, z] = &self.axes[..]
+            && (matches!(self.geometry, Geometry::Sphere { .. }) || unit(x) != unit(z))
+        {
+            let extent = domain.extent();
+            domain.scale[2] = VERTICAL_EDGE * extent[0].max(extent[1]) / extent[2];
         }
+        domain
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn heights_over_degrees_are_a_quarter_of_the_longest_edge() {
+        let axis = |units: &str, last: f64| Axis::uniform("a", units, 0.0, last, 5).unwrap();
+        let grid = |z: Axis, geometry| Grid { axes: vec![axis("degrees", 360.0), axis("degrees", 180.0), z], geometry, slab: (0.0, 1.0) };
+        let globe = grid(axis("m", 32_000.0), Geometry::Sphere { radius: super::super::EARTH_RADIUS }).domain();
+        assert_eq!(globe.lengths(), [360.0, 180.0, 90.0]);
+        assert_eq!(globe.extent(), [360.0, 180.0, 32_000.0], "coordinates stay what they are");
+        assert_eq!(grid(axis("m", 32_000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 90.0]);
+        assert_eq!(grid(axis("degrees", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "one unit: as it is");
     }
 }

@@ -13,7 +13,7 @@ pub mod turbulence;
 
 pub use axis::{Axis, AxisFault};
 pub use domain::Domain;
-pub use grid::{Geometry, Grid, is_pole};
+pub use grid::{Geometry, Grid, VERTICAL_EDGE, is_pole};
 pub use snapshot::Snapshot;
 pub use window::{Pushed, Window, WindowFault, WindowWarning};
 

@@ -90,6 +90,11 @@ impl Turbulence {
         Self { modes }
     }
 
+    /// What it is, in words, for whoever may take it for a measurement.
+    pub fn described(modes: usize, k_max: f64, amplitude: f64, seed: u64) -> String {
+        format!("synthetic turbulence, seed {seed}, {modes} modes up to {k_max} cycles, {amplitude} cells a snapshot")
+    }
+
     /// 48 modes, k_max 14, A 3.
     pub fn easy(shape: [usize; 3], seed: u64) -> Self {
         Self::new(shape, 48, 14.0, 3.0, seed)

@@ -15,7 +15,7 @@ const LEAST_AN_INTERVAL: usize = 2;
 const MOST_AN_INTERVAL: usize = 32;
 /// Most steps a snapshot interval for cells that are crossed: a velocity may be any number.
 const MOST_FOR_CELLS: usize = 256;
-/// Share of the points, the most different ones, that does not count on grids.
+/// Share of the points, the most different ones, that does not count on grids; of more without a finite log-stretch no difference is stated.
 const TRIMMED: f64 = 0.02;
 /// Points that must have lived the whole span for the judgement to rest on them alone.
 const ENOUGH: usize = 64;
@@ -32,21 +32,27 @@ pub fn points(domain: &Domain, count: usize) -> Vec<[f32; 3]> {
 /// Root mean square difference of two traces, over the points that lived the whole span in both (where such are rare: over all):
 /// a path that stops is cut to whole steps, an error of another kind and order that would hide the integrator's.
 pub fn difference(a: &Traced, b: &Traced) -> f64 {
-    trimmed_difference(a, b, 0.0)
+    trimmed_difference(a, b, 0.0).0
 }
 
-/// The same without the share `trimmed` of the points that differ most.
-fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> f64 {
+/// The same without the share `trimmed` of the points that differ most, and the number of points that have no finite difference; infinite
+/// where these are more than [`TRIMMED`] of all.
+fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> (f64, usize) {
     let whole = |i: &usize| a.lived[*i] >= 1.0 && b.lived[*i] >= 1.0;
     let all = 0..a.lived.len();
     let lived = all.clone().filter(whole).count();
     let chosen: Vec<usize> = if lived >= ENOUGH { all.filter(whole).collect() } else { all.collect() };
     let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
+    let compared = chosen.len();
     let mut squares: Vec<f64> =
         chosen.into_iter().map(|i| (value(a, i) - value(b, i)).powi(2)).filter(|square| square.is_finite()).collect();
+    let failed = compared - squares.len();
+    if squares.is_empty() || failed as f64 > TRIMMED * compared as f64 {
+        return (f64::INFINITY, failed);
+    }
     squares.sort_unstable_by(f64::total_cmp);
-    squares.truncate((squares.len() as f64 * (1.0 - trimmed)).ceil() as usize);
-    if squares.is_empty() { f64::INFINITY } else { (squares.iter().sum::<f64>() / squares.len() as f64).sqrt() }
+    squares.truncate((compared as f64 * (1.0 - trimmed)).ceil() as usize);
+    ((squares.iter().sum::<f64>() / squares.len() as f64).sqrt(), failed)
 }
 
 /// How the number of steps was chosen.
@@ -58,6 +64,13 @@ pub struct Chosen {
     pub difference: f64,
     /// Whether the difference is within the tolerance.
     pub met: bool,
+    /// Points, of [`Self::POINTS`], whose log-stretch is no finite number.
+    pub failed: usize,
+}
+
+impl Chosen {
+    /// Points on which a number of steps is judged.
+    pub const POINTS: usize = POINTS;
 }
 
 /// Where a ladder on a grid begins: what is known about it.
@@ -88,12 +101,12 @@ pub fn choose(
     let first = (least.ceil() as usize).clamp(LEAST_AN_INTERVAL * intervals, MOST_FOR_CELLS * intervals).next_multiple_of(intervals.max(1));
     let mut steps = if gridded { first } else { FEWEST };
     let most = if gridded { first.max(MOST_AN_INTERVAL * intervals) } else { MOST };
-    let mut last = Chosen { steps, difference: f64::INFINITY, met: false };
+    let mut last = Chosen { steps, difference: f64::INFINITY, met: false, failed: 0 };
     while steps <= most {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
-        let difference = trimmed_difference(&once, &twice, trimmed);
-        last = Chosen { steps, difference, met: difference <= tolerance };
+        let (difference, failed) = trimmed_difference(&once, &twice, trimmed);
+        last = Chosen { steps, difference, met: difference <= tolerance, failed };
         if last.met {
             return Ok(last);
         }
@@ -122,6 +135,19 @@ mod tests {
             let count = points.iter().filter(inside).count();
             // An even share is 64, from which independent points would stray by 7.5 on average and by about 15 somewhere.
             assert!((54..=74).contains(&count), "{count}");
+        }
+    }
+
+    #[test]
+    fn paths_without_a_number_are_counted() {
+        let traced = |failed: usize| Traced {
+            log_stretch: (0..1000).map(|i| if i < failed { f32::NAN } else { 1.0 }).collect(),
+            lived: vec![1.0; 1000],
+            ..Traced::default()
+        };
+        for trimmed in [0.0, TRIMMED] {
+            assert_eq!(trimmed_difference(&traced(0), &traced(20), trimmed), (0.0, 20));
+            assert_eq!(trimmed_difference(&traced(0), &traced(21), trimmed), (f64::INFINITY, 21), "no choice rests on what is left");
         }
     }
 

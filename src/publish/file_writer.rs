@@ -86,7 +86,7 @@ impl FileWriter {
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
         if state.pictures >= PICTURES_WAITING {
-            state.drop_oldest_pictures();
+            state.drop_oldest_pictures(self.when_full);
         }
         if state.queue.len() >= RECORDS_WAITING {
             // Only records wait in front, since their pictures were dropped long before.
@@ -107,7 +107,7 @@ impl FileWriter {
         while !state.queue.is_empty() || state.busy {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
-                let mut statistics = state.statistics;
+                let mut statistics = state.statistics.clone();
                 statistics.unfinished = (state.pictures + usize::from(state.busy)) as u64;
                 tracing::error!("the disk did not take the last {} frames within {:?}", statistics.unfinished, self.limit);
                 return (None, statistics);
@@ -116,20 +116,25 @@ impl FileWriter {
         }
         drop(state);
         let folder = self.thread.take().and_then(|thread| thread.join().ok());
-        let mut statistics = self.shared.lock().statistics;
+        let mut statistics = self.shared.lock().statistics.clone();
         statistics.bytes_kept = folder.as_ref().map_or(0, RunFolder::kept_bytes);
         (folder, statistics)
     }
 }
 
 impl State {
-    fn drop_oldest_pictures(&mut self) {
+    fn drop_oldest_pictures(&mut self, when_full: WhenFull) {
         let oldest = self.queue.iter_mut().find(|job| matches!(job, Job::Whole(_)));
         if let Some(job) = oldest {
             if let Job::Whole(frame) = job {
                 *job = Job::Record(Arc::clone(&frame.record));
             }
             self.pictures -= 1;
+            if when_full == WhenFull::Wait {
+                // It was to be waited for, and was, for as long as may be.
+                self.statistics.pictures_failed += 1;
+                return;
+            }
             self.statistics.pictures_dropped += 1;
             if self.statistics.pictures_dropped == 1 {
                 tracing::warn!("the disk is slower than the frames: pictures are dropped from here on (counted in the summary)");
@@ -194,6 +199,9 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
                 trouble = Some(error);
             }
             None => {}
+        }
+        if let Some(error) = &trouble {
+            statistics.refused.get_or_insert_with(|| error.to_string());
         }
         drop(state);
         match trouble {

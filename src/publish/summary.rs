@@ -30,7 +30,9 @@ pub struct Totals {
     pub queries: u64,
     /// Of them, answered by RK4.
     pub traced: u64,
-    /// `traced / queries`; 0 without queries.
+    /// Of the queries, without a value (land).
+    pub missing: u64,
+    /// `traced / (queries - missing)`, as in the records; 0 where there is none.
     pub traced_share: f64,
     /// Audit points traced.
     pub audited: u64,
@@ -51,7 +53,8 @@ impl Totals {
     pub fn add(&mut self, record: &FrameRecord) {
         self.queries += record.queries;
         self.traced += record.traced;
-        self.traced_share = if self.queries == 0 { 0.0 } else { self.traced as f64 / self.queries as f64 };
+        self.missing += record.missing;
+        self.traced_share = self.traced as f64 / (self.queries - self.missing).max(1) as f64;
         self.audited += record.audited;
         self.majorant_exceeded += record.majorant_exceeded;
         self.over_tolerance_frames += u64::from(record.over_tolerance.is_some());
@@ -65,7 +68,7 @@ impl Totals {
 
 /// What became of the frames on disk. `frames = pictures_written + pictures_dropped + pictures_failed + unfinished` when pictures
 /// are written at all.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FileStatistics {
     /// Lines in `records.jsonl`.
     pub records_written: u64,
@@ -87,6 +90,25 @@ pub struct FileStatistics {
     pub bytes_kept: u64,
     /// Frames still unwritten when the run gave up waiting for the disk.
     pub unfinished: u64,
+    /// Why the disk refused the first record or picture that it refused.
+    pub refused: Option<String>,
+}
+
+impl FileStatistics {
+    /// What was to be written and is not, in words; none where all is there but what settings let go.
+    pub fn lost(&self) -> Option<String> {
+        let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, .. } = *self;
+        let lost = pictures_failed + unfinished;
+        let why = self.refused.as_deref().unwrap_or("the disk does not answer");
+        match (lost, records_lost) {
+            (0, 0) => None,
+            (0, records) => Some(format!("{records} records are lost ({why})")),
+            (failed, _) => Some(format!(
+                "{pictures_written} of {} pictures written ({failed} failed: {why})",
+                pictures_written + pictures_dropped + failed
+            )),
+        }
+    }
 }
 
 /// Largest resident memory of this process so far, in bytes: VmHWM of `/proc/self/status`. None where there is no such file.
@@ -117,5 +139,7 @@ mod tests {
         totals.add(&FrameRecord { queries: 100, traced: 100, over_tolerance: Some(0.01), ..Default::default() });
         totals.add(&FrameRecord { queries: 300, traced: 0, warnings: vec!["odd".into()], ..Default::default() });
         assert_eq!((totals.queries, totals.traced_share, totals.over_tolerance_frames, totals.warnings), (400, 0.25, 1, 1));
+        totals.add(&FrameRecord { queries: 600, traced: 0, missing: 600, ..Default::default() });
+        assert_eq!((totals.missing, totals.traced_share), (600, 0.25), "land is not traced, and no share of it");
     }
 }

@@ -2,21 +2,21 @@
 //! the grid (majorant cells).
 
 use super::parameters::BoxParameters;
-use crate::field::Domain;
+use crate::field::{Domain, VERTICAL_EDGE};
 
 /// A factor per axis from domain to scene coordinates, for views that the program chooses itself: the longest edge becomes 1 and x
-/// and y keep their ratio. The third axis keeps it too, unless the flow is two-dimensional (the slab's thickness has no meaning) or
-/// its edge would come out shorter than a twentieth or longer than the others (other units: heights in metres over degrees); then
-/// the edge becomes a quarter.
+/// and y keep their ratio. The third axis keeps it too ([`Domain::lengths`]), unless the flow is two-dimensional (the slab's thickness has
+/// no meaning) or its edge would come out shorter than a twentieth or longer than the others; then the edge becomes a quarter.
 ///
 /// A scene that names its camera, a light's position or its extinction is rendered at scale 1: its numbers are lengths in domain
 /// coordinates.
 pub fn overview_scale(domain: &Domain) -> [f64; 3] {
-    let extent = domain.extent();
-    let horizontal = 1.0 / extent[0].max(extent[1]);
-    let edge = extent[2] * horizontal;
-    let vertical = if domain.dimensions == 2 || !(0.05..=1.0).contains(&edge) { 0.25 / extent[2] } else { horizontal };
-    [horizontal, horizontal, vertical]
+    let lengths = domain.lengths();
+    let horizontal = 1.0 / lengths[0].max(lengths[1]);
+    let edge = lengths[2] * horizontal;
+    let own = domain.dimensions == 3 && (0.05..=1.0).contains(&edge);
+    let vertical = if own { horizontal * domain.scale[2] } else { VERTICAL_EDGE / domain.extent()[2] };
+    [horizontal * domain.scale[0], horizontal * domain.scale[1], vertical]
 }
 
 /// The rendered box.

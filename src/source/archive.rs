@@ -10,7 +10,7 @@ use super::hyperslab::{Orders, read_component};
 use super::layout::{ComponentPlan, Layout, Resampling, difference, plan};
 use super::poles::Poles;
 use super::settings::{ArchiveSettings, Metric, Staggering, VelocityUnit};
-use super::synthetic::synthesized;
+use super::synthetic::{declared, synthesized};
 use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, time_gaps};
 use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
@@ -61,7 +61,18 @@ impl Archive {
     /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
     /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each names the file.
     pub fn open(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Self, SourceError> {
-        Self::open_files(files_of(paths, settings)?, settings)
+        let mut archive = Self::open_files(files_of(paths, settings)?, settings)?;
+        let made = settings.synthetic.as_ref().filter(|_| paths.is_empty() && settings.files.is_empty());
+        if let Some(made) = made.filter(|_| archive.description.synthetic.is_none()) {
+            // Written before files said so themselves.
+            archive.is_made_of(made.described());
+        }
+        Ok(archive)
+    }
+
+    fn is_made_of(&mut self, what: String) {
+        self.description.notes.push(format!("the velocities are {what}"));
+        self.description.synthetic = Some(what);
     }
 
     /// Opens files that are already a list.
@@ -72,6 +83,7 @@ impl Archive {
         let mut files = Vec::with_capacity(paths.len());
         let mut last_open = None;
         let mut like: Option<Header> = None;
+        let mut synthetic = None;
         for path in paths {
             let known = first.as_ref().map(|f| &f.0);
             let mut container = Container::open_like(&path, like.as_ref())?;
@@ -101,7 +113,10 @@ impl Archive {
                         return Err(SourceError::Mixed { first: files[0].path.clone(), second: files[index].path.clone(), what });
                     }
                 }
-                None => first = Some((layout, container.format.name())),
+                None => {
+                    synthetic = declared(&container.header).map(str::to_owned);
+                    first = Some((layout, container.format.name()));
+                }
             }
             last_open = Some((index, container));
         }
@@ -143,6 +158,9 @@ impl Archive {
             like,
             files,
         };
+        if let Some(what) = synthetic {
+            archive.is_made_of(what);
+        }
         if let Some([error, size]) = archive.resampling_error()? {
             archive.description.notes.push(format!(
                 "resampling error, measured on the first snapshot at the file's own points: {error:.3} m/s of {size:.3} m/s ({:.1} %), root mean square",
@@ -477,6 +495,7 @@ fn describe(layout: &Layout, format: &str, files: usize, seconds: &[f64]) -> Sou
         time_variable: Some(layout.time.variable.clone()),
         time_units_in_file: Some(layout.time.units.clone()),
         calendar: layout.time.calendar.map(|c| c.name().to_owned()),
+        synthetic: None,
         notes,
     }
 }

@@ -7,7 +7,7 @@ use super::cf::velocity;
 use super::container::{Container, Header};
 use super::layout::Planner;
 use super::settings::ArchiveSettings;
-use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span};
+use super::{SnapshotSource, SourceDescription, SourceError, TimeGap, median_interval, span, window_snapshots};
 use crate::setting::{Refused, word};
 use serde::Serialize;
 use std::fmt;
@@ -279,13 +279,6 @@ impl Inspection {
     }
 }
 
-/// Most snapshots that a window over `tau` holds: those inside, and one to interpolate from.
-fn fullest_window(times: &[f64], tau: f64) -> usize {
-    let slack = 1e-9 * tau;
-    let end = |i: usize| times.partition_point(|&t| t < times[i] + tau - slack);
-    (0..times.len()).map(|i| (i, end(i))).filter(|&(_, j)| j < times.len()).map(|(i, j)| j - i + 1).max().unwrap_or(times.len())
-}
-
 fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
@@ -298,7 +291,7 @@ fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: 
         None => archive.default_tau(),
     };
     // A steady flow is there twice (see [`super::Steady`]).
-    let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { fullest_window(times, t) });
+    let snapshots = tau.as_ref().ok().map(|&t| if steady { 2 } else { window_snapshots(times, t) });
     TimeReport {
         snapshots: times.len(),
         first: show(times[0]),
@@ -437,11 +430,11 @@ mod tests {
     fn the_fullest_window_counts() {
         let even: Vec<f64> = (0..60).map(f64::from).collect();
         assert_eq!(
-            (super::fullest_window(&even, 29.5), super::fullest_window(&even, 30.0), super::fullest_window(&even, 59.0)),
+            (super::window_snapshots(&even, 29.5), super::window_snapshots(&even, 30.0), super::window_snapshots(&even, 59.0)),
             (31, 31, 60)
         );
         // Hourly for two days, then daily.
         let uneven: Vec<f64> = (0..48).map(f64::from).chain((2..10).map(|d| f64::from(24 * d))).collect();
-        assert_eq!(super::fullest_window(&uneven, 48.0), 49);
+        assert_eq!(super::window_snapshots(&uneven, 48.0), 49);
     }
 }

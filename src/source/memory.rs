@@ -39,9 +39,16 @@ impl MemorySource {
             time_variable: None,
             time_units_in_file: None,
             calendar: None,
+            synthetic: None,
             notes: Vec::new(),
         };
         Ok(Self { grid, times, make: Box::new(make), description })
+    }
+
+    /// The same, its data made up: `what` says from what.
+    pub fn synthetic(mut self, what: String) -> Self {
+        self.description.synthetic = Some(what);
+        self
     }
 
     /// A source of finished snapshots, all on one grid, in ascending time.

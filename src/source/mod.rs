@@ -143,8 +143,17 @@ pub struct SourceDescription {
     pub time_units_in_file: Option<String>,
     /// Calendar of the dates.
     pub calendar: Option<String>,
+    /// What was made up, and from what; none for data that somebody measured or computed.
+    pub synthetic: Option<String>,
     /// Choices, conversions, gaps in time.
     pub notes: Vec<String>,
+}
+
+impl SourceDescription {
+    /// In one line, what is synthetic first.
+    pub fn line(&self) -> String {
+        self.synthetic.as_ref().map_or_else(|| self.kind.clone(), |synthetic| format!("{synthetic}; {}", self.kind))
+    }
 }
 
 /// An interval that is longer than the others.
@@ -166,6 +175,13 @@ pub fn time_gaps(times: &[f64]) -> Vec<TimeGap> {
         (steps > 1.5).then(|| TimeGap { after: w[0], before: w[1], missing: (steps.round() as usize).saturating_sub(1) })
     };
     if median > 0.0 { times.windows(2).filter_map(gap).collect() } else { Vec::new() }
+}
+
+/// Most snapshots that a window over `tau` holds: those inside, and one to interpolate from.
+pub fn window_snapshots(times: &[f64], tau: f64) -> usize {
+    let slack = 1e-9 * tau;
+    let end = |i: usize| times.partition_point(|&t| t < times[i] + tau - slack);
+    (0..times.len()).map(|i| (i, end(i))).filter(|&(_, j)| j < times.len()).map(|(i, j)| j - i + 1).max().unwrap_or(times.len())
 }
 
 fn span(times: &[f64]) -> f64 {

@@ -102,6 +102,11 @@ impl SyntheticSettings {
         PathBuf::from("out/synthetic")
     }
 
+    /// What the velocities are, in words.
+    pub(super) fn described(&self) -> String {
+        crate::field::turbulence::Turbulence::described(self.modes, self.k_max, self.amplitude, self.seed)
+    }
+
     /// The defaults of a shape.
     pub fn new(shape: SyntheticShape) -> Self {
         Self {

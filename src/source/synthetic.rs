@@ -3,6 +3,7 @@
 use super::SourceError;
 use super::axes::{AxisPlan, Quantity};
 use super::cf::coordinate::Kind;
+use super::container::{Attribute, Header};
 use super::conversion::Conversion;
 use super::settings::{SyntheticSettings, SyntheticShape};
 use crate::field::turbulence::Turbulence;
@@ -32,6 +33,18 @@ pub struct GlobeTurbulence {
     heights: [f64; 2],
     /// Seconds between snapshots.
     interval: f64,
+}
+
+/// Attribute of the files that says what they hold (CF conventions), and how it begins in those that are written here.
+const SOURCE: &str = "source";
+const WRITTEN_HERE: &str = "ridgewatch: ";
+
+/// What a file of ours says that its velocities are made from; none for other files.
+pub(super) fn declared(header: &Header) -> Option<&str> {
+    header.attributes.iter().find_map(|(name, value)| match value {
+        Attribute::Text(text) if name == SOURCE => text.trim().strip_prefix(WRITTEN_HERE),
+        _ => None,
+    })
 }
 
 /// How far the cube is shifted from the lowest to the highest level, as a share of its edge: levels differ.
@@ -134,6 +147,8 @@ fn flame(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
                 file.new_dataset_builder().with_data(axis.coordinates()).create(name)?;
             }
             file.new_attr::<f64>().create("time")?.write_scalar(&(index as f64))?;
+            let what: hdf5_metno::types::VarLenUnicode = format!("{WRITTEN_HERE}{}", settings.described()).parse()?;
+            file.new_attr::<hdf5_metno::types::VarLenUnicode>().create(SOURCE)?.write_scalar(&what)?;
             Ok(())
         };
         write().map_err(|e| SourceError::Write { path: path.clone(), what: e.to_string() })?;
@@ -210,17 +225,18 @@ fn ecmwf(settings: &SyntheticSettings, folder: &Path) -> Result<Vec<PathBuf>, So
             }
         }
         let path = folder.join(format!("ecmwf_{index:04}.nc"));
-        write_ecmwf(&path, &coordinates, &components, time * 24.0)
+        write_ecmwf(&path, &settings.described(), &coordinates, &components, time * 24.0)
             .map_err(|e| SourceError::Write { path: path.clone(), what: e.to_string() })?;
         files.push(path);
     }
     Ok(files)
 }
 
-fn write_ecmwf(path: &Path, coordinates: &[&[f64]; 3], components: &[Vec<f32>], hours: f64) -> Result<(), netcdf::Error> {
+fn write_ecmwf(path: &Path, what: &str, coordinates: &[&[f64]; 3], components: &[Vec<f32>], hours: f64) -> Result<(), netcdf::Error> {
     super::netcdf4::silence();
     let mut file = netcdf::create_with(path, netcdf::Options::_64BIT_OFFSET)?;
     file.add_attribute("Conventions", "CF-1.6")?;
+    file.add_attribute(SOURCE, format!("{WRITTEN_HERE}{what}"))?;
     let names = ["longitude", "latitude", "level"];
     file.add_dimension("time", 1)?;
     for (name, values) in names.iter().zip(coordinates).rev() {

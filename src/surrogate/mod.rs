@@ -346,9 +346,9 @@ impl SurrogateSettings {
             return Ok(nodes);
         }
         let longest = DEFAULT_NODES[usize::from(self.kind == Kind::Residual)];
-        let extent = domain.extent();
-        let most = extent[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
-        Ok(std::array::from_fn(|axis| ((extent[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
+        let lengths = domain.lengths();
+        let most = lengths[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
+        Ok(std::array::from_fn(|axis| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
     }
 }
 
@@ -440,5 +440,12 @@ mod tests {
         assert!(x * y * z <= MOST_OWN_NODES && x * y * z > MOST_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
         assert!(x.abs_diff(2 * y) <= 2, "{x} x {y}: all axes are divided alike");
         assert_eq!(open.at_resolution_of([128, 128, 128], 64 * 64 * 64).table_nodes, Some([64, 64, 64]));
+    }
+
+    #[test]
+    fn a_table_over_a_globe_has_nodes_along_its_longitudes() {
+        let globe = Domain { scale: [1.0, 1.0, 90.0 / 28_000.0], ..Domain::cuboid([0.0, -90.0, 1e3], [360.0, 90.0, 29e3]) };
+        let table = SurrogateSettings { kind: Kind::Table, table_nodes: None };
+        assert_eq!(table.nodes(&globe).unwrap(), [256, 128, 64], "metres are no degrees");
     }
 }

@@ -188,7 +188,7 @@ impl Trainer {
     pub(super) fn new(settings: &NetworkSettings, tracer: &dyn Tracer, seed: u64, centred: bool) -> Result<Self, SurrogateError> {
         let (domain, tau) = (tracer.domain(), tracer.tau());
         let axes: Vec<usize> = (0..domain.dimensions.clamp(1, 3)).collect();
-        let shape = Architecture::new(settings, &axes, domain.extent())?;
+        let shape = Architecture::new(settings, &axes, domain.lengths())?;
         let objective = Objective::new(settings, &shape, domain.extent(), tau);
         let model = Model::new(shape, seed, centred);
         let average = Arc::new(Average { tables: model.tables(), layers: model.layers() });

@@ -75,13 +75,13 @@ fn cell_of(shape: [usize; 3], point: [f32; 3]) -> usize {
     (index(2) * shape[1] + index(1)) * shape[0] + index(0)
 }
 
-/// About `count` cells over the axes along which the flow varies, as cubic as the domain's extents allow.
+/// About `count` cells over the axes along which the flow varies, as cubic as the domain's lengths allow.
 pub(crate) fn cubic_cells(domain: &Domain, count: usize) -> [usize; 3] {
-    let extent = domain.extent();
+    let lengths = domain.lengths();
     let axes = domain.dimensions;
-    let volume: f64 = extent[..axes].iter().product();
+    let volume: f64 = lengths[..axes].iter().product();
     let edge = (volume / count as f64).powf(1.0 / axes as f64);
-    std::array::from_fn(|k| if k < axes { ((extent[k] / edge).round() as usize).clamp(1, count) } else { 1 })
+    std::array::from_fn(|k| if k < axes { ((lengths[k] / edge).round() as usize).clamp(1, count) } else { 1 })
 }
 
 impl Cell {
@@ -323,6 +323,8 @@ mod tests {
         assert_eq!(TrustMap::new(&TrustSettings::default(), &domain()).shape(), [32, 16, 1]);
         let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
         assert_eq!(TrustMap::new(&TrustSettings::default(), &cube).shape(), [16, 16, 16]);
+        let globe = Domain { scale: [1.0, 1.0, 90.0 / 28_000.0], ..Domain::cuboid([0.0, -90.0, 1e3], [360.0, 90.0, 29e3]) };
+        assert_eq!(TrustMap::new(&TrustSettings::default(), &globe).shape(), [32, 16, 8], "metres are no degrees");
     }
 
     #[test]

@@ -15,6 +15,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+/// Lived share of the particles below which it is told.
+const SHORT_LIVED: f64 = 0.75;
+
 /// Number of the first warm-up picture, far beyond all others.
 const WARMUP_PICTURES: u64 = 1 << 40;
 
@@ -78,6 +81,13 @@ impl Cycle<'_> {
         record.surrogate = front.as_ref().map(|s| s.name().to_owned());
         if work.audit.drawn > 0 && work.audit.points == 0 {
             record.warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
+        }
+        let dying = record.audited > 0 && record.lived_share < SHORT_LIVED;
+        if dying && !std::mem::replace(&mut self.told_of_deaths, true) {
+            record.warnings.push(format!(
+                "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value,                  another unit?), and their FTLE is that of the path so far",
+                100.0 * record.lived_share
+            ));
         }
         let auditing = Instant::now();
         if let Some(front) = front.as_deref() {
@@ -285,6 +295,9 @@ impl Cycle<'_> {
             date: slide.date.clone(),
             live: slide.live.clone(),
             tau: tracer.tau(),
+            time_unit: self.plan.time_unit.clone(),
+            source: self.plan.source.clone(),
+            transfer: self.transfer,
             direction: self.plan.map.direction.name().into(),
             method: match self.plan.scene.render.method {
                 Method::Reference => "reference".into(),

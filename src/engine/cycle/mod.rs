@@ -14,8 +14,8 @@ use super::frames::{FrameRenderer, frame_renderer};
 use super::setup::{Plan, Setup};
 use super::stop::{Halt, Interruptible, heed};
 use super::training::{Threads, Turns};
-use super::{Device, EngineError, Frame, Settings};
-use crate::flow::{FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use super::{Device, EngineError, Frame, Settings, TransferRecord};
+use crate::flow::{Chosen, FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{Learned, Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
@@ -52,6 +52,8 @@ pub enum Event {
         /// What should be known.
         notes: Vec<String>,
     },
+    /// What was settled after that, before the first frame.
+    Note(String),
     /// A finished frame.
     Frame(Frame),
     /// Share of the current frame that is rendered.
@@ -77,6 +79,8 @@ pub struct RunReport {
     pub integration_steps: Option<usize>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
     pub integration_difference: Option<f64>,
+    /// The transfer function in force; none before there was one.
+    pub transfer: Option<TransferRecord>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
     /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no size is tried in vain twice.
@@ -103,6 +107,7 @@ struct Cycle<'a> {
     threads: Threads,
     frames: Box<dyn FrameRenderer>,
     renderer: Renderer,
+    transfer: TransferRecord,
     trust: TrustMap,
     ring: SampleRing,
     /// The times that are inputs of the network, and where the window of the ring's labels begins.
@@ -122,6 +127,8 @@ struct Cycle<'a> {
     pictures: u64,
     /// Whether a lost device was told of.
     told_of_failure: bool,
+    /// Whether it was told that particles do not live.
+    told_of_deaths: bool,
     /// What was learned after the last frame had gone out; the next one's record tells of it.
     learned_meanwhile: Option<Learned>,
     /// What training has of the device beside a simulation.
@@ -191,6 +198,7 @@ fn drive(
         None => plan.map.clone(),
     };
     let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
+    sink(Event::Note(cycle.colours()));
     let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| {
         // They hold the first window, here and on the device.
         drop((tracer, slide));
@@ -217,7 +225,11 @@ impl<'a> Cycle<'a> {
         let scene = &plan.scene;
         let settled = threads.render().install(|| prepare::settled_scene(plan, tracer, first));
         heed(stop)?;
-        let renderer = Renderer::new(settled?, &plan.domain, plan.map.tau)?;
+        let settled = settled?;
+        let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
+        let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
+        let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
+        report.transfer = Some(transfer);
         let surrogate = match &first.velocity {
             VelocitySource::Window(window) => {
                 let most = if first.live.is_some() { most_live_nodes(scene, &options.device) } else { usize::MAX };
@@ -258,6 +270,7 @@ impl<'a> Cycle<'a> {
             threads,
             frames: frame_renderer(&options.device),
             renderer,
+            transfer,
             trust: TrustMap::new(&scene.trust, &plan.domain),
             ring,
             times,
@@ -270,6 +283,7 @@ impl<'a> Cycle<'a> {
             probed: 0,
             pictures: 0,
             told_of_failure: false,
+            told_of_deaths: false,
             learned_meanwhile: None,
             turns: Turns::new(scene.training.share),
             report,
@@ -290,6 +304,14 @@ impl<'a> Cycle<'a> {
         begun: Instant,
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<(), Halt> {
+        slide.warnings.extend(self.uniform(tracer));
+        if let Some(chosen) = tracer.chosen().filter(|chosen| chosen.failed > 0) {
+            slide.warnings.push(format!(
+                "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
+                chosen.failed,
+                Chosen::POINTS
+            ));
+        }
         if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
             slide.warnings.push(format!(
                 "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",

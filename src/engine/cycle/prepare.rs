@@ -6,7 +6,7 @@ use crate::engine::audit;
 use crate::engine::feed::Slide;
 use crate::engine::setup::{Plan, assemble};
 use crate::engine::stop::{Halt, Interruptible, heed};
-use crate::engine::{Device, EngineError};
+use crate::engine::{Device, EngineError, TransferRecord};
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
 use crate::render::Scene;
 use crate::surrogate::network::{Input, Target, uniform};
@@ -18,6 +18,11 @@ use rayon::prelude::*;
 const PROBE_STREAM: u64 = 1 << 62;
 /// Random streams of points at which shorter durations are traced.
 const SHORTER_STREAM: u64 = 1 << 61;
+/// Range of the log-stretch below which colours that are scaled to it show next to nothing: neighbours part by less than five hundredths more
+/// in one place than in another.
+const UNIFORM: f64 = 0.05;
+/// The same as a share of the FTLE's size.
+const UNIFORM_SHARE: f64 = 0.01;
 /// Number of the pilot's picture.
 const PILOT_PICTURE: u64 = 1 << 41;
 
@@ -65,6 +70,33 @@ impl Cycle<'_> {
         let renderer = &mut self.renderer;
         self.threads.render().install(|| renderer.window_slid());
         Ok(())
+    }
+
+    /// What colours stand for, in words.
+    pub(super) fn colours(&self) -> String {
+        let TransferRecord { low, high, extinction } = self.transfer;
+        let unit = &self.plan.time_unit;
+        let per = if unit.is_empty() { "per time".to_owned() } else { format!("/{unit}") };
+        let given = self.plan.scene.transfer.as_ref().is_some_and(|transfer| transfer.low.is_some() && transfer.high.is_some());
+        let why = if given { "as set" } else { "as far as not set: median and 99.5th percentile over the domain at the first slide" };
+        format!("colours from FTLE {low:.3e} to {high:.3e} {per} ({why}), extinction {extinction:.3e}")
+    }
+
+    /// What should be told where colours are scaled to an FTLE that hardly varies.
+    pub(super) fn uniform(&self, tracer: &dyn Tracer) -> Option<String> {
+        let given = self.plan.scene.transfer.clone().unwrap_or_default();
+        if given.low.is_some() && given.high.is_some() {
+            return None;
+        }
+        let TransferRecord { low, high, .. } = self.transfer;
+        let range = (high - low) * tracer.tau();
+        let error = self.report.integration_difference.unwrap_or(0.0);
+        let size = low.abs().max(high.abs());
+        (range <= error.max(UNIFORM) || high - low <= UNIFORM_SHARE * size).then(|| {
+            format!(
+                "FTLE is uniform: nothing to scale colours to. The log-stretch varies by {range:.1e} over the domain, and its integration error                  is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
+            )
+        })
     }
 
     /// What should be told of a window's start time.

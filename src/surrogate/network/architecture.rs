@@ -66,9 +66,9 @@ fn check<T: PartialOrd + std::fmt::Display>(key: &str, value: T, low: T, high: T
 }
 
 impl Architecture {
-    /// Resolves `settings` for inputs along `axes` of the domain and the times of the settings; `extent` are the edge lengths of the domain
-    /// along x, y and z.
-    pub fn new(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Result<Self, SurrogateError> {
+    /// Resolves `settings` for inputs along `axes` of the domain and the times of the settings; `lengths` are those of the domain's
+    /// edges along x, y and z, in one unit ([`crate::field::Domain::lengths`]).
+    pub fn new(settings: &NetworkSettings, axes: &[usize], lengths: [f64; 3]) -> Result<Self, SurrogateError> {
         settings.validate()?;
         if axes.is_empty() || axes.len() > 3 || axes.windows(2).any(|w| w[0] >= w[1]) || axes.iter().any(|&a| a > 2) {
             return Err(SurrogateError::Setting {
@@ -92,7 +92,7 @@ impl Architecture {
             });
         }
         let (levels, encoded) = match settings.encoding {
-            Encoding::HashGrid => (levels(settings, &axes, extent), settings.levels * settings.features),
+            Encoding::HashGrid => (levels(settings, &axes, lengths), settings.levels * settings.features),
             Encoding::Frequency => (Vec::new(), 2 * settings.octaves * axes.len()),
         };
         let mut layers = Vec::new();
@@ -185,8 +185,8 @@ pub(super) fn row_stride(width: usize) -> usize {
 
 /// Cells of level `l`: base * growth^l along the longest axis and along times; shorter axes get fewer in proportion, down to an eighth, so
 /// that cells are about as wide as high. A level whose nodes fit into the table is stored densely.
-fn levels(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Vec<Level> {
-    let longest = axes.iter().filter_map(|&axis| extent.get(axis)).copied().fold(0.0, f64::max);
+fn levels(settings: &NetworkSettings, axes: &[usize], lengths: [f64; 3]) -> Vec<Level> {
+    let longest = axes.iter().filter_map(|&axis| lengths.get(axis)).copied().fold(0.0, f64::max);
     let capacity = 1_usize << settings.log2_table;
     let mut offset = 0;
     (0..settings.levels)
@@ -194,7 +194,7 @@ fn levels(settings: &NetworkSettings, axes: &[usize], extent: [f64; 3]) -> Vec<L
             let resolution = settings.base_resolution as f64 * f64::from(settings.growth).powi(l as i32);
             let mut cells = [1_u32; GRID_INPUTS];
             for (slot, &axis) in axes.iter().enumerate() {
-                let share = match extent.get(axis) {
+                let share = match lengths.get(axis) {
                     Some(edge) if settings.follow_aspect && longest > 0.0 => (edge / longest).clamp(0.125, 1.0),
                     _ => 1.0,
                 };
