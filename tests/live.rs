@@ -210,13 +210,23 @@ fn frames_resume_when_the_simulation_comes_back_in_other_blocks() {
     }
 }
 
-/// The nice values of a process's threads.
-fn niceness(process: u32) -> Vec<i32> {
+/// Field `number` (counted from 1) of what the kernel says of each thread of a process.
+fn of_threads<T: std::str::FromStr>(process: u32, number: usize) -> Vec<T> {
     let tasks = std::fs::read_dir(format!("/proc/{process}/task")).unwrap();
     let stat = |task: std::io::Result<std::fs::DirEntry>| std::fs::read_to_string(task.ok()?.path().join("stat")).ok();
-    // Behind the name, which is in parentheses, from the third field on: nice is the 19th.
-    let nice = |stat: String| stat.rsplit_once(") ")?.1.split(' ').nth(16)?.parse().ok();
-    tasks.filter_map(stat).filter_map(nice).collect()
+    // Behind the name, which is in parentheses, from the third field on.
+    let field = |stat: String| stat.rsplit_once(") ")?.1.split(' ').nth(number - 3)?.parse().ok();
+    tasks.filter_map(stat).filter_map(field).collect()
+}
+
+/// The nice values of a process's threads.
+fn niceness(process: u32) -> Vec<i32> {
+    of_threads(process, 19)
+}
+
+/// Whether each thread of a process runs (R), sleeps (S, D), stands still (T) or has ended (Z, X).
+fn states(process: u32) -> Vec<char> {
+    of_threads(process, 3)
 }
 
 /// How readily the kernel ends a process when memory is out: -1000 (never) to 1000 (before all others).
@@ -298,6 +308,8 @@ fn a_solver_that_waits_gives_up_a_follower_that_is_gone() {
         assert!((0..2 * SLOTS).all(|_| !publish().1), "a step is waited for while the follower lives");
         // SAFETY: a signal to a child of this test.
         assert_eq!(unsafe { libc::kill(sidecar.0.id() as i32, signal) }, 0);
+        // A signal comes to each thread in its time, until when it reads on.
+        until("the end of its threads' work", || states(sidecar.0.id()).iter().all(|state| matches!(state, 'T' | 'Z' | 'X')));
         let held: Vec<(Duration, bool)> = (0..4 * SLOTS).map(|_| publish()).collect();
         let longest = held.iter().map(|(held, _)| *held).max().unwrap();
         assert!((Duration::from_secs(3)..Duration::from_secs(6)).contains(&longest), "{signal}: {held:?}");
