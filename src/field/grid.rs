@@ -65,16 +65,29 @@ impl Grid {
             dimensions: self.dimensions(),
             scale: [1.0; 3],
         };
-        // Metres that count several times ("m x 20") are metres.
-        let unit = |axis: &Axis| axis.units().split(" x ").next().unwrap_or_default().to_owned();
         if let [x, _, z] = &self.axes[..]
-            && (matches!(self.geometry, Geometry::Sphere { .. }) || unit(x) != unit(z))
+            && (matches!(self.geometry, Geometry::Sphere { .. }) || differ(x.units(), z.units()))
         {
             let extent = domain.extent();
             domain.scale[2] = VERTICAL_EDGE * extent[0].max(extent[1]) / extent[2];
         }
         domain
     }
+}
+
+/// Whether two axes are known to count different things. One that says nothing of its unit counts as the other does.
+fn differ(one: &str, other: &str) -> bool {
+    let unit = |text: &str| {
+        // Metres that count several times ("m x 20") are metres.
+        let text = text.split(" x ").next().unwrap_or_default().trim().to_lowercase();
+        match text.as_str() {
+            "metre" | "metres" | "meter" | "meters" => "m".to_owned(),
+            "kilometre" | "kilometres" | "kilometer" | "kilometers" => "km".to_owned(),
+            _ => text,
+        }
+    };
+    let [one, other] = [one, other].map(unit);
+    !one.is_empty() && !other.is_empty() && one != other
 }
 
 #[cfg(test)]
@@ -90,5 +103,7 @@ mod tests {
         assert_eq!(globe.extent(), [360.0, 180.0, 32_000.0], "coordinates stay what they are");
         assert_eq!(grid(axis("m", 32_000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 90.0]);
         assert_eq!(grid(axis("degrees", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "one unit: as it is");
+        assert_eq!(grid(axis("", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "none is said: as it is");
+        assert!(!differ("m", "Metres") && !differ("m x 20", "meter") && differ("km", "m"));
     }
 }

@@ -3,12 +3,13 @@
 //! The crate takes memory for any length that a peer announces, and its PUB socket reads subscriptions from everybody: nine bytes of a stranger could end
 //! the run. So the socket itself listens where nobody else can reach it, connections over TCP end here, and a peer's bytes are handed on only as far as they
 //! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more, or does not subscribe in time, is cut off, and nobody else
-//! notices. What the socket sends passes as it is. Who subscribes may stay, so that places are shared out by address and, on this machine, by user: where
+//! notices. What the socket sends passes as it is. Who subscribes may stay, so that places are shared out by user on this machine, and by address else: where
 //! none is left, whoever has most of them gives up one, of those that have not subscribed yet if there are any, and of those the oldest.
 
+use std::fmt::{Display, Formatter};
 use std::fs::{File, OpenOptions};
 use std::io::{Error, ErrorKind, Result};
-use std::net::{IpAddr, SocketAddr};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::os::unix::net::UnixListener;
@@ -48,8 +49,31 @@ pub(super) fn private_listener() -> Result<(UnixListener, File)> {
     Ok((listener, place))
 }
 
-/// Whom a connection counts against: an address, on this machine a user of it.
-type Owner = (IpAddr, Option<u32>);
+/// Whom a connection counts against.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Owner {
+    /// A user of this machine, by whichever of its addresses: each may take any of 127.0.0.0/8.
+    User(u32),
+    /// Another machine; for users of this one that are not known, one address in place of all that are its own.
+    Address(IpAddr),
+}
+
+impl Owner {
+    fn of(peer: IpAddr, user: Option<u32>) -> Self {
+        let address = peer.to_canonical();
+        let unknown = Self::Address(if address.is_loopback() { IpAddr::V4(Ipv4Addr::LOCALHOST) } else { address });
+        user.map_or(unknown, Self::User)
+    }
+}
+
+impl Display for Owner {
+    fn fmt(&self, f: &mut Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::User(user) => write!(f, "user {user}"),
+            Self::Address(address) => write!(f, "{address}"),
+        }
+    }
+}
 
 /// One connection.
 struct Guest {
@@ -76,8 +100,8 @@ pub(super) async fn guard(listener: TcpListener, place: File) {
         guests.retain(|guest| !guest.connection.is_finished());
         if guests.len() >= CONNECTIONS {
             let there: Vec<_> = guests.iter().map(|guest| (guest.owner, guest.has_subscribed.load(Ordering::Relaxed))).collect();
-            let Guest { owner: (address, _), connection, .. } = guests.remove(displaced(&there));
-            tracing::debug!("a connection of {address} is cut off: {CONNECTIONS} are there, and nobody has more of them");
+            let Guest { owner, connection, .. } = guests.remove(displaced(&there));
+            tracing::debug!("a connection of {owner} is cut off: {CONNECTIONS} are there, and nobody has more of them");
             connection.abort();
         }
         let (socket, has_subscribed) = (socket.clone(), Arc::new(AtomicBool::new(false)));
@@ -87,7 +111,7 @@ pub(super) async fn guard(listener: TcpListener, place: File) {
                 tracing::debug!("{peer} is cut off: {error}");
             }
         });
-        guests.push(Guest { owner: (peer.ip().to_canonical(), user), has_subscribed, connection: connection.abort_handle() });
+        guests.push(Guest { owner: Owner::of(peer.ip(), user), has_subscribed, connection: connection.abort_handle() });
     }
 }
 
@@ -255,7 +279,7 @@ mod tests {
     #[test]
     fn whoever_has_most_places_gives_up_one_that_has_not_subscribed_or_the_oldest() {
         // Negative: has not subscribed.
-        let owner = |n: i32| ((IpAddr::from([127, 0, 0, 1]), Some(n.unsigned_abs())), n > 0);
+        let owner = |n: i32| (Owner::User(n.unsigned_abs()), n > 0);
         for (there, gone) in [
             (&[1, 2, 2, 3][..], 1),
             (&[1, 1, 2, 2], 0),
@@ -269,6 +293,24 @@ mod tests {
             let guests: Vec<_> = there.iter().map(|n| owner(*n)).collect();
             assert_eq!(displaced(&guests), gone, "{there:?}");
         }
+    }
+
+    #[test]
+    fn whoever_comes_from_many_addresses_of_this_machine_displaces_nobody_else() {
+        let loopback = |n: u8| IpAddr::from([127, 0, n, 7]);
+        let subscriber = Owner::of(loopback(0), Some(1000));
+        for stranger in [Some(1001), None] {
+            // All greet and subscribe, each from an address of its own; the last by the longer form of one.
+            let mapped = std::net::Ipv4Addr::new(127, 9, 9, 9).to_ipv6_mapped();
+            let addresses = (1..255).map(loopback).chain([IpAddr::from(mapped)]);
+            let guests: Vec<_> =
+                [(subscriber, true)].into_iter().chain(addresses.map(|address| (Owner::of(address, stranger), true))).collect();
+            assert_eq!(guests.len(), CONNECTIONS);
+            assert_eq!(displaced(&guests), 1, "{stranger:?}");
+        }
+        // One user is one owner wherever it comes from, and another machine is none of this one's.
+        assert_eq!(Owner::of("192.0.2.1".parse().unwrap(), Some(1000)), subscriber);
+        assert_ne!(Owner::of("192.0.2.1".parse().unwrap(), None), Owner::of(loopback(1), None));
     }
 
     #[test]
@@ -298,6 +340,16 @@ mod tests {
             assert_eq!(user_of(address, stream.local_addr().unwrap()), Some(own), "{address}");
             assert_eq!(user_of(peer.local_addr().unwrap(), "192.0.2.1:5577".parse().unwrap()), None, "no such connection");
         }
+        let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let peer = runtime.block_on(async {
+            let socket = tokio::net::TcpSocket::new_v4().unwrap();
+            socket.bind("127.0.3.7:0".parse().unwrap()).unwrap();
+            socket.connect(listener.local_addr().unwrap()).await.unwrap()
+        });
+        let (stream, address) = listener.accept().unwrap();
+        assert_eq!(address, peer.local_addr().unwrap());
+        assert_eq!(user_of(address, stream.local_addr().unwrap()), Some(own), "{address}");
         assert_eq!(user_of("192.0.2.7:1000".parse().unwrap(), "192.0.2.1:5577".parse().unwrap()), None, "of another machine");
     }
 

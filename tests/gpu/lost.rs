@@ -97,7 +97,7 @@ fn in_a_process_of_its_own() {
     }
 }
 
-/// A table of 8 MiB under a cap of 12, part of which the window has: the device traces it in parts, the CPU keeps it and walks, which is told once; and the
+/// A table of 8 MiB under a cap of 10, part of which the window has: the device traces it in parts, the CPU keeps it and walks, which is told once; and the
 /// run goes on, though it was to end with the device.
 #[test]
 #[ignore = "needs a GPU"]
@@ -107,7 +107,7 @@ fn memory_that_lacks_is_no_loss() {
     let scene = SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap();
     let (expected, error) = frames(&scene, Device::CPU, false);
     assert!(error.is_none() && expected.len() == 4);
-    let settings = GpuSettings { memory_cap: Some(12 << 20), when_lost: scene.device.when_lost, ..GpuSettings::default() };
+    let settings = GpuSettings { memory_cap: Some(10 << 20), when_lost: scene.device.when_lost, ..GpuSettings::default() };
     let (found, error) = frames(&scene, device(settings), false);
     assert!(error.is_none() && found.len() == 4, "{error:?} after {} frames", found.len());
     for (i, (found, expected)) in found.iter().zip(&expected).enumerate() {

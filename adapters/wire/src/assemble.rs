@@ -74,6 +74,10 @@ struct Start {
     round: u64,
     /// A block was opened since the last whole step.
     anew: bool,
+    /// How often the simulation was started anew under this key, as far as the openings show: a block took the place of one of the newest run.
+    run: u64,
+    /// When the first block of that run was opened, nanoseconds since 1970.
+    run_opened: u64,
 }
 
 #[derive(Debug)]
@@ -81,6 +85,8 @@ struct Block {
     generation: u64,
     extent: BlockExtent,
     ended: bool,
+    /// The run of its start that it belongs to. In an earlier one than the newest it is about to be opened anew.
+    run: u64,
     rounds: Rounds,
     /// When its last step was published.
     published: Option<u64>,
@@ -116,7 +122,7 @@ impl Block {
 
 impl Start {
     fn new(key: StartKey) -> Self {
-        Self { key, blocks: (0..key.1).map(|_| None).collect(), newest: None, round: 0, anew: true }
+        Self { key, blocks: (0..key.1).map(|_| None).collect(), newest: None, round: 0, anew: true, run: 0, run_opened: 0 }
     }
 
     fn block(&self, index: u32, generation: u64) -> Option<&Block> {
@@ -184,9 +190,17 @@ impl Assembler {
             (index == place || extent.overlaps(&other.extent)).then_some((index, other.ended))
         };
         let displaced: Vec<(usize, bool)> = start.blocks.iter().enumerate().filter_map(displaced).collect();
+        let newest_run = start.run;
+        if displaced.iter().any(|(index, _)| start.blocks[*index].as_ref().is_some_and(|other| other.run == newest_run)) {
+            (start.run, start.run_opened) = (newest_run + 1, generation);
+        }
+        // What waits belongs to the run before, also where it has none of the displaced blocks: the others will be opened anew too.
+        let is_new_run = start.run > newest_run;
         displaced.iter().for_each(|(index, _)| start.blocks[*index] = None);
-        start.blocks[place] = Some(Block { generation, extent, ended: false, rounds: Rounds::begin(start.round), published: None });
-        self.give_up_if(|p| p.start == key && displaced.iter().any(|(index, _)| p.came[*index]), "the simulation was started anew");
+        let (run, rounds) = (start.run, Rounds::begin(start.round));
+        start.blocks[place] = Some(Block { generation, extent, ended: false, run, rounds, published: None });
+        let is_before = |p: &Pending| p.start == key && (is_new_run || displaced.iter().any(|(index, _)| p.came[*index]));
+        self.give_up_if(is_before, "the simulation was started anew");
         let start = &mut self.starts[at];
         // Its steps may count from 0 again.
         (start.anew, start.newest) = (true, None);
@@ -208,7 +222,8 @@ impl Assembler {
 
     /// Takes one block of a step in; the whole step when it was the last that was missing. Where one block is the whole field, its values are
     /// taken out of `values`, which gets another buffer, and not copied. Blocks that were not introduced, or are followed no more, give nothing; nor
-    /// does what a block published at the same moment as one of its steps that came, or before.
+    /// does what a block published at the same moment as one of its steps that came, or before, or before the run was started of which another block
+    /// was opened already.
     ///
     /// # Errors
     /// Another number of values, or another time than the step's other blocks have.
@@ -232,6 +247,13 @@ impl Assembler {
         let start = &mut self.starts[at];
         let (key, newest) = (start.key, start.newest);
         let Some(known) = start.blocks[block as usize].as_mut() else { return Ok(None) };
+        if known.run < start.run {
+            // What the run before has left; unless the block goes on while another was opened anew.
+            if published <= start.run_opened {
+                return Ok(None);
+            }
+            known.run = start.run;
+        }
         let Some((round, _)) = known.next(step, published, newest.map_or(0, |(round, _)| round)) else { return Ok(None) };
         start.round = start.round.max(round);
         // What came before the newest and is not whole by now will not be asked for.
@@ -309,12 +331,11 @@ impl Assembler {
         self.steps.iter().filter(waits).count() + 1 >= self.pending
     }
 
-    /// Whether one of the blocks that a step lacks has come to a later one.
+    /// Whether one of the blocks that a step lacks has come to a later one, or has ended. Of one that is about to be opened anew that says nothing.
     fn is_hopeless(&self, pending: &Pending) -> bool {
-        let start = self.starts.iter().find(|start| start.key == pending.start);
-        let blocks = start.iter().flat_map(|start| &start.blocks);
-        let lacks = pending.came.iter().zip(blocks).filter(|(came, _)| !**came).filter_map(|(_, block)| block.as_ref());
-        lacks.filter_map(|block| block.rounds.last()).any(|last| last > pending.place())
+        let Some(start) = self.starts.iter().find(|start| start.key == pending.start) else { return true };
+        let lacks = pending.came.iter().zip(&start.blocks).filter(|(came, _)| !**came).filter_map(|(_, block)| block.as_ref());
+        lacks.filter(|block| block.run == start.run).any(|block| block.ended || block.rounds.last() > Some(pending.place()))
     }
 
     /// The steps that were given up since the last call.

@@ -5,6 +5,7 @@
 //! next, since it will be there for longest, and what is before it is passed over in all of them.
 
 use crate::place::{Place, Rounds};
+use crate::reader::Found;
 use crate::{ReadAt, RingReader, WireError};
 use std::collections::VecDeque;
 
@@ -33,12 +34,14 @@ impl Ahead {
         let there = reader.there()?;
         self.overwritten(reader, there.start);
         for number in self.next.max(there.start)..there.end {
-            match reader.step_of(number)? {
-                Some(step) => self.there.push_back((number, self.rounds.get_or_insert(Rounds::begin(newest)).next(step, newest))),
-                None => self.overwritten(reader, number + 1),
+            match reader.look_at(number)? {
+                Found::Step(step) => self.there.push_back((number, self.rounds.get_or_insert(Rounds::begin(newest)).next(step, newest))),
+                Found::Overwritten => self.overwritten(reader, number + 1),
+                // It comes with the next look.
+                Found::Unseen => break,
             }
+            self.next = number + 1;
         }
-        self.next = there.end;
         Ok(())
     }
 
@@ -104,4 +107,71 @@ pub(crate) fn catch_up(mut rings: Vec<&mut Ahead>) -> Option<Place> {
     let place = common.or_else(|| lost().filter_map(|ring| ring.first()).map(|(_, place)| place).max())?;
     rings.iter_mut().for_each(|ring| ring.lost = false);
     Some(place)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::header::PUBLISHED;
+    use crate::{AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, block_path};
+    use std::cell::RefCell;
+    use std::path::Path;
+    use std::rc::Rc;
+
+    /// A ring in memory.
+    struct Memory(Rc<RefCell<Vec<u8>>>);
+
+    impl ReadAt for Memory {
+        fn length(&self) -> std::io::Result<u64> {
+            Ok(self.0.borrow().len() as u64)
+        }
+
+        fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()> {
+            to.copy_from_slice(&self.0.borrow()[offset as usize..][..to.len()]);
+            Ok(())
+        }
+
+        fn write_at(&self, _: &[u8], _: u64) -> std::io::Result<()> {
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_step_whose_count_is_seen_before_its_head_is_not_lost() {
+        let ring = Path::new("/dev/shm").join(format!("rw-unseen-{}", std::process::id()));
+        let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, 2);
+        let description = Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
+        let producer = Producer::open(&ring, description, 2, Policy::NewestWins).unwrap();
+        let publish = |step| {
+            let (plane, extent) = ([0f32; 4], producer.description().block.extent);
+            // SAFETY: a value a node.
+            unsafe { producer.publish(step, 0.0, &Field::packed(&[plane.as_ptr().cast(); 2], Element::F32, extent)).unwrap() };
+            std::fs::read(block_path(&ring, 0)).unwrap()
+        };
+        let now: Vec<Vec<u8>> = (0..4).map(publish).collect();
+        drop(producer);
+        // As it was when so many steps were there, but for their count.
+        let seen = |steps: usize, published: u64| {
+            let mut bytes = now[steps - 1].clone();
+            bytes[PUBLISHED..PUBLISHED + 8].copy_from_slice(&published.to_ne_bytes());
+            bytes
+        };
+        let memory = Rc::new(RefCell::new(now[0].clone()));
+        let mut reader = RingReader::over("memory".into(), Memory(memory.clone()), &Limits::default()).unwrap();
+        let mut unread = Ahead::default();
+        let mut steps = |bytes: Vec<u8>| {
+            *memory.borrow_mut() = bytes;
+            unread.look(&mut reader, 0).unwrap();
+            unread.there.iter().map(|(number, _)| *number).collect::<Vec<_>>()
+        };
+        assert_eq!(steps(seen(1, 1)), [0]);
+        // The second slot was never written, the first still holds the first step.
+        assert_eq!(steps(seen(1, 2)), [0]);
+        assert_eq!(steps(seen(2, 2)), [0, 1]);
+        assert_eq!(steps(seen(2, 3)), [1]);
+        assert_eq!(steps(seen(3, 3)), [1, 2]);
+        // The other way about a step was overwritten.
+        assert_eq!(steps(seen(4, 3)), [1, 2], "what was looked at stays until it is read");
+        assert_eq!(steps(seen(4, 4)), [2, 3]);
+    }
 }

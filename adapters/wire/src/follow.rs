@@ -106,7 +106,8 @@ impl Followed {
         }
         self.looked = Instant::now();
         // The lock may already be that of a producer that took the place of this one.
-        self.gone = !self.reader.is_current() || !producer_lives(ring, block);
+        // Where it cannot be told, the ring is left as it is.
+        self.gone = !self.reader.is_current() || producer_lives(ring, block).is_ok_and(|lives| !lives);
         self.drained &= !self.gone;
     }
 
@@ -315,10 +316,12 @@ impl RingFollower {
                 }
             }
             // A ring without a producer that was never followed is what a killed run left.
-            if !producer_lives(&self.ring, block) && !self.closed_in_order(block) {
-                continue;
-            }
-            match RingReader::open(&self.ring, block, &self.limits) {
+            let opened = match producer_lives(&self.ring, block) {
+                Ok(false) if !self.closed_in_order(block) => continue,
+                Ok(_) => RingReader::open(&self.ring, block, &self.limits),
+                Err(error) => Err(error),
+            };
+            match opened {
                 Ok(reader) => {
                     let known = self.rings.get(&block).map(|f| f.reader.header().producer);
                     if known == Some(reader.header().producer) {

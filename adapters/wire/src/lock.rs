@@ -102,13 +102,21 @@ impl Drop for FileLock {
     }
 }
 
-/// The kind of somebody's lock that stands in the way of `kind`. None also where that cannot be told.
-fn in_the_way(path: &Path, kind: libc::c_int) -> Option<libc::c_int> {
-    let file = system::open_private(path, kind == libc::F_WRLCK).ok()?;
+/// The kind of somebody's lock that stands in the way of `kind`.
+///
+/// # Errors
+/// It cannot be told, for want of a descriptor for instance.
+fn in_the_way(path: &Path, kind: libc::c_int) -> Result<Option<libc::c_int>, WireError> {
+    let file = match system::open_private(path, kind == libc::F_WRLCK) {
+        Err(WireError::Io { source, .. }) if source.kind() == io::ErrorKind::NotFound => return Ok(None),
+        opened => opened?,
+    };
     let mut lock = presence(kind);
     // SAFETY: the descriptor is open, and the lock outlives the call.
-    let asked = unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_GETLK, &mut lock) };
-    Some(libc::c_int::from(lock.l_type)).filter(|found| asked == 0 && *found != libc::F_UNLCK)
+    if unsafe { libc::fcntl(file.as_raw_fd(), libc::F_OFD_GETLK, &mut lock) } != 0 {
+        return Err(WireError::io(path, "cannot be asked for its locks", io::Error::last_os_error()));
+    }
+    Ok(Some(libc::c_int::from(lock.l_type)).filter(|found| *found != libc::F_UNLCK))
 }
 
 /// A block's name, which is this producer's until it is dropped.
@@ -127,25 +135,44 @@ impl NameLock {
     }
 }
 
-/// Whether a block's producer lives (its process runs, and has not closed the ring). False also where that cannot be told.
-pub fn producer_lives(ring: &Path, block: u32) -> bool {
-    in_the_way(&lock_path(ring, block), libc::F_RDLCK).is_some()
+/// Whether a block's producer lives (its process runs, and has not closed the ring).
+///
+/// # Errors
+/// It cannot be told, for want of a descriptor for instance.
+pub fn producer_lives(ring: &Path, block: u32) -> Result<bool, WireError> {
+    Ok(in_the_way(&lock_path(ring, block), libc::F_RDLCK)?.is_some())
 }
 
-/// Whether anybody follows the ring.
+/// Whether anybody follows the ring, for all that can be told: what nobody reads is lost.
 pub(crate) fn is_followed(ring: &Path) -> bool {
-    in_the_way(&followers_path(ring), libc::F_WRLCK).is_some()
+    in_the_way(&followers_path(ring), libc::F_WRLCK).map_or(true, |found| found.is_some())
 }
 
-/// Removes what producers that have ended left, those with them that were killed while they opened; their rings by `remove`.
-pub(crate) fn remove_dead(ring: &Path, remove: impl Fn(&Path)) {
-    for block in blocks(ring) {
-        if let Ok(Some(name)) = NameLock::take(ring, block) {
-            remove(&block_path(ring, block));
-            let _ = std::fs::remove_file(part_path(ring, block));
-            name.remove();
-        }
+/// What a producer left that has ended, or was killed while it opened. Nobody else can take its name meanwhile.
+pub(crate) struct Dead {
+    ring: PathBuf,
+    part: PathBuf,
+    name: NameLock,
+}
+
+impl Dead {
+    /// Its files that take room.
+    pub fn files(&self) -> [PathBuf; 2] {
+        [self.ring.clone(), self.part.clone()]
     }
+
+    /// Removes it, the ring by `remove`.
+    pub fn remove(self, remove: impl Fn(&Path)) {
+        remove(&self.ring);
+        let _ = std::fs::remove_file(self.part);
+        self.name.remove();
+    }
+}
+
+/// What producers that have ended left in a folder.
+pub(crate) fn dead(ring: &Path) -> impl Iterator<Item = Dead> {
+    let of = |block| Some(Dead { ring: block_path(ring, block), part: part_path(ring, block), name: NameLock::take(ring, block).ok()?? });
+    blocks(ring).into_iter().filter_map(of)
 }
 
 /// Removes the rings of producers that have ended, and the folder when it is empty, where nobody follows. Somebody else who does so is waited for, so
@@ -157,7 +184,7 @@ pub(crate) fn sweep(ring: &Path, limit: Duration) {
             Ok(Some(last)) => break last,
             Ok(None) => {
                 // Who follows will do it.
-                if in_the_way(&path, libc::F_WRLCK) == Some(libc::F_RDLCK) || begin.elapsed() > limit {
+                if matches!(in_the_way(&path, libc::F_WRLCK), Ok(Some(libc::F_RDLCK))) || begin.elapsed() > limit {
                     return;
                 }
                 std::thread::sleep(Duration::from_millis(1));
@@ -167,7 +194,7 @@ pub(crate) fn sweep(ring: &Path, limit: Duration) {
         }
     };
     // Whoever has a name publishes, and looks for followers once more when it has ended.
-    remove_dead(ring, |path| drop(std::fs::remove_file(path)));
+    dead(ring).for_each(|dead| dead.remove(|path| drop(std::fs::remove_file(path))));
     last.remove();
     let _ = std::fs::remove_dir(ring);
 }

@@ -201,12 +201,25 @@ impl Session {
     /// # Errors
     /// The peer has another key or speaks another protocol, or the connection broke.
     pub fn accept(stream: &mut (impl Read + Write), key: &Key) -> Result<Self, WireError> {
+        Self::accept_if(stream, key, || Ok(()))
+    }
+
+    /// The same, where a follower that has proved the key may still be sent away: `admit` is asked before the relay signs, so that the follower learns it.
+    ///
+    /// # Errors
+    /// Those of [`Session::accept`], and that of `admit`.
+    pub fn accept_if(
+        stream: &mut (impl Read + Write),
+        key: &Key,
+        admit: impl FnOnce() -> Result<(), WireError>,
+    ) -> Result<Self, WireError> {
         let mine: [u8; 32] = system::random().map_err(failed)?;
         stream.write_all(&greeting(&mine)).map_err(failed)?;
         let theirs = read_greeting(stream)?;
         let mut signature = [0; SIGNATURE];
         stream.read_exact(&mut signature).map_err(failed)?;
         key.verify(&[b"follower", &mine, &theirs], &signature)?;
+        admit()?;
         stream.write_all(&key.signature(&[b"relay", &mine, &theirs])).map_err(failed)?;
         Ok(Self { key: Key(key.signature(&[b"session", &mine, &theirs])), number: 0, asked: 0 })
     }

@@ -2,9 +2,11 @@
 
 use crate::copy::Field;
 use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, SLOTS, STATE};
-use crate::lock::{NameLock, is_followed, remove_dead, sweep};
-use crate::system::{self, Map, create_private, open_private};
+use crate::lock::{Dead, NameLock, dead, is_followed, sweep};
+use crate::system::{self, Map, create_private, open_private, room_with, taken};
 use crate::{Description, Limits, WireError, block_path, part_path};
+use std::collections::VecDeque;
+use std::fs::File;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -133,24 +135,14 @@ impl Producer {
     }
 
     /// Memory for a ring, under another name until it is whole. Where there is none, that of rings whose producers have ended is taken, with what followers
-    /// had not read of them.
+    /// had not read of them, one after another, and only where all of it is enough.
     fn room(ring: &Path, block: u32, bytes: u64) -> Result<Map, WireError> {
         let (part, path) = (part_path(ring, block), block_path(ring, block));
-        let attempt = || {
-            // A killed run may have left it, or the last attempt.
-            let _ = std::fs::remove_file(&part);
-            let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
-            Map::create(&file, &path, bytes)
-        };
-        attempt().or_else(|error| match error {
-            WireError::NoSpace { .. } => {
-                // The one of this name is nobody else's.
-                give_up(&path);
-                remove_dead(ring, give_up);
-                attempt()
-            }
-            error => Err(error),
-        })
+        // A killed run may have left it.
+        let _ = std::fs::remove_file(&part);
+        let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
+        let mut left = None;
+        Map::create(&file, &path, bytes, || left.get_or_insert_with(|| Left::enough(ring, &path, &file, bytes)).give_up_one())
     }
 
     /// What is published.
@@ -278,6 +270,38 @@ impl Drop for Producer {
         lock.remove();
         // Only where it is empty: other blocks may be there.
         let _ = std::fs::remove_dir(&self.ring);
+    }
+}
+
+/// Rings of producers that have ended, to be given up for the room that they take.
+struct Left {
+    /// The one whose name this producer has.
+    own: Option<PathBuf>,
+    others: VecDeque<Dead>,
+}
+
+impl Left {
+    /// Those of a folder; none where a file of so many bytes would not fit even without them.
+    fn enough(ring: &Path, own: &Path, file: &File, bytes: u64) -> Self {
+        let others: VecDeque<Dead> = dead(ring).collect();
+        let size = |path: &Path| std::fs::symlink_metadata(path).map_or(0, |about| taken(&about));
+        let freed = size(own) + others.iter().flat_map(Dead::files).map(|path| size(&path)).sum::<u64>();
+        match room_with(file, freed) {
+            Ok(room) if room >= bytes => Self { own: Some(own.to_owned()), others },
+            _ => Self { own: None, others: VecDeque::new() },
+        }
+    }
+
+    /// Gives one up; whether there was one.
+    fn give_up_one(&mut self) -> bool {
+        match self.own.take().filter(|own| own.exists()) {
+            Some(own) => give_up(&own),
+            None => match self.others.pop_front() {
+                Some(dead) => dead.remove(give_up),
+                None => return false,
+            },
+        }
+        true
     }
 }
 

@@ -14,6 +14,19 @@ use std::sync::atomic::{Ordering, fence};
 /// Steps that are begun to be read in one look, if the producer overtakes each of them.
 const ATTEMPTS: usize = 4;
 
+const CUT_SHORT: &str = "cannot be read (was it cut short?)";
+
+/// What stands in the slot of a step that was published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Found {
+    /// The step, with the solver's number.
+    Step(u64),
+    /// A later one.
+    Overwritten,
+    /// What was there before it: the step is not seen yet.
+    Unseen,
+}
+
 /// Bytes that can be read anywhere: a file, or memory in tests.
 pub trait ReadAt {
     /// Bytes there.
@@ -153,7 +166,7 @@ impl<F: ReadAt> RingReader<F> {
         for _ in 0..ATTEMPTS {
             let published = self.word(PUBLISHED)?;
             if published < began {
-                return Err(WireError::field("published", published, format!("at least {began}, which was seen before")));
+                return Err(self.ran_back(published, began));
             }
             self.next = self.next.max(published.saturating_sub(slots));
             if self.next >= published {
@@ -179,14 +192,21 @@ impl<F: ReadAt> RingReader<F> {
     pub(crate) fn there(&self) -> Result<std::ops::Range<u64>, WireError> {
         let published = self.word(PUBLISHED)?;
         if published < self.next {
-            return Err(WireError::field("published", published, format!("at least {}, which was seen before", self.next)));
+            return Err(self.ran_back(published, self.next));
         }
         Ok(published.saturating_sub(u64::from(self.header.slots))..published)
     }
 
-    /// The solver's number of a step; none: it was overwritten.
-    pub(crate) fn step_of(&self, number: u64) -> Result<Option<u64>, WireError> {
-        Ok(self.head(number)?.map(|head| head[1]))
+    /// What stands where a step was published.
+    pub(crate) fn look_at(&self, number: u64) -> Result<Found, WireError> {
+        let head = self.any_head(number)?;
+        if head[0] == sequence(number) {
+            return Ok(Found::Step(head[1]));
+        }
+        // The slot's next step has come, or is being written: either is seen, and what was there before the step is no sign of that.
+        let slots = u64::from(self.header.slots);
+        let is_over = head[0] > sequence(number) || self.word(PUBLISHED)? >= number.saturating_add(slots);
+        Ok(if is_over { Found::Overwritten } else { Found::Unseen })
     }
 
     /// Reads this step and no other, as [`Self::read`] does; none: it was overwritten. What is before it counts as missed.
@@ -209,7 +229,7 @@ impl<F: ReadAt> RingReader<F> {
     /// [`crate::Following::mark`].
     ///
     /// # Errors
-    /// The file cannot be written.
+    /// The file cannot be written, or was cut short.
     pub fn acknowledge(&self, mark: u32) -> Result<(), WireError> {
         self.put_mark(mark, system::monotonic())
     }
@@ -217,13 +237,33 @@ impl<F: ReadAt> RingReader<F> {
     /// Tells the producer that this follower goes: nobody waits for it any more.
     ///
     /// # Errors
-    /// The file cannot be written.
+    /// The file cannot be written, or was cut short.
     pub fn leave(&self, mark: u32) -> Result<(), WireError> {
         // Long ago.
         self.put_mark(mark, 1)
     }
 
+    /// A ring that was given up is empty. Its length is looked at before anything is written, which would make it long again.
+    ///
+    /// # Errors
+    /// It is shorter than its header says.
+    fn check_whole(&self) -> Result<(), WireError> {
+        let needed = self.first_slot + self.header.stride() * u64::from(self.header.slots);
+        let length = self.file.length().map_err(|e| WireError::io(&self.path, "cannot be looked at", e))?;
+        if length < needed {
+            return Err(WireError::io(&self.path, CUT_SHORT, std::io::ErrorKind::UnexpectedEof.into()));
+        }
+        Ok(())
+    }
+
+    /// The error of a count below one that was seen; of a ring that was cut short, and made longer by a mark, that.
+    fn ran_back(&self, published: u64, seen: u64) -> WireError {
+        let ran_back = || WireError::field("published", published, format!("at least {seen}, which was seen before"));
+        self.check_whole().err().unwrap_or_else(ran_back)
+    }
+
     fn put_mark(&self, mark: u32, heartbeat: u64) -> Result<(), WireError> {
+        self.check_whole()?;
         let mut words = [0; MARK_BYTES];
         words[..8].copy_from_slice(&self.next.to_ne_bytes());
         words[8..].copy_from_slice(&heartbeat.to_ne_bytes());
@@ -233,9 +273,7 @@ impl<F: ReadAt> RingReader<F> {
 
     /// Whether the producer has closed the ring: what is read of it afterwards is all that it will ever hold.
     pub fn is_closed(&self) -> Result<bool, WireError> {
-        let closed = self.word(STATE)? == ENDED;
-        fence(Ordering::Acquire);
-        Ok(closed)
+        Ok(self.word(STATE)? == ENDED)
     }
 
     /// Steps published so far.
@@ -247,12 +285,16 @@ impl<F: ReadAt> RingReader<F> {
         self.first_slot + number % u64::from(self.header.slots) * self.header.stride()
     }
 
-    /// The head of a step's slot in words; none: it holds another step, or is being written.
-    fn head(&self, number: u64) -> Result<Option<[u64; 4]>, WireError> {
+    /// The head of a step's slot in words, whatever step it holds.
+    fn any_head(&self, number: u64) -> Result<[u64; 4], WireError> {
         let mut head = [0; 32];
         self.read_bytes(&mut head, self.slot(number))?;
-        let words = [0, 1, 2, 3].map(|k| u64::from_ne_bytes(head.as_chunks::<8>().0[k]));
-        Ok((words[0] == sequence(number)).then_some(words))
+        Ok([0, 1, 2, 3].map(|k| u64::from_ne_bytes(head.as_chunks::<8>().0[k])))
+    }
+
+    /// The head of a step's slot; none: it holds another step, or is being written.
+    fn head(&self, number: u64) -> Result<Option<[u64; 4]>, WireError> {
+        Ok(Some(self.any_head(number)?).filter(|words| words[0] == sequence(number)))
     }
 
     fn try_slot(&self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
@@ -279,14 +321,16 @@ impl<F: ReadAt> RingReader<F> {
         Ok(Some(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
     }
 
+    /// A word of the producer's: what it wrote before that is seen by whatever is read after.
     fn word(&self, offset: usize) -> Result<u64, WireError> {
         let mut bytes = [0; 8];
         self.read_bytes(&mut bytes, offset as u64)?;
+        fence(Ordering::Acquire);
         Ok(u64::from_ne_bytes(bytes))
     }
 
     fn read_bytes(&self, to: &mut [u8], offset: u64) -> Result<(), WireError> {
-        self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, "cannot be read (was it cut short?)", e))
+        self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, CUT_SHORT, e))
     }
 }
 

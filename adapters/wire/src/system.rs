@@ -137,6 +137,22 @@ fn reserve(end: libc::off_t, mut allocate: impl FnMut(libc::off_t, libc::off_t) 
     0
 }
 
+/// Bytes that a file could take at most if these were freed besides: what the file system has left for this user, and what the file has already.
+pub(crate) fn room_with(file: &File, freed: u64) -> io::Result<u64> {
+    // SAFETY: all of its fields are integers.
+    let mut about: libc::statvfs = unsafe { std::mem::zeroed() };
+    // SAFETY: the descriptor is open, and `about` outlives the call.
+    if unsafe { libc::fstatvfs(file.as_raw_fd(), &mut about) } != 0 {
+        return Err(io::Error::last_os_error());
+    }
+    Ok(about.f_bavail.saturating_mul(about.f_frsize).saturating_add(taken(&file.metadata()?)).saturating_add(freed))
+}
+
+/// Bytes of the file system that a file has.
+pub(crate) fn taken(about: &Metadata) -> u64 {
+    about.blocks() * 512
+}
+
 /// A file mapped for reading and writing, all its pages there.
 #[derive(Debug)]
 pub(crate) struct Map {
@@ -150,11 +166,12 @@ unsafe impl Send for Map {}
 unsafe impl Sync for Map {}
 
 impl Map {
-    /// Gives the file `length` bytes, all of them backed by memory, and maps it.
+    /// Gives the file `length` bytes, all of them backed by memory, and maps it. Where the file system or the user's share of it is full, `make_room` is
+    /// asked, each time that it is so, until it says that there is nothing to be done.
     ///
     /// # Errors
     /// `NoSpace`: there is no room. Never leaves pages that could fail when they are written.
-    pub fn create(file: &File, path: &Path, length: u64) -> Result<Self, WireError> {
+    pub fn create(file: &File, path: &Path, length: u64, mut make_room: impl FnMut() -> bool) -> Result<Self, WireError> {
         let no_space = || WireError::NoSpace { path: path.to_owned(), needed: length };
         let most = file_size_limit().map_err(|e| WireError::io(path, "no limit of its length can be had", e))?;
         if length > most {
@@ -163,8 +180,14 @@ impl Map {
         }
         let size = libc::off_t::try_from(length).ok().zip(usize::try_from(length).ok());
         let (end, length) = size.ok_or_else(no_space)?;
-        // SAFETY: the descriptor is open. Unlike `ftruncate`, this reserves: a full file system answers here and not by SIGBUS later.
-        match reserve(end, |from, bytes| unsafe { libc::posix_fallocate(file.as_raw_fd(), from, bytes) }) {
+        let status = loop {
+            // SAFETY: the descriptor is open. Unlike `ftruncate`, this reserves: a full file system answers here and not by SIGBUS later.
+            match reserve(end, |from, bytes| unsafe { libc::posix_fallocate(file.as_raw_fd(), from, bytes) }) {
+                libc::ENOSPC | libc::EDQUOT if make_room() => {}
+                status => break status,
+            }
+        };
+        match status {
             0 => {}
             libc::ENOSPC | libc::EFBIG | libc::ENOMEM | libc::EDQUOT => return Err(no_space()),
             code => return Err(WireError::io(path, "room cannot be reserved", io::Error::from_raw_os_error(code))),

@@ -12,7 +12,8 @@ use ridgewatch_wire::{
     Assembler, AxisDescription, BlockExtent, Description, Element, Event, Field, Geometry, Incomplete, Limits, Policy, Producer, Published,
     RingFollower, WireError,
 };
-use std::io::Read;
+use std::cell::Cell;
+use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -231,6 +232,80 @@ fn strangers_take_no_followers_place() {
 }
 
 #[test]
+fn a_follower_for_whom_there_is_no_place_is_told_so_once_and_comes_in_when_there_is() {
+    let folder = Folder::new("places");
+    let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    let wait = |count: &AtomicU64, enough: u64| {
+        let begin = Instant::now();
+        while count.load(Ordering::Relaxed) < enough {
+            assert!(begin.elapsed() < LONG, "{} of {enough}", count.load(Ordering::Relaxed));
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    };
+    let mut followers: Vec<RelayFollower> = (0..16).map(|_| relay.follow(LONG)).collect();
+    wait(&relay.counts.accepted, 16);
+    let mut late = relay.follow(LONG);
+    // It tries again and again.
+    wait(&relay.counts.refused, 3);
+    followers.pop();
+    let seen = events(&mut |values| late.poll(values, Duration::from_millis(10)), "step 0");
+    assert_eq!(seen, [&format!("refused {}", WireError::SentAway), "opened 4", "step 0 missed 0"]);
+    assert_eq!(relay.counts.accepted.load(Ordering::Relaxed), 17);
+}
+
+/// Lets this process open no file any more; what it was let before.
+fn exhaust_descriptors() -> libc::rlimit {
+    let mut before = libc::rlimit { rlim_cur: 0, rlim_max: 0 };
+    // SAFETY: both limits outlive the calls.
+    unsafe {
+        assert_eq!(libc::getrlimit(libc::RLIMIT_NOFILE, &mut before), 0);
+        assert_eq!(libc::setrlimit(libc::RLIMIT_NOFILE, &libc::rlimit { rlim_cur: 0, ..before }), 0);
+    }
+    before
+}
+
+#[test]
+fn a_block_that_lives_goes_on_when_descriptors_were_wanting_for_a_while() {
+    let folder = Folder::alone("wanting");
+    let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
+    publish(&producer, 0);
+    let (mut heard, mut says) = std::io::pipe().unwrap();
+    let follow = || {
+        let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+        let mut poll = |values: &mut Vec<f32>| follower.poll(values);
+        assert_eq!(events(&mut poll, "step 0"), ["opened 4", "step 0 missed 0"]);
+        let before = exhaust_descriptors();
+        assert!(ridgewatch_wire::producer_lives(&folder.0, 0).is_err());
+        let (mut seen, begin) = (Vec::new(), Instant::now());
+        while begin.elapsed() < Duration::from_millis(500) {
+            seen.extend(poll(&mut Vec::new()));
+        }
+        // SAFETY: the limit outlives the call.
+        assert_eq!(unsafe { libc::setrlimit(libc::RLIMIT_NOFILE, &before) }, 0);
+        assert!(matches!(seen[..], [Event::Refused(_)]), "{seen:?}");
+        says.write_all(&[1]).unwrap();
+        assert_eq!(events(&mut poll, "step 1"), ["step 1 missed 0"]);
+    };
+    // SAFETY: no other test runs meanwhile, and no other thread of the child is needed.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        let passed = std::panic::catch_unwind(std::panic::AssertUnwindSafe(follow)).is_ok();
+        // SAFETY: ends the child, without what the tests would do at their end.
+        unsafe { libc::_exit(i32::from(!passed)) };
+    }
+    drop(says);
+    // None comes where the child has failed.
+    let _ = heard.read(&mut [0]);
+    publish(&producer, 1);
+    let mut status = -1;
+    // SAFETY: waits for that child.
+    unsafe { libc::waitpid(child, &mut status, 0) };
+    assert_eq!(status, 0);
+}
+
+#[test]
 fn two_followers_of_a_relay_lose_nothing_of_a_solver_that_waits() {
     let folder = Folder::new("two");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
@@ -271,19 +346,20 @@ fn columns(nodes: u64, count: u32) -> Vec<Description> {
     (0..count).map(|index| Description { start: 1, block: block(index), ..description(nodes) }).collect()
 }
 
-/// Follows until `enough` says so of the whole steps, whose values are the step's number. A reader who is slow takes `pause` for each block.
-fn assemble(folder: &Folder, pause: Duration, enough: &dyn Fn(&[u64]) -> bool) -> (Vec<u64>, Vec<Incomplete>) {
+/// Follows until `enough` says so of the whole steps, whose values are the step's number. After each look `meanwhile` hears whether a block came.
+fn assemble(folder: &Folder, meanwhile: &mut dyn FnMut(bool), enough: &dyn Fn(&[u64]) -> bool) -> (Vec<u64>, Vec<Incomplete>) {
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
     let (mut values, mut whole, mut assembler, begin) = (Vec::new(), Vec::new(), None::<Assembler>, Instant::now());
     while !enough(&whole) {
         assert!(begin.elapsed() < LONG, "{whole:?}");
-        match follower.poll(&mut values) {
+        let event = follower.poll(&mut values);
+        let block_came = matches!(event, Some(Event::Step { .. }));
+        match event {
             Some(Event::Opened { description, generation }) => {
                 let assembler = assembler.get_or_insert_with(|| Assembler::new(&description, LONG, 4));
                 assembler.introduce(&description, generation).unwrap();
             }
             Some(Event::Step { block, generation, step, time, published, .. }) => {
-                std::thread::sleep(pause);
                 let came = assembler.as_mut().unwrap().block(block, generation, step, time, published, &mut values).unwrap();
                 if let Some(came) = came {
                     assert!(came.values.iter().all(|v| *v == came.step as f32));
@@ -291,8 +367,9 @@ fn assemble(folder: &Folder, pause: Duration, enough: &dyn Fn(&[u64]) -> bool) -
                 }
             }
             Some(other) => panic!("{other:?}"),
-            None => std::thread::sleep(Duration::from_micros(100)),
+            None => {}
         }
+        meanwhile(block_came);
     }
     (whole, assembler.unwrap().incomplete())
 }
@@ -304,19 +381,17 @@ fn blocks_of_a_solver_that_is_too_fast_meet_about_as_often_as_one_block_comes() 
         let folder = Folder::new(&format!("fast{count}"));
         let producers: Vec<Producer> =
             columns(64, count).into_iter().map(|block| Producer::open(&folder.0, block, 4, Policy::NewestWins).unwrap()).collect();
-        let over = AtomicBool::new(false);
-        std::thread::scope(|scope| {
-            scope.spawn(|| {
-                let begin = Instant::now();
-                for n in 0..STEPS {
-                    std::thread::sleep((Duration::from_millis(3) * n as u32).saturating_sub(begin.elapsed()));
-                    producers.iter().for_each(|producer| _ = publish(producer, n));
-                }
-                over.store(true, Ordering::Relaxed);
-            });
-            // While the solver runs: what is in the rings at last is no news.
-            assemble(&folder, Duration::from_millis(8) / count, &|_| over.load(Ordering::Relaxed)).0.len() as u64
-        })
+        // While a field is read, in however many blocks, 8/3 steps are published; where nothing was there to be read, the next one.
+        let (published, mut due) = (Cell::new(0), 0);
+        let mut solve = |block_came: bool| {
+            due += if block_came { 8 } else { 3 * count };
+            while due >= 3 * count {
+                producers.iter().for_each(|producer| _ = publish(producer, published.get()));
+                (due, _) = (due - 3 * count, published.replace(published.get() + 1));
+            }
+        };
+        // While the solver runs: what is in the rings at last is no news.
+        assemble(&folder, &mut solve, &|_| published.get() >= STEPS).0.len() as u64
     });
     assert!(one < STEPS / 2, "{one} of {STEPS}: the reader is not slow");
     assert!(2 * four >= one, "{four} steps of four blocks, {one} of one block");
@@ -335,7 +410,8 @@ fn a_block_that_is_late_is_waited_for_and_no_step_is_lost() {
                 (0..40).for_each(|n| assert!(!publish(producer, n).overwrote));
             });
         }
-        let (whole, given_up) = assemble(&folder, Duration::ZERO, &|whole| whole.len() == 40);
+        let mut rest = |block_came: bool| std::thread::sleep(Duration::from_micros(if block_came { 0 } else { 100 }));
+        let (whole, given_up) = assemble(&folder, &mut rest, &|whole| whole.len() == 40);
         assert_eq!((whole, given_up), ((0..40).collect(), Vec::new()));
     });
 }

@@ -85,7 +85,7 @@ impl Cycle<'_> {
         let dying = record.audited > 0 && record.lived_share < SHORT_LIVED;
         if dying && !std::mem::replace(&mut self.told_of_deaths, true) {
             record.warnings.push(format!(
-                "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value,                  another unit?), and their FTLE is that of the path so far",
+                "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value, another unit?), and their FTLE is that of the path so far",
                 100.0 * record.lived_share
             ));
         }

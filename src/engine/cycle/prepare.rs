@@ -96,7 +96,7 @@ impl Cycle<'_> {
         let size = low.abs().max(high.abs());
         (range <= error.max(UNIFORM) || high - low <= UNIFORM_SHARE * size).then(|| {
             format!(
-                "FTLE is uniform: nothing to scale colours to. The log-stretch varies by {range:.1e} over the domain, and its integration error                  is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
+                "FTLE is uniform: nothing to scale colours to. The log-stretch varies by {range:.1e} over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
             )
         })
     }

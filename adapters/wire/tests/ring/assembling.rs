@@ -2,6 +2,7 @@
 
 use super::{cube, values};
 use ridgewatch_wire::{Assembler, BlockExtent, Description, Incomplete, Step};
+use std::collections::VecDeque;
 use std::time::Duration;
 
 /// Columns of a grid of 4 x 3 x 2 nodes, as wide as told.
@@ -21,9 +22,9 @@ fn cut(block: &Description, n: u64) -> Vec<f32> {
     values(&cube([4, 3, 2]), n).concat().chunks_exact(4).flat_map(|row| row[begin..begin + width].to_vec()).collect()
 }
 
-/// Gives a block of step `n` at time n / 2.
+/// Gives a block of step `n` at time n / 2, published after all openings.
 fn give(assembler: &mut Assembler, block: &Description, generation: u64, n: u64) -> Option<Step> {
-    assembler.block(block.block.index, generation, n, n as f64 / 2.0, n, &mut cut(block, n)).unwrap()
+    assembler.block(block.block.index, generation, n, n as f64 / 2.0, 1000 + n, &mut cut(block, n)).unwrap()
 }
 
 fn numbers(given_up: &[Incomplete]) -> Vec<u64> {
@@ -44,11 +45,11 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     // Either order.
     assert_eq!(give(&mut assembler, &right, 2, 1), None);
     let whole = give(&mut assembler, &left, 1, 1).unwrap();
-    assert_eq!((whole.step, whole.time, whole.published, whole.anew), (1, 0.5, 1, true));
+    assert_eq!((whole.step, whole.time, whole.published, whole.anew), (1, 0.5, 1001, true));
     assert_eq!(whole.values, values(&cube([4, 3, 2]), 1).concat());
     // Another time, another length.
     assert_eq!(give(&mut assembler, &left, 1, 2), None);
-    let other = assembler.block(1, 2, 2, 1.5, 2, &mut cut(&right, 2)).unwrap_err().to_string();
+    let other = assembler.block(1, 2, 2, 1.5, 1002, &mut cut(&right, 2)).unwrap_err().to_string();
     assert!(other.contains("the time that its other blocks have"));
     assert!(assembler.block(1, 2, 2, 1.0, 0, &mut cut(&left, 2)).unwrap_err().to_string().contains("18 values"));
     // A step that lacks a block goes when a newer one is whole,
@@ -249,4 +250,97 @@ fn blocks_that_are_set_back_meet_again() {
         }
         assert_eq!(whole, expected);
     }
+}
+
+/// What a relay has to tell of its block.
+#[derive(Clone, Copy)]
+enum Told {
+    Opened { generation: u64 },
+    Step { generation: u64, n: u64, published: u64 },
+}
+
+/// A relay of one block: the first run up to a step, what its ring held besides, the second run.
+fn relayed(last: u64, left: u64, opened: u64) -> VecDeque<Told> {
+    let first = (0..=last + left).map(|n| Told::Step { generation: 1, n, published: 2 + n });
+    let second = (0..=120).map(|n| Told::Step { generation: opened, n, published: 2000 + n });
+    let begin = |generation| std::iter::once(Told::Opened { generation });
+    begin(1).chain(first).chain(begin(opened)).chain(second).collect()
+}
+
+#[test]
+fn a_restart_that_one_relay_tells_before_another_mixes_no_runs_and_waits_for_no_limit() {
+    let blocks = columns(0, &[2, 2]);
+    let cases = [0, 1].into_iter().flat_map(|ahead| [0, 3, 40].map(|left| (ahead, left)));
+    for (ahead, left, stays_behind) in cases.flat_map(|(ahead, left)| [(ahead, left, false), (ahead, left, true)]) {
+        let other = 1 - ahead;
+        let mut assembler = Assembler::new(&blocks[0], Duration::from_secs(3600), 4);
+        let mut relays = [VecDeque::new(), VecDeque::new()];
+        relays[ahead] = relayed(103, left, 1001);
+        relays[other] = relayed(100, 0, 1000);
+        let (mut whole, mut run): (Vec<Step>, _) = (Vec::new(), [1; 2]);
+        while relays.iter().any(|relay| !relay.is_empty()) {
+            let order = if stays_behind && run[other] > 1 { [other, ahead] } else { [ahead, other] };
+            let may = |index: &usize| !assembler.is_ahead(*index as u32, run[*index]) && !relays[*index].is_empty();
+            let index = order.into_iter().find(may).expect("all relays are held back");
+            match relays[index].pop_front() {
+                Some(Told::Opened { generation }) => {
+                    run[index] = generation;
+                    assembler.introduce(&blocks[index], generation).unwrap();
+                }
+                Some(Told::Step { generation, n, published }) => {
+                    let second = 500 * u64::from(generation > 1);
+                    let mut cut = cut(&blocks[index], n + second);
+                    whole.extend(assembler.block(index as u32, generation, n, n as f64, published, &mut cut).unwrap());
+                }
+                None => unreachable!("it is not empty"),
+            }
+        }
+        let expected: Vec<u64> = (0..=100).chain(500..=620).collect();
+        let numbers_of: Vec<u64> = whole.iter().zip(&expected).map(|(step, n)| step.step + 500 * (n / 500)).collect();
+        assert_eq!(numbers_of, expected, "relay {ahead} was ahead, {left} steps were left");
+        assert_eq!(whole.len(), expected.len());
+        for (step, n) in whole.iter().zip(&expected) {
+            assert_eq!(step.values, values(&cube([4, 3, 2]), *n).concat(), "step {n} is of two runs");
+            assert_eq!(step.anew, [0, 500].contains(n));
+        }
+        let given_up = assembler.incomplete();
+        assert_eq!(numbers(&given_up), [101, 102, 103]);
+        assert!(given_up.iter().all(|g| g.why == "the simulation was started anew"));
+    }
+}
+
+#[test]
+fn a_block_that_goes_on_while_another_is_opened_anew_is_taken() {
+    let blocks = columns(0, &[2, 2]);
+    let mut assembler = Assembler::new(&blocks[0], Duration::from_secs(3600), 4);
+    blocks.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
+    assert_eq!(give(&mut assembler, &blocks[0], 1, 5), None);
+    assembler.introduce(&blocks[1], 1007).unwrap();
+    assert_eq!(numbers(&assembler.incomplete()), [5]);
+    assert_eq!(
+        (give(&mut assembler, &blocks[0], 1, 6), give(&mut assembler, &blocks[1], 1007, 6)),
+        (None, None),
+        "published before it was opened"
+    );
+    assert_eq!((give(&mut assembler, &blocks[0], 1, 8), give(&mut assembler, &blocks[1], 1007, 8).map(|s| s.step)), (None, Some(8)));
+}
+
+#[test]
+fn a_block_that_is_over_holds_nobody_back() {
+    let blocks = columns(0, &[2, 2]);
+    let mut assembler = Assembler::new(&blocks[0], Duration::from_secs(3600), 4);
+    blocks.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
+    for n in 0..3 {
+        assert_eq!(give(&mut assembler, &blocks[0], 1, n), None);
+    }
+    assert!(assembler.is_ahead(0, 1), "the other may still come");
+    assert!(!assembler.ended(1, 1));
+    for n in 3..20 {
+        assert!(!assembler.is_ahead(0, 1), "step {n}");
+        assert_eq!(give(&mut assembler, &blocks[0], 1, n), None);
+    }
+    // Its connection comes back.
+    assembler.introduce(&blocks[1], 1).unwrap();
+    assert!(assembler.is_ahead(0, 1));
+    assert_eq!(give(&mut assembler, &blocks[1], 1, 19).map(|s| s.step), Some(19));
 }

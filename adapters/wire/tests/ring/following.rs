@@ -189,3 +189,27 @@ fn a_ring_that_is_cut_short_or_runs_backwards_under_the_reader_is_an_error() {
     std::fs::OpenOptions::new().write(true).open(block_path(&copy, 0)).unwrap().set_len(12288 + 64).unwrap();
     assert!(matches!(reader.read(&mut buffer), Err(WireError::Io { .. })));
 }
+
+#[test]
+fn a_ring_that_was_given_up_is_not_made_long_again() {
+    let folder = Folder::new("givenup");
+    let producer = Producer::open(&folder.0, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
+    publish(&producer, 0, 0.0).unwrap();
+    // The producer's own is mapped, and not to be cut.
+    let copy = folder.0.join("copy");
+    std::fs::create_dir(&copy).unwrap();
+    let (path, mut buffer) = (block_path(&copy, 0), Vec::new());
+    std::fs::copy(block_path(&folder.0, 0), &path).unwrap();
+    let mut reader = RingReader::open(&copy, 0, &Limits::default()).unwrap();
+    assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 0);
+    let file = std::fs::OpenOptions::new().write(true).open(&path).unwrap();
+    file.set_len(0).unwrap();
+    for marked in [reader.acknowledge(3), reader.leave(3)] {
+        assert!(marked.unwrap_err().to_string().contains("was it cut short?"));
+    }
+    assert_eq!(file.metadata().unwrap().len(), 0);
+    // A mark that was on its way.
+    overwrite(&path, 4096, &[1; 16]);
+    let error = reader.read(&mut buffer).unwrap_err().to_string();
+    assert!(error.contains("was it cut short?"), "{error}");
+}

@@ -52,12 +52,12 @@ fn two_producers_of_one_name_and_what_a_killed_one_leaves() {
     let first = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     let error = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
     assert!(matches!(error, WireError::InUse { pid, .. } if pid == u64::from(std::process::id())), "{error}");
-    assert!(producer_lives(&folder.0, 0));
+    assert!(producer_lives(&folder.0, 0).unwrap());
     // As SIGKILL leaves it: the files stay, the lock goes.
     let reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
     let left = std::fs::read(block_path(&folder.0, 0)).unwrap();
     drop(first);
-    assert!(!producer_lives(&folder.0, 0) && !folder.0.exists(), "nobody follows: the folder goes");
+    assert!(!producer_lives(&folder.0, 0).unwrap() && !folder.0.exists(), "nobody follows: the folder goes");
     std::fs::create_dir_all(&folder.0).unwrap();
     std::fs::write(block_path(&folder.0, 0), left).unwrap();
     std::fs::write(folder.0.join(".block-00000.part"), "half").unwrap();
@@ -181,6 +181,28 @@ fn no_room_is_an_error_and_leaves_nothing() {
     assert!(!folder.0.exists());
 }
 
+#[test]
+fn what_cannot_be_there_at_all_takes_nothing_from_who_follows() {
+    let folder = Folder::new("impossible");
+    let following = Following::begin(&folder.0).unwrap();
+    for index in 0..2 {
+        let mut description = cube([4, 4, 4]);
+        description.block = BlockExtent { index, count: 2, offset: [0, 0, 2 * u64::from(index)], extent: [4, 4, 2] };
+        publish(&Producer::open(&folder.0, description, 2, Policy::NewestWins).unwrap(), 7, 0.0).unwrap();
+    }
+    // 4096 slots of 2^50 bytes are more than a length can say; a petabyte is more than there is.
+    for (nodes, slots) in [([1 << 16, 1 << 16, 1 << 16], 4096), ([1 << 15, 1 << 15, 1 << 14], 16)] {
+        let error = Producer::open(&folder.0, cube(nodes), slots, Policy::NewestWins).unwrap_err();
+        assert!(matches!(error, WireError::NoSpace { .. }), "{error}");
+        for block in 0..2 {
+            let mut reader = RingReader::open(&folder.0, block, &Limits::default()).unwrap();
+            assert_eq!(step(&mut reader, &mut Vec::new()).unwrap().step, 7);
+        }
+    }
+    drop(following);
+    assert!(!folder.0.exists());
+}
+
 /// A small file system that is gone when the test ends.
 struct SmallDisk(PathBuf);
 
@@ -298,4 +320,28 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     let seen = told("step 3");
     assert!(seen.len() == 4 && seen[0].contains("was it cut short?"), "{seen:?}");
     assert_eq!(seen[1..], ["ended false", "opened", "step 3"]);
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn no_more_of_a_killed_run_goes_than_the_next_needs() {
+    let _alone = Folder::alone("least");
+    let disk = SmallDisk::new("least", "3m");
+    let ring = disk.0.join("ring");
+    // Three rings of 0.79 MB, and 0.7 MB are left.
+    killed(&ring, 3);
+    let there = || [0, 1, 2].map(|block| block_path(&ring, block).exists());
+    let open = |slots| {
+        let block = BlockExtent { index: 1, count: 3, offset: [0, 0, 28], extent: [24, 24, 28] };
+        Producer::open(&ring, Description { block, ..cube([24, 24, 84]) }, slots, Policy::NewestWins).map(drop)
+    };
+    // 3.9 MB would not fit into the empty file system.
+    assert!(matches!(open(20), Err(WireError::NoSpace { .. })));
+    assert_eq!(there(), [true; 3]);
+    // 1.2 MB fit without the one of this name, 2 MB without one more.
+    let _following = Following::begin(&ring).unwrap();
+    open(6).unwrap();
+    assert_eq!(there(), [true; 3], "its own is in place of the old one");
+    open(10).unwrap();
+    assert_eq!(there(), [false, true, true]);
 }
