@@ -161,8 +161,7 @@ impl Health {
     /// # Errors
     /// Once the device has failed, and where it refuses.
     pub fn ask_for_room<T>(&self, call: impl FnOnce() -> Result<T, DeviceError>) -> Result<T, NotTaken> {
-        let refused =
-            |error: DeviceError| if error.is_refusal() { Ok(Err(NotTaken::NoRoom(error.to_string()))) } else { Err(error) };
+        let refused = |error: DeviceError| if error.is_refusal() { Ok(Err(NotTaken::NoRoom(error.to_string()))) } else { Err(error) };
         self.ask(|| call().map(Ok).or_else(refused)).ok_or(DeviceLost)?
     }
 
