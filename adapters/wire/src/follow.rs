@@ -1,6 +1,6 @@
 //! Following blocks, wherever they come from: rings of this node, or relays of others.
 
-use crate::choice::{self, Ahead};
+use crate::choice::{self, Unread};
 use crate::lock::{Following, blocks, producer_lives};
 use crate::place::Place;
 use crate::reader::{Read, RingReader, StepInfo};
@@ -63,7 +63,7 @@ type Simulation = (u64, u32);
 struct Followed {
     reader: RingReader,
     /// Of one block among several: what is there.
-    ahead: Ahead,
+    unread: Unread,
     /// Nothing more is read, since what was read could not be: until a new producer takes its place.
     refused: bool,
     /// There was nothing to be read when it was last looked at.
@@ -83,9 +83,9 @@ struct Followed {
 
 impl Followed {
     fn begin(reader: RingReader) -> Self {
-        let (ahead, now) = (Ahead::default(), Instant::now());
+        let (unread, now) = (Unread::default(), Instant::now());
         let (refused, drained, closed, gone, replaced, ended) = (false, false, false, false, false, false);
-        Self { reader, ahead, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
+        Self { reader, unread, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
     }
 
     /// Tells the producer how far its steps were taken. A ring that cannot be written to is one that nobody waits for.
@@ -233,14 +233,14 @@ impl RingFollower {
                 }
             };
             let followed = self.rings.get_mut(&block)?;
-            let (number, _) = followed.ahead.first()?;
+            let (number, _) = followed.unread.first()?;
             match followed.reader.take(number, values) {
                 Ok(Some(info)) => {
-                    followed.ahead.took();
+                    followed.unread.took();
                     return Some(followed.step(block, info, self.mark));
                 }
                 Ok(None) => {
-                    followed.ahead.overwritten(&mut followed.reader, number + 1);
+                    followed.unread.overwritten(&mut followed.reader, number + 1);
                     self.current = None;
                 }
                 Err(error) => return Some(followed.refuse(error)),
@@ -252,7 +252,7 @@ impl RingFollower {
     /// The ring to be read next, and the place of its oldest step. What is in a ring that was replaced comes first: its block is not opened anew before.
     fn next(&self, simulation: Simulation) -> Option<(u32, Place)> {
         let rings = self.rings.iter().filter(|(_, f)| f.simulation() == simulation && !f.refused && !f.ended);
-        let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.ahead));
+        let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.unread));
         choice::next(of(true)).or_else(|| choice::next(of(false)))
     }
 
@@ -260,21 +260,21 @@ impl RingFollower {
     fn look_ahead(&mut self, simulation: Simulation) -> Option<Event> {
         let mut rings: Vec<&mut Followed> =
             self.rings.values_mut().filter(|f| f.simulation() == simulation && !f.refused && !f.ended).collect();
-        let newest = rings.iter().filter_map(|followed| followed.ahead.last()).map(|(round, _)| round).max().unwrap_or(0);
+        let newest = rings.iter().filter_map(|followed| followed.unread.last()).map(|(round, _)| round).max().unwrap_or(0);
         for followed in &mut rings {
             let looked = followed.reader.is_closed().and_then(|closed| {
                 followed.closed |= closed;
-                followed.ahead.look(&mut followed.reader, newest)
+                followed.unread.look(&mut followed.reader, newest)
             });
             if let Err(error) = looked {
                 return Some(followed.refuse(error));
             }
-            followed.drained = followed.ahead.is_empty();
+            followed.drained = followed.unread.is_empty();
         }
         rings.retain(|followed| !followed.replaced);
-        let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.ahead).collect())?;
+        let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.unread).collect())?;
         for followed in rings {
-            if followed.ahead.pass(&mut followed.reader, place) {
+            if followed.unread.pass(&mut followed.reader, place) {
                 followed.acknowledge(self.mark);
             }
         }

@@ -422,7 +422,7 @@ fn hear(stream: &mut Paced, session: &mut Session, limit: Duration) -> Result<Op
 }
 
 /// Where a relay is; usually what its connection file says now.
-pub type Place = Box<dyn Fn() -> Result<ConnectionFile, WireError> + Send>;
+pub type Whereabouts = Box<dyn Fn() -> Result<ConnectionFile, WireError> + Send>;
 
 /// Follows a relay; connects anew whenever the connection breaks.
 pub struct RelayFollower {
@@ -442,7 +442,7 @@ impl RelayFollower {
     ///
     /// # Errors
     /// The thread could not be started.
-    pub fn begin(place: Place, limits: Limits, gone: Duration) -> Result<Self, WireError> {
+    pub fn begin(place: Whereabouts, limits: Limits, gone: Duration) -> Result<Self, WireError> {
         // One step waits, one is being received, and the rest waits at the relay: newest wins there.
         let ((sender, events), (spare, back)) = (sync_channel(1), sync_channel(2));
         let stop = Arc::new(AtomicBool::new(false));
@@ -511,7 +511,7 @@ struct Known {
 
 /// The thread that receives.
 struct Receiving {
-    place: Place,
+    place: Whereabouts,
     limits: Limits,
     gone: Duration,
     to: SyncSender<(Event, Vec<f32>)>,
