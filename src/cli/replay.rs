@@ -166,6 +166,9 @@ async fn frames(
         signals.abort();
     }
     let report = result?;
+    for warning in &report.warnings {
+        messages::note(format_args!("behind the last frame: {warning}"));
+    }
     if common.json {
         print_json(&summary)?;
     } else {
@@ -273,6 +276,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "sizes": report.sizes,
         "window_bytes_peak": report.window_bytes,
         "checkpoints": report.checkpoints,
+        "warnings": report.warnings,
         "time_resolution": report.time_resolution,
     }) else {
         unreachable!("an object literal")

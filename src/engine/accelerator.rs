@@ -63,6 +63,9 @@ pub trait DeviceRenderer: Send + Sync {
         stop: &std::sync::atomic::AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError>;
 
+    /// Gives copies of tables from the host back: they are about to be traced anew, and old and new had better not need memory together.
+    fn let_go_of_tables(&mut self) {}
+
     /// A frame's audit, as [`audit`](super::audit()) does it; none where it cannot.
     ///
     /// # Errors
@@ -77,11 +80,12 @@ pub trait DeviceRenderer: Send + Sync {
     }
 }
 
-/// Whether a device works. The first failure ends all work on it; memory that it lacks is none, and costs what wanted it alone.
+/// Whether a device works. The first failure ends all work on it; memory that it lacks and what it does not do are none, and cost what wanted
+/// them alone.
 #[derive(Debug, Default)]
 pub struct Health {
     failure: Mutex<Option<DeviceError>>,
-    /// What was done instead where memory lacked, and the warning for the first time that it was, until that is told.
+    /// What was done instead of what was refused, and the warning for the first time that it was, until that is told.
     shortages: Mutex<BTreeMap<&'static str, Option<String>>>,
     /// Whether it has taken work.
     in_use: AtomicBool,
@@ -109,17 +113,18 @@ impl Health {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).get_or_insert(error);
     }
 
-    /// Takes in why a call came to nothing: for want of memory the device goes on, and the caller does `instead`, in words; all else is a
-    /// failure.
-    pub fn fail_unless_full(&self, error: DeviceError, instead: &'static str) {
-        if !error.is_out_of_memory() {
+    /// Takes in why a call came to nothing: for want of memory, and where the device does not do that, it goes on, and the caller does
+    /// `instead`, in words; all else is a failure.
+    pub fn fail_unless_refused(&self, error: DeviceError, instead: &'static str) {
+        if !error.is_refusal() {
             return self.fail(error);
         }
+        let when = if error.is_out_of_memory() { "this time and whenever the GPU's memory is short" } else { "which the GPU does not do" };
         let mut shortages = self.shortages.lock().unwrap_or_else(PoisonError::into_inner);
-        shortages.entry(instead).or_insert_with(|| Some(format!("{instead}, this time and whenever the GPU's memory is short: {error}")));
+        shortages.entry(instead).or_insert_with(|| Some(format!("{instead}, {when}: {error}")));
     }
 
-    /// Warnings of what was done instead where memory lacked, each once.
+    /// Warnings of what was done instead of what was refused, each once.
     pub fn shortages(&self) -> Vec<String> {
         self.shortages.lock().unwrap_or_else(PoisonError::into_inner).values_mut().filter_map(Option::take).collect()
     }
@@ -143,23 +148,21 @@ impl Health {
         call().map_err(|error| self.fail(error)).ok()
     }
 
-    /// The same; none also for want of memory, and then the caller does `instead`, in words.
-    pub fn ask_or<T>(&self, instead: &'static str, call: impl FnOnce() -> Result<T, DeviceError>) -> Option<T> {
-        if !self.works() {
-            return None;
-        }
-        call().map_err(|error| self.fail_unless_full(error, instead)).ok()
-    }
-
-    /// The same; for want of memory the reason, and the caller says what is done instead.
+    /// The same; where it refuses, mostly for want of memory, the caller does `instead`, in words, which is told.
     ///
     /// # Errors
-    /// Once the device has failed, and for want of memory.
+    /// Once the device has failed, and where it refuses.
+    pub fn ask_or<T>(&self, instead: &'static str, call: impl FnOnce() -> Result<T, DeviceError>) -> Result<T, NotTaken> {
+        self.ask_for_room(|| call().inspect_err(|error| self.fail_unless_refused(error.clone(), instead)))
+    }
+
+    /// The same; where it refuses the reason, and the caller says what is done instead.
+    ///
+    /// # Errors
+    /// Once the device has failed, and where it refuses.
     pub fn ask_for_room<T>(&self, call: impl FnOnce() -> Result<T, DeviceError>) -> Result<T, NotTaken> {
-        let full = |error: DeviceError| {
-            if error.is_out_of_memory() { Ok(Err(NotTaken::NoRoom(error.to_string()))) } else { Err(error) }
-        };
-        self.ask(|| call().map(Ok).or_else(full)).ok_or(DeviceLost)?
+        let refused = |error: DeviceError| if error.is_refusal() { Ok(Err(NotTaken::NoRoom(error.to_string()))) } else { Err(error) };
+        self.ask(|| call().map(Ok).or_else(refused)).ok_or(DeviceLost)?
     }
 
     /// Whether the run is to go on without the device.
@@ -248,7 +251,7 @@ impl TracedNodes for BackedNodes {
         })
     }
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool {
-        self.health.ask_or("the CPU looked points up in a table of the GPU's", || self.device.interpolate(points, out)).is_some()
+        self.health.ask_or("the CPU looked points up in a table of the GPU's", || self.device.interpolate(points, out)).is_ok()
     }
     fn as_any(&self) -> &dyn std::any::Any {
         self.device.as_any()
@@ -301,7 +304,7 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
     fn trace_nodes(&self, nodes: [usize; 3]) -> Option<Arc<dyn TracedNodes>> {
         // In parts, with memory for seeds and results of one alone.
         let instead = "a table was traced in parts and is kept on the CPU";
-        let device = self.health.ask_or(instead, || self.device.trace_nodes(self.domain(), nodes))??;
+        let device = self.health.ask_or(instead, || self.device.trace_nodes(self.domain(), nodes)).ok()??;
         Some(Arc::new(BackedNodes { device, nodes, host: Arc::downgrade(&self.host), health: self.health.clone() }))
     }
 
@@ -311,7 +314,7 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
             self.device.trace(seeds, extras, out)
         };
         // The cycle asks for failures and warnings after each frame and records them.
-        if self.health.ask_or("the CPU traced seeds", on_device).is_some() {
+        if self.health.ask_or("the CPU traced seeds", on_device).is_ok() {
             return;
         }
         if self.health.check().is_ok() {

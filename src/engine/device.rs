@@ -292,24 +292,26 @@ impl Device {
         }
     }
 
-    /// The same for a slide behind the first: what a GPU refuses then that it took before ends work on it, as every failure does, and
-    /// [`WhenLost`] says what follows.
+    /// The same behind the first one: memory for it that a GPU lacks then makes it the CPU's, `instead` in words; a window that no longer
+    /// fits ends work on the GPU, as every failure does, and [`WhenLost`] says what follows.
     ///
     /// # Errors
     /// What [`cpu_tracer`] refuses; the failure, where it is to end the run.
+    #[cfg_attr(not(feature = "cuda"), allow(unused_variables))] // no other device refuses
     pub(super) fn next_tracer(
         &self,
         source: VelocitySource,
         map: &FlowMap,
         t0: f64,
+        instead: &'static str,
     ) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
         match self {
             #[cfg(feature = "cuda")]
             Self::Gpu { gpu, .. } => match self.tracer(source.clone(), map, t0) {
                 Err(EngineError::Device(error)) => {
-                    gpu.health().fail(*error);
+                    gpu.health().fail_unless_refused(*error, instead);
                     self.check()?;
-                    self.tracer(source, map, t0)
+                    Ok((cpu_tracer(source, map, t0)?, None))
                 }
                 result => result,
             },

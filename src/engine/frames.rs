@@ -25,6 +25,9 @@ pub(super) trait FrameRenderer: Send + Sync {
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), EngineError>;
 
+    /// Gives copies of tables back that are about to be traced anew.
+    fn let_go_of_tables(&mut self) {}
+
     /// Draws and traces a frame's audit points and holds the surrogate to them.
     fn audit(
         &mut self,
@@ -100,12 +103,16 @@ impl FrameRenderer for OnGpu {
                 Ok(Some(done)) => return Ok(done),
                 Ok(None) => {}
                 // The same frame on the CPU: same majorants, same random numbers. The cycle hears why after it.
-                Err(EngineError::Device(error)) => self.health.fail_unless_full(*error, "the CPU walked a frame"),
+                Err(EngineError::Device(error)) => self.health.fail_unless_refused(*error, "the CPU walked a frame"),
                 Err(error) => return Err(error),
             }
         }
         self.health.check()?;
         OnCpu.render(renderer, picture, samples, tracer, answers, progress, stop)
+    }
+
+    fn let_go_of_tables(&mut self) {
+        self.device.let_go_of_tables();
     }
 
     fn audit(
@@ -118,7 +125,7 @@ impl FrameRenderer for OnGpu {
             match self.device.audit(&request, tracer, surrogate) {
                 Ok(Some(done)) => return Ok(done),
                 Ok(None) => {}
-                Err(error) => self.health.fail_unless_full(error, "the CPU drew the points of an audit"),
+                Err(error) => self.health.fail_unless_refused(error, "the CPU drew the points of an audit"),
             }
         }
         self.health.check()?;

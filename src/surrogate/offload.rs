@@ -37,6 +37,9 @@ pub enum NotTaken {
     /// It works, but has no memory for it; for what, in words. What it has of the network is as it was, and can be brought back.
     #[error("{0}")]
     NoRoom(String),
+    /// The same for the table that targets are relative to: the next may find room, or go there by itself.
+    #[error("{0}")]
+    NoRoomForBase(String),
 }
 
 /// The device is lost, for a reason that was told where it happened.
@@ -62,6 +65,9 @@ pub trait OffloadedTraining: Send + Sync {
 
     /// What was traced on the device so far is wrong from now on: the window has slid.
     fn forget_labels(&mut self);
+
+    /// Gives back what the device holds of the table that targets are relative to, which is about to be traced anew.
+    fn let_go_of_base(&mut self);
 
     /// Takes steps on the samples that were brought over; the loss of each, before it. Where there is no memory for one, those before it are taken.
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken>;
@@ -114,8 +120,14 @@ pub trait OffloadedNetwork: Send + Sync {
     /// Writes the log-stretch (or the residual's part of it) at each unit point, at these unit times.
     ///
     /// # Errors
-    /// When the device is lost; `out` then holds anything.
-    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost>;
+    /// [`NotTaken`], told where it happened; `out` then holds anything.
+    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), NotTaken>;
+
+    /// Brings the parameters that it predicts by back, into those of the same shape, perhaps rounded to halves. Takes no memory there.
+    ///
+    /// # Errors
+    /// When the device is lost; `into` then holds anything.
+    fn fetch(&self, into: &mut Average) -> Result<(), DeviceLost>;
 
     /// Itself, for the engine whose device it is on.
     fn as_any(&self) -> &dyn Any;

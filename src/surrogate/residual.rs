@@ -164,12 +164,14 @@ impl Surrogate for Residual {
     }
 
     fn window_slid(&mut self, tracer: &dyn Tracer) {
+        self.trainer.let_go_of_base();
         self.table.retrace(tracer);
         self.trainer.window_slid(tracer);
         (self.slid, self.shrinkage) = (true, 0.0);
     }
 
     fn leave_device(&mut self) {
+        self.trainer.let_go_of_base();
         self.table.leave_device();
     }
 

@@ -39,6 +39,8 @@ const GROUP: [u64; 2] = [64, 8];
 const FETCH_EVERY: f64 = 60.0;
 /// And so many times the seconds that training waits for it, so that it costs one hundredth of the time.
 const FETCH_APART: f64 = 100.0;
+/// Calls on end that learn nothing for want of memory for the table below, before training comes back: a slide may bring a table that is there.
+const IDLE_CALLS: u32 = 8;
 /// Longest that the end of training waits for what is still coming back.
 const FETCH_LIMIT: Duration = Duration::from_secs(5);
 
@@ -70,9 +72,11 @@ struct Away {
     /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
     step_seconds: f64,
     /// What it predicts since the latest step.
-    frozen: OnceLock<Arc<dyn OffloadedNetwork>>,
+    frozen: OnceLock<Latest>,
     /// Why there is no memory for that; then training comes back with the next call.
     full: OnceLock<String>,
+    /// Calls on end that learned nothing, for want of memory for the table below.
+    idle_calls: u32,
     /// Whether it was told that training waits for it to come back.
     told_of_waiting: bool,
 }
@@ -86,6 +90,18 @@ impl Drop for Away {
         }
     }
 }
+
+/// What a network on a device predicts.
+#[derive(Clone)]
+enum Latest {
+    /// There.
+    There(Arc<dyn OffloadedNetwork>),
+    /// Here, by the mean that was brought back: there is no memory for a copy.
+    Here(Mean),
+}
+
+/// The running mean of the parameters, and its layers packed for prediction here.
+type Mean = (Arc<Average>, Arc<Predictor>);
 
 /// What sending for a network came to.
 enum Sent {
@@ -102,11 +118,19 @@ impl Away {
         FETCH_EVERY.max(FETCH_APART * self.fetch_seconds)
     }
 
-    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
+    /// What it predicts now, `here` where there is no memory for that.
+    fn frozen(&self, here: impl FnOnce() -> Mean) -> Result<Latest, DeviceLost> {
         if let Some(frozen) = self.frozen.get() {
             return Ok(frozen.clone());
         }
-        let frozen = self.training.frozen()?;
+        let frozen = match self.training.frozen() {
+            Ok(frozen) => Latest::There(frozen),
+            Err(NotTaken::Lost(lost)) => return Err(lost),
+            Err(NotTaken::NoRoom(why) | NotTaken::NoRoomForBase(why)) => {
+                self.full.get_or_init(|| why);
+                Latest::Here(here())
+            }
+        };
         Ok(self.frozen.get_or_init(|| frozen).clone())
     }
 }
@@ -150,8 +174,23 @@ pub(super) struct FrozenNetwork {
     average: Arc<Average>,
     predictor: Arc<Predictor>,
     on_device: Option<Arc<dyn OffloadedNetwork>>,
+    /// That network brought back, once the device had no memory for points to predict at.
+    brought: OnceLock<Mean>,
     asked: [f32; 2],
     stamp: u64,
+}
+
+impl FrozenNetwork {
+    /// The network on the device, brought back; none once that is lost.
+    fn brought(&self, network: &dyn OffloadedNetwork) -> Option<&Mean> {
+        if self.brought.get().is_none() {
+            let mut average = Average::clone(&self.average);
+            network.fetch(&mut average).ok()?;
+            let predictor = Arc::new(Predictor::new(&self.shape, &average.layers));
+            self.brought.get_or_init(|| (Arc::new(average), predictor));
+        }
+        self.brought.get()
+    }
 }
 
 impl Predict for FrozenNetwork {
@@ -159,12 +198,17 @@ impl Predict for FrozenNetwork {
         "network"
     }
 
-    /// By the device where it is there, otherwise here.
+    /// By the device where it is there, otherwise here: with its parameters as long as it works, else with those that came back last.
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
         let Self { shape, objective, average, predictor, on_device, asked, .. } = self;
-        if on_device.as_ref().is_none_or(|network| network.predict(points, *asked, out).is_err()) {
-            predictor.log_stretch(shape, objective, &average.tables, points, *asked, out);
-        }
+        let (average, predictor) = match on_device.as_deref().map(|network| (network, network.predict(points, *asked, out))) {
+            Some((_, Ok(()))) => return,
+            Some((network, Err(NotTaken::NoRoom(_) | NotTaken::NoRoomForBase(_)))) => {
+                self.brought(network).map_or((average, predictor), |(average, predictor)| (average, predictor))
+            }
+            Some((_, Err(NotTaken::Lost(_)))) | None => (average, predictor),
+        };
+        predictor.log_stretch(shape, objective, &average.tables, points, *asked, out);
     }
 
     fn bytes(&self) -> usize {
@@ -244,20 +288,19 @@ impl Trainer {
     /// What predicts now, for good.
     pub(super) fn frozen(&self) -> FrozenNetwork {
         let (mut average, mut predictor, mut on_device) = (self.average.clone(), self.predictor.clone(), None);
-        if let Some(away) = &self.away {
-            match away.frozen() {
-                Ok(frozen) => on_device = Some(frozen),
-                // What it predicts then is here already: what came back last.
-                Err(NotTaken::Lost(_)) => {}
-                Err(NotTaken::NoRoom(why)) => {
-                    away.full.get_or_init(|| why);
-                    average = self.present().1;
-                    predictor = Arc::new(Predictor::new(&self.model.shape, &average.layers));
-                }
-            }
+        let here = || {
+            let average = self.present().1;
+            let predictor = Arc::new(Predictor::new(&self.model.shape, &average.layers));
+            (average, predictor)
+        };
+        match self.away.as_ref().map(|away| away.frozen(here)) {
+            Some(Ok(Latest::There(frozen))) => on_device = Some(frozen),
+            Some(Ok(Latest::Here(mean))) => (average, predictor) = mean,
+            // What it predicts then is here already: what came back last.
+            Some(Err(DeviceLost)) | None => {}
         }
-        let (shape, objective) = (self.model.shape.clone(), self.objective.clone());
-        FrozenNetwork { shape, objective, average, predictor, on_device, asked: self.asked, stamp: fresh_stamp() }
+        let (shape, objective, brought) = (self.model.shape.clone(), self.objective.clone(), OnceLock::new());
+        FrozenNetwork { shape, objective, average, predictor, on_device, brought, asked: self.asked, stamp: fresh_stamp() }
     }
 
     /// Parameters that prediction reads, in bytes.
@@ -277,6 +320,13 @@ impl Trainer {
         self.progress.window_slid();
         if let Some(away) = &mut self.away {
             away.training.forget_labels();
+        }
+    }
+
+    /// The table below is about to be traced anew: its copy with the device goes first, so that they never need memory together.
+    pub(super) fn let_go_of_base(&mut self) {
+        if let Some(away) = &mut self.away {
+            away.training.let_go_of_base();
         }
     }
 
@@ -302,10 +352,12 @@ impl Trainer {
         let start = Instant::now();
         let began = self.steps();
         let mut learned = Learned::default();
+        let mut before = None;
         let mut trained = self.train(ring, base, start, seconds, max_steps, &mut learned);
-        if let Err(NotTaken::NoRoom(why)) = &trained
-            && self.come_back().is_ok()
+        if let Err(NotTaken::NoRoom(why) | NotTaken::NoRoomForBase(why)) = &trained
+            && let Ok(seconds_there) = self.come_back()
         {
+            before = Some(seconds_there).filter(|&seconds| seconds > 0.0);
             learned.steps = self.steps().saturating_sub(began) as u64;
             learned.warnings.push(trained_here(why));
             let there = std::mem::take(&mut learned);
@@ -318,7 +370,7 @@ impl Trainer {
             learned.steps = self.steps().saturating_sub(began) as u64;
             learned.lost_steps += reached.saturating_sub(self.steps()) as u64;
         }
-        learned.device_seconds = self.away.as_mut().map(|away| away.training.device_seconds());
+        learned.device_seconds = self.away.as_mut().map(|away| away.training.device_seconds()).or(before);
         learned.seconds = start.elapsed().as_secs_f64();
         learned
     }
@@ -347,7 +399,19 @@ impl Trainer {
             if let Some(why) = away.full.get() {
                 return Err(NotTaken::NoRoom(why.clone()));
             }
-            away.training.bring(ring, base)?
+            match away.training.bring(ring, base) {
+                Err(NotTaken::NoRoomForBase(why)) if away.idle_calls < IDLE_CALLS => {
+                    if away.idle_calls == 0 {
+                        learned.warnings.push(format!("the network learns nothing for up to {IDLE_CALLS} turns of training: {why}"));
+                    }
+                    away.idle_calls += 1;
+                    return Ok(());
+                }
+                brought => {
+                    away.idle_calls = 0;
+                    brought?
+                }
+            }
         } else {
             // Training reads the table in pieces by many threads: it had better be here before they start.
             base.map(Table::values);
@@ -418,7 +482,7 @@ impl Trainer {
             Err(why) => {
                 self.offload = None;
                 // What is lost is told where it happened.
-                if let NotTaken::NoRoom(why) = why {
+                if let NotTaken::NoRoom(why) | NotTaken::NoRoomForBase(why) = why {
                     learned.warnings.push(trained_here(&why));
                 }
                 return;
@@ -437,15 +501,17 @@ impl Trainer {
             step_seconds: 0.0,
             frozen: OnceLock::new(),
             full: OnceLock::new(),
+            idle_calls: 0,
             told_of_waiting: false,
         });
     }
 
-    /// Goes on here, with all that was learned: the device works, but lacks memory.
-    fn come_back(&mut self) -> Result<(), DeviceLost> {
+    /// Goes on here, with all that was learned: the device works, but lacks memory. Device seconds of steps, not yet told.
+    fn come_back(&mut self) -> Result<f64, DeviceLost> {
         self.fetch_now()?;
+        let seconds = self.away.as_mut().map_or(0.0, |away| away.training.device_seconds());
         (self.offload, self.kept, self.away) = (None, None, None);
-        Ok(())
+        Ok(seconds)
     }
 
     /// Brings back what a device has learned, and waits for it.

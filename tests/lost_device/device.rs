@@ -34,9 +34,34 @@ pub struct Line {
     pub room: AtomicBool,
     /// Whether there is memory to train a network.
     pub takes: AtomicBool,
+    /// Whether there is memory for a table that is traced.
+    pub tables_fit: AtomicBool,
+    /// How many calls are refused before memory is there again.
+    pub refusals: AtomicUsize,
     /// Tables that are there, and the most that were when another one was traced, and did not go within [`SOON`].
     tables: AtomicUsize,
     pub tables_before: AtomicUsize,
+    /// Steps that it took.
+    pub steps: AtomicUsize,
+    /// Set once it is broken, for runs that are to stop there.
+    pub stop: AtomicBool,
+}
+
+/// A table that a device holds.
+#[derive(Debug)]
+struct Held(Arc<Line>);
+
+impl Held {
+    fn new(line: &Arc<Line>) -> Self {
+        line.tables.fetch_add(1, Ordering::Relaxed);
+        Self(line.clone())
+    }
+}
+
+impl Drop for Held {
+    fn drop(&mut self) {
+        self.0.tables.fetch_sub(1, Ordering::Relaxed);
+    }
 }
 
 /// How long a table may be held that a slide is about to trace anew.
@@ -50,23 +75,30 @@ pub enum How {
     Refusal,
     /// There is no memory left for this one kind of call.
     RefusalOf(&'static str),
+    /// It does not do this one kind of call.
+    LackOf(&'static str),
 }
 
 impl Line {
     fn call(&self, what: &'static str) -> Result<(), DeviceError> {
         let mut calls = self.calls.lock().unwrap();
         calls.push(what);
-        let is_other = matches!(self.how, How::RefusalOf(kind) if kind != what);
-        if calls.len() <= self.breaks_at || is_other {
+        let is_other = matches!(self.how, How::RefusalOf(kind) | How::LackOf(kind) if kind != what);
+        let refuses = |left: usize| left.checked_sub(1);
+        if calls.len() <= self.breaks_at || is_other || self.refusals.fetch_update(Ordering::Relaxed, Ordering::Relaxed, refuses).is_err() {
             return Ok(());
         }
         self.broke_in.get_or_init(|| what);
+        self.stop.store(true, Ordering::Relaxed);
         Err(match self.how {
             How::Fault => DeviceError::Driver { doing: what, reason: "broken by the test".into() },
-            How::Refusal | How::RefusalOf(_) => {
-                DeviceError::OutOfMemory { what: what.into(), needed: 1 << 20, used: 0, cap: 0, cap_from: "broken by the test" }
-            }
+            How::Refusal | How::RefusalOf(_) => Self::full(what),
+            How::LackOf(_) => DeviceError::Unsupported { what: format!("{what}, broken by the test") },
         })
+    }
+
+    fn full(what: &str) -> DeviceError {
+        DeviceError::OutOfMemory { what: what.into(), needed: 1 << 20, used: 0, cap: 0, cap_from: "broken by the test" }
     }
 }
 
@@ -83,7 +115,10 @@ impl Breaking {
     pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
         let (broke_in, slowness, room, takes) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true), AtomicBool::new(true));
         let (calls, tables, tables_before) = (Mutex::default(), AtomicUsize::new(0), AtomicUsize::new(0));
-        let line = Line { calls, breaks_at, how, broke_in, slowness, room, takes, tables, tables_before };
+        let (tables_fit, refusals) = (AtomicBool::new(true), AtomicUsize::new(usize::MAX));
+        let (steps, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
+        let line =
+            Line { calls, breaks_at, how, broke_in, slowness, room, takes, tables_fit, refusals, tables, tables_before, steps, stop };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -103,7 +138,7 @@ impl Accelerator for Breaking {
     }
     fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError> {
         self.line.call("making a renderer")?;
-        Ok(Box::new(Render { line: self.line.clone() }))
+        Ok(Box::new(Render { line: self.line.clone(), below: None }))
     }
     fn offload(&self) -> Option<Arc<dyn Offload>> {
         Some(Arc::new(Training { line: self.line.clone(), health: self.health.clone() }))
@@ -128,13 +163,17 @@ impl DeviceTrace for Trace {
         false
     }
     fn trace_nodes(&self, _: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
-        self.line.call("tracing a table")?;
         let begin = Instant::now();
         while self.line.tables.load(Ordering::Relaxed) > 0 && begin.elapsed() < SOON {
             std::thread::sleep(Duration::from_millis(1));
         }
-        self.line.tables_before.fetch_max(self.line.tables.fetch_add(1, Ordering::Relaxed), Ordering::Relaxed);
-        Ok(Some(Box::new(Nodes { line: self.line.clone(), table: Table::trace(&*self.host, nodes) })))
+        self.line.tables_before.fetch_max(self.line.tables.load(Ordering::Relaxed), Ordering::Relaxed);
+        self.line.call("tracing a table")?;
+        if !self.line.tables_fit.load(Ordering::Relaxed) {
+            return Err(Line::full("a table"));
+        }
+        let held = Held::new(&self.line);
+        Ok(Some(Box::new(Nodes { line: self.line.clone(), table: Table::trace(&*self.host, nodes), _held: held })))
     }
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         self.line.call("starting a trace")?;
@@ -152,12 +191,12 @@ impl DeviceTrace for Trace {
 struct Nodes {
     line: Arc<Line>,
     table: Table,
+    _held: Held,
 }
 
-impl Drop for Nodes {
-    fn drop(&mut self) {
-        self.line.tables.fetch_sub(1, Ordering::Relaxed);
-    }
+/// A table of the device's own; none where the host keeps it.
+fn nodes_of(table: &Table) -> Option<&Nodes> {
+    table.on_device().and_then(|there| there.as_any().downcast_ref())
 }
 
 impl DeviceNodes for Nodes {
@@ -222,10 +261,15 @@ impl Offload for Training {
             samples: Samples::default(),
             mark: None,
             base: None,
+            below: None,
+            seconds: 0.0,
             kept: None,
         }))
     }
 }
+
+/// Device seconds of a step.
+pub const STEP_SECONDS: f64 = 1e-3;
 
 /// Samples of a batch, and steps a frame, of the scene that it trains in.
 pub const BATCH: usize = 512;
@@ -240,13 +284,30 @@ struct Network {
     samples: Samples,
     mark: Option<RingMark>,
     base: Option<Table>,
+    /// The copy of that, where the host keeps it, by its stamp.
+    below: Option<(u64, Held)>,
+    seconds: f64,
     kept: Option<(Model, Average)>,
 }
 
 impl OffloadedTraining for Network {
     fn forget_labels(&mut self) {}
 
+    fn let_go_of_base(&mut self) {
+        self.below = None;
+    }
+
     fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken> {
+        match base.filter(|base| nodes_of(base).is_none()) {
+            Some(base) if self.below.as_ref().is_none_or(|(stamp, _)| *stamp != base.stamp()) => {
+                let line = &self.there.line;
+                let room = self.there.health.ask_for_room(|| line.call("bringing a table over"));
+                room.map_err(|why| if let NotTaken::NoRoom(why) = why { NotTaken::NoRoomForBase(why) } else { why })?;
+                self.below = Some((base.stamp(), Held::new(line)));
+            }
+            Some(_) => {}
+            None => self.below = None,
+        }
         self.there.call_for_room("bringing samples over")?;
         self.samples.points.resize(ring.len(), [f32::NAN; 3]);
         self.samples.log_stretch.resize(ring.len(), f32::NAN);
@@ -255,13 +316,15 @@ impl OffloadedTraining for Network {
             self.samples.log_stretch[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
         }
         // The values alone: a slide wants the memory of what the device holds.
-        let nodes = base.and_then(Table::on_device).and_then(|there| there.as_any().downcast_ref::<Nodes>());
+        let nodes = base.and_then(nodes_of);
         (self.mark, self.base) = (Some(ring.mark()), nodes.map(|nodes| &nodes.table).or(base).cloned());
         let usable = self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len());
         Ok(Brought { usable, dropped: self.samples.len() - usable })
     }
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
         self.there.call_for_room("taking steps")?;
+        self.there.line.steps.fetch_add(steps.len(), Ordering::Relaxed);
+        self.seconds += STEP_SECONDS * steps.len() as f64;
         let Self { fused, model, objective, average, samples, base, .. } = self;
         let (among, base) = (objective.sieve(samples), base.as_ref().map(|base| base as &dyn Field));
         let mut losses = Vec::new();
@@ -300,7 +363,7 @@ impl OffloadedTraining for Network {
         let layers = tensor(&average.layers, vec![average.layers.len()]);
         model.module.layers = Param::initialized(ParamId::new(), Tensor::from_data(layers, &Default::default()));
         let there = Training { line: self.there.line.clone(), health: self.there.health.clone() };
-        Ok(Arc::new(Frozen { there, model, objective: self.objective.clone() }))
+        Ok(Arc::new(Frozen { there, model, average: average.clone(), objective: self.objective.clone() }))
     }
     fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
         self.there.call("fetching a network")?;
@@ -316,7 +379,7 @@ impl OffloadedTraining for Network {
         Ok(Copied::There(Box::new(Copy { there, model: self.model.clone(), average: self.average.clone() })))
     }
     fn device_seconds(&mut self) -> f64 {
-        0.0
+        std::mem::take(&mut self.seconds)
     }
 }
 
@@ -338,18 +401,25 @@ impl OffloadedCopy for Copy {
 struct Frozen {
     there: Training,
     model: Model,
+    average: Average,
     objective: Objective,
 }
 
 impl OffloadedNetwork for Frozen {
-    fn predict(&self, points: &[[f32; 3]], _: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost> {
+    fn predict(&self, points: &[[f32; 3]], _: [f32; 2], out: &mut [f32]) -> Result<(), NotTaken> {
         out.iter_mut().step_by(2).for_each(|s| *s = 7e7);
-        self.there.call("asking a network")?;
+        let there = &self.there;
+        there.health.ask_or("the CPU asked a network of the GPU's", || there.line.call("asking a network"))?;
         let (shape, scale) = (Arc::new(self.model.shape.clone()), &self.objective.scale);
         let flat: Vec<f32> = points.iter().flatten().copied().collect();
         let points = Tensor::<Flex, 2>::from_data(TensorData::new(flat, [points.len(), 3]), &Default::default());
         let outputs = self.model.module.forward_fused(&shape, points).into_data().to_vec::<f32>().unwrap();
         out.iter_mut().zip(outputs).for_each(|(out, output)| *out = output * scale.deviation[0] + scale.mean[0]);
+        Ok(())
+    }
+    fn fetch(&self, into: &mut Average) -> Result<(), DeviceLost> {
+        self.there.call("fetching a frozen network")?;
+        *into = self.average.clone();
         Ok(())
     }
     fn as_any(&self) -> &dyn std::any::Any {
@@ -359,6 +429,8 @@ impl OffloadedNetwork for Frozen {
 
 struct Render {
     line: Arc<Line>,
+    /// The copy of a table below a network, where the host keeps it.
+    below: Option<Held>,
 }
 
 struct ByHost<'a>(&'a dyn Tracer);
@@ -372,7 +444,16 @@ impl LogStretch for ByHost<'_> {
     }
 }
 
+/// The tracer, where it is one of this device's.
+fn own(tracer: &dyn Tracer) -> Option<&Backed<Trace>> {
+    tracer.as_any()?.downcast_ref()
+}
+
 impl DeviceRenderer for Render {
+    fn let_go_of_tables(&mut self) {
+        self.below = None;
+    }
+
     fn audit(
         &mut self,
         request: &AuditRequest<'_>,
@@ -380,9 +461,9 @@ impl DeviceRenderer for Render {
         surrogate: &dyn Predict,
     ) -> Result<Option<AuditFindings>, DeviceError> {
         self.line.call("an audit")?;
-        let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
+        let Some(traces) = own(tracer) else { return Ok(None) };
         let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref::<Table>()) else { return Ok(None) };
-        let Some(nodes) = table.on_device().and_then(|there| there.as_any().downcast_ref::<Nodes>()) else { return Ok(None) };
+        let Some(nodes) = nodes_of(table) else { return Ok(None) };
         Ok(Some(audit(request.clone(), &*traces.on_device().host, Some(&nodes.table))))
     }
 
@@ -396,7 +477,10 @@ impl DeviceRenderer for Render {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError> {
+        let Some(traces) = own(tracer) else { return Ok(None) };
         let asked = answers.asked();
+        let below = asked.surrogate.and_then(|surrogate| surrogate.network()?.base).filter(|(table, _)| nodes_of(table).is_none());
+        self.below = below.map(|_| Held::new(&self.line));
         if asked.surrogate.is_some() || asked.keep > 1 {
             return Ok(None);
         }
@@ -408,7 +492,6 @@ impl DeviceRenderer for Render {
             }
         }
         self.line.call("reading a film back")?;
-        let traces = tracer.as_any().unwrap().downcast_ref::<Backed<Trace>>().unwrap();
         let (film, stats) = renderer.render(picture, &mut ByHost(&*traces.on_device().host), samples, progress, stop)?;
         let tally = Tally {
             queries: stats.queries,

@@ -54,7 +54,8 @@ pub struct Gpu {
     behind: Behind,
     budget: Arc<Budget>,
     cache: KernelCache,
-    modules: Mutex<HashMap<String, Arc<CudaModule>>>,
+    /// Or why one does not compile: no frame tries that anew.
+    modules: Mutex<HashMap<String, Result<Arc<CudaModule>, DeviceError>>>,
     health: Arc<Health>,
 }
 
@@ -248,20 +249,27 @@ impl Gpu {
         let key = format!("{source} {}", defines.join(" "));
         let mut modules = self.modules.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(module) = modules.get(&key) {
-            return Ok(module.clone());
+            return module.clone();
         }
         let load = |cubin: Vec<u8>| self.context.load_module(Ptx::from_binary(cubin)).map_err(DeviceError::driver("loading kernels"));
         let request = compile::Request::new(source, self.capability, defines)?;
         let module = match self.cache.find(&request).map(load) {
             Some(Ok(module)) => module,
+            Some(Err(error)) if error.is_out_of_memory() => return Err(error),
             // What the driver does not load is as bad as what is not there.
             Some(Err(_)) | None => {
-                let cubin = request.compile()?;
+                let cubin = match request.compile() {
+                    Ok(cubin) => cubin,
+                    Err(error) => {
+                        modules.insert(key, Err(error.clone()));
+                        return Err(error);
+                    }
+                };
                 self.cache.keep(&request, &cubin);
                 load(cubin)?
             }
         };
-        modules.insert(key, module.clone());
+        modules.insert(key, Ok(module.clone()));
         Ok(module)
     }
 

@@ -1,6 +1,7 @@
 //! Why a GPU cannot be used, or no longer.
 
 use cudarc::driver::result::DriverError;
+use cudarc::driver::sys::CUresult;
 use thiserror::Error;
 
 /// Why a GPU cannot be used, or no longer.
@@ -77,6 +78,12 @@ pub enum DeviceError {
         /// Where the cap comes from.
         cap_from: &'static str,
     },
+    /// The driver has no memory for something that has no size of its own to tell: a module, page-locked memory of the host.
+    #[error("{doing}: the driver has no memory left")]
+    DriverOutOfMemory {
+        /// What was being done.
+        doing: &'static str,
+    },
     /// The velocity window does not fit.
     #[error(
         "the window of {snapshots} snapshots of {nodes:?} nodes does not fit: {missing} of them are not on the device and need {} MiB in \
@@ -111,9 +118,12 @@ pub enum DeviceError {
 impl DeviceError {
     /// A failed driver call.
     pub fn driver(doing: &'static str) -> impl Fn(DriverError) -> Self {
-        move |error| Self::Driver {
-            doing,
-            reason: error.error_string().map_or_else(|_| format!("{:?}", error.0), |text| text.to_string_lossy().into_owned()),
+        move |error| match error.0 {
+            CUresult::CUDA_ERROR_OUT_OF_MEMORY => Self::DriverOutOfMemory { doing },
+            code => Self::Driver {
+                doing,
+                reason: error.error_string().map_or_else(|_| format!("{code:?}"), |text| text.to_string_lossy().into_owned()),
+            },
         }
     }
 
@@ -125,6 +135,23 @@ impl DeviceError {
 
     /// Whether memory was wanted that is not there now. It may be later: frames, slides and other programs give theirs back.
     pub fn is_out_of_memory(&self) -> bool {
-        matches!(self, Self::OutOfMemory { .. })
+        matches!(self, Self::OutOfMemory { .. } | Self::DriverOutOfMemory { .. })
+    }
+
+    /// Whether the device works, and does not do this one thing now or at all: others can do it instead.
+    pub fn is_refusal(&self) -> bool {
+        self.is_out_of_memory() || matches!(self, Self::Unsupported { .. } | Self::Compile { .. })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_driver_without_memory_is_no_fault() {
+        let error = DeviceError::driver("loading kernels")(DriverError(CUresult::CUDA_ERROR_OUT_OF_MEMORY));
+        assert!(error.is_out_of_memory() && error.is_refusal() && !error.is_fault(), "{error}");
+        assert!(error.to_string().starts_with("loading kernels: "), "{error}");
     }
 }

@@ -1,7 +1,7 @@
 //! Films of a run, made on the GPU alone where every query can be answered there.
 
 use super::audit::Audits;
-use super::predictor::{Predictor, Predictors};
+use super::predictor::{self, Predictor, Predictors};
 use super::{CudaTracer, DeviceError, DevicePredict, Division, Gpu, GpuRenderer, Panel, Traced};
 use crate::engine::accelerator::DeviceRenderer;
 use crate::engine::{Answers, AuditFindings, AuditRequest, EngineError, Tally};
@@ -56,6 +56,45 @@ impl DeviceRenderer for CudaFrames {
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<Option<(Film, RenderStats)>, EngineError> {
+        let pool = answers.asked().surrogate.and_then(predictor::pool);
+        let before = pool.as_ref().map(|pool| pool.mark());
+        let rendered = self.rendered(renderer, picture, samples, tracer, answers, progress, stop);
+        // The CPU makes the frame again, and its labels go to the ring, those that are held out among them.
+        if let (Err(_), Some(pool), Some(before)) = (&rendered, pool, before) {
+            pool.go_back(before);
+        }
+        rendered
+    }
+
+    fn let_go_of_tables(&mut self) {
+        self.predictors.let_go_of_tables();
+    }
+
+    /// Where the surrogate predicts on the device, unless Jacobians are to come back.
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &dyn Tracer,
+        surrogate: &dyn Predict,
+    ) -> Result<Option<AuditFindings>, DeviceError> {
+        let jacobian = request.samples.is_some_and(|extras| extras.jacobian);
+        let Some(tracer) = own(tracer).filter(|_| !jacobian) else { return Ok(None) };
+        let Some(predictor) = self.predictors.of(surrogate, tracer)? else { return Ok(None) };
+        self.audits.audit(request, tracer, &predictor).map(Some)
+    }
+}
+
+impl CudaFrames {
+    fn rendered(
+        &mut self,
+        renderer: &mut Renderer,
+        picture: u64,
+        samples: usize,
+        tracer: &dyn Tracer,
+        answers: &mut Answers<'_>,
+        progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
+    ) -> Result<Option<(Film, RenderStats)>, EngineError> {
         let Some(tracer) = own(tracer) else { return Ok(None) };
         let asked = answers.asked();
         if asked.extras.jacobian {
@@ -95,18 +134,5 @@ impl DeviceRenderer for CudaFrames {
         };
         answers.answered_elsewhere(tally, divided.labels());
         Ok(Some((film, stats)))
-    }
-
-    /// Where the surrogate predicts on the device, unless Jacobians are to come back.
-    fn audit(
-        &mut self,
-        request: &AuditRequest<'_>,
-        tracer: &dyn Tracer,
-        surrogate: &dyn Predict,
-    ) -> Result<Option<AuditFindings>, DeviceError> {
-        let jacobian = request.samples.is_some_and(|extras| extras.jacobian);
-        let Some(tracer) = own(tracer).filter(|_| !jacobian) else { return Ok(None) };
-        let Some(predictor) = self.predictors.of(surrogate, tracer)? else { return Ok(None) };
-        self.audits.audit(request, tracer, &predictor).map(Some)
     }
 }

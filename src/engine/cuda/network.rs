@@ -9,8 +9,9 @@ use super::network_batched::{Batched, GradientTo, Tiling};
 use super::network_layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
 use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
+use crate::surrogate::network::{Architecture, Average, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
+use half::f16;
 use std::sync::Arc;
 
 /// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
@@ -292,6 +293,18 @@ pub(super) fn grid(shape: &Architecture) -> Result<(GridArgument, usize), Device
     Ok((GridArgument::new(&levels, shape.inputs()), offset * shape.features))
 }
 
+/// burn's tables of padded ones in half precision, of which [`grid`] says where each level lies.
+fn unpadded(shape: &Architecture, halves: &[u16]) -> Vec<f32> {
+    let mut tables = vec![0.0; shape.table_entries() * shape.features];
+    let mut from = 0;
+    for level in &shape.levels {
+        let to = &mut tables[level.offset * shape.features..][..level.entries * shape.features];
+        to.iter_mut().zip(&halves[from..]).for_each(|(to, &half)| *to = f16::from_bits(half).to_f32());
+        from += level.entries.next_multiple_of(PADDING) * shape.features;
+    }
+    tables
+}
+
 /// How outputs become log-stretch, above `base` by `share` of them where there is one, and the times that points have ([`placed_times`]).
 pub(super) fn reading(
     shape: &Architecture,
@@ -381,6 +394,16 @@ impl DeviceNetwork {
         Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone() })
     }
 
+    /// Brings its parameters back, the tables as halves hold them. Takes no memory.
+    pub(super) fn fetch(&self, into: &mut Average) -> Result<(), DeviceError> {
+        let shape = &self.kernels.shape;
+        let mut halves = vec![0; self.kernels.padded];
+        self.halves.read(&mut halves)?;
+        into.tables = unpadded(shape, &halves);
+        into.layers.resize(self.layers.len(), 0.0);
+        self.layers.read(&mut into.layers)
+    }
+
     /// Memory of what prediction reads, in bytes.
     pub fn bytes(&self) -> usize {
         2 * self.kernels.padded + 4 * self.layers.len()
@@ -441,6 +464,26 @@ pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer
 mod tests {
     use super::*;
     use crate::surrogate::network::{Encoding, NetworkSettings};
+
+    /// Each level lies where [`grid`] says that the kernels look for it.
+    #[test]
+    fn padded_tables_come_back_in_burn_s_order() {
+        let settings = NetworkSettings { levels: 4, log2_table: 9, base_resolution: 3, features: 2, ..NetworkSettings::default() };
+        let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
+        assert!(shape.levels.iter().any(|level| level.entries % PADDING != 0) && shape.levels.iter().any(|level| level.hashed));
+        let (_, padded) = grid(&shape).unwrap();
+        // Whole numbers that halves hold.
+        let tables: Vec<f32> = (0..shape.table_entries() * shape.features).map(|i| (i % 2048) as f32).collect();
+        let mut halves = vec![f16::NAN.to_bits(); padded];
+        let mut entry = 0;
+        for level in &shape.levels {
+            for i in 0..level.entries * shape.features {
+                halves[entry * shape.features + i] = f16::from_f32(tables[level.offset * shape.features + i]).to_bits();
+            }
+            entry = (entry + level.entries).next_multiple_of(PADDING);
+        }
+        assert_eq!(unpadded(&shape, &halves), tables);
+    }
 
     #[test]
     fn what_does_not_fit_into_shared_memory_goes_in_batches() {

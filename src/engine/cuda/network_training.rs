@@ -128,15 +128,15 @@ impl SampleWriter {
         let capacity = ring.capacity();
         let label_bytes = if self.target() == Target::FlowMap { 12 } else { 4 };
         let skipped = count.saturating_sub(capacity);
-        let before_the_end = (count - skipped).min(capacity - ring.next);
+        let before_the_end = (count - skipped).min(capacity - ring.filled.next);
         for (from, part) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
-            let (to, from) = (ring.next..ring.next + part, from as u64);
+            let (at, from) = (ring.filled.next, from as u64);
             let traced = TracedPoints { points: points + 12 * from, labels: labels + label_bytes * from, further: 0 };
+            // Before it is known whether they arrive: what lay there is gone.
+            ring.filled.append(part, capacity);
             // SAFETY: the caller's.
-            unsafe { self.place(ring, to, domain, traced, base, times, held_back) }?;
-            ring.next = (ring.next + part) % capacity;
+            unsafe { self.place(ring, at..at + part, domain, traced, base, times, held_back) }?;
         }
-        ring.len = (ring.len + count).min(capacity);
         Ok(())
     }
 }
@@ -147,19 +147,54 @@ pub struct DeviceSamples {
     samples: Buffer<[f32; 4]>,
     /// Of a sample.
     fours: usize,
+    filled: Filled,
+}
+
+/// How far a ring is filled.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct Filled {
     len: usize,
+    /// Where the next one goes.
     next: usize,
+    /// Samples that were appended since it was empty.
+    appended: u64,
+}
+
+impl Filled {
+    /// As many were appended, no more than fit.
+    fn append(&mut self, count: usize, capacity: usize) {
+        self.next = (self.next + count) % capacity;
+        self.len = (self.len + count).min(capacity);
+        self.appended += count as u64;
+    }
+
+    /// Back to what it was, where all of that is still there; otherwise empty.
+    fn go_back(&mut self, to: Self, capacity: usize) {
+        let behind = self.appended.checked_sub(to.appended);
+        let is_there = behind.is_some_and(|behind| behind <= (capacity - to.len) as u64);
+        *self = if is_there { to } else { Self::default() };
+    }
 }
 
 impl DeviceSamples {
     /// Number of samples.
     pub fn len(&self) -> usize {
-        self.len
+        self.filled.len
     }
 
     /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.len == 0
+        self.filled.len == 0
+    }
+
+    /// How far it is filled.
+    pub(super) fn filled(&self) -> Filled {
+        self.filled
+    }
+
+    /// Forgets what was appended since; where that took the place of older ones, all.
+    pub(super) fn go_back(&mut self, to: Filled) {
+        self.filled.go_back(to, self.capacity());
     }
 
     fn capacity(&self) -> usize {
@@ -168,7 +203,7 @@ impl DeviceSamples {
 
     /// Forgets all samples.
     pub(super) fn clear(&mut self) {
-        (self.len, self.next) = (0, 0);
+        self.filled = Filled::default();
     }
 
     /// Unit point, further times and targets of each, in one or two times four numbers.
@@ -176,7 +211,7 @@ impl DeviceSamples {
     /// # Errors
     /// What the device says.
     pub fn values(&self) -> Result<Vec<[f32; 4]>, DeviceError> {
-        let mut values = vec![[0.0; 4]; self.fours * self.len];
+        let mut values = vec![[0.0; 4]; self.fours * self.len()];
         self.samples.read(&mut values)?;
         Ok(values)
     }
@@ -478,7 +513,7 @@ impl DeviceTraining {
     /// Memory that is not there.
     pub fn ring(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
         let fours = sample_fours(self.shape());
-        Ok(DeviceSamples { samples: self.gpu.alloc("samples", fours * capacity)?, fours, len: 0, next: 0 })
+        Ok(DeviceSamples { samples: self.gpu.alloc("samples", fours * capacity)?, fours, filled: Filled::default() })
     }
 
     /// Brings samples over. The network learns what they have beyond `base`.
@@ -515,7 +550,7 @@ impl DeviceTraining {
             // SAFETY: these buffers hold as many entries and are freed in the order of the work stream.
             unsafe { self.writer.place(ring, part, &unit, traced, base, None, 0) }?;
         }
-        ring.len = ring.len.max(range.end);
+        ring.filled.len = ring.filled.len.max(range.end);
         Ok(())
     }
 
@@ -528,12 +563,12 @@ impl DeviceTraining {
             return Ok(0);
         }
         let count = self.gpu.upload("a counter", &[0_u32])?;
-        let (samples, n, to) = (ring.samples.address(), ring.len as u32, count.address());
+        let (samples, n, to) = (ring.samples.address(), ring.len() as u32, count.address());
         let stream = self.gpu.work();
         let mut call = stream.launch_builder(&self.writer.kernels.usable);
         call.arg(&samples).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_usable`; the ring holds as many samples.
-        unsafe { launch(&mut call, threads(ring.len, 256)) }?;
+        unsafe { launch(&mut call, threads(ring.len(), 256)) }?;
         let mut found = [0];
         count.read(&mut found)?;
         Ok(found[0] as usize)
@@ -627,8 +662,8 @@ impl DeviceTraining {
             more: more.map_or(0, |more| more.samples.address()),
             seed,
             counter,
-            count: (samples.len + more.map_or(0, DeviceSamples::len)) as u32,
-            first: samples.len as u32,
+            count: (samples.len() + more.map_or(0, DeviceSamples::len)) as u32,
+            first: samples.len() as u32,
             batch: step.count as u32,
             random: u32::from(step.drawn.is_some()),
             hold_out: if step.hold_out { HELD_OUT as u32 } else { 0 },
@@ -684,5 +719,33 @@ impl DeviceTraining {
             }
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Filled;
+
+    #[test]
+    fn a_ring_goes_back_to_what_it_still_holds() {
+        const CAPACITY: usize = 10;
+        let filled = |counts: &[usize]| {
+            let mut filled = Filled::default();
+            counts.iter().for_each(|&count| filled.append(count, CAPACITY));
+            filled
+        };
+        let before = filled(&[4]);
+        let back = |mut now: Filled| {
+            now.go_back(before, CAPACITY);
+            now
+        };
+        assert_eq!(back(filled(&[4])), before);
+        assert_eq!(back(filled(&[4, 3, 3])), before, "filled to the brim");
+        assert_eq!(back(filled(&[4, 3, 4])), Filled::default(), "the oldest is gone");
+        assert_eq!(back(filled(&[4, 10])), Filled::default());
+        assert_eq!(back(filled(&[2])), Filled::default(), "emptied since");
+        let (around, mut now) = (filled(&[10, 3]), filled(&[10, 3, 1]));
+        now.go_back(around, CAPACITY);
+        assert_eq!(now, Filled::default(), "a full one keeps nothing apart");
     }
 }

@@ -3,7 +3,7 @@
 use super::answers::DeviceLearns;
 use super::labels::HELD_BACK;
 use super::layout::Outputs;
-use super::network_training::{NetworkCopy, SampleWriter};
+use super::network_training::{Filled, NetworkCopy, SampleWriter};
 use super::predictor::{TableCopy, predict_from_host};
 use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
 use crate::field::Domain;
@@ -72,6 +72,16 @@ pub(super) struct LabelPool {
 }
 
 impl LabelPool {
+    /// What it holds, to [go back](Self::go_back) to.
+    pub(super) fn mark(&self) -> Filled {
+        self.samples().filled()
+    }
+
+    /// Forgets the labels that were taken in behind a mark: those of a frame that broke off come from elsewhere, and less of them may be learned from.
+    pub(super) fn go_back(&self, to: Filled) {
+        self.samples().go_back(to);
+    }
+
     fn samples(&self) -> MutexGuard<'_, DeviceSamples> {
         self.samples.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -175,8 +185,18 @@ impl CudaTraining {
     }
 
     /// The samples on the device are those of the ring.
-    fn follow(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, DeviceError> {
+    fn follow(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Result<Brought, NotTaken>, DeviceError> {
         let pool = self.pool(ring.capacity())?;
+        // In two dimensions tables have one node along z.
+        let domain = match base.map(Table::nodes) {
+            Some([.., 1]) => Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)),
+            _ => Domain::cuboid([0.0; 3], [1.0; 3]),
+        };
+        let below = match base.map(|table| self.below.of(&self.gpu, &domain, table)).transpose() {
+            // What the ring has comes over once there is a table to hold it against.
+            Err(error) if error.is_refusal() => return Ok(Err(NotTaken::NoRoomForBase(error.to_string()))),
+            below => below?,
+        };
         let stamp = base.map(Table::stamp);
         let held = self.held.take().filter(|held| held.capacity == ring.capacity());
         // Where samples were moved, those of the window before lie behind what the ring holds now.
@@ -193,12 +213,6 @@ impl CudaTraining {
         if self.pool_base.replace(stamp).is_some_and(|of| of != stamp) {
             pool.samples().clear();
         }
-        // In two dimensions tables have one node along z.
-        let domain = match base.map(Table::nodes) {
-            Some([.., 1]) => Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)),
-            _ => Domain::cuboid([0.0; 3], [1.0; 3]),
-        };
-        let below = base.map(|table| self.below.of(&self.gpu, &domain, table)).transpose()?;
         // What lies before what was written comes first.
         let [newest, wrapped] = ranges;
         for range in [wrapped, newest].into_iter().filter(|range| !range.is_empty()) {
@@ -207,7 +221,7 @@ impl CudaTraining {
         let usable = self.training.usable(&samples)?;
         let more_usable = self.training.usable(&pool.samples())?;
         self.held = Some(Held { samples, capacity: ring.capacity(), mark: Some(ring.mark()), base: stamp, usable, more_usable });
-        Ok(Brought { usable: usable + more_usable, dropped: ring.len() - usable })
+        Ok(Ok(Brought { usable: usable + more_usable, dropped: ring.len() - usable }))
     }
 
     /// The labels that stay here.
@@ -226,7 +240,7 @@ impl CudaTraining {
 
 impl OffloadedTraining for CudaTraining {
     fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken> {
-        self.ask_for_room(|training| training.follow(ring, base))
+        self.ask_for_room(|training| training.follow(ring, base))?
     }
 
     fn forget_labels(&mut self) {
@@ -234,6 +248,10 @@ impl OffloadedTraining for CudaTraining {
             pool.samples().clear();
         }
         self.pool_base = None;
+    }
+
+    fn let_go_of_base(&mut self) {
+        self.below.let_go();
     }
 
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
@@ -314,6 +332,11 @@ pub(super) struct CudaNetwork {
 }
 
 impl CudaNetwork {
+    /// Where labels that stay here go.
+    pub(super) fn pool(&self) -> Option<&Arc<LabelPool>> {
+        self.pool.as_ref()
+    }
+
     /// Who learns from what a frame traces at these unit times, beyond `base`.
     pub(super) fn pupil<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>, times: [f32; 2]) -> Option<Pupil<'a>> {
         self.pool.as_ref().map(|pool| Pupil { pool, domain, base, times })
@@ -325,9 +348,13 @@ impl CudaNetwork {
 }
 
 impl OffloadedNetwork for CudaNetwork {
-    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), DeviceLost> {
+    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), NotTaken> {
         let network = self.network.above(None).at(times);
-        self.gpu.health().ask(|| predict_from_host(&self.gpu, &network, points, out)).ok_or(DeviceLost)
+        self.gpu.health().ask_or("the CPU asked a network of the GPU's", || predict_from_host(&self.gpu, &network, points, out))
+    }
+
+    fn fetch(&self, into: &mut Average) -> Result<(), DeviceLost> {
+        self.gpu.health().ask(|| self.network.fetch(into)).ok_or(DeviceLost)
     }
 
     fn as_any(&self) -> &dyn std::any::Any {

@@ -1,6 +1,6 @@
 //! What predicts on the device what a surrogate predicts: tables and networks that are there, and copies of those that are not.
 
-use super::offload::{CudaNetwork, Pupil};
+use super::offload::{CudaNetwork, LabelPool, Pupil};
 use super::{CudaTracer, DeviceError, DeviceLearns, DeviceNetwork, DevicePredict, DeviceTable, Gpu, NetworkAbove};
 use crate::field::Domain;
 use crate::flow::Tracer;
@@ -30,9 +30,15 @@ pub(super) fn predict_from_host(gpu: &Gpu, by: &dyn DevicePredict, points: &[[f3
 pub(super) struct TableCopy(Option<(u64, DeviceTable)>);
 
 impl TableCopy {
+    /// Gives its memory back.
+    pub(super) fn let_go(&mut self) {
+        self.0 = None;
+    }
+
     /// The table on the device: itself where it was traced there, otherwise the copy, which is made where there is none yet.
     pub(super) fn of<'a>(&'a mut self, gpu: &Arc<Gpu>, domain: &Domain, table: &'a Table) -> Result<&'a DeviceTable, DeviceError> {
         if let Some(there) = DeviceTable::of(table) {
+            self.let_go();
             return Ok(there);
         }
         let copy = match self.0.take() {
@@ -88,6 +94,11 @@ impl Predictors {
         Self { gpu: gpu.clone(), network: None, below: TableCopy::default() }
     }
 
+    /// Gives copies of tables back.
+    pub(super) fn let_go_of_tables(&mut self) {
+        self.below.let_go();
+    }
+
     /// What predicts what `surrogate` predicts; none where nothing does.
     pub(super) fn of<'a>(&'a mut self, surrogate: &'a dyn Predict, tracer: &'a CudaTracer) -> Result<Option<Predictor<'a>>, DeviceError> {
         if let Some(table) = surrogate.as_any().and_then(|any| any.downcast_ref()).and_then(DeviceTable::of) {
@@ -111,6 +122,12 @@ impl Predictors {
         let pupil = there.and_then(|there| there.pupil(tracer.domain(), base.map(|(table, _)| table), state.times));
         Ok(Some(Predictor::Network(network.above(base).at(state.times), pupil)))
     }
+}
+
+/// Where labels go that stay on the device for the network that predicts; none where nothing learns there.
+pub(super) fn pool(surrogate: &dyn Predict) -> Option<Arc<LabelPool>> {
+    let there = surrogate.network()?.on_device?.as_any().downcast_ref::<CudaNetwork>()?;
+    there.pool().cloned()
 }
 
 /// The copy of a network from the host, which is made where there is none yet.

@@ -91,6 +91,8 @@ pub struct RunReport {
     pub window_bytes: usize,
     /// What became of the checkpoints; none where none was asked for.
     pub checkpoints: Option<CheckpointTotals>,
+    /// What was met behind the last frame, whose record tells of all before.
+    pub warnings: Vec<String>,
 }
 
 /// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
@@ -353,7 +355,8 @@ impl<'a> Cycle<'a> {
             heed(self.stop)?;
             let Some(mut slide) = next else { return Ok(()) };
             begun = Instant::now();
-            let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time)?;
+            let instead = "the CPU traced a slide";
+            let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time, instead)?;
             slide.warnings.extend(told);
             self.slid(&*tracer)?;
             slide.warnings.extend(self.beyond_the_range(slide.time));
@@ -391,11 +394,18 @@ impl<'a> Cycle<'a> {
     }
 
     fn finish(&mut self) -> Result<(), EngineError> {
-        self.report.train_steps += self.learned_meanwhile.take().map_or(0, |learned| learned.steps);
+        let learned = self.learned_meanwhile.take().unwrap_or_default();
+        self.report.train_steps += learned.steps;
         self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
-        let (Some(checkpoints), Some(live)) = (&mut self.checkpoints, &self.live) else { return Ok(()) };
-        let last = checkpoints.finish(self.frame.checked_sub(1), &**live);
-        self.report.checkpoints = Some(checkpoints.totals().clone());
+        let last = match (&mut self.checkpoints, &self.live) {
+            (Some(checkpoints), Some(live)) => {
+                let last = checkpoints.finish(self.frame.checked_sub(1), &**live);
+                self.report.checkpoints = Some(checkpoints.totals().clone());
+                last
+            }
+            _ => Ok(()),
+        };
+        self.report.warnings = [learned.warnings, self.options.device.shortages()].concat();
         Ok(last?)
     }
 }

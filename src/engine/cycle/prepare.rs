@@ -30,6 +30,7 @@ impl Cycle<'_> {
     /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
     pub(super) fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
         let Some(resize) = self.resize.take() else { return Ok(false) };
+        self.frames.let_go_of_tables();
         // So that two tables never need a device's memory together; kept until then, since it is what a stop would write.
         if let Some(live) = &mut self.live {
             live.leave_device();
@@ -49,6 +50,7 @@ impl Cycle<'_> {
     pub(super) fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
         let tracer = Interruptible::new(tracer, self.stop);
         self.peak = f32::NEG_INFINITY;
+        self.frames.let_go_of_tables();
         let resized = self.resized(&tracer)?;
         if let Some(live) = &mut self.live {
             if !resized {
@@ -198,8 +200,9 @@ impl Cycle<'_> {
             let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
             let unit = audit::stratified_points(&strata, seed, SHORTER_STREAM + draw);
             let extras = self.label_extras();
+            let instead = "the CPU traced shorter durations";
             let (shorter, _) =
-                self.threads.render().install(|| self.options.device.next_tracer(slide.velocity.clone(), &map, slide.time))?;
+                self.threads.render().install(|| self.options.device.next_tracer(slide.velocity.clone(), &map, slide.time, instead))?;
             let interruptible = Interruptible::new(&*shorter, self.stop);
             let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
             found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];

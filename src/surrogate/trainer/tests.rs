@@ -11,6 +11,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 #[derive(Clone, Default)]
 struct Full(Arc<AtomicUsize>);
 
+fn trainer() -> Trainer {
+    let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
+    let tracer = cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
+    let settings = NetworkSettings { levels: 2, log2_table: 4, width: 16, batch: 64, ..NetworkSettings::default() };
+    Trainer::new(&settings, &*tracer, 1, false).unwrap()
+}
+
+fn labels() -> SampleRing {
+    let points: Vec<[f32; 3]> = (0..64).map(|i| [i as f32 / 64.0, 0.5, 0.5]).collect();
+    SampleRing::holding(&Samples { log_stretch: vec![1.0; points.len()], points, ..Samples::default() })
+}
+
 impl Offload for Full {
     fn takes(&self, _: &Architecture, _: &Objective) -> bool {
         true
@@ -25,6 +37,7 @@ impl OffloadedTraining for Full {
         Ok(Brought { usable: ring.len(), dropped: 0 })
     }
     fn forget_labels(&mut self) {}
+    fn let_go_of_base(&mut self) {}
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
         Ok(vec![0.5; steps.len()])
     }
@@ -41,7 +54,7 @@ impl OffloadedTraining for Full {
         Ok(())
     }
     fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
-        Err(DeviceLost.into())
+        Err(NotTaken::NoRoom("no room to predict, by the test".into()))
     }
     fn fetch(&self, _: &mut Model, _: &mut Average) -> Result<(), DeviceLost> {
         self.0.fetch_add(1, Ordering::Relaxed);
@@ -55,17 +68,32 @@ impl OffloadedTraining for Full {
     }
 }
 
+/// Without memory for what predicts, the network comes back once for all questions until it changes.
 #[test]
-fn a_network_that_is_waited_for_every_minute_is_told_of_once() {
-    let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
-    let tracer = cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
-    let settings = NetworkSettings { levels: 2, log2_table: 4, width: 16, batch: 64, ..NetworkSettings::default() };
-    let mut trainer = Trainer::new(&settings, &*tracer, 1, false).unwrap();
-    let full = Full::default();
+fn a_network_that_is_asked_twice_comes_back_once() {
+    let (mut trainer, full, ring) = (trainer(), Full::default(), labels());
     let offload: Arc<dyn Offload> = Arc::new(full.clone());
     trainer.offload(&offload);
-    let points: Vec<[f32; 3]> = (0..64).map(|i| [i as f32 / 64.0, 0.5, 0.5]).collect();
-    let ring = SampleRing::holding(&Samples { log_stretch: vec![1.0; points.len()], points, ..Samples::default() });
+    assert_eq!(trainer.learn(&ring, None, f64::INFINITY, 4).steps, 4);
+    let fetched = || full.0.load(Ordering::Relaxed);
+    assert_eq!(fetched(), 0);
+    let mut out = [0.0; 64];
+    for _ in 0..3 {
+        trainer.predict(&ring.samples().points, &mut out);
+        assert_eq!(fetched(), 1);
+    }
+    trainer.forget_output();
+    trainer.predict(&ring.samples().points, &mut out);
+    assert_eq!(fetched(), 2, "it has changed");
+    let learned = trainer.learn(&ring, None, f64::INFINITY, 4);
+    assert!(learned.steps == 4 && !trainer.is_offloaded(), "{:?}", learned.warnings);
+}
+
+#[test]
+fn a_network_that_is_waited_for_every_minute_is_told_of_once() {
+    let (mut trainer, full, ring) = (trainer(), Full::default(), labels());
+    let offload: Arc<dyn Offload> = Arc::new(full.clone());
+    trainer.offload(&offload);
     let told: Vec<Vec<String>> = (0..4)
         .map(|call| {
             if call >= 2 {
