@@ -24,7 +24,7 @@ mod pace;
 pub use follower::{BUFFERS, RelayFollower, Whereabouts};
 pub use pace::PATIENCE;
 
-/// How often a relay with nothing to send says that it lives.
+/// How often either side that has nothing to say, or not yet, says that it lives.
 const PULSE: Duration = Duration::from_secs(1);
 /// How often an idle thread looks for new steps.
 const IDLE: Duration = Duration::from_millis(1);
@@ -117,6 +117,8 @@ struct Relay {
     strangers: Strangers,
     stop: Arc<AtomicBool>,
     tell: Arc<dyn Fn(String) + Send + Sync>,
+    /// How often it says that it lives, where there is nothing to send or what there is takes long to read.
+    pulse: Duration,
     sent_away: News,
     lost: News,
     left: News,
@@ -139,18 +141,7 @@ pub fn serve(
     // Steps are kept for followers that come later only as long as somebody follows: the relay itself does.
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
-    let relay = Arc::new(Relay {
-        ring: ring.to_owned(),
-        key: key.clone(),
-        counts: counts.clone(),
-        strangers: Strangers::default(),
-        stop: stop.clone(),
-        tell,
-        sent_away: News::new("were sent away"),
-        lost: News::new("connections were lost"),
-        left: News::new("follower connections ended"),
-        refused: News::new("rings were refused"),
-    });
+    let relay = Arc::new(Relay::new(ring, key, counts, stop, tell));
     let mut threads: Vec<std::thread::JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
@@ -185,6 +176,22 @@ pub fn serve(
 }
 
 impl Relay {
+    fn new(ring: &Path, key: &Key, counts: &Arc<RelayCounts>, stop: &Arc<AtomicBool>, tell: Arc<dyn Fn(String) + Send + Sync>) -> Self {
+        Self {
+            ring: ring.to_owned(),
+            key: key.clone(),
+            counts: counts.clone(),
+            strangers: Strangers::default(),
+            stop: stop.clone(),
+            tell,
+            pulse: PULSE,
+            sent_away: News::new("were sent away"),
+            lost: News::new("connections were lost"),
+            left: News::new("follower connections ended"),
+            refused: News::new("rings were refused"),
+        }
+    }
+
     fn refuse(&self, peer: SocketAddr, why: String) {
         self.counts.refused.fetch_add(1, Ordering::Relaxed);
         self.say(&self.sent_away, || format!("{peer} was sent away: {why}"));
@@ -232,8 +239,16 @@ impl Relay {
         let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 0, step: 0, time: 0.0, published: 0, missed: 0 };
         while !self.stop.load(Ordering::Relaxed) {
             let begin = Instant::now();
-            let event = if asked { rings.poll(&mut values) } else { None };
-            // The follower is silent while it waits for what takes long to read.
+            let mut pulsed = Ok(());
+            let mut pulse = || {
+                if pulsed.is_ok() && sent.elapsed() > self.pulse {
+                    pulsed = session.send(&mut Paced::new(stream, &self.stop), &quiet, None, &[]);
+                    sent = Instant::now();
+                }
+            };
+            let event = if asked { rings.poll_beside(&mut values, &mut pulse) } else { None };
+            pulsed?;
+            // What the follower said while a step was read is not heard yet.
             heard += begin.elapsed();
             if event.is_none() {
                 if !asked {
@@ -268,7 +283,7 @@ impl Relay {
                     self.say(&self.refused, || format!("refused: {error}"));
                     continue;
                 }
-                None if sent.elapsed() > PULSE => (quiet, None),
+                None if sent.elapsed() > self.pulse => (quiet, None),
                 None => continue,
             };
             let step: &[f32] = if facts.kind == Kind::Step { &values } else { &[] };
@@ -340,6 +355,56 @@ mod tests {
         beating.write_all(&[0]).unwrap();
         assert!(heartbeat() > opened);
         drop((rings, producer));
+        assert!(!ring.exists());
+    }
+
+    #[test]
+    fn a_follower_hears_of_its_relay_while_a_step_is_read() {
+        let ring = PathBuf::from("/dev/shm").join(format!("rw-pulses-{}", std::process::id()));
+        let axis = |name| crate::AxisDescription::uniform(name, "m", 0.0, 1.0, 1024);
+        let description = Description::whole(crate::Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
+        let producer = crate::Producer::open(&ring, description, 2, crate::Policy::NewestWins).unwrap();
+        let plane = vec![1.0f32; 1 << 20];
+        let field = [plane.as_ptr().cast::<u8>(); 2];
+        // SAFETY: a value a node.
+        unsafe { producer.publish(0, 0.0, &crate::Field::packed(&field, crate::Element::F32, [1024, 1024, 1])).unwrap() };
+        let (counts, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
+        let key = Key::random().unwrap();
+        let mut relay = Relay::new(&ring, &key, &counts, &stop, Arc::new(|_| ()));
+        // So that each piece is longer.
+        relay.pulse = Duration::ZERO;
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        std::thread::scope(|scope| {
+            scope.spawn(|| {
+                let (stream, peer) = listener.accept().unwrap();
+                relay.connection(&stream, peer);
+            });
+            let mut session = Session::connect(&mut stream, &key).unwrap();
+            let mut block_bytes = None;
+            let mut note = |_: u32, announced: Option<Description>| {
+                block_bytes = announced.map(|announced| announced.block_bytes()).or(block_bytes);
+                block_bytes
+            };
+            let mut next = |session: &mut Session, values: &mut Vec<f32>| {
+                session.ask(&mut stream, Ask::Next).unwrap();
+                let mut pulses = 0;
+                loop {
+                    match session.receive(&mut stream, &Limits::default(), &mut note, values).unwrap().kind {
+                        Kind::Pulse => pulses += 1,
+                        kind => return (kind, pulses),
+                    }
+                }
+            };
+            let mut values = Vec::new();
+            assert_eq!(next(&mut session, &mut values).0, Kind::Opened);
+            let (kind, pulses) = next(&mut session, &mut values);
+            stop.store(true, Ordering::Relaxed);
+            // 8 MiB; others may be said where the step was not looked for yet.
+            assert!(kind == Kind::Step && pulses >= 8, "{kind:?} after {pulses} pulses");
+            assert!(values.len() == 1 << 21 && values.iter().all(|v| *v == 1.0));
+        });
+        drop(producer);
         assert!(!ring.exists());
     }
 

@@ -1,6 +1,6 @@
 //! The other end: what a relay sends.
 
-use super::pace::{PATIENCE, Paced, greet, patience};
+use super::pace::{PATIENCE, Paced, greet};
 use super::{IDLE, PULSE};
 use crate::follow::Event;
 use crate::message::{Ask, ConnectionFile, Facts, Kind, Session};
@@ -178,11 +178,10 @@ impl Receiving {
         self.blocks.values_mut().for_each(|known| known.announced = false);
         let mut ask = Ask::Next;
         while !self.stop.load(Ordering::Relaxed) {
-            if let Err(error) = session.ask(to.begin(PATIENCE), ask) {
+            if let Err(error) = session.ask(to.begin(), ask) {
                 return Ok(Err(error));
             }
-            let largest = self.blocks.values().map(|known| known.description.block_bytes()).max();
-            from.get_mut().begin(patience(largest.unwrap_or_default()));
+            from.get_mut().begin();
             let mut values = self.spare.try_recv().unwrap_or_default();
             let mut announced = None;
             let mut note = |block: u32, description: Option<Description>| {
@@ -241,7 +240,7 @@ impl Receiving {
                 return Err(Left);
             }
             if said.elapsed() > PULSE {
-                if let Err(error) = session.ask(to.begin(PATIENCE), Ask::Hold) {
+                if let Err(error) = session.ask(to.begin(), Ask::Hold) {
                     return Ok(Err(error));
                 }
                 said = Instant::now();

@@ -1,7 +1,8 @@
 //! The pace that a connection must keep.
 
 use crate::WireError;
-use crate::message::{PIECE, Session};
+use crate::bytes::PIECE;
+use crate::message::Session;
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
 use std::path::Path;
@@ -12,12 +13,6 @@ use std::time::{Duration, Instant};
 pub const PATIENCE: Duration = Duration::from_secs(5);
 /// The longest that a wait lasts before it is looked whether to stop.
 const TICK: Duration = Duration::from_millis(200);
-
-/// How long a peer may take until the first bytes of a step are there: [`PATIENCE`], and a second for each 256 MB that it copies from its ring and signs
-/// before it sends them.
-pub(super) fn patience(bytes: u64) -> Duration {
-    PATIENCE + Duration::from_micros(bytes / 256)
-}
 
 /// A stream of which each [`PIECE`] of a message must be through within [`PATIENCE`], however slowly the peer dribbles; a wait ends with `stop`.
 pub(super) struct Paced<'a> {
@@ -34,9 +29,9 @@ impl<'a> Paced<'a> {
         Self { stream, stop, until: None, through: 0 }
     }
 
-    /// Begins a message, of which the first bytes may take so long.
-    pub fn begin(&mut self, first: Duration) -> &mut Self {
-        (self.until, self.through) = (Some(Instant::now() + first), 0);
+    /// Begins a piece.
+    pub fn begin(&mut self) -> &mut Self {
+        (self.until, self.through) = (Some(Instant::now() + PATIENCE), 0);
         self
     }
 
@@ -54,7 +49,7 @@ impl<'a> Paced<'a> {
             Ok(bytes) => {
                 self.through += bytes;
                 if self.through >= PIECE {
-                    self.begin(PATIENCE);
+                    self.begin();
                 } else if Instant::now() >= until {
                     return Err(ErrorKind::TimedOut.into());
                 }
