@@ -14,10 +14,12 @@ use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSetti
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
 use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};
-use crate::surrogate::{Kind, SurrogateSettings, network::NetworkSettings};
+use crate::surrogate::network::{Encoding, Loss, NetworkSettings, Size, Target};
+use crate::surrogate::{Kind, SurrogateSettings};
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
+use toml_edit::TableLike;
 
 /// A whole scene file. Every table but `[source]` may be left out.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -101,6 +103,9 @@ impl Origin {
 /// What stands for the scene file where there is none.
 const COMMAND_LINE: &str = "(command line)";
 
+/// The one path of a scene at which something is written.
+const WRITTEN: &str = "archive.synthetic.folder";
+
 /// Dotted keys of all values.
 fn keys_of(table: &toml::Table) -> Vec<String> {
     let below = |(key, value): (&String, &toml::Value)| match value {
@@ -119,13 +124,12 @@ impl SceneFile {
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
         let mut scene = Self::parse(path, &text, overrides)?;
         let folder = path.parent().unwrap_or(Path::new("."));
-        // What is named by `--set` is relative to where the command runs, as on any command line.
-        let files = scene.archive.files.iter_mut().filter(|_| !scene.origin.sets("archive.files"));
-        let resume = scene.training.resume.iter_mut().filter(|_| !scene.origin.sets("training.resume"));
-        let ring = scene.live.ring.iter_mut().filter(|_| !scene.origin.sets("live.ring"));
-        let connections = scene.live.connections.iter_mut().filter(|_| !scene.origin.sets("live.connections"));
-        for file in files.chain(resume).chain(ring).chain(connections).filter(|file| file.is_relative()) {
-            *file = folder.join(&*file);
+        let origin = scene.origin.clone();
+        for (key, file) in scene.paths() {
+            // What is named by `--set` is relative to where the command runs, as on any command line, and so is what is written.
+            if file.is_relative() && key != WRITTEN && !origin.sets(key) {
+                *file = folder.join(&*file);
+            }
         }
         Ok(scene)
     }
@@ -160,37 +164,99 @@ impl SceneFile {
         let mut scene = if overrides.is_empty() { plain.clone() } else { Self::overridden(&plain, overrides)? };
         scene.origin = origin;
         scene.check()?;
-        // What the file says is judged by the file alone: an option that makes a part of it idle is no fault of the file.
-        plain.refuse_idle(keys)?;
-        let set: Vec<String> = scene.origin.elsewhere.iter().map(|(key, _)| key.clone()).collect();
-        scene.refuse_idle(&set)?;
+        // An option that makes a part of the file idle is no fault of the file; one that gives a part of it work mends it.
+        let of_file = keys.iter().map(String::as_str).filter(|key| plain.why_idle(key).is_some());
+        let given = scene.origin.elsewhere.iter().map(|(key, _)| key.as_str());
+        if let Some((key, accepted)) = of_file.chain(given).find_map(|key| Some((key, scene.why_idle(key)?))) {
+            return Err(scene.locate(Refused::new(key, "does nothing here", accepted)));
+        }
         Ok(scene)
     }
 
-    /// Refuses keys that would be read and do nothing in this scene. (Keys of `[source]` are refused by their room, those of `[archive]` that
-    /// do not fit the files when these are open.)
-    fn refuse_idle(&self, keys: &[String]) -> Result<(), ConfigError> {
+    /// Paths that the scene names, with their keys.
+    fn paths(&mut self) -> impl Iterator<Item = (&'static str, &mut PathBuf)> {
+        let files = self.archive.files.iter_mut().map(|path| ("archive.files", path));
+        let written = self.archive.synthetic.iter_mut().map(|synthetic| (WRITTEN, &mut synthetic.folder));
+        let ring = self.live.ring.iter_mut().map(|path| ("live.ring", path));
+        let connections = self.live.connections.iter_mut().map(|path| ("live.connections", path));
+        let resume = self.training.resume.iter_mut().map(|path| ("training.resume", path));
+        files.chain(written).chain(ring).chain(connections).chain(resume)
+    }
+
+    /// Keys and tables that would be read and do nothing in this scene, each with what is accepted. What only `render.method = "reference"` has no
+    /// use for is not among them, since the method is changed by an option. (Keys of `[source]` are refused by their room, those of `[archive]`
+    /// that do not fit the files when these are open.)
+    fn idle(&self) -> impl Iterator<Item = (&'static str, &'static str)> {
         use SourceKind::{Archive, Live, Turbulence};
-        let (kind, flow) = (self.source.kind, &self.flow);
+        const LEARNS: &str = "only with surrogate.kind = \"network\" or \"residual\"; a table learns nothing";
+        const HASHED: &str = "only with network.encoding = \"hash_grid\"";
+        let Self { source: SourceSettings { kind, .. }, flow, network, training, .. } = self;
         let gridded = matches!(kind, Archive | Live | Turbulence);
         let adaptive = flow.integrator == Integrator::DormandPrince;
-        for (idle, works, accepted) in [
-            ("archive", kind == Archive, "only with source.kind = \"archive\""),
-            ("live", kind == Live, "only with source.kind = \"live\""),
+        let (learns, hashed) = (self.surrogate.kind != Kind::Table, network.encoding == Encoding::HashGrid);
+        let keys = [
+            ("archive", *kind == Archive, "only with source.kind = \"archive\""),
+            ("archive.synthetic", self.archive.files.is_empty(), "only without archive.files"),
+            ("live", *kind == Live, "only with source.kind = \"live\""),
             ("time.start", !gridded, "only with closed forms; snapshots have times of their own"),
             ("time.step", !gridded, "only with closed forms; time.stride says how far the window of snapshots moves"),
             ("time.stride", gridded, "only with snapshots; time.step says how far the seed time of a closed form moves"),
             ("flow.gap", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
             ("flow.steps", !adaptive, "left out with flow.integrator = \"dormand_prince\", which chooses its own"),
             ("flow.tolerance", !adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\""),
+            ("flow.interpolation", gridded, "only with snapshots; a closed form is known everywhere"),
             ("surrogate.table_nodes", self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\""),
-        ] {
-            let below = |key: &&String| key.strip_prefix(idle).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
-            if let Some(key) = keys.iter().find(below).filter(|_| !works) {
-                return Err(self.locate(Refused::new(key.as_str(), "does nothing here", accepted)));
+            ("network", learns || network.size == Size::Auto, LEARNS),
+            ("network.levels", hashed, HASHED),
+            ("network.features", hashed, HASHED),
+            ("network.log2_table", hashed, HASHED),
+            ("network.base_resolution", hashed, HASHED),
+            ("network.growth", hashed, HASHED),
+            ("network.follow_aspect", hashed, HASHED),
+            ("network.octaves", !hashed, "only with network.encoding = \"frequency\""),
+            ("network.mean_penalty", network.loss == Loss::Published, "only with network.loss = \"published\""),
+            ("network.jacobian_weight", network.target == Target::FlowMap, "only with network.target = \"flow_map\""),
+            ("training.share", learns, LEARNS),
+            ("training.seconds_per_frame", learns, LEARNS),
+            ("training.steps_per_frame", learns, LEARNS),
+            ("training.resume", learns, LEARNS),
+            ("training.seconds_per_frame", training.steps_per_frame.is_none(), "only without training.steps_per_frame"),
+        ];
+        keys.into_iter().filter(|(_, works, _)| !works).map(|(key, _, accepted)| (key, accepted))
+    }
+
+    /// What is accepted in place of a key that does nothing in this scene; none where it does something.
+    fn why_idle(&self, key: &str) -> Option<&'static str> {
+        let below = |idle: &str| key.strip_prefix(idle).is_some_and(|rest| rest.is_empty() || rest.starts_with('.'));
+        self.idle().find(|(idle, _)| below(idle)).map(|(_, accepted)| accepted)
+    }
+
+    /// The text of a scene file that says the same from any folder: options and `--set` applied, defaults filled in (but those that the
+    /// data decide), paths absolute, and without what does nothing in this scene.
+    ///
+    /// # Errors
+    /// A value out of its range, and what no TOML file can hold: a path that is no UTF-8.
+    pub fn to_toml(&self) -> Result<String, ConfigError> {
+        self.check()?;
+        let unwritable = |message: String| ConfigError::Unwritable { message };
+        let mut scene = self.clone();
+        for (key, path) in scene.paths() {
+            let refused = |why: &str| unwritable(format!("`{key}` is {path:?}: {why}"));
+            let whole = std::path::absolute(&*path).map_err(|e| refused(&e.to_string()))?;
+            whole.to_str().ok_or_else(|| refused("no UTF-8"))?;
+            *path = whole;
+        }
+        let text = toml::to_string(&scene).map_err(|e| unwritable(e.to_string()))?;
+        let mut document: toml_edit::DocumentMut = text.parse().map_err(|e: toml_edit::TomlError| unwritable(e.to_string()))?;
+        for (idle, _) in scene.idle() {
+            let (tables, key) = idle.rsplit_once('.').unwrap_or(("", idle));
+            let mut tables = tables.split('.').filter(|name| !name.is_empty());
+            let table = tables.try_fold(document.as_table_mut() as &mut dyn TableLike, |at, name| at.get_mut(name)?.as_table_like_mut());
+            if let Some(table) = table {
+                table.remove(key);
             }
         }
-        Ok(())
+        Ok(document.to_string())
     }
 
     /// What the cycle is told.

@@ -377,16 +377,27 @@ fn a_step_that_waits_for_its_blocks_does_not_grow_older_while_no_step_is_taken()
     let solvers: Vec<Producer> = columns(9, 3).into_iter().map(|block| producer(&folder, block)).collect();
     let window = follow(&LiveSettings { follow: Follow::Every, incomplete_seconds: 5.0, ..settings(&folder) }, 2.0);
     let publish = |block: usize, n: u64| publish(&solvers[block], n, n as f64, 1.0);
+    // Until so many steps of a block were taken, as the follower's mark says.
+    let taken = |block: u32, steps: u64| {
+        let (ring, mut word) = (std::fs::File::open(ridgewatch_wire::block_path(&folder.0, block)).unwrap(), [0; 8]);
+        let begin = Instant::now();
+        while u64::from_ne_bytes(word) < steps {
+            assert!(begin.elapsed() < LONG, "block {block}");
+            std::thread::sleep(Duration::from_millis(1));
+            std::os::unix::fs::FileExt::read_exact_at(&ring, &mut word, 4096).unwrap();
+        }
+    };
     for n in 0..2 {
         (0..3).for_each(|block| publish(block, n));
     }
     // The first block of step 3 is taken before the last one of step 2 is there, with which a slide is due.
     [(0, 2), (0, 3), (1, 2)].iter().for_each(|(block, n)| publish(*block, *n));
-    std::thread::sleep(Duration::from_millis(200));
+    taken(0, 4);
     [(2, 2), (1, 3)].iter().for_each(|(block, n)| publish(*block, *n));
+    // Longer than a step may wait.
     std::thread::sleep(Duration::from_secs(6));
     take(&window, |taken| newest(taken) == 2.0);
-    std::thread::sleep(Duration::from_millis(200));
+    taken(1, 4);
     publish(2, 3);
     let (taken, warnings) = take(&window, |taken| newest(taken) == 3.0);
     assert_eq!((taken.live.incomplete, taken.live.steps), (0, 4), "{warnings:?}");

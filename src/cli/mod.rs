@@ -47,8 +47,8 @@ pub struct Common {
     /// Overrides one key of the scene, e.g. `--set render.samples=64`; may be repeated.
     #[arg(long = "set", global = true, value_name = "TABLE.KEY=VALUE")]
     pub overrides: Vec<String>,
-    /// Seed of every random number; overrides the scene's.
-    #[arg(long, global = true, value_name = "N")]
+    /// Seed of every random number; overrides the scene's, which holds no larger ones.
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: Option<u64>,
     /// Prints a machine-readable result on standard output; everything else goes to standard error.
     #[arg(long, global = true)]

@@ -3,7 +3,7 @@
 use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
 use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions};
-use ridgewatch::publish::write_exr;
+use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
 use ridgewatch::render::Method;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -30,7 +30,8 @@ pub struct Options {
     /// Starts from a surrogate written by `replay --checkpoint`.
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
-    /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it.
+    /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it, and both a .scene.toml,
+    /// from which `render` makes the picture again.
     #[arg(long, short, default_value = "out/render.exr")]
     out: PathBuf,
 }
@@ -46,8 +47,10 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         bail!(Usage(format!("--out {}: accepted: a name that ends in .exr or .png", options.out.display())));
     }
     check_folder(&options.out)?;
-    let warmup_samples = scene.render.samples;
+    let scene_file = options.out.with_extension("scene.toml");
+    refuse_foreign_scene(&scene_file)?;
     if let Some(samples) = options.spp {
+        scene.time.warmup_samples.get_or_insert(scene.render.samples);
         scene.render.samples = samples;
         scene.set_by("render.samples", format!("--spp {samples}"));
     }
@@ -62,10 +65,10 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let run_options = RunOptions {
         verify_points: options.verify as usize,
         threads: common.threads,
-        warmup_samples: Some(warmup_samples),
         device: super::device(common, &scene)?,
         ..RunOptions::default()
     };
+    let scene_text = scene.to_toml()?;
     let setup = super::open(&scene)?;
     let bar = messages::progress(Some(100));
     let mut picture: Option<Frame> = None;
@@ -90,7 +93,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     if extension == "exr" {
         write_exr(&options.out, &frame.film, Some(&*frame.record))?;
     }
-    ridgewatch::publish::write_png(&options.out.with_extension("png"), &frame.film, frame.tone_map)?;
+    write_png(&options.out.with_extension("png"), &frame.film, frame.tone_map)?;
+    write_scene(&scene_file, "render", &scene_text)?;
     if common.json {
         return print_json(&*frame.record);
     }

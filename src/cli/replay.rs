@@ -104,9 +104,8 @@ async fn frames(
     open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
 ) -> Result<()> {
     // Before anything is waited for or read; what another run makes of the folder meanwhile is refused below.
-    if !options.overwrite {
-        RunFolder::refuse_occupied(&options.out)?;
-    }
+    RunFolder::refuse_occupied(&options.out, options.overwrite)?;
+    let scene_text = scene.to_toml()?;
     let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
     let watch = || watch_signals(stop.clone(), caught.clone()).map(tokio::spawn);
     // A source that is waited for must be left by a signal; one that is there is opened before signals are caught, so that they end it at once.
@@ -125,7 +124,9 @@ async fn frames(
     // The socket first: a port in use must not cost the run that the folder holds.
     let publish = scene.publish_settings();
     let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
-    output.write_to(RunFolder::create(&options.out, options.overwrite)?, &publish)?;
+    let folder = RunFolder::create(&options.out, options.overwrite)?;
+    folder.write_scene(if follows { "attach" } else { "replay" }, &scene_text)?;
+    output.write_to(folder, &publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));
     }
@@ -136,7 +137,6 @@ async fn frames(
         checkpoint: options.checkpoint.clone(),
         checkpoint_seconds,
         device,
-        ..RunOptions::default()
     };
     let (source, time_unit) = (setup.plan.source.clone(), setup.plan.time_unit.clone());
     // The cycle is plain blocking work; reading, training and publishing go on beside it on threads of their own.

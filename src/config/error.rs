@@ -49,6 +49,12 @@ pub enum ConfigError {
         /// What is wrong with it.
         message: String,
     },
+    /// The scene of a run cannot be written beside what it makes.
+    #[error("the scene cannot be written as a file: {message}")]
+    Unwritable {
+        /// What is wrong with it.
+        message: String,
+    },
 }
 
 fn excerpt(line: &Option<(usize, String)>) -> String {

@@ -170,7 +170,15 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
         ("flow", "gap = 1e-3", "flow.gap"),
         ("flow", "tolerance = 0.1\nsteps = 9", "flow.tolerance"),
         ("flow", "steps = 9\nintegrator = \"dormand_prince\"\nprecision = \"f64\"", "flow.steps"),
+        ("flow", "interpolation = \"cubic\"", "flow.interpolation"),
         ("surrogate", "table_nodes = [8, 8, 8]\nkind = \"network\"", "surrogate.table_nodes"),
+        ("network", "width = 32\n[surrogate]\nkind = \"table\"", "network.width"),
+        ("training", "steps_per_frame = 9\n[surrogate]\nkind = \"table\"", "training.steps_per_frame"),
+        ("training", "seconds_per_frame = 0.1\nsteps_per_frame = 9", "training.seconds_per_frame"),
+        ("network", "growth = 2.0\nencoding = \"frequency\"", "network.growth"),
+        ("network", "octaves = 8", "network.octaves"),
+        ("network", "mean_penalty = 0.5", "network.mean_penalty"),
+        ("network", "jacobian_weight = 0.5", "network.jacobian_weight"),
     ] {
         let (text, at) = with_fault(section, line);
         let said = error(&text, &[]);
@@ -185,8 +193,16 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
     assert!(error(GYRE, &["time.step=0", "time.slides=2"]).starts_with("--set time.slides=2: `time.step` is 0"));
     // An option that makes a part of the file idle is no fault of the file.
     let text = format!("{GYRE}[surrogate]\ntable_nodes = [8, 8, 8]\n");
-    let set = ["surrogate.kind=network".to_owned()];
-    assert!(SceneFile::parse(Path::new("s"), &text, &set).is_ok());
+    let parsed = |text: &str, set: &str| SceneFile::parse(Path::new("s"), text, &[set.to_owned()]);
+    assert!(parsed(&text, "surrogate.kind=network").is_ok());
+    // One that gives a part of it work mends it.
+    let text = format!("{GYRE}[surrogate]\nkind = \"table\"\n[training]\nsteps_per_frame = 9\n");
+    assert!(parsed(&text, "surrogate.kind=residual").is_ok() && parsed(&text, "surrogate.table_nodes=[8, 8, 8]").is_err());
+    // The method is changed by an option.
+    assert!(parsed(&format!("{GYRE}[network]\nwidth = 32\n"), "render.method=reference").is_ok());
+    let files = "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[archive.synthetic]\nshape = \"flame\"\n";
+    let said = error(files, &[]);
+    assert!(said.starts_with("scene.toml:6: `archive.synthetic.shape` does nothing here; accepted: only without archive.files"), "{said}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! What a run is told: `[time]` and `[training]`, and the settings of all rooms that the cycle calls.
 
 use crate::flow::{Direction, FlowSettings};
-use crate::render::{Camera, CameraSettings, Light, LightSettings, RenderSettings, Transfer, TransferSettings};
+use crate::render::{Camera, CameraSettings, Light, LightSettings, MAX_SAMPLES, RenderSettings, Transfer, TransferSettings};
 use crate::setting::{Refused, count, require};
 use crate::source::live::LiveSettings;
 use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};
@@ -136,11 +136,23 @@ pub struct TimeSettings {
     pub frames_per_slide: usize,
     /// Further frames at the first slide, in which the surrogate is trained up.
     pub warmup_frames: usize,
+    /// Samples a pixel of those; none: as many as of the others.
+    pub warmup_samples: Option<usize>,
 }
 
 impl Default for TimeSettings {
     fn default() -> Self {
-        Self { tau: None, direction: None, start: 0.0, step: 1.0, slides: None, stride: 1, frames_per_slide: 1, warmup_frames: 0 }
+        Self {
+            tau: None,
+            direction: None,
+            start: 0.0,
+            step: 1.0,
+            slides: None,
+            stride: 1,
+            frames_per_slide: 1,
+            warmup_frames: 0,
+            warmup_samples: None,
+        }
     }
 }
 
@@ -171,7 +183,8 @@ impl TimeSettings {
         }
         count("time.stride", time.stride, 1, 1_000_000)?;
         count("time.frames_per_slide", time.frames_per_slide, 1, 1_000_000)?;
-        count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)
+        count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)?;
+        count("time.warmup_samples", time.warmup_samples.unwrap_or(1), 1, MAX_SAMPLES)
     }
 }
 

@@ -56,6 +56,14 @@ pub enum PublishError {
         /// A file of the older run.
         found: String,
     },
+    /// The place where the scene of a run goes is not free, or cannot be written.
+    #[error("{path}: {problem}", path = path.display())]
+    Scene {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
     /// An EXR file that cannot be read or written.
     #[error("{path}: {problem}", path = path.display())]
     Exr {

@@ -1,5 +1,6 @@
-//! The run folder: `frames/frame_000000.exr` and `.png`, `records.jsonl`, `summary.json`.
+//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `records.jsonl`, `summary.json`.
 
+use super::scene::{is_ours, refuse_foreign_scene, write_scene};
 use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
 use crate::engine::{Frame, FrameRecord};
 use std::collections::VecDeque;
@@ -13,6 +14,8 @@ const FRAMES: &str = "frames";
 const RECORDS: &str = "records.jsonl";
 /// Holds the files of the run that is about to be replaced.
 const PREVIOUS: &str = ".previous";
+/// What the run is of.
+const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
 
@@ -89,11 +92,15 @@ impl RunFolder {
         unreachable!("a folder holds fewer than 2^32 others")
     }
 
-    /// Refuses a folder that holds a run, and changes nothing.
+    /// Refuses a folder that holds a run, unless `overwrite`, or a scene that no run wrote; changes nothing.
     ///
     /// # Errors
     /// It holds one, or cannot be read.
-    pub fn refuse_occupied(path: &Path) -> Result<(), PublishError> {
+    pub fn refuse_occupied(path: &Path, overwrite: bool) -> Result<(), PublishError> {
+        refuse_foreign_scene(&path.join(SCENE))?;
+        if overwrite {
+            return Ok(());
+        }
         match occupied(path).map_err(|source| PublishError::Folder { path: path.to_owned(), source })? {
             Some(found) => Err(PublishError::Occupied { path: path.to_owned(), found }),
             None => Ok(()),
@@ -106,9 +113,7 @@ impl RunFolder {
         let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
         let frames = path.join(FRAMES);
         fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
-        if !overwrite {
-            Self::refuse_occupied(path)?;
-        }
+        Self::refuse_occupied(path, overwrite)?;
         let old = run_files(path).map_err(|e| refuse(path, e))?;
         let (aside, empty) = (path.join(PREVIOUS), old.iter().all(|file| is_empty(file)));
         if aside.exists() && !empty {
@@ -146,6 +151,12 @@ impl RunFolder {
     /// Those of the system; what could not be put back lies in `.previous`.
     pub fn put_back(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
+        // One that was made without a scene must not be left with this one's.
+        if let Err(error) = fs::remove_file(self.path.join(SCENE))
+            && error.kind() != io::ErrorKind::NotFound
+        {
+            return Err(error);
+        }
         for entry in fs::read_dir(&previous)? {
             let entry = entry?;
             let folder = if entry.file_name().to_str().is_some_and(is_picture) { self.path.join(FRAMES) } else { self.path.clone() };
@@ -254,6 +265,11 @@ impl RunFolder {
         removed
     }
 
+    /// Writes `scene.toml`, from which `command` makes the run again.
+    pub fn write_scene(&self, command: &str, scene: &str) -> Result<(), PublishError> {
+        write_scene(&self.path.join(SCENE), command, scene)
+    }
+
     /// Writes `summary.json`.
     pub fn write_summary(&self, summary: &super::Summary) -> Result<(), PublishError> {
         let path = self.path.join(SUMMARY);
@@ -276,7 +292,12 @@ fn remove(files: &[(PathBuf, u64)]) {
 
 /// Files that a run writes, as far as they are there.
 fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut files: Vec<PathBuf> = [RECORDS, SUMMARY, ".summary.json.part"].iter().map(|f| path.join(f)).filter(|f| f.exists()).collect();
+    let mut files: Vec<PathBuf> =
+        [RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"].iter().map(|f| path.join(f)).filter(|f| f.exists()).collect();
+    let scene = path.join(SCENE);
+    if scene.exists() && is_ours(&scene)? {
+        files.push(scene);
+    }
     for entry in fs::read_dir(path.join(FRAMES))? {
         let entry = entry?;
         if entry.file_name().to_str().is_some_and(is_picture) {
@@ -343,9 +364,15 @@ mod tests {
         fs::write(&picture, b"picture").unwrap();
         drop(run);
         let records = fs::read(folder.path().join(RECORDS)).unwrap();
+        let scene = || fs::read_to_string(folder.path().join(SCENE)).ok();
         let mut failed = RunFolder::create(folder.path(), true).unwrap();
         assert!(!picture.exists());
-        assert!(failed.put_back().unwrap());
+        failed.write_scene("replay", "seed = 1\n").unwrap();
+        assert!(failed.put_back().unwrap() && scene().is_none(), "a run of before scenes were written");
+        failed.write_scene("replay", "seed = 2\n").unwrap();
+        let mut failed = RunFolder::create(folder.path(), true).unwrap();
+        failed.write_scene("replay", "seed = 3\n").unwrap();
+        assert!(failed.put_back().unwrap() && scene().unwrap().ends_with("again.\nseed = 2\n"));
         drop(failed);
         assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
         assert!(!folder.path().join(PREVIOUS).exists());

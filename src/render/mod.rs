@@ -30,6 +30,7 @@ pub use majorant::MajorantGrid;
 pub use parameters::{FrameParameters, FrameSetup, PixelValue, SeenInCells};
 pub use renderer::{RenderStats, Renderer};
 pub use scene::Scene;
+pub(crate) use settings::MAX_SAMPLES;
 pub use settings::{CameraSettings, LightSettings, Method, RenderSettings, TransferSettings};
 pub use space::overview_scale;
 pub use transfer::{ALBEDO_PRESETS, Transfer, albedo_preset};

@@ -8,7 +8,7 @@ const MAX_EDGE: usize = 16_384;
 /// Largest number of pixels: a film of them takes 3 GB.
 const MAX_PIXELS: usize = 1 << 26;
 /// Largest number of samples a pixel in one call.
-const MAX_SAMPLES: usize = 1 << 24;
+pub(crate) const MAX_SAMPLES: usize = 1 << 24;
 /// Largest number of majorant cells along one axis.
 const MAX_CELLS: usize = 1024;
 

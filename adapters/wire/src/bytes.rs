@@ -2,6 +2,31 @@
 
 use crate::WireError;
 
+/// Values are moved in pieces of so many bytes; between two of them it is looked whether to go on, and whoever waits is told.
+pub(crate) const PIECE: usize = 1 << 20;
+
+/// Fills `values` with so many, piece by piece: memory that was never touched takes as long as what is put there. False: `next` broke off.
+pub(crate) fn fill(
+    values: &mut Vec<f32>,
+    count: usize,
+    mut next: impl FnMut(&mut [u8]) -> Result<bool, WireError>,
+) -> Result<bool, WireError> {
+    values.truncate(count);
+    for start in (0..count).step_by(PIECE / 4) {
+        let end = count.min(start + PIECE / 4);
+        if values.len() < end {
+            values.resize(end, 0.0);
+        }
+        let piece = &mut values[start..end];
+        // SAFETY: any bytes are f32s, and the length is that of the values.
+        let bytes = unsafe { std::slice::from_raw_parts_mut(piece.as_mut_ptr().cast::<u8>(), size_of_val(piece)) };
+        if !next(bytes)? {
+            return Ok(false);
+        }
+    }
+    Ok(true)
+}
+
 /// Takes values from the front of some bytes.
 pub(crate) struct Parser<'a> {
     what: &'static str,

@@ -1,7 +1,7 @@
 //! Which step is read next where a node has the rings of several blocks, so that what is read of them belongs together.
 //!
 //! The heads of a ring's slots are looked at before any values are read. Steps are read in the order of their places, and no ring runs further than
-//! [`AHEAD`] ahead of the slowest. Where a ring has lost steps the solver is faster than the reading: then the newest step that all rings hold comes
+//! [`LEAD`] ahead of the slowest. Where a ring has lost steps the solver is faster than the reading: then the newest step that all rings hold comes
 //! next, since it will be there for longest, and what is before it is passed over in all of them.
 
 use crate::place::{Place, Rounds};
@@ -10,11 +10,11 @@ use crate::{ReadAt, RingReader, WireError};
 use std::collections::VecDeque;
 
 /// Steps of a ring that are read before the slowest ring has published them. Whoever puts blocks together lets one more wait at least.
-pub(crate) const AHEAD: usize = 2;
+pub const LEAD: usize = 2;
 
 /// Steps of a ring that were looked at and not read.
 #[derive(Debug, Default)]
-pub(crate) struct Ahead {
+pub(crate) struct Unread {
     /// Their numbers in the ring, and their places, which rise.
     there: VecDeque<(u64, Place)>,
     /// The first number that was not looked at.
@@ -27,7 +27,7 @@ pub(crate) struct Ahead {
     lost: bool,
 }
 
-impl Ahead {
+impl Unread {
     /// Looks for steps that were published, and for those that were overwritten unread, which the reader passes over. `newest` is the round that the
     /// rings have come to.
     pub fn look<F: ReadAt>(&mut self, reader: &mut RingReader<F>, newest: u64) -> Result<(), WireError> {
@@ -69,7 +69,7 @@ impl Ahead {
     pub fn took(&mut self) {
         if let Some((_, place)) = self.there.pop_front() {
             self.read.push_back(place);
-            if self.read.len() > AHEAD {
+            if self.read.len() > LEAD {
                 self.read.pop_front();
             }
         }
@@ -77,7 +77,7 @@ impl Ahead {
 
     /// Whether so many were read that a ring whose last one is `slowest` has not had yet, that no more of them are to be.
     fn is_far_from(&self, slowest: Option<Place>) -> bool {
-        self.read.len() == AHEAD && self.read.front().copied() > slowest
+        self.read.len() == LEAD && self.read.front().copied() > slowest
     }
 
     fn has(&self, place: Place) -> bool {
@@ -92,14 +92,14 @@ impl Ahead {
 }
 
 /// Of rings of one simulation, those that are waited for: the one whose oldest step is read next.
-pub(crate) fn next<'a, K: Ord>(rings: impl Iterator<Item = (K, &'a Ahead)> + Clone) -> Option<(K, Place)> {
+pub(crate) fn next<'a, K: Ord>(rings: impl Iterator<Item = (K, &'a Unread)> + Clone) -> Option<(K, Place)> {
     let slowest = rings.clone().map(|(_, ring)| ring.last()).min()?;
     let near = rings.filter(|(_, ring)| !ring.is_far_from(slowest));
     near.filter_map(|(key, ring)| ring.first().map(|(_, place)| (place, key))).min().map(|(place, key)| (key, place))
 }
 
 /// Where one of the rings has lost steps: the place from which reading goes on in all of them.
-pub(crate) fn catch_up(mut rings: Vec<&mut Ahead>) -> Option<Place> {
+pub(crate) fn catch_up(mut rings: Vec<&mut Unread>) -> Option<Place> {
     let lost = || rings.iter().filter(|ring| ring.lost);
     let newest_first = lost().next()?.there.iter().rev().map(|(_, place)| *place);
     let common = newest_first.into_iter().find(|place| rings.iter().all(|ring| ring.has(*place)));
@@ -158,7 +158,7 @@ mod tests {
         };
         let memory = Rc::new(RefCell::new(now[0].clone()));
         let mut reader = RingReader::over("memory".into(), Memory(memory.clone()), &Limits::default()).unwrap();
-        let mut unread = Ahead::default();
+        let mut unread = Unread::default();
         let mut steps = |bytes: Vec<u8>| {
             *memory.borrow_mut() = bytes;
             unread.look(&mut reader, 0).unwrap();

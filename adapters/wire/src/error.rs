@@ -147,9 +147,9 @@ pub enum WireError {
     /// The signature is not that of the key.
     #[error("the signature does not fit: another key, or the message was changed on the way")]
     Signature,
-    /// The payload is not the one that was signed for.
-    #[error("the payload's hash does not fit: it was changed on the way")]
-    Hash,
+    /// What came with a message is not what was signed.
+    #[error("the signature of a message's payload does not fit: it was changed on the way")]
+    Payload,
     /// A message that came before.
     #[error("message {found} is a replay: {newest} came already")]
     Replayed {

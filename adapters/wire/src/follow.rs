@@ -1,6 +1,6 @@
 //! Following blocks, wherever they come from: rings of this node, or relays of others.
 
-use crate::choice::{self, Ahead};
+use crate::choice::{self, Unread};
 use crate::lock::{Following, blocks, producer_lives};
 use crate::place::Place;
 use crate::reader::{Read, RingReader, StepInfo};
@@ -15,7 +15,8 @@ use std::time::{Duration, Instant};
 const ATTEMPTS: usize = 4;
 /// How often new rings are looked for.
 const LOOK: Duration = Duration::from_millis(100);
-/// How often producers are told that somebody follows, at least while [`RingFollower::poll`] or [`RingFollower::beat`] is called.
+/// How often producers are told that somebody follows, at least: while [`RingFollower::poll`] or [`RingFollower::beat`] is called again and again, and
+/// while a step is read.
 const BEAT: Duration = Duration::from_secs(1);
 
 /// What happened to a block.
@@ -63,7 +64,7 @@ type Simulation = (u64, u32);
 struct Followed {
     reader: RingReader,
     /// Of one block among several: what is there.
-    ahead: Ahead,
+    unread: Unread,
     /// Nothing more is read, since what was read could not be: until a new producer takes its place.
     refused: bool,
     /// There was nothing to be read when it was last looked at.
@@ -83,15 +84,21 @@ struct Followed {
 
 impl Followed {
     fn begin(reader: RingReader) -> Self {
-        let (ahead, now) = (Ahead::default(), Instant::now());
+        let (unread, now) = (Unread::default(), Instant::now());
         let (refused, drained, closed, gone, replaced, ended) = (false, false, false, false, false, false);
-        Self { reader, ahead, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
+        Self { reader, unread, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
     }
 
-    /// Tells the producer how far its steps were taken. A ring that cannot be written to is one that nobody waits for.
+    /// Tells the producer how far its steps were taken.
     fn acknowledge(&mut self, mark: u32) {
-        self.told = Instant::now();
-        let _ = self.reader.acknowledge(mark);
+        acknowledge(&self.reader, &mut self.told, mark);
+    }
+
+    /// [`Self::acknowledge`], where the producer has heard nothing for a second.
+    fn beat(&mut self, mark: u32) {
+        if !self.refused {
+            beat(&self.reader, &mut self.told, mark);
+        }
     }
 
     fn simulation(&self) -> Simulation {
@@ -129,6 +136,18 @@ impl Followed {
         self.acknowledge(mark);
         let StepInfo { step, time, published, missed, .. } = info;
         Event::Step { block, generation: self.reader.header().generation, step, time, published, missed }
+    }
+}
+
+/// A ring that cannot be written to is one that nobody waits for.
+fn acknowledge(reader: &RingReader, told: &mut Instant, mark: u32) {
+    *told = Instant::now();
+    let _ = reader.acknowledge(mark);
+}
+
+fn beat(reader: &RingReader, told: &mut Instant, mark: u32) {
+    if told.elapsed() > BEAT {
+        acknowledge(reader, told, mark);
     }
 }
 
@@ -176,6 +195,11 @@ impl RingFollower {
 
     /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
     pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
+        self.poll_beside(values, &mut || ())
+    }
+
+    /// The same, with `beside` called again and again while a step is read.
+    pub fn poll_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
         self.beat();
         if self.looked.is_none_or(|looked| looked.elapsed() > LOOK) {
             if let Some(event) = self.look() {
@@ -193,7 +217,10 @@ impl RingFollower {
         let later = (Bound::Excluded(self.turn), Bound::Unbounded);
         for simulation in simulations.range(later).chain(simulations.range(..=self.turn)) {
             self.turn = *simulation;
-            let event = if simulation.1 == 1 { self.read_field(*simulation, values) } else { self.read_block(*simulation, values) };
+            let event = match simulation.1 {
+                1 => self.read_field(*simulation, values, beside),
+                _ => self.read_block(*simulation, values, beside),
+            };
             if event.is_some() {
                 return event;
             }
@@ -202,12 +229,14 @@ impl RingFollower {
     }
 
     /// Of a simulation in one block, its next step.
-    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>) -> Option<Event> {
-        let (block, followed) = self.rings.iter_mut().find(|(_, followed)| followed.simulation() == simulation && !followed.refused)?;
-        match followed.reader.read(values) {
+    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
+        let block = *self.rings.iter().find(|(_, followed)| followed.simulation() == simulation && !followed.refused)?.0;
+        let found = self.read_ring(block, beside, |reader, beside| reader.read_beside(values, beside))?;
+        let followed = self.rings.get_mut(&block)?;
+        match found {
             Ok(Read::Step(info)) => {
                 followed.drained = false;
-                Some(followed.step(*block, info, self.mark))
+                Some(followed.step(block, info, self.mark))
             }
             Ok(end) => {
                 (followed.drained, followed.closed) = (true, followed.closed || end == Read::Ended);
@@ -218,7 +247,7 @@ impl RingFollower {
     }
 
     /// Of a simulation in several blocks, the next block of the step that is being read, or the first one of another step.
-    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>) -> Option<Event> {
+    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
         for _ in 0..ATTEMPTS {
             // The step goes on from what is known. Before another is begun all rings are looked at.
             let block = match self.next(simulation).filter(|(_, place)| self.current == Some((simulation, *place))) {
@@ -232,15 +261,16 @@ impl RingFollower {
                     block
                 }
             };
+            let (number, _) = self.rings.get(&block)?.unread.first()?;
+            let found = self.read_ring(block, beside, |reader, beside| reader.take(number, values, beside))?;
             let followed = self.rings.get_mut(&block)?;
-            let (number, _) = followed.ahead.first()?;
-            match followed.reader.take(number, values) {
+            match found {
                 Ok(Some(info)) => {
-                    followed.ahead.took();
+                    followed.unread.took();
                     return Some(followed.step(block, info, self.mark));
                 }
                 Ok(None) => {
-                    followed.ahead.overwritten(&mut followed.reader, number + 1);
+                    followed.unread.overwritten(&mut followed.reader, number + 1);
                     self.current = None;
                 }
                 Err(error) => return Some(followed.refuse(error)),
@@ -252,7 +282,7 @@ impl RingFollower {
     /// The ring to be read next, and the place of its oldest step. What is in a ring that was replaced comes first: its block is not opened anew before.
     fn next(&self, simulation: Simulation) -> Option<(u32, Place)> {
         let rings = self.rings.iter().filter(|(_, f)| f.simulation() == simulation && !f.refused && !f.ended);
-        let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.ahead));
+        let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.unread));
         choice::next(of(true)).or_else(|| choice::next(of(false)))
     }
 
@@ -260,21 +290,21 @@ impl RingFollower {
     fn look_ahead(&mut self, simulation: Simulation) -> Option<Event> {
         let mut rings: Vec<&mut Followed> =
             self.rings.values_mut().filter(|f| f.simulation() == simulation && !f.refused && !f.ended).collect();
-        let newest = rings.iter().filter_map(|followed| followed.ahead.last()).map(|(round, _)| round).max().unwrap_or(0);
+        let newest = rings.iter().filter_map(|followed| followed.unread.last()).map(|(round, _)| round).max().unwrap_or(0);
         for followed in &mut rings {
             let looked = followed.reader.is_closed().and_then(|closed| {
                 followed.closed |= closed;
-                followed.ahead.look(&mut followed.reader, newest)
+                followed.unread.look(&mut followed.reader, newest)
             });
             if let Err(error) = looked {
                 return Some(followed.refuse(error));
             }
-            followed.drained = followed.ahead.is_empty();
+            followed.drained = followed.unread.is_empty();
         }
         rings.retain(|followed| !followed.replaced);
-        let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.ahead).collect())?;
+        let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.unread).collect())?;
         for followed in rings {
-            if followed.ahead.pass(&mut followed.reader, place) {
+            if followed.unread.pass(&mut followed.reader, place) {
                 followed.acknowledge(self.mark);
             }
         }
@@ -289,9 +319,26 @@ impl RingFollower {
 
     /// [`Self::hold`] for those producers that have heard nothing for a second: costs nothing in between.
     pub fn beat(&mut self) {
-        let (mark, now) = (self.mark, Instant::now());
-        let quiet = |followed: &&mut Followed| !followed.refused && now.duration_since(followed.told) > BEAT;
-        self.rings.values_mut().filter(quiet).for_each(|followed| followed.acknowledge(mark));
+        self.rings.values_mut().for_each(|followed| followed.beat(self.mark));
+    }
+
+    /// Reads a ring; after each piece of the values all producers are told, where it is time, and `beside` is called.
+    fn read_ring<T>(
+        &mut self,
+        block: u32,
+        beside: &mut dyn FnMut(),
+        read: impl FnOnce(&mut RingReader, &mut dyn FnMut(&RingReader)) -> T,
+    ) -> Option<T> {
+        // Apart from the others, which are told of meanwhile.
+        let mut followed = self.rings.remove(&block)?;
+        let Followed { reader, told, .. } = &mut followed;
+        let found = read(reader, &mut |reader| {
+            beat(reader, told, self.mark);
+            self.beat();
+            beside();
+        });
+        self.rings.insert(block, followed);
+        Some(found)
     }
 
     /// Looks for rings that are new, or that a new producer put in the place of an old one.

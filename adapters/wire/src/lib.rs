@@ -28,6 +28,7 @@ pub mod relay;
 mod system;
 
 pub use assemble::{Assembler, Incomplete, Step};
+pub use choice::LEAD;
 pub use copy::{Element, Field};
 pub use description::{AxisDescription, BlockExtent, Description, Geometry, Limits, even};
 pub use error::WireError;

@@ -2,14 +2,15 @@
 //!
 //! Both sides know the key of a [`ConnectionFile`]. They greet each other with random numbers, prove the key, and derive a session key from both:
 //! a message of another session never fits. Each message is a head of fixed length with its signature (HMAC-SHA256), then the
-//! description (of a block that was opened) and the values, for whose BLAKE3 hash the head vouches. Its number rises strictly within the
-//! session. So nothing is believed, and no memory taken, before the signature has been checked. A follower asks for each message but pulses
-//! (signed and numbered as well), so that nothing is on its way to one that does not take it.
+//! description (of a block that was opened) and the values, and a signature of the head with the BLAKE3 hash of both, which comes last so that
+//! nothing waits until all was hashed. Its number rises strictly within the session. So no memory is taken before the head's signature has been
+//! checked, and nothing is believed before the last. A follower asks for each message but pulses (signed and numbered as well), so that nothing
+//! is on its way to one that does not take it.
 //!
 //! TCP with these frames and not ZeroMQ: the `zeromq` crate takes memory for any length that a peer announces, before a signature could be
 //! looked at, and is half as fast with steps of 340 MB (`benches/relay.rs`).
 
-use crate::bytes::{Parser, Writer};
+use crate::bytes::{PIECE, Parser, Writer, fill};
 use crate::header::DESCRIPTION_BYTES;
 use crate::system::{self, create_private, open_private};
 use crate::{Description, Limits, WireError};
@@ -28,16 +29,14 @@ const GREETING: [u8; 12] = *b"RIDGEWIRE\0\0\0";
 const MAGIC: [u8; 4] = *b"RWMS";
 /// First bytes of what a follower asks.
 const ASK_MAGIC: [u8; 4] = *b"RWAS";
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 /// Bytes of what a follower asks, with its signature.
 pub const ASK_BYTES: usize = 20 + SIGNATURE;
 /// Bytes of a message's head, and of its signature.
-const HEAD: usize = 100;
+const HEAD: usize = 76;
 const SIGNATURE: usize = 32;
 /// Longest connection file.
 const FILE_BYTES: u64 = 4096;
-/// Values go through the socket in pieces of so many bytes, so that a peer that stalls is noticed.
-pub(crate) const PIECE: usize = 1 << 20;
 
 /// What both sides know.
 #[derive(Clone, PartialEq, Eq)]
@@ -315,14 +314,15 @@ impl Session {
         head.u64(facts.missed);
         head.u32(description.len() as u32);
         head.u64(values.len() as u64);
-        let mut hash = blake3::Hasher::new();
-        hash.update(&description).update(values);
-        // 192 of its 256 bits, under a signature.
-        head.0.extend_from_slice(&hash.finalize().as_bytes()[..HEAD - 76]);
         to.write_all(&head.0).map_err(failed)?;
         to.write_all(&self.key.signature(&[&head.0])).map_err(failed)?;
-        to.write_all(&description).map_err(failed)?;
-        values.chunks(PIECE).try_for_each(|piece| to.write_all(piece)).and_then(|()| to.flush()).map_err(failed)
+        let mut hasher = blake3::Hasher::new();
+        for piece in std::iter::once(description.as_slice()).chain(values.chunks(PIECE)) {
+            hasher.update(piece);
+            to.write_all(piece).map_err(failed)?;
+        }
+        let signature = self.key.signature(&[&head.0, hasher.finalize().as_bytes()]);
+        to.write_all(&signature).and_then(|()| to.flush()).map_err(failed)
     }
 
     /// Receives a message. `description` is the block's as it was last announced and is replaced when the message brings one;
@@ -341,7 +341,7 @@ impl Session {
         from.read_exact(&mut head).map_err(failed)?;
         from.read_exact(&mut signature).map_err(failed)?;
         self.key.verify(&[&head], &signature)?;
-        let (facts, description_bytes, payload, hash) = self.check_head(&head)?;
+        let (facts, description_bytes, payload) = self.check_head(&head)?;
         let mut hasher = blake3::Hasher::new();
         let mut description = vec![0; description_bytes as usize];
         from.read_exact(&mut description).map_err(failed)?;
@@ -360,29 +360,20 @@ impl Session {
             return Err(WireError::field("payload bytes", payload, accepted));
         }
         let count = payload as usize / 4;
-        values.truncate(count);
-        let missing = count - values.len();
+        let missing = count.saturating_sub(values.len());
         values.try_reserve_exact(missing).map_err(|_| WireError::no_memory(4 * missing))?;
-        // Memory that was never touched, and the hash, take as long as the bytes' way: piece by piece the relay is kept waiting by neither.
-        for start in (0..count).step_by(PIECE / 4) {
-            let end = count.min(start + PIECE / 4);
-            if values.len() < end {
-                values.resize(end, 0.0);
-            }
-            let piece = &mut values[start..end];
-            // SAFETY: any bytes are f32s, and the length is that of the values.
-            let bytes = unsafe { std::slice::from_raw_parts_mut(piece.as_mut_ptr().cast::<u8>(), size_of_val(piece)) };
-            from.read_exact(bytes).map_err(failed)?;
-            hasher.update(bytes);
-        }
-        if hasher.finalize().as_bytes()[..hash.len()] != hash {
-            return Err(WireError::Hash);
-        }
+        fill(values, count, |piece| {
+            from.read_exact(piece).map_err(failed)?;
+            hasher.update(piece);
+            Ok(true)
+        })?;
+        from.read_exact(&mut signature).map_err(failed)?;
+        self.key.verify(&[&head, hasher.finalize().as_bytes()], &signature).map_err(|_| WireError::Payload)?;
         Ok(facts)
     }
 
     /// A head whose signature fits.
-    fn check_head(&mut self, head: &[u8; HEAD]) -> Result<(Facts, u32, u64, [u8; HEAD - 76]), WireError> {
+    fn check_head(&mut self, head: &[u8; HEAD]) -> Result<(Facts, u32, u64), WireError> {
         let mut input = Parser::new("a message", head);
         let magic: [u8; 4] = input.array()?;
         if magic != MAGIC {
@@ -410,10 +401,9 @@ impl Session {
         if description > DESCRIPTION_BYTES {
             return Err(WireError::TooLarge { what: "the description", needed: description.into(), limit: DESCRIPTION_BYTES.into() });
         }
-        let hash = input.array()?;
         input.end()?;
         self.number = number;
-        Ok((Facts { kind, block, generation, step, time, published, missed }, description, payload, hash))
+        Ok((Facts { kind, block, generation, step, time, published, missed }, description, payload))
     }
 }
 
@@ -491,7 +481,7 @@ mod tests {
         ] {
             let error = found.unwrap();
             assert!(matches!(error, WireError::Version { what: w, found: 1, known: VERSION } if w == what), "{what}: {error}");
-            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 3 and knows no other"));
+            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 4 and knows no other"));
         }
     }
 
@@ -523,17 +513,18 @@ mod tests {
             let begin = HEAD + SIGNATURE;
             for _ in 0..1 + random(3) {
                 // The head's plain part, or the description.
-                let place = if random(2) == 0 { random(76) } else { begin + random(message.len() - begin - 160) };
+                let place = if random(2) == 0 { random(HEAD) } else { begin + random(message.len() - begin - 160 - SIGNATURE) };
                 match random(3) {
                     0 => message[place] ^= 1 << random(8),
                     1 => message[place] = [0, 1, 2, 0x7f, 0x80, 0xff][random(6)],
                     _ => message[place..place + 4].copy_from_slice(&[0u32, 1, 0x7fff_ffff, u32::MAX][random(4)].to_le_bytes()),
                 }
             }
-            let hash = blake3::hash(&message[begin..]);
-            message[76..HEAD].copy_from_slice(&hash.as_bytes()[..HEAD - 76]);
             let signature = from.key.signature(&[&message[..HEAD]]);
             message[HEAD..begin].copy_from_slice(&signature);
+            let end = message.len() - SIGNATURE;
+            let signature = from.key.signature(&[&message[..HEAD], blake3::hash(&message[begin..end]).as_bytes()]);
+            message[end..].copy_from_slice(&signature);
             let mut known = |_, announced: Option<Description>| announced.map(|d| d.block_bytes());
             // Where the head says how long the description is.
             let announced = u32::from_le_bytes(message[64..68].try_into().unwrap());
@@ -554,7 +545,7 @@ mod tests {
                     let kind = match error {
                         WireError::Field { .. } | WireError::Block { .. } => 0,
                         WireError::TooLarge { .. } => 1,
-                        WireError::Short { .. } | WireError::Io { .. } | WireError::Hash => 2,
+                        WireError::Short { .. } | WireError::Io { .. } | WireError::Payload => 2,
                         WireError::Replayed { .. } | WireError::Version { .. } => 3,
                         other => panic!("{other}: the signature fits"),
                     };

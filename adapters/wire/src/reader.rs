@@ -3,6 +3,7 @@
 //! Everything is read through the file, not through a mapping: a ring that is cut short under the reader's hands gives an error and no
 //! signal, and what a producer writes meanwhile is seen by the sequence numbers.
 
+use crate::bytes::fill;
 use crate::header::{DESCRIPTION, ENDED, FIXED, Header, MARK, MARK_BYTES, MARKS, PUBLISHED, SLOT_HEADER, STATE};
 use crate::system::{self, open_private};
 use crate::{Limits, WireError, block_path};
@@ -159,6 +160,11 @@ impl<F: ReadAt> RingReader<F> {
     /// # Errors
     /// The file went away or was cut short; its counts run backwards.
     pub fn read(&mut self, values: &mut Vec<f32>) -> Result<Read, WireError> {
+        self.read_beside(values, &mut |_| ())
+    }
+
+    /// The same, with `beside` called after each piece of the values.
+    pub(crate) fn read_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self)) -> Result<Read, WireError> {
         let slots = u64::from(self.header.slots);
         let began = self.next;
         // Before the count is read: no step can come after it.
@@ -175,7 +181,7 @@ impl<F: ReadAt> RingReader<F> {
                 self.next = began;
                 return Ok(if missed == 0 && ended { Read::Ended } else { Read::Nothing });
             }
-            if let Some(mut info) = self.try_slot(self.next, values)? {
+            if let Some(mut info) = self.try_slot(self.next, values, beside)? {
                 info.missed = info.number - began;
                 self.next += 1;
                 return Ok(Read::Step(info));
@@ -209,9 +215,14 @@ impl<F: ReadAt> RingReader<F> {
         Ok(if is_over { Found::Overwritten } else { Found::Unseen })
     }
 
-    /// Reads this step and no other, as [`Self::read`] does; none: it was overwritten. What is before it counts as missed.
-    pub(crate) fn take(&mut self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
-        let Some(mut info) = self.try_slot(number, values)? else { return Ok(None) };
+    /// Reads this step and no other, as [`Self::read_beside`] does; none: it was overwritten. What is before it counts as missed.
+    pub(crate) fn take(
+        &mut self,
+        number: u64,
+        values: &mut Vec<f32>,
+        beside: &mut dyn FnMut(&Self),
+    ) -> Result<Option<StepInfo>, WireError> {
+        let Some(mut info) = self.try_slot(number, values, beside)? else { return Ok(None) };
         self.pass(number);
         info.missed = std::mem::take(&mut self.passed);
         self.next = number + 1;
@@ -297,21 +308,22 @@ impl<F: ReadAt> RingReader<F> {
         Ok(Some(self.any_head(number)?).filter(|words| words[0] == sequence(number)))
     }
 
-    fn try_slot(&self, number: u64, values: &mut Vec<f32>) -> Result<Option<StepInfo>, WireError> {
+    fn try_slot(&self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self)) -> Result<Option<StepInfo>, WireError> {
         let slot = self.slot(number);
         // At most what the limits allow: the header was checked.
         let count = (self.header.description.block_bytes() / 4) as usize;
         let Some(head) = self.head(number)? else { return Ok(None) };
         fence(Ordering::Acquire);
-        values.resize(count, 0.0);
-        // SAFETY: any bytes are f32s, and the length is that of the values.
-        let bytes = unsafe { std::slice::from_raw_parts_mut(values.as_mut_ptr().cast::<u8>(), count * 4) };
-        self.read_bytes(bytes, slot + SLOT_HEADER as u64)?;
-        // All values before the second look at the number.
-        fence(Ordering::Acquire);
-        let mut after = [0; 8];
-        self.read_bytes(&mut after, slot)?;
-        if u64::from_ne_bytes(after) != sequence(number) {
+        let mut place = slot + SLOT_HEADER as u64;
+        let is_whole = fill(values, count, |piece| {
+            self.read_bytes(piece, place)?;
+            place += piece.len() as u64;
+            beside(self);
+            // All values so far before another look at the number.
+            fence(Ordering::Acquire);
+            Ok(self.head(number)?.is_some())
+        })?;
+        if !is_whole {
             return Ok(None);
         }
         let time = f64::from_bits(head[2]);

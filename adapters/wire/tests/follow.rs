@@ -13,6 +13,7 @@ use ridgewatch_wire::{
     RingFollower, WireError,
 };
 use std::cell::Cell;
+use std::collections::BTreeMap;
 use std::io::{Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::sync::Arc;
@@ -31,10 +32,10 @@ fn publish(producer: &Producer, step: u64) -> Published {
     unsafe { producer.publish(step, step as f64, &Field::packed(&pointers, Element::F32, producer.description().block.extent)).unwrap() }
 }
 
-/// Events in words, until `enough` or five seconds went by.
+/// Events in words, until `enough` or a minute went by.
 fn events(poll: &mut dyn FnMut(&mut Vec<f32>) -> Option<Event>, enough: &str) -> Vec<String> {
     let (mut seen, mut values, begin) = (Vec::new(), Vec::new(), Instant::now());
-    while begin.elapsed() < Duration::from_secs(5) {
+    while begin.elapsed() < Duration::from_secs(60) {
         let words = match poll(&mut values) {
             Some(Event::Opened { description, .. }) => format!("opened {}", description.shape()[0]),
             Some(Event::Step { step, time, missed, .. }) => {
@@ -126,7 +127,10 @@ fn a_killed_solver_is_noticed_and_its_ring_is_no_news_to_others() {
     assert_eq!(events(&mut poll, "ended"), ["ended true"]);
     killed();
     // It was dead before it was seen: its ring is what a killed run left.
-    assert_eq!(events(&mut poll, "opened").len(), 0);
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(1) {
+        assert!(poll(&mut Vec::new()).is_none(), "it is no news");
+    }
     // A new one takes its place.
     let producer = Producer::open(&folder.0, description(4), 4, Policy::NewestWins).unwrap();
     publish(&producer, 2);
@@ -635,7 +639,7 @@ fn a_follower_that_dribbles_is_cut_off() {
 }
 
 #[test]
-fn a_relay_may_take_longer_for_a_large_step() {
+fn a_relay_that_says_nothing_is_left_and_one_that_lives_is_waited_for() {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let key = Key::random().unwrap();
     let file = ConnectionFile { address: listener.local_addr().unwrap().to_string(), key: key.clone() };
@@ -646,18 +650,60 @@ fn a_relay_may_take_longer_for_a_large_step() {
         let quiet = Facts { kind: Kind::Pulse, block: 0, generation: 1, step: 0, time: 0.0, published: 0, missed: 0 };
         let mut asked = [0; ASK_BYTES];
         stream.read_exact(&mut asked).unwrap();
-        // 2.1 GB, of which none is sent.
-        session.send(&mut stream, &Facts { kind: Kind::Opened, ..quiet }, Some(&description(16384)), &[]).unwrap();
+        session.send(&mut stream, &Facts { kind: Kind::Opened, ..quiet }, Some(&description(4)), &[]).unwrap();
         stream.read_exact(&mut asked).unwrap();
-        // As if it copied and signed a step all the while.
-        std::thread::sleep(ridgewatch_wire::relay::PATIENCE + Duration::from_secs(1));
-        session.send(&mut stream, &Facts { kind: Kind::Ended, ..quiet }, None, &[]).unwrap();
+        // As if it read a large step for longer than its follower's patience.
+        let begin = Instant::now();
+        while begin.elapsed() < ridgewatch_wire::relay::PATIENCE + Duration::from_secs(1) {
+            session.send(&mut stream, &quiet, None, &[]).unwrap();
+            std::thread::sleep(Duration::from_millis(500));
+        }
+        session.send(&mut stream, &Facts { kind: Kind::Step, ..quiet }, None, &[0.0; 32]).unwrap();
+        // Nothing any more, until the follower comes anew.
+        let mut again = listener.accept().unwrap().0;
+        Session::accept(&mut again, &key).unwrap();
     });
     let mut poll = |values: &mut Vec<f32>| follower.poll(values, Duration::from_millis(10));
-    assert_eq!(events(&mut poll, "opened"), ["opened 16384"]);
-    std::thread::sleep(Duration::from_secs(3));
-    assert_eq!(events(&mut poll, "ended"), ["ended true"]);
+    assert_eq!(events(&mut poll, "step 0"), ["opened 4", "step 0 missed 0"]);
+    let told = events(&mut poll, "refused");
+    assert!(told.len() == 1 && told[0].contains("timed out"), "{told:?}");
     relay.join().unwrap();
+}
+
+#[test]
+fn producers_wait_while_a_step_is_read_slowly() {
+    let folder = Folder::new("slowly");
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    // 4 MiB a block, in four pieces.
+    let solvers: Vec<_> = columns(1024, 2)
+        .into_iter()
+        .map(|block| {
+            let producer = Producer::open(&folder.0, block, 2, Policy::Wait(10 * LONG)).unwrap();
+            std::thread::spawn(move || (0..5).for_each(|n| _ = publish(&producer, n)))
+        })
+        .collect();
+    let (mut values, mut seen, begin) = (Vec::new(), BTreeMap::<u32, Vec<u64>>::new(), Instant::now());
+    // Together longer than a producer waits for one that it does not hear of.
+    let mut pieces = 0;
+    while seen.values().map(Vec::len).sum::<usize>() < 10 {
+        assert!(begin.elapsed() < 10 * LONG, "{seen:?}");
+        let event = follower.poll_beside(&mut values, &mut || {
+            pieces += 1;
+            if pieces <= 4 {
+                std::thread::sleep(Duration::from_secs(2));
+            }
+        });
+        match event {
+            Some(Event::Step { block, step, missed, .. }) => {
+                assert_eq!(missed, 0, "before step {step} of block {block}");
+                seen.entry(block).or_default().push(step);
+            }
+            Some(Event::Refused(error)) => panic!("{error}"),
+            _ => {}
+        }
+    }
+    assert!(pieces == 40 && seen.values().all(|steps| *steps == [0, 1, 2, 3, 4]), "{pieces} {seen:?}");
+    solvers.into_iter().for_each(|solver| solver.join().unwrap());
 }
 
 #[test]
@@ -665,15 +711,17 @@ fn a_relay_may_take_longer_for_a_large_step() {
 fn steps_of_two_gigabytes_arrive_over_one_connection() {
     let folder = Folder::new("gigabytes");
     let relay = Relay::start(&folder, "127.0.0.1:0", &Key::random().unwrap());
-    let producer = Producer::open(&folder.0, description(16384), 2, Policy::Wait(4 * LONG)).unwrap();
+    let producer = Producer::open(&folder.0, description(16384), 2, Policy::Wait(20 * LONG)).unwrap();
     let mut follower = relay.follow(LONG);
     let solver = std::thread::spawn(move || (0..4).for_each(|n| _ = publish(&producer, n)));
     let (mut values, mut steps, begin) = (Vec::new(), 0, Instant::now());
     while steps < 4 {
-        assert!(begin.elapsed() < 4 * LONG, "{steps} steps came");
+        // Memory that was never touched may come at a tenth of a gigabyte a second.
+        assert!(begin.elapsed() < 20 * LONG, "{steps} steps came");
         match follower.poll(&mut values, Duration::from_millis(10)) {
             Some(Event::Step { step, missed, .. }) => {
-                assert!(step == steps && missed == 0 && values.len() == 1 << 29 && values.iter().all(|v| *v == step as f32));
+                assert_eq!((step, missed, values.len()), (steps, 0, 1 << 29));
+                assert!(values.iter().all(|v| *v == step as f32), "step {step}");
                 steps += 1;
                 println!("step {step} after {:?}", begin.elapsed());
             }

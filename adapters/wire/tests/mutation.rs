@@ -200,7 +200,7 @@ fn mutated_messages() {
         // One in eight arrives as it was sent.
         if case % 8 != 0 {
             let length = bytes.len();
-            mutate(&mut bytes, &[0..132, 132..length - 700, length - 700..length], &mut random);
+            mutate(&mut bytes, &[0..108, 108..length - 700, length - 700..length], &mut random);
         }
         let held = HELD.get();
         PEAK.set(held);

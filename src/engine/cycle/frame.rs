@@ -160,7 +160,7 @@ impl Cycle<'_> {
         let waits = !live || scene.training.steps_per_frame.is_some();
         let per_cell = scene.trust.audit_per_cell;
         let cells = self.trust.shape();
-        let samples_per_pixel = self.options.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
+        let samples_per_pixel = scene.time.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
         // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
         // the warm-up was.
         let picture = if place.warmup { WARMUP_PICTURES + self.frame } else { self.pictures };

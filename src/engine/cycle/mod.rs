@@ -37,8 +37,6 @@ pub struct RunOptions {
     pub checkpoint: Option<PathBuf>,
     /// Writes it also while the run goes on, when so many seconds have gone by since the last time: what is killed goes on from there.
     pub checkpoint_seconds: Option<f64>,
-    /// Samples a pixel of warm-up frames; none: the scene's.
-    pub warmup_samples: Option<usize>,
     /// What traces.
     pub device: Device,
 }

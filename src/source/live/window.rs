@@ -5,15 +5,15 @@ use super::thinning::Thinning;
 use super::{AtEnd, Follow, Live, memory};
 use crate::field::{Window, WindowFault};
 use crate::source::{Listener, SourceError, StillReading};
-use ridgewatch_wire::{Assembler, Event, Step};
+use ridgewatch_wire::{Assembler, Event, LEAD, Step};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// Steps that may wait for their blocks at once.
-const PENDING: usize = 4;
+/// Steps that may wait for their blocks at once: those by which one ring may lead the slowest, the one that the slowest comes to, and one more.
+const PENDING: usize = LEAD + 2;
 /// Snapshots beside the windows: the one that is being made, and one that was left out, against which interpolation is measured.
 const BESIDE: u64 = 2;
 /// Warnings that are kept for the next frame; the rest is counted.
