@@ -22,8 +22,10 @@ const MEMORY: u64 = 2_000_000;
 /// whole file too. 2^20 values that a file claims and does not have would take 16 MB more as f64, the library's copy and ours. (Values that
 /// a file does have by right, up to 2^20 or 1032 / 4 a byte, take 108 bytes each in a window; no mutant came to that.)
 const LARGEST: u64 = 45 << 20;
-/// Milliseconds' work; the machine may be busy.
-const LONGEST: Duration = Duration::from_secs(20);
+/// Seconds after which the program gives up the opening of a file. Milliseconds' work; the machine may be slow and busy.
+const OPENING_LIMIT: &str = "30";
+/// After so long a child hangs.
+const LONGEST: Duration = Duration::from_secs(120);
 
 /// How a child ended.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Clone, Copy)]
@@ -48,7 +50,7 @@ fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
     let command = format!("ulimit -v {MEMORY}; exec {} {work} {} {options}", env!("CARGO_BIN_EXE_ridgewatch"), files.join(" "));
     let mut child = Command::new("sh")
         .args(["-c", &command])
-        .env("RIDGEWATCH_OPENING_LIMIT", "5")
+        .env("RIDGEWATCH_OPENING_LIMIT", OPENING_LIMIT)
         // Looking up the names for a backtrace takes 100 MB.
         .env("RUST_BACKTRACE", "0")
         .stdout(Stdio::null())
@@ -77,7 +79,7 @@ fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
             let damaged = files.last().unwrap();
             assert!(said.contains(damaged), "does not name {damaged}: {command}: {said}");
             match () {
-                () if said.contains("not opened within 5 s") => End::GivenUp,
+                () if said.contains(&format!("not opened within {OPENING_LIMIT} s")) => End::GivenUp,
                 () if said.contains("crashed") => End::Crashed,
                 () => End::Refused,
             }

@@ -209,9 +209,9 @@ fn a_signal_ends_the_run_after_the_current_frame() {
         .stderr(std::process::Stdio::piped())
         .spawn()
         .unwrap();
-    let deadline = std::time::Instant::now() + std::time::Duration::from_secs(60);
+    let deadline = std::time::Instant::now() + std::time::Duration::from_secs(300);
     while !run.join("frames/frame_000002.exr").exists() {
-        assert!(std::time::Instant::now() < deadline, "no frame within a minute");
+        assert!(std::time::Instant::now() < deadline, "no frame within five minutes");
         std::thread::sleep(std::time::Duration::from_millis(50));
     }
     assert!(Command::new("kill").args(["-TERM", &child.id().to_string()]).status().unwrap().success());

@@ -12,6 +12,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+/// After so long a test that hangs fails.
+const LONG: Duration = Duration::from_secs(120);
+
 struct Folder(PathBuf);
 
 impl Folder {
@@ -35,7 +38,7 @@ fn plane(nodes: u64) -> Description {
 
 /// A producer that waits, so that no step is lost however slow the machine is.
 fn producer(folder: &Folder, description: Description) -> Producer {
-    Producer::open(&folder.0, description, 4, Policy::Wait(Duration::from_secs(20))).unwrap()
+    Producer::open(&folder.0, description, 4, Policy::Wait(LONG)).unwrap()
 }
 
 /// u = value everywhere, v = time.
@@ -61,7 +64,7 @@ fn follow(settings: &LiveSettings, tau: f64) -> LiveWindow {
 fn take(window: &LiveWindow, wanted: impl Fn(&Taken) -> bool) -> (Taken, Vec<String>) {
     let (mut warnings, begin) = (Vec::new(), Instant::now());
     loop {
-        assert!(begin.elapsed() < Duration::from_secs(10), "it never came; warnings: {warnings:?}");
+        assert!(begin.elapsed() < LONG, "it never came; warnings: {warnings:?}");
         if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_millis(50)) {
             warnings.extend(taken.warnings.clone());
             if wanted(&taken) {
@@ -89,7 +92,7 @@ fn the_window_fills_and_moves_with_the_simulation() {
     }
     let begin = Instant::now();
     while (window.filled() - 0.75).abs() > 1e-9 {
-        assert!(begin.elapsed() < Duration::from_secs(10), "{}", window.filled());
+        assert!(begin.elapsed() < LONG, "{}", window.filled());
         std::thread::sleep(Duration::from_millis(1));
     }
     assert!(window.next_within(Duration::from_millis(50)).is_err(), "1.5 of 2 is not full");
@@ -100,7 +103,7 @@ fn the_window_fills_and_moves_with_the_simulation() {
     let filling = &taken.live.filling;
     assert!(filling.len() == 10 && filling.is_sorted() && filling[0] == filling[1] && filling[5] == filling[6], "{filling:?}");
     assert!(filling[9] - filling[6] >= 0.05, "{filling:?}: the last quarter was late");
-    assert!(taken.live.delay <= taken.live.age && taken.live.age < 5.0 && warnings.is_empty(), "{warnings:?}");
+    assert!(taken.live.delay <= taken.live.age && taken.live.age < 60.0 && warnings.is_empty(), "{warnings:?}");
     assert!(window.next_within(Duration::from_millis(20)).is_err(), "nothing new");
     publish(&solver, 5, 2.5, 3.0);
     let (taken, _) = take(&window, |_| true);
@@ -123,6 +126,11 @@ fn a_listener_hears_of_each_snapshot_before_the_window_has_it() {
             let heard = heard.lock().unwrap();
             assert!(taken.window.snapshots().all(|s| heard.iter().any(|h| Arc::ptr_eq(h, s))));
         }
+    }
+    let begin = Instant::now();
+    while heard.lock().unwrap().len() < 8 {
+        assert!(begin.elapsed() < LONG, "{:?}", heard.lock().unwrap());
+        std::thread::sleep(Duration::from_millis(1));
     }
     assert_eq!(heard.lock().unwrap().iter().map(|s| s.time).collect::<Vec<_>>(), (0..8).map(|n| f64::from(n) * 0.5).collect::<Vec<_>>());
 }
@@ -188,13 +196,13 @@ fn another_grid_in_mid_run_is_refused_and_the_old_one_taken_again() {
     take(&window, |_| true);
     drop(solver);
     let other = producer(&folder, plane(9));
-    (2..4).for_each(|n| publish(&other, n, n as f64, 1.0));
-    std::thread::sleep(Duration::from_millis(300));
+    // More than its ring holds: by the last of them it is followed.
+    (2..10).for_each(|n| publish(&other, n, n as f64, 1.0));
     assert!(window.next_within(Duration::from_millis(50)).is_err());
     drop(other);
     let solver = producer(&folder, plane(8));
-    publish(&solver, 5, 5.0, 1.0);
-    let (_, warnings) = take(&window, |taken| newest(taken) == 5.0);
+    publish(&solver, 10, 10.0, 1.0);
+    let (_, warnings) = take(&window, |taken| newest(taken) == 10.0);
     assert!(has(&warnings, "another grid needs a run of its own"), "{warnings:?}");
 }
 
@@ -316,7 +324,7 @@ fn a_reading_thread_that_panicked_is_an_error_and_no_end() {
     (0..2).for_each(|n| publish(&solver, n, n as f64, 1.0));
     let begin = Instant::now();
     let error = loop {
-        assert!(begin.elapsed() < Duration::from_secs(10), "it is waited for");
+        assert!(begin.elapsed() < LONG, "it is waited for");
         if let Ok(next) = window.next_within(Duration::from_millis(50)) {
             break next.expect("no end").unwrap_err().to_string();
         }
@@ -352,7 +360,8 @@ fn a_step_that_lacks_a_block_is_given_up_after_its_time_and_later_ones_come() {
     let solvers: Vec<Producer> = columns(8, 2).into_iter().map(|block| producer(&folder, block)).collect();
     let window = follow(&LiveSettings { incomplete_seconds: 0.2, ..settings(&folder) }, 2.0);
     publish(&solvers[0], 3, 3.0, 1.0);
-    std::thread::sleep(Duration::from_millis(400));
+    // Its time and more, also where the thread that reads comes late.
+    std::thread::sleep(Duration::from_secs(3));
     // On a busy machine one of these may come too late as well.
     for n in 4..20 {
         solvers.iter().for_each(|solver| publish(solver, n, n as f64, 1.0));
@@ -373,7 +382,7 @@ fn a_step_that_waits_for_its_blocks_does_not_grow_older_while_no_step_is_taken()
         let (ring, mut word) = (std::fs::File::open(ridgewatch_wire::block_path(&folder.0, block)).unwrap(), [0; 8]);
         let begin = Instant::now();
         while u64::from_ne_bytes(word) < steps {
-            assert!(begin.elapsed() < Duration::from_secs(30), "block {block}");
+            assert!(begin.elapsed() < LONG, "block {block}");
             std::thread::sleep(Duration::from_millis(1));
             std::os::unix::fs::FileExt::read_exact_at(&ring, &mut word, 4096).unwrap();
         }
@@ -450,7 +459,7 @@ fn every_step_is_taken_when_asked_for_and_the_end_ends() {
     let play = std::thread::spawn(move || (0..20).for_each(|n| publish(&solver, n, n as f64, 1.0)));
     let mut times = Vec::new();
     let begin = Instant::now();
-    while begin.elapsed() < Duration::from_secs(20) {
+    while begin.elapsed() < LONG {
         match window.next_within(Duration::from_millis(50)) {
             // Slower than the simulation would be by itself.
             Ok(Some(taken)) => {
@@ -472,16 +481,22 @@ fn a_simulation_that_never_waits_is_seen_at_its_newest() {
     let folder = Folder::new("newest");
     let solver = Producer::open(&folder.0, plane(64), 2, Policy::NewestWins).unwrap();
     let window = follow(&settings(&folder), 50.0);
-    for n in 0..3000 {
-        publish(&solver, n, n as f64, 1.0);
-    }
-    // However late the window's thread came to its first look: these fill it.
-    for n in 3000..3200 {
+    let mut steps = 0;
+    let mut publish_next = || {
+        publish(&solver, steps, steps as f64, 1.0);
+        steps += 1;
+        steps
+    };
+    let burst = (0..3000).map(|_| publish_next()).last().unwrap();
+    // However late the window's thread came to its first look.
+    let (mut published, begin) = (burst, Instant::now());
+    while published == burst || window.filled() < 1.0 {
+        assert!(begin.elapsed() < LONG, "{} after {published} steps", window.filled());
         std::thread::sleep(Duration::from_millis(2));
-        publish(&solver, n, n as f64, 1.0);
+        published = publish_next();
     }
-    let (taken, _) = take(&window, |taken| newest(taken) == 3199.0);
-    assert_eq!(taken.live.steps + taken.live.missed_blocks, 3200, "each step is taken or counted");
+    let (taken, _) = take(&window, |taken| newest(taken) == (published - 1) as f64);
+    assert_eq!(taken.live.steps + taken.live.missed_blocks, published, "each step is taken or counted");
     assert!(taken.window.is_full());
 }
 

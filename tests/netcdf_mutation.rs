@@ -74,9 +74,9 @@ fn mutated_files_are_answered() {
             if let Ok(inspection) = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None) {
                 assert!(inspection.to_string().contains("mutant.nc"));
             }
-            // A millisecond's work; the machine may be busy.
+            // A millisecond's work; the machine may be slow and busy.
             longest = longest.max(begin.elapsed());
-            assert!(begin.elapsed() < Duration::from_secs(10), "took {:?}", begin.elapsed());
+            assert!(begin.elapsed() < Duration::from_secs(60), "took {:?}", begin.elapsed());
         }
         println!("{name}, {} bytes: {share} mutants: {read} read, {refused} refused", whole.len());
         assert!(read > 0 && refused > 0, "mutations must reach both ends");

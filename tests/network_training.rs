@@ -47,7 +47,7 @@ fn every_variant_learns() {
         ("frequency", frequency, 0.8),
     ] {
         let mut surrogate = surrogate(Kind::Network, &network, &tracer);
-        let learned = surrogate.learn(&SampleRing::holding(&samples), 60.0, 300);
+        let learned = surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 300);
         assert_eq!((learned.steps, learned.rollbacks, learned.dropped), (300, 0, 0), "{name}");
         assert_eq!(learned.samples, 300 * 2048);
         let error = rms(&*surrogate, &held_out) / deviation;
@@ -65,8 +65,8 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
     for jacobian_weight in [0.0, 0.1] {
         let network = NetworkSettings { target: Target::FlowMap, jacobian_weight, ..small() };
         let mut surrogate = surrogate(Kind::Network, &network, &tracer);
-        let first = surrogate.learn(&SampleRing::holding(&samples), 60.0, 20).loss.unwrap();
-        let last = (0..14).map(|_| surrogate.learn(&SampleRing::holding(&samples), 60.0, 20).loss.unwrap()).last().unwrap();
+        let first = surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 20).loss.unwrap();
+        let last = (0..14).map(|_| surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 20).loss.unwrap()).last().unwrap();
         assert!(last < 0.5 * first, "weight {jacobian_weight}: loss {first}, then {last}");
         // A network that has learned nothing maps every point nearly onto itself: hardly any stretch. Derivatives lag behind values, so in
         // 300 steps only a third of the way is asked for.
@@ -75,7 +75,7 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
     }
     // Labels that lack what the target asks for are dropped, not trained on.
     let network = NetworkSettings { target: Target::FlowMap, ..small() };
-    assert_eq!(surrogate(Kind::Network, &network, &tracer).learn(&SampleRing::holding(&held_out), 60.0, 20).dropped, 2_000);
+    assert_eq!(surrogate(Kind::Network, &network, &tracer).learn(&SampleRing::holding(&held_out), f64::INFINITY, 20).dropped, 2_000);
 }
 
 #[test]
@@ -89,14 +89,14 @@ fn a_residual_starts_as_its_table_and_improves_on_it() {
     residual.predict(&held_out.points, &mut b);
     assert_eq!(a, b);
     let before = psnr(&residual, &held_out);
-    residual.learn(&SampleRing::holding(&traced(&tracer, uniform_points(1, 40_000), false)), 60.0, 400);
+    residual.learn(&SampleRing::holding(&traced(&tracer, uniform_points(1, 40_000), false)), f64::INFINITY, 400);
     let after = psnr(&residual, &held_out);
     assert!(after > before + 2.0, "{before} dB, then {after} dB");
     // Another start time: the table is traced anew; a residual that no longer fits is forgotten at the next samples.
     let later = DoubleGyre::new(5.0, 10.0, 40);
     let held_out = traced(&later, uniform_points(3, 4_000), false);
     residual.window_slid(&later);
-    residual.learn(&SampleRing::holding(&traced(&later, uniform_points(4, 40_000), false)), 60.0, 1);
+    residual.learn(&SampleRing::holding(&traced(&later, uniform_points(4, 40_000), false)), f64::INFINITY, 1);
     let (slid, table) = (psnr(&residual, &held_out), psnr(&Table::trace(&later, [33, 17, 1]), &held_out));
     // One step at the full rate may cost a little.
     assert!(slid > table - 1.0, "residual {slid} dB on a table of {table} dB");
@@ -106,11 +106,11 @@ fn a_residual_starts_as_its_table_and_improves_on_it() {
 fn a_network_does_not_lose_to_the_constant_after_a_slide() {
     let (early, late) = (DoubleGyre::new(0.0, 10.0, 40), DoubleGyre::new(0.5, 10.0, 40));
     let mut network = surrogate(Kind::Network, &small(), &early);
-    network.learn(&SampleRing::holding(&traced(&early, uniform_points(1, 20_000), false)), 60.0, 300);
+    network.learn(&SampleRing::holding(&traced(&early, uniform_points(1, 20_000), false)), f64::INFINITY, 300);
     network.window_slid(&late);
     let held_out = traced(&late, uniform_points(2, 4_000), false);
     let carried = rms(&*network, &held_out);
-    network.learn(&SampleRing::holding(&traced(&late, uniform_points(3, 20_000), false)), 60.0, 300);
+    network.learn(&SampleRing::holding(&traced(&late, uniform_points(3, 20_000), false)), f64::INFINITY, 300);
     assert!(rms(&*network, &held_out) < carried);
 }
 
@@ -122,12 +122,12 @@ fn samples_without_a_value_are_dropped_and_counted() {
     samples.log_stretch[77] = f32::INFINITY;
     samples.points[100][1] = f32::NAN;
     let mut network = surrogate(Kind::Network, &small(), &tracer);
-    let learned = network.learn(&SampleRing::holding(&samples), 60.0, 50);
+    let learned = network.learn(&SampleRing::holding(&samples), f64::INFINITY, 50);
     assert_eq!((learned.dropped, learned.rollbacks, learned.steps), (3, 0, 50));
     assert!(learned.loss.unwrap().is_finite());
     assert!(rms(&*network, &traced(&tracer, uniform_points(2, 500), false)).is_finite());
     let nothing = Samples { points: vec![[0.5; 3]], log_stretch: vec![f32::NAN], ..Samples::default() };
-    let learned = network.learn(&SampleRing::holding(&nothing), 60.0, 50);
+    let learned = network.learn(&SampleRing::holding(&nothing), f64::INFINITY, 50);
     assert_eq!((learned.dropped, learned.steps, learned.loss), (1, 0, None));
 }
 
@@ -138,7 +138,7 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     // A rate at which Adam throws every weight across the whole landscape.
     let network = NetworkSettings { learning_rate: Some(1.0), ..small() };
     let mut wild = surrogate(Kind::Network, &network, &tracer);
-    let learned = wild.learn(&SampleRing::holding(&samples), 60.0, 300);
+    let learned = wild.learn(&SampleRing::holding(&samples), f64::INFINITY, 300);
     assert!(learned.rollbacks > 0, "{learned:?}");
     let held_out = traced(&tracer, uniform_points(2, 2_000), false);
     let error = rms(&*wild, &held_out);
@@ -146,10 +146,10 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     assert!(error.is_finite() && error < 4.0 * scale, "{error} beside labels of {scale}");
     // A label from hell: finite, but its square is not.
     let mut calm = surrogate(Kind::Network, &small(), &tracer);
-    calm.learn(&SampleRing::holding(&samples), 60.0, 100);
+    calm.learn(&SampleRing::holding(&samples), f64::INFINITY, 100);
     let before = rms(&*calm, &held_out);
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples.clone() };
-    let learned = calm.learn(&SampleRing::holding(&poison), 2.0, 20);
+    let learned = calm.learn(&SampleRing::holding(&poison), f64::INFINITY, 20);
     assert!(learned.rollbacks > 0 && learned.steps == 0, "{learned:?}");
     assert_eq!(rms(&*calm, &held_out), before);
 }
@@ -164,7 +164,7 @@ fn a_flow_that_grows_is_not_taken_for_a_divergence() {
         let mut growth = 0.01;
         for window in 0..8 {
             let log_stretch = calm.log_stretch.iter().map(|s| growth * s).collect();
-            let learned = surrogate.learn(&SampleRing::holding(&Samples { log_stretch, ..calm.clone() }), 60.0, 40);
+            let learned = surrogate.learn(&SampleRing::holding(&Samples { log_stretch, ..calm.clone() }), f64::INFINITY, 40);
             assert_eq!((learned.rollbacks, learned.steps), (0, 40), "{kind:?}, window {window}: {learned:?}");
             surrogate.window_slid(&tracer);
             growth *= 3.0;
@@ -193,12 +193,12 @@ fn a_resumed_run_goes_on_bit_for_bit() {
     {
         let path = folder.path().join(number.to_string());
         let mut first = surrogate(kind, &network, &tracer);
-        first.learn(&SampleRing::holding(&samples), 60.0, 37);
+        first.learn(&SampleRing::holding(&samples), f64::INFINITY, 37);
         first.save(&path).unwrap();
-        first.learn(&SampleRing::holding(&samples), 60.0, 23);
+        first.learn(&SampleRing::holding(&samples), f64::INFINITY, 23);
         let mut second = surrogate(kind, &network, &tracer);
         second.load(&path).unwrap();
-        second.learn(&SampleRing::holding(&samples), 60.0, 23);
+        second.learn(&SampleRing::holding(&samples), f64::INFINITY, 23);
         let (mut a, mut b) = (vec![0.0; 5_000], vec![0.0; 5_000]);
         first.predict(&samples.points, &mut a);
         second.predict(&samples.points, &mut b);
@@ -224,7 +224,7 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint");
     let mut network = surrogate(Kind::Network, &small(), &tracer);
-    network.learn(&SampleRing::holding(&samples), 60.0, 20);
+    network.learn(&SampleRing::holding(&samples), f64::INFINITY, 20);
     network.save(&path).unwrap();
     let good = std::fs::read(&path).unwrap();
     let reference = rms(&*network, &samples);
@@ -279,8 +279,8 @@ fn time_and_steps_bound_learning() {
     let samples = traced(&tracer, uniform_points(1, 5_000), false);
     let mut network = surrogate(Kind::Network, &small(), &tracer);
     assert_eq!(network.learn(&SampleRing::holding(&samples), 0.0, 100).steps, 0);
-    assert_eq!(network.learn(&SampleRing::holding(&samples), 60.0, 0).steps, 0);
+    assert_eq!(network.learn(&SampleRing::holding(&samples), f64::INFINITY, 0).steps, 0);
     let learned = network.learn(&SampleRing::holding(&samples), 0.3, u64::MAX);
-    // One step of 2048 samples takes milliseconds; a second is for a machine under load.
-    assert!(learned.steps > 0 && learned.seconds < 1.3, "{learned:?}");
+    // One step of 2048 samples takes milliseconds; the rest is for a machine that stands still for a while.
+    assert!(learned.steps > 0 && (0.3..30.0).contains(&learned.seconds), "{learned:?}");
 }

@@ -47,7 +47,7 @@ fn noise(number: u64) -> Frame {
 fn wait_for(path: &Path) {
     let start = Instant::now();
     while !path.exists() {
-        assert!(start.elapsed() < Duration::from_secs(20), "{} was not written", path.display());
+        assert!(start.elapsed() < Duration::from_secs(120), "{} was not written", path.display());
         std::thread::sleep(Duration::from_millis(5));
     }
 }

@@ -206,12 +206,12 @@ mod tests {
             assert_eq!((record.frame, record.bytes, record.postponed), (Some(0), None, frame));
         }
         end.send(Ok(77)).unwrap();
-        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(result.is_ok() && record.bytes == Some(77) && record.postponed == 5, "{record:?}");
         assert_eq!(checkpoints.look(), None, "told once");
         // The next one.
         checkpoints.after_frame(6, &mut table);
-        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(result.is_ok() && record.frame == Some(6) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()));
         checkpoints.finish(Some(7), &table).unwrap();
         assert_eq!((checkpoints.totals.written, checkpoints.totals.failed, checkpoints.totals.postponed), (3, 0, 5));
@@ -233,7 +233,7 @@ mod tests {
         // What cannot be written is an error at the end, and in a record while frames go on.
         let mut nowhere = Checkpoints::new(folder.path().join("no/such/weights"), Some(0.0));
         nowhere.after_frame(0, &mut table());
-        let (record, _) = nowhere.hear(Duration::from_secs(10)).unwrap();
+        let (record, _) = nowhere.hear(DISK_LIMIT).unwrap();
         assert!(record.failed.unwrap().contains("no/such/weights"));
         assert!(matches!(nowhere.finish(Some(1), &table()), Err(CheckpointError::Io { .. })));
         assert_eq!(nowhere.totals.failed, 2);
@@ -244,17 +244,15 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (mut checkpoints, end) = slow(folder.path());
         checkpoints.limit = Duration::from_millis(50);
-        let begin = Instant::now();
+        // It comes back at all: the writer goes on until it is told to end.
         assert!(matches!(checkpoints.finish(Some(1), &table()), Err(CheckpointError::Hangs { .. })));
         drop(checkpoints);
-        // The limit, and what a busy machine adds to a wake-up.
-        assert!(begin.elapsed() < Duration::from_secs(5));
         end.send(Ok(1)).unwrap();
 
         let (mut checkpoints, end) = slow(folder.path());
         // Its thread finds nobody to hear from.
         drop(end);
-        let (record, result) = checkpoints.hear(Duration::from_secs(10)).unwrap();
+        let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(matches!(result, Err(CheckpointError::Writer { .. })) && record.failed.unwrap().contains("panicked"));
     }
 }

@@ -26,19 +26,25 @@ use std::time::{Duration, Instant};
 pub struct Line {
     /// What was asked for, call by call.
     pub calls: Mutex<Vec<&'static str>>,
+    /// Calls that it does before, of this kind or of all: how many there are in all depends on the machine's speed, by which a trace is cut up.
     breaks_at: usize,
+    breaks_in: Option<&'static str>,
     how: How,
     pub broke_in: OnceLock<&'static str>,
-    /// How long a copied network takes to come back, and whether there is room for a copy.
-    pub slowness: Mutex<Duration>,
+    /// A copied network comes back once so many frames were made and tables traced since it was asked for; whether there is room for a copy.
+    pub slowness: AtomicUsize,
     pub room: AtomicBool,
+    /// Frames that were made, as the test says, and tables that were traced.
+    pub moments: AtomicUsize,
+    /// Copies that came back since nothing happened any more: whoever was to go on meanwhile waited for them.
+    pub waited_for: AtomicUsize,
     /// Whether there is memory to train a network.
     pub takes: AtomicBool,
     /// Whether there is memory for a table that is traced.
     pub tables_fit: AtomicBool,
     /// How many calls are refused before memory is there again.
     pub refusals: AtomicUsize,
-    /// Tables that are there, and the most that were when another one was traced, and did not go within [`SOON`].
+    /// Tables that are there, and the most that were when another one was traced, and did not go within [`LONG`].
     tables: AtomicUsize,
     pub tables_before: AtomicUsize,
     /// Steps that it took.
@@ -64,8 +70,8 @@ impl Drop for Held {
     }
 }
 
-/// How long a table may be held that a slide is about to trace anew.
-pub const SOON: Duration = Duration::from_secs(1);
+/// After so long whatever is waited for does not come: a moment's work, on a machine that may be busy.
+const LONG: Duration = Duration::from_secs(60);
 
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum How {
@@ -85,7 +91,8 @@ impl Line {
         calls.push(what);
         let is_other = matches!(self.how, How::RefusalOf(kind) | How::LackOf(kind) if kind != what);
         let refuses = |left: usize| left.checked_sub(1);
-        if calls.len() <= self.breaks_at || is_other || self.refusals.fetch_update(Ordering::Relaxed, Ordering::Relaxed, refuses).is_err() {
+        let count = self.breaks_in.map_or(calls.len(), |kind| calls.iter().filter(|call| **call == kind).count());
+        if count <= self.breaks_at || is_other || self.refusals.fetch_update(Ordering::Relaxed, Ordering::Relaxed, refuses).is_err() {
             return Ok(());
         }
         self.broke_in.get_or_init(|| what);
@@ -95,6 +102,14 @@ impl Line {
             How::Refusal | How::RefusalOf(_) => Self::full(what),
             How::LackOf(_) => DeviceError::Unsupported { what: format!("{what}, broken by the test") },
         })
+    }
+
+    /// A frame was made; when it was the last one, all that is on its way comes back.
+    pub fn frame_made(&self, last: bool) {
+        self.moments.fetch_add(1, Ordering::Relaxed);
+        if last {
+            self.slowness.store(0, Ordering::Relaxed);
+        }
     }
 
     fn full(what: &str) -> DeviceError {
@@ -113,12 +128,38 @@ pub const NAME: &str = "a device that breaks";
 impl Breaking {
     /// Breaks behind so many calls.
     pub fn new(breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
-        let (broke_in, slowness, room, takes) = (OnceLock::new(), Mutex::default(), AtomicBool::new(true), AtomicBool::new(true));
+        Self::behind(breaks_at, None, how, when_lost)
+    }
+
+    /// Breaks in a call of this kind, behind so many of them.
+    pub fn at(kind: &'static str, breaks_at: usize, how: How, when_lost: WhenLost) -> Arc<Self> {
+        Self::behind(breaks_at, Some(kind), how, when_lost)
+    }
+
+    fn behind(breaks_at: usize, breaks_in: Option<&'static str>, how: How, when_lost: WhenLost) -> Arc<Self> {
+        let (broke_in, room, takes) = (OnceLock::new(), AtomicBool::new(true), AtomicBool::new(true));
+        let (slowness, moments, waited_for) = (AtomicUsize::new(0), AtomicUsize::new(0), AtomicUsize::new(0));
         let (calls, tables, tables_before) = (Mutex::default(), AtomicUsize::new(0), AtomicUsize::new(0));
         let (tables_fit, refusals) = (AtomicBool::new(true), AtomicUsize::new(usize::MAX));
         let (steps, stop) = (AtomicUsize::new(0), AtomicBool::new(false));
-        let line =
-            Line { calls, breaks_at, how, broke_in, slowness, room, takes, tables_fit, refusals, tables, tables_before, steps, stop };
+        let line = Line {
+            calls,
+            breaks_at,
+            breaks_in,
+            how,
+            broke_in,
+            slowness,
+            room,
+            moments,
+            waited_for,
+            takes,
+            tables_fit,
+            refusals,
+            tables,
+            tables_before,
+            steps,
+            stop,
+        };
         Arc::new(Self { line: Arc::new(line), health: Arc::new(Health::new(when_lost)) })
     }
 }
@@ -164,10 +205,11 @@ impl DeviceTrace for Trace {
     }
     fn trace_nodes(&self, _: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
         let begin = Instant::now();
-        while self.line.tables.load(Ordering::Relaxed) > 0 && begin.elapsed() < SOON {
+        while self.line.tables.load(Ordering::Relaxed) > 0 && begin.elapsed() < LONG {
             std::thread::sleep(Duration::from_millis(1));
         }
         self.line.tables_before.fetch_max(self.line.tables.load(Ordering::Relaxed), Ordering::Relaxed);
+        self.line.moments.fetch_add(1, Ordering::Relaxed);
         self.line.call("tracing a table")?;
         if !self.line.tables_fit.load(Ordering::Relaxed) {
             return Err(Line::full("a table"));
@@ -391,7 +433,15 @@ struct Copy {
 
 impl OffloadedCopy for Copy {
     fn read(self: Box<Self>, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
-        std::thread::sleep(*self.there.line.slowness.lock().unwrap());
+        let Line { slowness, moments, waited_for, .. } = &*self.there.line;
+        let (before, begin) = (moments.load(Ordering::Relaxed), Instant::now());
+        while moments.load(Ordering::Relaxed) < before + slowness.load(Ordering::Relaxed) {
+            if begin.elapsed() > 2 * LONG {
+                waited_for.fetch_add(1, Ordering::Relaxed);
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
         self.there.call("reading a copy")?;
         (*model, *average) = (self.model, self.average);
         Ok(())

@@ -6,7 +6,7 @@
 
 mod device;
 
-use device::{BATCH, Breaking, How, NAME, SOON, STEP_SECONDS, STEPS};
+use device::{BATCH, Breaking, How, NAME, STEP_SECONDS, STEPS};
 use ridgewatch::config::SceneFile;
 use ridgewatch::engine::{Device, EngineError, Event, FrameRecord, RunOptions, Setup, StageSeconds, WhenLost, run};
 use ridgewatch::field::Domain;
@@ -97,7 +97,7 @@ fn refuse_each(scene: &SceneFile, kinds: &[&'static str]) {
 }
 
 /// Breaks the device at every call of a run in turn.
-fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
+fn break_everywhere(scene: &SceneFile, kinds: &[&'static str]) {
     let expected = made(scene, Device::CPU);
     assert!(expected.error.is_none() && expected.records.len() >= 4);
     for how in [How::Fault, How::Refusal] {
@@ -105,24 +105,23 @@ fn break_everywhere(scene: &SceneFile, kinds: &[&str]) {
     }
 }
 
-fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&str]) {
+fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&'static str]) {
     let whole = Breaking::new(usize::MAX, how, WhenLost::Cpu);
     let unbroken = on(&whole, scene);
     assert!(unbroken.error.is_none() && unbroken.films == expected.films);
     assert!(unbroken.records.iter().all(|r| r.device == NAME && has_ended(r) == 0));
     let asked = whole.line.calls.lock().unwrap().clone();
-    let calls = asked.len();
     // Of every kind of call some, from the first to the last: a few dozen runs instead of thousands.
-    let chosen = || kinds.iter().flat_map(|kind| some(&asked, kind));
+    let chosen = || kinds.iter().flat_map(|&kind| some(&asked, kind).into_iter().map(move |breaks_at| (kind, breaks_at)));
 
     let mut broke_in = BTreeSet::new();
-    for breaks_at in chosen() {
-        let device = Breaking::new(breaks_at, how, WhenLost::Cpu);
+    for (kind, breaks_at) in chosen() {
+        let device = Breaking::at(kind, breaks_at, how, WhenLost::Cpu);
         let found = on(&device, scene);
         // How often a trace is cut up depends on the machine's speed: the last calls may not come.
         let Some(what) = device.line.broke_in.get() else { continue };
         broke_in.insert(*what);
-        let case = format!("{how:?} at call {breaks_at} of {calls}, {what}");
+        let case = format!("{how:?} behind {breaks_at} calls, {what}");
         if how == How::Refusal && ["making a tracer", "bringing a snapshot over"].contains(what) && found.films.is_empty() {
             // What a device that was asked for by name refuses from the start is an error of the request.
             assert!(matches!(found.error, Some(EngineError::Device(_))), "{case}: {:?}", found.error);
@@ -154,11 +153,11 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
         return;
     }
     let mut ended = 0;
-    for breaks_at in chosen() {
-        let device = Breaking::new(breaks_at, how, WhenLost::Stop);
+    for (kind, breaks_at) in chosen() {
+        let device = Breaking::at(kind, breaks_at, how, WhenLost::Stop);
         let found = on(&device, scene);
         let Some(what) = device.line.broke_in.get() else { continue };
-        let case = format!("{how:?} at call {breaks_at} of {calls}, {what}");
+        let case = format!("{how:?} behind {breaks_at} calls, {what}");
         match &found.error {
             Some(EngineError::Device(error)) => {
                 assert!(error.to_string().contains("broken by the test"), "{case}: {error}");
@@ -175,12 +174,12 @@ fn break_at_every_call(scene: &SceneFile, expected: &Made, how: How, kinds: &[&s
     assert!(ended > 0);
 }
 
-/// Places of up to a dozen calls of a kind, evenly spread.
+/// Up to a dozen calls of a kind, evenly spread: behind how many of them each comes.
 fn some(asked: &[&str], kind: &str) -> Vec<usize> {
     const MOST: usize = 12;
-    let places: Vec<usize> = (0..asked.len()).filter(|&i| asked[i] == kind).collect();
-    let count = places.len().min(MOST);
-    (0..count).map(|i| places[i * (places.len() - 1) / (count - 1).max(1)]).collect()
+    let calls = asked.iter().filter(|call| **call == kind).count();
+    let count = calls.min(MOST);
+    (0..count).map(|i| i * (calls - 1) / (count - 1).max(1)).collect()
 }
 
 #[test]
@@ -356,8 +355,8 @@ fn training_that_runs_out_of_memory_comes_back_with_what_it_has_learned() {
         let places = some(&asked, kind);
         assert!(places.len() > 1, "{kind}");
         for breaks_at in places {
-            let case = format!("{kind} at call {breaks_at}");
-            let device = Breaking::new(breaks_at, How::RefusalOf(kind), WhenLost::Stop);
+            let case = format!("{kind} behind {breaks_at} calls");
+            let device = Breaking::at(kind, breaks_at, How::RefusalOf(kind), WhenLost::Stop);
             let found = on(&device, &scene);
             assert!(found.error.is_none() && device.line.broke_in.get() == Some(&kind), "{case}: {:?}", found.error);
             assert!(found.films == expected.films, "{case}: nothing learned is lost");
@@ -396,7 +395,7 @@ fn a_network_that_cannot_be_asked_answers_from_here() {
     assert!(on(&whole, &scene).error.is_none());
     let asked = whole.line.calls.lock().unwrap().clone();
     for breaks_at in some(&asked, "asking a network") {
-        let device = Breaking::new(breaks_at, How::RefusalOf("asking a network"), WhenLost::Stop);
+        let device = Breaking::at("asking a network", breaks_at, How::RefusalOf("asking a network"), WhenLost::Stop);
         let found = on(&device, &scene);
         assert!(found.error.is_none() && found.films == expected.films, "call {breaks_at}: {:?}", found.error);
         // How often a trace is cut up depends on the machine's speed: the last calls may not come.
@@ -423,7 +422,7 @@ fn a_tracer_may_be_refused() {
     let asked = whole.line.calls.lock().unwrap().clone();
     // Behind the window's own.
     for breaks_at in some(&asked, "making a tracer").into_iter().skip(1) {
-        let device = Breaking::new(breaks_at, How::RefusalOf("making a tracer"), WhenLost::Stop);
+        let device = Breaking::at("making a tracer", breaks_at, How::RefusalOf("making a tracer"), WhenLost::Stop);
         let found = on(&device, &scene);
         assert!(found.error.is_none() && found.films == unbroken.films, "call {breaks_at}: {:?}", found.error);
         for (found, expected) in found.records.iter().zip(&unbroken.records) {
@@ -479,10 +478,7 @@ fn memory_for_the_table_below_is_waited_for_a_while() {
 #[test]
 fn what_is_met_behind_the_last_frame_is_told() {
     let scene = residual(&[]);
-    let whole = Breaking::new(usize::MAX, How::Fault, WhenLost::Stop);
-    assert!(on(&whole, &scene).error.is_none());
-    let second = some(&whole.line.calls.lock().unwrap(), "tracing a table")[1];
-    let device = Breaking::new(second, How::RefusalOf("tracing a table"), WhenLost::Stop);
+    let device = Breaking::at("tracing a table", 1, How::RefusalOf("tracing a table"), WhenLost::Stop);
     let options = RunOptions { device: Device::Gpu { gpu: device.clone(), may_fall_back: false }, threads: 2, ..RunOptions::default() };
     let mut told = 0;
     let mut sink = |event: Event| {
@@ -500,8 +496,11 @@ fn what_is_met_behind_the_last_frame_is_told() {
 #[test]
 fn a_slide_under_a_checkpoint_finds_the_table_gone() {
     let folder = tempfile::tempdir().unwrap();
+    let scene = residual(&[]);
+    let frames = made(&scene, Device::CPU).films.len();
     let slow = Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
-    *slow.line.slowness.lock().unwrap() = 2 * SOON;
+    // It comes back when the last frame is made.
+    slow.line.slowness.store(1 << 30, Ordering::Relaxed);
     let options = RunOptions {
         device: Device::Gpu { gpu: slow.clone(), may_fall_back: false },
         threads: 2,
@@ -509,11 +508,12 @@ fn a_slide_under_a_checkpoint_finds_the_table_gone() {
         checkpoint_seconds: Some(0.0),
         ..RunOptions::default()
     };
-    let found = made_with(&residual(&[]), options);
+    let found = made_behind(&scene, options, &mut |frame| slow.line.frame_made(frame as usize + 1 == frames));
     assert!(found.error.is_none() && found.records.iter().any(|record| record.checkpoint.is_some()), "{:?}", found.error);
     let asked = slow.line.calls.lock().unwrap().clone();
     assert!(some(&asked, "tracing a table").len() >= 4 && asked.contains(&"reading a copy"));
     assert_eq!(slow.line.tables_before.load(Ordering::Relaxed), 0, "tables that were there when another was traced");
+    assert_eq!(slow.line.waited_for.load(Ordering::Relaxed), 0, "frames waited for it");
 }
 
 /// A table of another size takes the place of one that the device holds, which goes before.
@@ -563,7 +563,7 @@ fn training_of_a_residual_over_a_sliding_window() {
         assert!(!places.is_empty(), "{kind}");
         for breaks_at in places {
             for when_lost in [WhenLost::Cpu, WhenLost::Stop] {
-                let device = Breaking::new(breaks_at, How::Fault, when_lost);
+                let device = Breaking::at(kind, breaks_at, How::Fault, when_lost);
                 let found = run(&device);
                 // How often a trace is cut up depends on the machine's speed.
                 let what = device.line.broke_in.get();
@@ -596,54 +596,59 @@ fn training_of_a_residual_over_a_sliding_window() {
 /// what it was copied from; without room for a copy frames wait and a record says so; a copy that is lost costs one checkpoint.
 #[test]
 fn checkpoints_while_a_device_trains() {
-    const SLOW: Duration = Duration::from_secs(1);
+    // Frames and slides that go by before a copy is back.
+    const SLOW: usize = 6;
     let scene = residual(&["time.frames_per_slide=5".into()]);
+    let frames = made(&scene, Device::CPU).films.len();
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint");
-    let run = |device: &Arc<Breaking>, checkpoint_seconds| {
+    let run = |there: &Arc<Breaking>, checkpoint_seconds, slowness| {
         drop(std::fs::remove_file(&path));
-        let (device, checkpoint) = (Device::Gpu { gpu: device.clone(), may_fall_back: false }, Some(path.clone()));
+        let (device, checkpoint) = (Device::Gpu { gpu: there.clone(), may_fall_back: false }, Some(path.clone()));
         let options = RunOptions { device, threads: 2, checkpoint, checkpoint_seconds, ..RunOptions::default() };
-        // The first checkpoint is made here, before the network goes to the device; the disk has its time for it.
+        // The first checkpoint is waited for: the disk has its time for it.
         let written = || checkpoint_seconds.is_none() || path.exists();
+        let line = there.line.clone();
         let found = made_behind(&scene, options, &mut |frame| {
+            line.frame_made(frame as usize + 1 == frames);
             let begin = Instant::now();
             while frame > 0 && !written() && begin.elapsed() < Duration::from_secs(60) {
                 std::thread::sleep(Duration::from_millis(1));
+            }
+            if frame == 1 {
+                line.slowness.store(slowness, Ordering::Relaxed);
             }
         });
         assert!(found.error.is_none(), "{:?}", found.error);
         (found, std::fs::read(&path).unwrap())
     };
     let whole = || Breaking::new(usize::MAX, How::Fault, WhenLost::Cpu);
-    let (expected, last) = run(&whole(), None);
+    let (expected, last) = run(&whole(), None, 0);
     assert!(expected.records.iter().all(|record| record.checkpoint.is_none()));
 
     let slow = whole();
-    *slow.line.slowness.lock().unwrap() = SLOW;
-    let (found, with_others_before) = run(&slow, Some(0.0));
+    let (found, with_others_before) = run(&slow, Some(0.0), SLOW);
     assert!(found.films == expected.films && with_others_before == last, "checkpoints change nothing");
     let behind = |record: &&FrameRecord| record.checkpoint.as_ref().is_some_and(|checkpoint| checkpoint.frame > Some(0));
     let under_way: Vec<&FrameRecord> = found.records.iter().filter(behind).collect();
     assert!(under_way.len() >= 3);
-    for record in &under_way {
-        assert!(record.checkpoint.as_ref().unwrap().behind && record.seconds.total < 0.5 * SLOW.as_secs_f64(), "{record:?}");
-    }
+    assert_eq!(slow.line.waited_for.load(Ordering::Relaxed), 0, "frames waited for it");
+    assert!(under_way.iter().all(|record| record.checkpoint.as_ref().unwrap().behind), "{under_way:?}");
     assert!(under_way[2].checkpoint.as_ref().unwrap().postponed >= 1, "one at a time: {:?}", under_way[2].checkpoint);
 
     let full = whole();
     full.line.room.store(false, Ordering::Relaxed);
-    let (found, without_room) = run(&full, Some(0.0));
+    let (found, without_room) = run(&full, Some(0.0), 0);
     assert!(found.films == expected.films && without_room == last);
     let told = found.records.iter().flat_map(|record| &record.warnings).filter(|warning| warning.contains("refused by the test")).count();
     assert!(told >= 1, "a record says that frames waited");
     let not_there = found.records.iter().filter_map(|record| record.checkpoint.as_ref()).filter(|checkpoint| checkpoint.frame > Some(0));
     assert!(not_there.map(|checkpoint| checkpoint.behind).all(|behind| !behind));
 
-    let asked = slow.line.calls.lock().unwrap().clone();
     for kind in ["copying a network", "reading a copy"] {
-        let device = Breaking::new(asked.iter().position(|call| *call == kind).unwrap(), How::Fault, WhenLost::Cpu);
-        let (found, _) = run(&device, Some(0.0));
+        // The second: the first checkpoint is on the disk.
+        let device = Breaking::at(kind, 1, How::Fault, WhenLost::Cpu);
+        let (found, _) = run(&device, Some(0.0), 0);
         assert!(device.line.broke_in.get().is_some() && found.films.len() == expected.films.len(), "{kind}");
         assert_eq!(found.records.iter().map(has_ended).sum::<usize>(), 1, "{kind}");
         let goes_on = made(&residual(&[format!("training.resume={:?}", path.display().to_string())]), Device::CPU);

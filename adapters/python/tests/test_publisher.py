@@ -118,14 +118,20 @@ def test_closing_while_another_thread_publishes(ring):
     """A thread that waits for ridgewatch (which never comes) keeps the ring, and `close` does not wait for that thread."""
     x = np.arange(4.0)
     good = np.zeros((4, 4), np.float32)
-    publisher = Publisher(x, x, slots=2, wait_ms=2000)
-    answers = []
-    worker = threading.Thread(target=lambda: answers.extend(publisher.publish(n, float(n), good, good) for n in range(4)))
+    publisher = Publisher(x, x, slots=2, wait_ms=6000)
+    begun, answers = [], []
+
+    def publish():
+        for n in range(4):
+            begun.append(n)
+            answers.append(publisher.publish(n, float(n), good, good))
+
+    worker = threading.Thread(target=publish)
     worker.start()
     # Two steps fill the ring; the third waits.
-    while publisher.published < 2:
+    while len(begun) < 3:
         time.sleep(0.01)
-    time.sleep(0.3)
+    time.sleep(1)
     publisher.close()
     assert worker.is_alive() and not publisher.is_open and os.path.exists(ring)
     worker.join()

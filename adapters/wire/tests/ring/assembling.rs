@@ -61,8 +61,6 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     assert_eq!(give(&mut assembler, &right, 2, 2), None, "too late");
     // when time is up,
     assert_eq!(give(&mut assembler, &left, 1, 4), None);
-    assembler.expire();
-    assert!(assembler.incomplete().is_empty());
     std::thread::sleep(Duration::from_millis(40));
     // Of which nothing counts in which none was taken.
     assembler.held(Duration::from_secs(60));
@@ -86,6 +84,13 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     assert_eq!(numbers(&assembler.incomplete()), [8]);
     assert_eq!(give(&mut assembler, &left, 1, 11), None);
     assert_eq!(numbers(&assembler.incomplete()), [9], "step 10 may still be whole");
+    // Before its time is up a step is waited for.
+    let mut patient = Assembler::new(&left, Duration::from_secs(3600), 2);
+    patient.introduce(&left, 1).unwrap();
+    assert_eq!(give(&mut patient, &left, 1, 1), None);
+    std::thread::sleep(Duration::from_millis(40));
+    patient.expire();
+    assert!(patient.incomplete().is_empty());
 }
 
 #[test]

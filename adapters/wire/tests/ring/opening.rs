@@ -299,7 +299,7 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     let mut follower = RingFollower::begin(&ring, Limits::default()).unwrap();
     let mut told = |enough: &str| {
         let (mut seen, mut values, begin) = (Vec::new(), Vec::new(), Instant::now());
-        while !seen.last().is_some_and(|last: &String| last.starts_with(enough)) && begin.elapsed() < Duration::from_secs(5) {
+        while !seen.last().is_some_and(|last: &String| last.starts_with(enough)) && begin.elapsed() < Duration::from_secs(120) {
             match follower.poll(&mut values) {
                 Some(Event::Opened { .. }) => seen.push("opened".to_owned()),
                 Some(Event::Step { step, .. }) => seen.push(format!("step {step}")),
