@@ -27,6 +27,19 @@ fn says(file: &Path, pieces: &[&str]) {
     }
 }
 
+#[test]
+fn a_file_that_another_has_locked_is_not_called_damaged() {
+    let dir = tempdir().unwrap();
+    let hdf5 = dir.path().join("flame.h5");
+    drop(hdf5_metno::File::create(&hdf5).unwrap());
+    let netcdf = Fixture::new(NETCDF4, &[("y", 2), ("x", 2)]).write(&dir.path().join("plain.nc"));
+    for path in [hdf5, netcdf] {
+        let file = std::fs::File::open(&path).unwrap();
+        file.lock().unwrap();
+        says(&path, &["cannot be locked", "another process has locked it", "HDF5_USE_FILE_LOCKING=FALSE"]);
+    }
+}
+
 const DAYS: &str = "days since 2000-01-01";
 
 #[test]

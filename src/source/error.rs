@@ -25,6 +25,17 @@ pub enum SourceError {
         /// What the operating system says.
         cause: std::io::Error,
     },
+    /// HDF5 locks a file before it reads it, and cannot.
+    #[error(
+        "{}: cannot be locked, as HDF5 does before it reads: {why}. To read it all the same, set HDF5_USE_FILE_LOCKING=FALSE in the environment",
+        path.display()
+    )]
+    Locked {
+        /// The file.
+        path: PathBuf,
+        /// Who or what is in the way.
+        why: String,
+    },
     /// Some other format.
     #[error("{}: neither NetCDF nor HDF5 ({found}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4 and HDF5", path.display())]
     NotNetCdf {

@@ -8,6 +8,7 @@ use super::netcdf4::silence;
 use hdf5_metno::types::{FixedAscii, FixedUnicode, FloatSize, IntSize, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5_metno::{Group, Hyperslab, LinkType, SliceOrIndex};
 use ndarray::ArrayD;
+use std::fs::TryLockError;
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
 
@@ -18,6 +19,16 @@ const MOST_DATASETS: usize = 100_000;
 const LONGEST_ATTRIBUTE: usize = 4096;
 /// Characters of a text attribute that are read.
 const LONGEST_TEXT: usize = 1024;
+
+/// Whether a file that could not be opened only could not be locked. The libraries say no more than that they failed.
+pub(super) fn locked(path: &Path) -> Option<SourceError> {
+    let why = match std::fs::File::open(path).ok()?.try_lock_shared() {
+        Ok(()) => return None,
+        Err(TryLockError::WouldBlock) => "another process has locked it, perhaps since it is still being written".to_owned(),
+        Err(TryLockError::Error(error)) => format!("its file system says {error}"),
+    };
+    Some(SourceError::Locked { path: path.into(), why })
+}
 
 /// An open HDF5 file.
 pub(super) struct Hdf5Store {
@@ -40,7 +51,7 @@ impl Hdf5Store {
         }));
         match opened {
             Ok(Ok((header, file))) => Ok((header, Self { file, path: path.into() })),
-            Ok(Err(error)) => Err(damaged(error.to_string())),
+            Ok(Err(error)) => Err(locked(path).unwrap_or_else(|| damaged(error.to_string()))),
             Err(_) => Err(damaged("the HDF5 library failed on it".into())),
         }
     }

@@ -3,6 +3,7 @@
 use super::SourceError;
 use super::container::{Attribute, Dimension, Header, NumberType, Variable};
 use super::crash::Reading;
+use super::hdf5_store::locked;
 use netcdf::AttributeValue;
 use netcdf::types::{FloatType, IntType, NcVariableType};
 use std::cell::Cell;
@@ -29,7 +30,7 @@ impl NetCdf4Store {
         }));
         let (header, file) = match opened {
             Ok(Ok(pair)) => pair,
-            Ok(Err(error)) => return Err(damaged(error.to_string())),
+            Ok(Err(error)) => return Err(locked(path).unwrap_or_else(|| damaged(error.to_string()))),
             Err(_) => return Err(damaged("its header holds names or types that are not understood".into())),
         };
         // libnetcdf invents dimensions for HDF5 files that have none.
