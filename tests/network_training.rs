@@ -7,7 +7,9 @@ mod network_support;
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
-use ridgewatch::surrogate::{CheckpointError, Kind, Predict, Residual, SampleRing, Samples, Surrogate, SurrogateSettings, Table, build};
+use ridgewatch::surrogate::{
+    CheckpointError, Kind, Predict, ResidualNetwork, SampleRing, Samples, Surrogate, SurrogateSettings, Table, build,
+};
 
 fn small() -> NetworkSettings {
     NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }
@@ -81,7 +83,7 @@ fn a_residual_starts_as_its_table_and_improves_on_it() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
     let held_out = traced(&tracer, uniform_points(2, 4_000), false);
     let table = Table::trace(&tracer, [33, 17, 1]);
-    let mut residual = Residual::new(&small(), [33, 17, 1], 5, &tracer).unwrap();
+    let mut residual = ResidualNetwork::new(&small(), [33, 17, 1], 5, &tracer).unwrap();
     let (mut a, mut b) = (vec![0.0; held_out.len()], vec![0.0; held_out.len()]);
     table.predict(&held_out.points, &mut a);
     residual.predict(&held_out.points, &mut b);

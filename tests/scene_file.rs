@@ -189,4 +189,11 @@ fn a_scene_that_no_run_wrote_is_never_replaced() {
     for name in left {
         assert_eq!(std::fs::read_to_string(folder.path().join(name)).unwrap(), SMALL);
     }
+    // A pipe has a writer to wait for, without end.
+    let piped = folder.path().join("piped");
+    std::fs::create_dir(&piped).unwrap();
+    assert!(Command::new("mkfifo").arg(piped.join("scene.toml")).status().unwrap().success());
+    let output = ridgewatch(folder.path(), &["replay", "scene.toml", "--out", "piped"]);
+    let said = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.code() == Some(1) && said.contains("accepted: a regular file"), "{said}");
 }

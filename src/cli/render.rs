@@ -17,7 +17,7 @@ pub struct Options {
     /// reference, surrogate (neural) or gated; overrides the scene's.
     #[arg(long, value_parser = super::method)]
     method: Option<Method>,
-    /// Samples a pixel; overrides the scene's.
+    /// Samples a pixel; overrides the scene's `render.samples`.
     #[arg(long, value_name = "N")]
     spp: Option<usize>,
     /// Frames rendered and thrown away first, with the scene's samples: they train the surrogate and tighten the majorants.

@@ -2,7 +2,6 @@
 
 use super::PublishError;
 use super::run_folder::write_whole;
-use std::fs::File;
 use std::io::{self, Read};
 use std::path::Path;
 
@@ -12,7 +11,7 @@ const FIRST_WORDS: &str = "# Written by ridgewatch ";
 /// Whether a run wrote the scene file that is there.
 pub(super) fn is_ours(path: &Path) -> io::Result<bool> {
     let mut start = Vec::new();
-    File::open(path)?.take(FIRST_WORDS.len() as u64).read_to_end(&mut start)?;
+    crate::files::open(path)?.take(FIRST_WORDS.len() as u64).read_to_end(&mut start)?;
     Ok(start == FIRST_WORDS.as_bytes())
 }
 

@@ -23,7 +23,7 @@ mod trainer;
 
 pub use draft::Draft;
 pub use offload::{Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
-pub use residual::Residual;
+pub use residual::ResidualNetwork;
 pub use ring::{KEEP_STALE, RingMark, SampleRing};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;
@@ -309,7 +309,7 @@ impl SurrogateSettings {
                 accepted: "none, or surrogate.kind = \"network\": a table knows one window and one duration".into(),
             });
         }
-        if self.kind == Kind::Residual { Residual::check(network) } else { Ok(()) }
+        if self.kind == Kind::Residual { ResidualNetwork::check(network) } else { Ok(()) }
     }
 
     /// Checks the nodes along as many axes as the flow varies along.
@@ -363,7 +363,7 @@ pub fn build(
     Ok(match settings.kind {
         Kind::Table => Box::new(Table::trace(tracer, settings.nodes(domain)?)),
         Kind::Network => Box::new(Network { trainer: Trainer::new(network, tracer, seed, false)? }),
-        Kind::Residual => Box::new(Residual::new(network, settings.nodes(domain)?, seed, tracer)?),
+        Kind::Residual => Box::new(ResidualNetwork::new(network, settings.nodes(domain)?, seed, tracer)?),
     })
 }
 

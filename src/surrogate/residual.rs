@@ -19,7 +19,7 @@ const COMPARED: usize = 8192;
 const USELESS: f32 = 0.05;
 
 /// Table and network.
-pub struct Residual {
+pub struct ResidualNetwork {
     table: Table,
     trainer: Trainer,
     shrinkage: f32,
@@ -27,7 +27,7 @@ pub struct Residual {
     slid: bool,
 }
 
-impl Residual {
+impl ResidualNetwork {
     /// Traces the table with `nodes` along x, y, z. The network must have the target `ftle` and the mean-square loss: nothing else adds up.
     pub fn new(network: &NetworkSettings, nodes: [usize; 3], seed: u64, tracer: &dyn Tracer) -> Result<Self, SurrogateError> {
         Self::check(network)?;
@@ -82,7 +82,7 @@ impl Residual {
     }
 }
 
-impl Predict for Residual {
+impl Predict for ResidualNetwork {
     fn name(&self) -> &'static str {
         "residual"
     }
@@ -132,7 +132,7 @@ impl Predict for Frozen {
     }
 }
 
-impl Surrogate for Residual {
+impl Surrogate for ResidualNetwork {
     fn freeze(&self) -> Arc<dyn Predict> {
         Arc::new(Frozen { table: self.table.clone(), network: self.trainer.frozen(), shrinkage: self.shrinkage })
     }

@@ -1,17 +1,23 @@
-//! Little-endian values, one after another.
+//! Little-endian values, one after another; and a step's values, piece by piece.
 
 use crate::WireError;
 
 /// Values are moved in pieces of so many bytes; between two of them it is looked whether to go on, and whoever waits is told.
 pub(crate) const PIECE: usize = 1 << 20;
 
-/// Fills `values` with so many, piece by piece: memory that was never touched takes as long as what is put there. False: `next` broke off.
+/// Fills `values` with so many, piece by piece: the first touch of fresh memory, which can take longer than the filling, comes piece by piece too.
+/// False: `next` broke off.
+///
+/// # Errors
+/// No memory for all of them, and those of `next`.
 pub(crate) fn fill(
     values: &mut Vec<f32>,
     count: usize,
     mut next: impl FnMut(&mut [u8]) -> Result<bool, WireError>,
 ) -> Result<bool, WireError> {
     values.truncate(count);
+    let missing = count - values.len();
+    values.try_reserve_exact(missing).map_err(|_| WireError::no_memory(4 * missing))?;
     for start in (0..count).step_by(PIECE / 4) {
         let end = count.min(start + PIECE / 4);
         if values.len() < end {

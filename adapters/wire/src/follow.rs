@@ -3,7 +3,7 @@
 use crate::choice::{self, Unread};
 use crate::lock::{Following, blocks, producer_lives};
 use crate::place::Place;
-use crate::reader::{Read, RingReader, StepInfo};
+use crate::reader::{Read, RingReader, StepInfo, Tried};
 use crate::{Description, Limits, WireError};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
@@ -195,11 +195,12 @@ impl RingFollower {
 
     /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
     pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
-        self.poll_beside(values, &mut || ())
+        self.poll_beside(values, &mut || true)
     }
 
-    /// The same, with `beside` called again and again while a step is read.
-    pub fn poll_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
+    /// The same, with `beside` asked after each MiB of a step whether to go on; where it says no, nothing is taken. A step whose producer does not wait may be
+    /// overwritten meanwhile.
+    pub fn poll_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
         self.beat();
         if self.looked.is_none_or(|looked| looked.elapsed() > LOOK) {
             if let Some(event) = self.look() {
@@ -229,16 +230,17 @@ impl RingFollower {
     }
 
     /// Of a simulation in one block, its next step.
-    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
+    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
         let block = *self.rings.iter().find(|(_, followed)| followed.simulation() == simulation && !followed.refused)?.0;
         let found = self.read_ring(block, beside, |reader, beside| reader.read_beside(values, beside))?;
         let followed = self.rings.get_mut(&block)?;
         match found {
-            Ok(Read::Step(info)) => {
+            Ok(None) => None,
+            Ok(Some(Read::Step(info))) => {
                 followed.drained = false;
                 Some(followed.step(block, info, self.mark))
             }
-            Ok(end) => {
+            Ok(Some(end)) => {
                 (followed.drained, followed.closed) = (true, followed.closed || end == Read::Ended);
                 None
             }
@@ -247,7 +249,7 @@ impl RingFollower {
     }
 
     /// Of a simulation in several blocks, the next block of the step that is being read, or the first one of another step.
-    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut()) -> Option<Event> {
+    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
         for _ in 0..ATTEMPTS {
             // The step goes on from what is known. Before another is begun all rings are looked at.
             let block = match self.next(simulation).filter(|(_, place)| self.current == Some((simulation, *place))) {
@@ -265,11 +267,12 @@ impl RingFollower {
             let found = self.read_ring(block, beside, |reader, beside| reader.take(number, values, beside))?;
             let followed = self.rings.get_mut(&block)?;
             match found {
-                Ok(Some(info)) => {
+                Ok(Tried::Step(info)) => {
                     followed.unread.took();
                     return Some(followed.step(block, info, self.mark));
                 }
-                Ok(None) => {
+                Ok(Tried::BrokenOff) => return None,
+                Ok(Tried::Overwritten) => {
                     followed.unread.overwritten(&mut followed.reader, number + 1);
                     self.current = None;
                 }
@@ -326,8 +329,8 @@ impl RingFollower {
     fn read_ring<T>(
         &mut self,
         block: u32,
-        beside: &mut dyn FnMut(),
-        read: impl FnOnce(&mut RingReader, &mut dyn FnMut(&RingReader)) -> T,
+        beside: &mut dyn FnMut() -> bool,
+        read: impl FnOnce(&mut RingReader, &mut dyn FnMut(&RingReader) -> bool) -> T,
     ) -> Option<T> {
         // Apart from the others, which are told of meanwhile.
         let mut followed = self.rings.remove(&block)?;
@@ -335,7 +338,7 @@ impl RingFollower {
         let found = read(reader, &mut |reader| {
             beat(reader, told, self.mark);
             self.beat();
-            beside();
+            beside()
         });
         self.rings.insert(block, followed);
         Some(found)

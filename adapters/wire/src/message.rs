@@ -4,7 +4,7 @@
 //! a message of another session never fits. Each message is a head of fixed length with its signature (HMAC-SHA256), then the
 //! description (of a block that was opened) and the values, and a signature of the head with the BLAKE3 hash of both, which comes last so that
 //! nothing waits until all was hashed. Its number rises strictly within the session. So no memory is taken before the head's signature has been
-//! checked, and nothing is believed before the last. A follower asks for each message but pulses (signed and numbered as well), so that nothing
+//! checked, and nothing counts before the last. A follower asks for each message but pulses (signed and numbered as well), so that nothing
 //! is on its way to one that does not take it.
 //!
 //! TCP with these frames and not ZeroMQ: the `zeromq` crate takes memory for any length that a peer announces, before a signature could be
@@ -325,8 +325,8 @@ impl Session {
         to.write_all(&signature).and_then(|()| to.flush()).map_err(failed)
     }
 
-    /// Receives a message. `description` is the block's as it was last announced and is replaced when the message brings one;
-    /// a step's values are in `values` then, which keeps its memory from call to call.
+    /// Receives a message. `known` hears of its block and of the description that it brings, if any, and says how many bytes a step of that block has;
+    /// what it heard counts only when this returns without an error. A step's values are in `values` then, which keeps its memory from call to call.
     ///
     /// # Errors
     /// Wrong key, a changed or replayed message, lengths that lie, a field larger than `limits`, no memory: the session is over.
@@ -360,8 +360,6 @@ impl Session {
             return Err(WireError::field("payload bytes", payload, accepted));
         }
         let count = payload as usize / 4;
-        let missing = count.saturating_sub(values.len());
-        values.try_reserve_exact(missing).map_err(|_| WireError::no_memory(4 * missing))?;
         fill(values, count, |piece| {
             from.read_exact(piece).map_err(failed)?;
             hasher.update(piece);

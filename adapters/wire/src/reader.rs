@@ -28,6 +28,16 @@ pub(crate) enum Found {
     Unseen,
 }
 
+/// What came of reading one step.
+pub(crate) enum Tried {
+    /// The step; its values are in the buffer.
+    Step(StepInfo),
+    /// A later one stands in its slot, or is being written.
+    Overwritten,
+    /// Whoever reads did not want to go on.
+    BrokenOff,
+}
+
 /// Bytes that can be read anywhere: a file, or memory in tests.
 pub trait ReadAt {
     /// Bytes there.
@@ -160,13 +170,15 @@ impl<F: ReadAt> RingReader<F> {
     /// # Errors
     /// The file went away or was cut short; its counts run backwards.
     pub fn read(&mut self, values: &mut Vec<f32>) -> Result<Read, WireError> {
-        self.read_beside(values, &mut |_| ())
+        self.read_beside(values, &mut |_| true).map(|found| found.unwrap_or(Read::Nothing))
     }
 
-    /// The same, with `beside` called after each piece of the values.
-    pub(crate) fn read_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self)) -> Result<Read, WireError> {
+    /// The same, with `beside` asked after each piece of the values whether to go on; none: it broke off, and nothing was taken.
+    pub(crate) fn read_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Option<Read>, WireError> {
         let slots = u64::from(self.header.slots);
         let began = self.next;
+        // Not `next` itself, which the producer is told of meanwhile.
+        let mut number = began;
         // Before the count is read: no step can come after it.
         let ended = self.is_closed()?;
         for _ in 0..ATTEMPTS {
@@ -174,24 +186,23 @@ impl<F: ReadAt> RingReader<F> {
             if published < began {
                 return Err(self.ran_back(published, began));
             }
-            self.next = self.next.max(published.saturating_sub(slots));
-            if self.next >= published {
+            number = number.max(published.saturating_sub(slots));
+            if number >= published {
                 // What was overwritten while it was read counts as missed by the step that comes.
-                let missed = self.next - began;
-                self.next = began;
-                return Ok(if missed == 0 && ended { Read::Ended } else { Read::Nothing });
+                return Ok(Some(if number == began && ended { Read::Ended } else { Read::Nothing }));
             }
-            if let Some(mut info) = self.try_slot(self.next, values, beside)? {
-                info.missed = info.number - began;
-                self.next += 1;
-                return Ok(Read::Step(info));
+            match self.try_slot(number, values, beside)? {
+                Tried::Step(mut info) => {
+                    info.missed = number - began;
+                    self.next = number + 1;
+                    return Ok(Some(Read::Step(info)));
+                }
+                Tried::BrokenOff => return Ok(None),
+                Tried::Overwritten => number = (number + 1).max(self.word(PUBLISHED)?.saturating_sub(1)),
             }
-            // It was overwritten meanwhile.
-            self.next = (self.next + 1).max(self.word(PUBLISHED)?.saturating_sub(1));
         }
         // The producer is faster than any reading; what else is to be done comes first.
-        self.next = began;
-        Ok(Read::Nothing)
+        Ok(Some(Read::Nothing))
     }
 
     /// Numbers of the steps that the ring holds; the first may be overwritten at this moment.
@@ -215,18 +226,15 @@ impl<F: ReadAt> RingReader<F> {
         Ok(if is_over { Found::Overwritten } else { Found::Unseen })
     }
 
-    /// Reads this step and no other, as [`Self::read_beside`] does; none: it was overwritten. What is before it counts as missed.
-    pub(crate) fn take(
-        &mut self,
-        number: u64,
-        values: &mut Vec<f32>,
-        beside: &mut dyn FnMut(&Self),
-    ) -> Result<Option<StepInfo>, WireError> {
-        let Some(mut info) = self.try_slot(number, values, beside)? else { return Ok(None) };
-        self.pass(number);
-        info.missed = std::mem::take(&mut self.passed);
-        self.next = number + 1;
-        Ok(Some(info))
+    /// Reads this step and no other, as [`Self::read_beside`] does. What is before it counts as missed.
+    pub(crate) fn take(&mut self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Tried, WireError> {
+        let mut tried = self.try_slot(number, values, beside)?;
+        if let Tried::Step(info) = &mut tried {
+            self.pass(number);
+            info.missed = std::mem::take(&mut self.passed);
+            self.next = number + 1;
+        }
+        Ok(tried)
     }
 
     /// Wants nothing before a step any more; whether that changes anything.
@@ -308,29 +316,29 @@ impl<F: ReadAt> RingReader<F> {
         Ok(Some(self.any_head(number)?).filter(|words| words[0] == sequence(number)))
     }
 
-    fn try_slot(&self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self)) -> Result<Option<StepInfo>, WireError> {
+    fn try_slot(&self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Tried, WireError> {
         let slot = self.slot(number);
         // At most what the limits allow: the header was checked.
         let count = (self.header.description.block_bytes() / 4) as usize;
-        let Some(head) = self.head(number)? else { return Ok(None) };
+        let Some(head) = self.head(number)? else { return Ok(Tried::Overwritten) };
         fence(Ordering::Acquire);
-        let mut place = slot + SLOT_HEADER as u64;
+        let (mut place, mut broken_off) = (slot + SLOT_HEADER as u64, false);
         let is_whole = fill(values, count, |piece| {
             self.read_bytes(piece, place)?;
             place += piece.len() as u64;
-            beside(self);
+            broken_off = !beside(self);
             // All values so far before another look at the number.
             fence(Ordering::Acquire);
-            Ok(self.head(number)?.is_some())
+            Ok(!broken_off && self.head(number)?.is_some())
         })?;
         if !is_whole {
-            return Ok(None);
+            return Ok(if broken_off { Tried::BrokenOff } else { Tried::Overwritten });
         }
         let time = f64::from_bits(head[2]);
         if !time.is_finite() {
             return Err(WireError::field("time", time, "a finite number"));
         }
-        Ok(Some(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
+        Ok(Tried::Step(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
     }
 
     /// A word of the producer's: what it wrote before that is seen by whatever is read after.

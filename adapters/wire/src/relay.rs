@@ -245,6 +245,7 @@ impl Relay {
                     pulsed = session.send(&mut Paced::new(stream, &self.stop), &quiet, None, &[]);
                     sent = Instant::now();
                 }
+                pulsed.is_ok() && !self.stop.load(Ordering::Relaxed)
             };
             let event = if asked { rings.poll_beside(&mut values, &mut pulse) } else { None };
             pulsed?;

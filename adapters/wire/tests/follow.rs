@@ -590,8 +590,9 @@ fn dribble(relay: &Relay, folder: &Folder, bytes: usize) -> (Producer, std::thre
     let mut session = Session::connect(&mut stream, &relay.key).unwrap();
     session.ask(&mut stream, Ask::Next).unwrap();
     let mut note = |_: u32, announced: Option<Description>| announced.map(|announced| announced.block_bytes());
-    let opened = session.receive(&mut stream, &Limits::default(), &mut note, &mut Vec::new()).unwrap();
-    assert_eq!(opened.kind, Kind::Opened);
+    let mut receive = || session.receive(&mut stream, &Limits::default(), &mut note, &mut Vec::new()).unwrap().kind;
+    let opened = std::iter::repeat_with(&mut receive).find(|kind| *kind != Kind::Pulse);
+    assert_eq!(opened, Some(Kind::Opened));
     session.ask(&mut stream, Ask::Next).unwrap();
     let reading = std::thread::spawn(move || {
         let mut piece = vec![0; bytes];
@@ -670,12 +671,74 @@ fn a_relay_that_says_nothing_is_left_and_one_that_lives_is_waited_for() {
     relay.join().unwrap();
 }
 
+/// Block, step and missed ones of the first so many steps of blocks that are read, in three pieces each, and the pieces that this took. `meanwhile` hears
+/// of each, numbered from 1, and may overwrite the step or break off. Two steps are there at first, in two slots.
+fn read_in_pieces(
+    name: &str,
+    count: u32,
+    enough: usize,
+    meanwhile: &mut dyn FnMut(u32, &[Producer]) -> bool,
+) -> (Vec<(u32, u64, u64)>, u32) {
+    let folder = Folder::new(name);
+    // 2.25 MiB a block: two pieces and a quarter.
+    let blocks = if count == 1 { vec![description(544)] } else { columns(768, count) };
+    let producers: Vec<Producer> =
+        blocks.into_iter().map(|block| Producer::open(&folder.0, block, 2, Policy::NewestWins).unwrap()).collect();
+    (0..2).for_each(|n| producers.iter().for_each(|producer| _ = publish(producer, n)));
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let (mut values, mut seen, mut pieces, begin) = (Vec::new(), Vec::new(), 0, Instant::now());
+    while seen.len() < enough {
+        assert!(begin.elapsed() < LONG, "{seen:?}");
+        let event = follower.poll_beside(&mut values, &mut || {
+            pieces += 1;
+            meanwhile(pieces, &producers)
+        });
+        match event {
+            Some(Event::Step { block, step, missed, .. }) => {
+                assert!(values.iter().all(|v| *v == step as f32), "step {step} of block {block} is torn");
+                seen.push((block, step, missed));
+            }
+            Some(Event::Refused(error)) => panic!("{error}"),
+            _ => {}
+        }
+    }
+    (seen, pieces)
+}
+
+#[test]
+fn a_step_that_is_overwritten_between_its_pieces_is_left_there() {
+    let mut overwrite = |piece: u32, producers: &[Producer]| {
+        if piece == 2 {
+            (2..4).for_each(|n| producers.iter().for_each(|producer| _ = publish(producer, n)));
+        }
+        true
+    };
+    // The newest, after two pieces for nothing; then what comes.
+    let mut one = |piece: u32, producers: &[Producer]| {
+        overwrite(piece, producers);
+        if piece == 5 {
+            publish(&producers[0], 4);
+        }
+        true
+    };
+    assert_eq!(read_in_pieces("between-1", 1, 2, &mut one), (vec![(0, 3, 3), (0, 4, 0)], 2 + 3 + 3));
+    // Of several blocks as of one.
+    assert_eq!(read_in_pieces("between-2", 2, 2, &mut overwrite), (vec![(0, 3, 3), (1, 3, 3)], 2 + 2 * 3));
+}
+
+#[test]
+fn a_step_whose_reading_was_broken_off_is_read_later() {
+    let mut stop = |piece: u32, _: &[Producer]| piece != 2;
+    assert_eq!(read_in_pieces("off-1", 1, 2, &mut stop), (vec![(0, 0, 0), (0, 1, 0)], 2 + 2 * 3));
+    assert_eq!(read_in_pieces("off-2", 2, 4, &mut stop), (vec![(0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)], 2 + 4 * 3));
+}
+
 #[test]
 fn producers_wait_while_a_step_is_read_slowly() {
     let folder = Folder::new("slowly");
     let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
-    // 4 MiB a block, in four pieces.
-    let solvers: Vec<_> = columns(1024, 2)
+    // 16 MiB a block, in as many pieces.
+    let solvers: Vec<_> = columns(2048, 2)
         .into_iter()
         .map(|block| {
             let producer = Producer::open(&folder.0, block, 2, Policy::Wait(10 * LONG)).unwrap();
@@ -689,9 +752,10 @@ fn producers_wait_while_a_step_is_read_slowly() {
         assert!(begin.elapsed() < 10 * LONG, "{seen:?}");
         let event = follower.poll_beside(&mut values, &mut || {
             pieces += 1;
-            if pieces <= 4 {
-                std::thread::sleep(Duration::from_secs(2));
+            if pieces <= 8 {
+                std::thread::sleep(Duration::from_secs(1));
             }
+            true
         });
         match event {
             Some(Event::Step { block, step, missed, .. }) => {
@@ -702,7 +766,7 @@ fn producers_wait_while_a_step_is_read_slowly() {
             _ => {}
         }
     }
-    assert!(pieces == 40 && seen.values().all(|steps| *steps == [0, 1, 2, 3, 4]), "{pieces} {seen:?}");
+    assert!(pieces == 160 && seen.values().all(|steps| *steps == [0, 1, 2, 3, 4]), "{pieces} {seen:?}");
     solvers.into_iter().for_each(|solver| solver.join().unwrap());
 }
 

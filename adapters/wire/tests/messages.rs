@@ -31,7 +31,8 @@ fn two(session: &mut Session) -> (Vec<u8>, Vec<u8>) {
     let values: Vec<f32> = (0..32).map(|v| v as f32).collect();
     let (mut first, mut second) = (Vec::new(), Vec::new());
     session.send(&mut first, &facts(1), Some(&description()), &values).unwrap();
-    session.send(&mut second, &facts(2), None, &values).unwrap();
+    let values: Vec<f32> = values.iter().map(|v| -v).collect();
+    session.send(&mut second, &facts(2), Some(&description()), &values).unwrap();
     (first, second)
 }
 
@@ -104,6 +105,8 @@ fn every_changed_byte_is_noticed() {
                 let client = fresh_client.insert(fresh_server.1.unwrap());
                 let error = receive(client, &message, &mut None).map(|_| ()).unwrap_err();
                 assert!(!matches!(error, WireError::Signature | WireError::Replayed { .. }), "{place}: {error}");
+                // Values and the last signature. What comes before them is looked at first.
+                assert!(place < first.len() - 160 || matches!(error, WireError::Payload), "{place}: {error}");
             }
         }
     }
@@ -111,6 +114,16 @@ fn every_changed_byte_is_noticed() {
     for length in [0, 1, 50, 107, 108, 200, first.len() - 1] {
         assert!(receive(&mut client, &first[..length], &mut None).is_err(), "{length}");
     }
+}
+
+#[test]
+fn a_head_vouches_for_no_other_payload() {
+    let key = Key::random().unwrap();
+    let (server, client) = pair(&key, &key);
+    let (first, second) = two(&mut server.unwrap());
+    assert_eq!(first.len(), second.len());
+    let spliced = [&first[..108], &second[108..]].concat();
+    assert!(matches!(receive(&mut client.unwrap(), &spliced, &mut None), Err(WireError::Payload)));
 }
 
 #[test]

@@ -26,6 +26,7 @@ mod network_batched;
 #[cfg(test)]
 mod network_host_parity;
 mod network_layout;
+mod network_samples;
 mod network_training;
 mod offload;
 mod pinned;
@@ -53,7 +54,8 @@ pub use layout::Outputs;
 pub use memory::{Budget, Buffer};
 pub use network::{DeviceNetwork, NetworkAbove, is_fused, network_defines};
 pub use network_batched::Tiling;
-pub use network_training::{DeviceSamples, DeviceTraining};
+pub use network_samples::DeviceSamples;
+pub use network_training::DeviceTraining;
 pub use offload::CudaOffload;
 pub use render::{GpuRenderer, LookAhead, Timeline};
 pub use sort::{SortCells, Sorter};

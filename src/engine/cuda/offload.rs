@@ -3,7 +3,8 @@
 use super::answers::DeviceLearns;
 use super::labels::HELD_BACK;
 use super::layout::Outputs;
-use super::network_training::{Filled, NetworkCopy, SampleWriter};
+use super::network_samples::{Filled, SampleWriter};
+use super::network_training::NetworkCopy;
 use super::predictor::{TableCopy, predict_from_host};
 use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
 use crate::field::Domain;

@@ -4,8 +4,10 @@ use super::*;
 use crate::field::Domain;
 use crate::field::analytic::Analytic;
 use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
+use crate::surrogate::{Copied, OffloadedTraining};
 use std::ops::Range;
 use std::sync::atomic::{AtomicUsize, Ordering};
+use std::time::Duration;
 
 /// A device that takes steps, whatever they are, and has no memory for a copy; how often it was waited for.
 #[derive(Clone, Default)]
