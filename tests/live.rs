@@ -374,8 +374,8 @@ fn as_many_threads_render_as_the_simulation_leaves_cores() {
     let all = cores();
     // What the cgroup leaves counts too.
     let most = std::thread::available_parallelism().unwrap().get();
-    for left in [&all[..1], &all] {
-        let run = place.files.join(format!("{}", left.len()));
+    for (name, left) in [("one", &all[..1]), ("all", &all)] {
+        let run = place.files.join(name);
         let mut command = Command::new(env!("CARGO_BIN_EXE_ridgewatch"));
         command.args(["attach", text(&live), &ring, "--device", "cpu", "--out", text(&run)]).env_remove("RIDGEWATCH_RING");
         let sidecar = start(bound(&mut command, left.to_vec()));
