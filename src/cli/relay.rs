@@ -54,25 +54,26 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     super::open_files::allow_many();
     let key = Key::random()?;
     super::check_folder(&options.connection)?;
-    ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;
-    messages::note(format_args!(
-        "relaying {} at {host}:{port}; on the other node: ridgewatch attach {}",
-        ring.display(),
-        options.connection.display()
-    ));
     let (stop, counts) = (Arc::new(AtomicBool::new(false)), Arc::new(RelayCounts::default()));
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
     let served = runtime.block_on(async {
+        // Before the file is there, so that no signal leaves it behind.
         let signals = super::replay::watch_signals(stop.clone(), Arc::default()).map(tokio::spawn);
+        ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;
+        messages::note(format_args!(
+            "relaying {} at {host}:{port}; on the other node: ridgewatch attach {}",
+            ring.display(),
+            options.connection.display()
+        ));
         let (flag, counts) = (stop.clone(), counts.clone());
         let work = move || serve(&ring, &listener, &key, &counts, &flag, Arc::new(messages::note));
         let served = tokio::task::spawn_blocking(work).await;
         if let Some(signals) = signals {
             signals.abort();
         }
-        served
-    });
+        anyhow::Ok(served)
+    })?;
     // Whoever reads it later would wait for nobody.
     let _ = std::fs::remove_file(&options.connection);
     served.context("the relay stopped unexpectedly")??;
