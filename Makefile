@@ -142,8 +142,10 @@ test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-adapter
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release -p ridgewatch-adapter --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored; else \
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes; else \
 	  echo "NOT RUN: a ring on a full file system, files of another user, since these tests need root"; fi
+	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release -p ridgewatch-wire --test follow -- --ignored gigabytes; else \
+	  echo "NOT RUN: a relay of steps of 2 GB, since that test needs 16 GB of memory"; fi
 	@$(MAKE) --no-print-directory install-adapters PREFIX=$(CURDIR)/$(ADAPTERS)/installed
 	scripts/adapters-installed $(ADAPTERS)/installed
 	@if ls $(ADAPTERS)/wheel/*.whl >/dev/null 2>&1; then \

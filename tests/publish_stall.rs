@@ -123,9 +123,10 @@ fn beside_a_healthy_one(seconds: u64, publisher: Publisher, other: impl FnOnce(&
     stop.send(true).unwrap();
     runtime.block_on(healthy).unwrap();
     drop(other);
-    let times: Vec<Instant> = arrivals.lock().unwrap().iter().copied().filter(|time| *time > begin).chain([end]).collect();
+    let came: Vec<Instant> = arrivals.lock().unwrap().iter().copied().filter(|time| *time > begin).collect();
+    let times: Vec<Instant> = [begin].into_iter().chain(came).chain([end]).collect();
     let gap = times.windows(2).map(|w| w[1].saturating_duration_since(w[0])).max().unwrap();
-    Beside { statistics: publisher.finish(Duration::from_millis(500)), gap, arrivals: times.len() - 1 }
+    Beside { statistics: publisher.finish(Duration::from_millis(500)), gap, arrivals: times.len() - 2 }
 }
 
 /// As in [`PublishSettings`].

@@ -174,8 +174,10 @@ fn a_second_signal_ends_at_once() {
     // One frame of many minutes, prepared in a moment: the first signal lets it finish.
     let mut run = Run::start(GYRE, &["render.width=64", "render.height=32", "render.samples=16000000", "render.method=surrogate"]);
     // What is said before the slide is prepared, and behind each signal.
-    let mut said = BufReader::new(run.child.as_mut().unwrap().stderr.take().unwrap()).lines().map(Result::unwrap);
-    let mut hears = |words: &str| assert!(said.any(|line| line.contains(words)), "it does not say: {words}");
+    let said = BufReader::new(run.child.as_mut().unwrap().stderr.take().unwrap()).lines().map(Result::unwrap);
+    let (tell, told) = std::sync::mpsc::channel();
+    std::thread::spawn(move || said.for_each(|line| drop(tell.send(line))));
+    let hears = |words: &str| while !told.recv_timeout(SOON).unwrap_or_else(|_| panic!("it does not say: {words}")).contains(words) {};
     hears("colours from FTLE");
     std::thread::sleep(Duration::from_millis(3000));
     run.signal("-INT");

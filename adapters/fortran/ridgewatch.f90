@@ -26,7 +26,8 @@ module ridgewatch
     private
     integer :: dimensions = 0
     type(c_ptr) :: description = c_null_ptr, field = c_null_ptr
-    integer(c_int64_t) :: extent(3) = 1
+    ! Nodes of the axes and of the block as described (0: the whole), and of what was opened, as far as arrays are read.
+    integer(c_int64_t) :: nodes(3) = 1, block_nodes(3) = 0, extent(3) = 1
   contains
     procedure :: begin => publisher_begin
     procedure :: uniform => publisher_uniform
@@ -192,7 +193,8 @@ contains
       return
     end if
     self%description = c_describe(int(dimensions, c_int32_t))
-    ! Arrays are read as far as it says.
+    self%nodes = 1
+    self%block_nodes = 0
     self%dimensions = merge(dimensions, 0, c_associated(self%description))
     call give(merge(rw_ok, rw_argument, c_associated(self%description)), status)
   end subroutine
@@ -205,10 +207,12 @@ contains
     real(real64), intent(in), optional :: period
     integer, intent(out), optional :: status
     real(real64) :: repeats
+    integer :: found
     repeats = 0
     if (present(period)) repeats = period
-    call give(c_uniform(self%description, int(axis - 1, c_int32_t), first, last, int(nodes, c_int64_t), repeats), status)
-    if (axis >= 1 .and. axis <= 3) self%extent(axis) = nodes
+    found = c_uniform(self%description, int(axis - 1, c_int32_t), first, last, int(nodes, c_int64_t), repeats)
+    if (found == rw_ok) self%nodes(axis) = nodes
+    call give(found, status)
   end subroutine
 
   !> Axis 1, 2 or 3 with its own coordinates, strictly ascending.
@@ -220,7 +224,7 @@ contains
     integer, intent(out), optional :: status
     real(real64) :: repeats
     real(real64), allocatable :: packed(:)
-    integer :: failed
+    integer :: failed, found
     repeats = 0
     if (present(period)) repeats = period
     allocate (packed(size(coordinates)), stat=failed)
@@ -229,8 +233,9 @@ contains
       return
     end if
     packed(:) = coordinates
-    call give(c_rectilinear(self%description, int(axis - 1, c_int32_t), packed, size(packed, kind=c_int64_t), repeats), status)
-    if (axis >= 1 .and. axis <= 3) self%extent(axis) = size(packed)
+    found = c_rectilinear(self%description, int(axis - 1, c_int32_t), packed, size(packed, kind=c_int64_t), repeats)
+    if (found == rw_ok) self%nodes(axis) = size(packed)
+    call give(found, status)
   end subroutine
 
   !> Axes 1 and 2 are longitude and latitude in degrees.
@@ -247,6 +252,7 @@ contains
     integer, intent(in) :: index, count, first(:), extent(:)
     integer, intent(out), optional :: status
     integer(c_int64_t) :: offset(3), nodes(3)
+    integer :: found
     if (.not. c_associated(self%description) .or. size(first) < self%dimensions .or. size(extent) < self%dimensions) then
       call give(rw_argument, status)
       return
@@ -255,8 +261,9 @@ contains
     nodes = 1
     offset(:self%dimensions) = first(:self%dimensions) - 1
     nodes(:self%dimensions) = extent(:self%dimensions)
-    self%extent = nodes
-    call give(c_block(self%description, int(index, c_int32_t), int(count, c_int32_t), offset, nodes), status)
+    found = c_block(self%description, int(index, c_int32_t), int(count, c_int32_t), offset, nodes)
+    if (found == rw_ok) self%block_nodes = nodes
+    call give(found, status)
   end subroutine
 
   !> A number that all blocks of this start of the simulation name, and those of its next start do not; 0: none.
@@ -333,6 +340,8 @@ contains
     else
       found = c_open(c_null_ptr, self%description, self%field)
     end if
+    ! What is described later is that of the next opening.
+    if (found == rw_ok) self%extent = merge(self%block_nodes, self%nodes, self%block_nodes > 0)
     call give(found, status)
   end subroutine
 

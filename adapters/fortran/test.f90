@@ -45,6 +45,13 @@ program test
   call want(status == rw_argument, 5)
   call publisher%publish(3, 2d0, u64(1:4, 2:6:2, :), v64(1:4, 1:3, :), w64(1:4, 1:3, :), status)
   call want(status == rw_argument, 6)
+  ! What is described now is that of the next opening: smaller arrays are too small still.
+  call publisher%uniform(1, 0d0, 2d0, 3)
+  call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
+  call want(status == rw_argument, 90)
+  call publisher%block(0, 1, [1, 1, 1], [3, 3, 2])
+  call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
+  call want(status == rw_argument, 91)
   ! No grid has five dimensions; whoever passes over that reads and writes nothing of five.
   call second%begin(5, status)
   call want(status == rw_argument, 35)

@@ -43,13 +43,15 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
     if options.run.checkpoint.is_some() && !fixed {
         messages::note("network.size is \"auto\": weights of an earlier run are not gone on from, since a checkpoint has one size");
     }
-    if fixed && options.run.resume.is_none() && scene.training.resume.is_none() {
-        options.run.resume = options.run.checkpoint.clone().filter(|path| path.exists());
-        if let Some(path) = &options.run.resume {
+    options.run.apply(&mut scene)?;
+    // Whoever runs it again has weights of his own to go on from.
+    let scene_text = scene.to_toml()?;
+    if fixed && scene.training.resume.is_none() {
+        scene.training.resume = options.run.checkpoint.clone().filter(|path| path.exists());
+        if let Some(path) = &scene.training.resume {
             messages::note(format_args!("going on from the weights in {}", path.display()));
         }
     }
-    options.run.apply(&mut scene)?;
     if !options.run.overwrite {
         let out = RunFolder::vacant(&options.run.out)?;
         if out != options.run.out {
@@ -65,7 +67,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         messages::note(format_args!("found {}", live.describe()));
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, EngineError::refused))
     };
-    conduct(common, &options.run, scene, Some(CHECKPOINT_SECONDS), open)
+    conduct(common, &options.run, scene, &scene_text, Some(CHECKPOINT_SECONDS), open)
 }
 
 /// The scene that the paths mean.

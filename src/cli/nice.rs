@@ -31,6 +31,11 @@ const OUT_OF_MEMORY: &str = "/proc/self/oom_score_adj";
 const OFFERED: &str = "1000";
 
 fn lower(nice: i32) -> std::io::Result<()> {
+    // SAFETY: asks for this process's own.
+    if unsafe { libc::getpriority(libc::PRIO_PROCESS, 0) } >= nice {
+        // Whoever started it has stepped back further already.
+        return Ok(());
+    }
     for task in std::fs::read_dir("/proc/self/task")? {
         let Some(thread) = task?.file_name().to_str().and_then(|name| name.parse().ok()) else { continue };
         // SAFETY: changes a priority and touches no memory.

@@ -57,7 +57,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
     options.run.apply(&mut scene)?;
     let open = |scene: &SceneFile, _: &AtomicBool| super::open(scene).map(Some);
-    conduct(common, &options.run, scene, None, open)
+    let scene_text = scene.to_toml()?;
+    conduct(common, &options.run, scene, &scene_text, None, open)
 }
 
 impl RunArguments {
@@ -83,29 +84,30 @@ impl RunArguments {
     }
 }
 
-/// Runs a scene into a run folder and onto the socket. `open` may wait for its source until the flag is set, and gives none then.
+/// Runs a scene into a run folder, where it is kept as `scene_text`, and onto the socket. `open` may wait for its source until the flag is set, and gives none then.
 pub(super) fn conduct(
     common: &Common,
     options: &RunArguments,
     scene: SceneFile,
+    scene_text: &str,
     checkpoint_seconds: Option<f64>,
     open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
 ) -> Result<()> {
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(2).enable_all().build().context("cannot start the I/O threads")?;
-    runtime.block_on(frames(common, options, scene, checkpoint_seconds, open))
+    runtime.block_on(frames(common, options, scene, scene_text, checkpoint_seconds, open))
 }
 
 async fn frames(
     common: &Common,
     options: &RunArguments,
     scene: SceneFile,
+    scene_text: &str,
     checkpoint_seconds: Option<f64>,
     open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>,
 ) -> Result<()> {
     // Before anything is waited for or read; what another run makes of the folder meanwhile is refused below.
     RunFolder::refuse_occupied(&options.out, options.overwrite)?;
-    let scene_text = scene.to_toml()?;
     let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
     let watch = || watch_signals(stop.clone(), caught.clone()).map(tokio::spawn);
     // A source that is waited for must be left by a signal; one that is there is opened before signals are caught, so that they end it at once.
@@ -124,8 +126,11 @@ async fn frames(
     // The socket first: a port in use must not cost the run that the folder holds.
     let publish = scene.publish_settings();
     let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
-    let folder = RunFolder::create(&options.out, options.overwrite)?;
-    folder.write_scene(if follows { "attach" } else { "replay" }, &scene_text)?;
+    let mut folder = RunFolder::create(&options.out, options.overwrite)?;
+    if let Err(error) = folder.write_scene(if follows { "attach" } else { "replay" }, scene_text) {
+        folder.put_back().with_context(|| format!("{}: the run before cannot be put back", options.out.display()))?;
+        return Err(error.into());
+    }
     output.write_to(folder, &publish)?;
     if let Some(endpoint) = output.endpoint() {
         messages::note(format_args!("publishing at {endpoint}"));

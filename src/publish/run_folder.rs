@@ -131,7 +131,12 @@ impl RunFolder {
             }
         }
         let probe = frames.join(".probe");
-        fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)).map_err(|e| refuse(&frames, e))?;
+        if let Err(error) = fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)) {
+            if aside.exists() {
+                put_back(path, &aside).map_err(|e| refuse(&aside, e))?;
+            }
+            return Err(refuse(&frames, error));
+        }
         let file = path.join(RECORDS);
         // `create_new`: of two runs that start at once in one folder, one is told.
         let records = OpenOptions::new().append(true).create_new(true).open(&file).map_err(|e| refuse(&file, e))?;
@@ -151,18 +156,7 @@ impl RunFolder {
     /// Those of the system; what could not be put back lies in `.previous`.
     pub fn put_back(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
-        // One that was made without a scene must not be left with this one's.
-        if let Err(error) = fs::remove_file(self.path.join(SCENE))
-            && error.kind() != io::ErrorKind::NotFound
-        {
-            return Err(error);
-        }
-        for entry in fs::read_dir(&previous)? {
-            let entry = entry?;
-            let folder = if entry.file_name().to_str().is_some_and(is_picture) { self.path.join(FRAMES) } else { self.path.clone() };
-            fs::rename(entry.path(), folder.join(entry.file_name()))?;
-        }
-        fs::remove_dir(&previous)?;
+        put_back(&self.path, &previous)?;
         Ok(true)
     }
 
@@ -290,6 +284,22 @@ fn remove(files: &[(PathBuf, u64)]) {
     }
 }
 
+/// Puts the files of the run before back in their places.
+fn put_back(path: &Path, previous: &Path) -> io::Result<()> {
+    // One that was made without a scene must not be left with this one's.
+    if let Err(error) = fs::remove_file(path.join(SCENE))
+        && error.kind() != io::ErrorKind::NotFound
+    {
+        return Err(error);
+    }
+    for entry in fs::read_dir(previous)? {
+        let entry = entry?;
+        let folder = if entry.file_name().to_str().is_some_and(is_picture) { path.join(FRAMES) } else { path.to_owned() };
+        fs::rename(entry.path(), folder.join(entry.file_name()))?;
+    }
+    fs::remove_dir(previous)
+}
+
 /// Files that a run writes, as far as they are there.
 fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files: Vec<PathBuf> =
@@ -374,6 +384,11 @@ mod tests {
         failed.write_scene("replay", "seed = 3\n").unwrap();
         assert!(failed.put_back().unwrap() && scene().unwrap().ends_with("again.\nseed = 2\n"));
         drop(failed);
+        // A folder that cannot be written any more.
+        let probe = folder.path().join(FRAMES).join(".probe");
+        fs::create_dir(&probe).unwrap();
+        assert!(RunFolder::create(folder.path(), true).is_err() && scene().unwrap().ends_with("again.\nseed = 2\n"));
+        fs::remove_dir(&probe).unwrap();
         assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
         assert!(!folder.path().join(PREVIOUS).exists());
         // Killed while it prepares: the earlier run is neither lost nor taken for nothing.

@@ -39,7 +39,7 @@ pub fn write_scene(path: &Path, command: &str, scene: &str) -> Result<(), Publis
     let name = path.file_name().unwrap_or_default().to_string_lossy();
     let name = name.escape_debug();
     let version = env!("CARGO_PKG_VERSION");
-    let text = format!("{FIRST_WORDS}{version}, which replaces it: `ridgewatch {command} {name}` makes this again.\n{scene}");
+    let text = format!("{FIRST_WORDS}{version}, whose next run here replaces it: `ridgewatch {command} {name}` makes this again.\n{scene}");
     let written = write_whole(path, text.as_bytes());
     written.map_err(|error| PublishError::Scene { path: path.to_owned(), problem: format!("cannot be written: {error}") })
 }

@@ -27,7 +27,7 @@ pub enum SourceError {
     },
     /// HDF5 locks a file before it reads it, and cannot.
     #[error(
-        "{}: cannot be locked, as HDF5 does before it reads: {why}. To read it all the same, set HDF5_USE_FILE_LOCKING=FALSE in the environment",
+        "{}: cannot be locked, as HDF5 does before it reads: {why} (the library: {what}). To read it all the same, set HDF5_USE_FILE_LOCKING=FALSE in the environment",
         path.display()
     )]
     Locked {
@@ -35,6 +35,8 @@ pub enum SourceError {
         path: PathBuf,
         /// Who or what is in the way.
         why: String,
+        /// What the library says.
+        what: String,
     },
     /// Some other format.
     #[error("{}: neither NetCDF nor HDF5 ({found}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4 and HDF5", path.display())]

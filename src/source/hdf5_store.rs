@@ -21,13 +21,17 @@ const LONGEST_ATTRIBUTE: usize = 4096;
 const LONGEST_TEXT: usize = 1024;
 
 /// Whether a file that could not be opened only could not be locked. The libraries say no more than that they failed.
-pub(super) fn locked(path: &Path) -> Option<SourceError> {
+pub(super) fn locked(path: &Path, what: &str) -> Option<SourceError> {
+    // As libhdf5 reads it.
+    if std::env::var_os("HDF5_USE_FILE_LOCKING").is_some_and(|value| value == "FALSE" || value == "0") {
+        return None;
+    }
     let why = match std::fs::File::open(path).ok()?.try_lock_shared() {
         Ok(()) => return None,
         Err(TryLockError::WouldBlock) => "another process has locked it, perhaps since it is still being written".to_owned(),
         Err(TryLockError::Error(error)) => format!("its file system says {error}"),
     };
-    Some(SourceError::Locked { path: path.into(), why })
+    Some(SourceError::Locked { path: path.into(), why, what: what.into() })
 }
 
 /// An open HDF5 file.
@@ -51,7 +55,7 @@ impl Hdf5Store {
         }));
         match opened {
             Ok(Ok((header, file))) => Ok((header, Self { file, path: path.into() })),
-            Ok(Err(error)) => Err(locked(path).unwrap_or_else(|| damaged(error.to_string()))),
+            Ok(Err(error)) => Err(locked(path, &error.to_string()).unwrap_or_else(|| damaged(error.to_string()))),
             Err(_) => Err(damaged("the HDF5 library failed on it".into())),
         }
     }

@@ -30,7 +30,7 @@ impl NetCdf4Store {
         }));
         let (header, file) = match opened {
             Ok(Ok(pair)) => pair,
-            Ok(Err(error)) => return Err(locked(path).unwrap_or_else(|| damaged(error.to_string()))),
+            Ok(Err(error)) => return Err(locked(path, &error.to_string()).unwrap_or_else(|| damaged(error.to_string()))),
             Err(_) => return Err(damaged("its header holds names or types that are not understood".into())),
         };
         // libnetcdf invents dimensions for HDF5 files that have none.

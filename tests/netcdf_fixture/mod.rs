@@ -148,7 +148,7 @@ impl Fixture {
         file.close().unwrap();
         // A process that another test started meanwhile has the file, and its lock, until it ends.
         let begin = std::time::Instant::now();
-        while std::fs::File::open(path).unwrap().try_lock().is_err() {
+        while std::fs::File::open(path).unwrap().try_lock_shared().is_err() {
             assert!(begin.elapsed().as_secs() < 300, "{} stays locked", path.display());
             std::thread::sleep(std::time::Duration::from_millis(10));
         }

@@ -10,6 +10,8 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
+/// Attempts to lock a file that others remove or replace meanwhile.
+const ATTEMPTS: usize = 100;
 /// How long somebody is waited for who sweeps a ring's folder up.
 const SWEEP_PATIENCE: Duration = Duration::from_secs(5);
 
@@ -46,7 +48,7 @@ impl FileLock {
             attempts += 1;
             let gone = |error: &io::Error| matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::AlreadyExists);
             match crate::producer::make_folder(ring).and_then(|()| Self::take(path.clone(), kind)) {
-                Err(WireError::Io { source, .. }) if gone(&source) && attempts < 100 => std::thread::yield_now(),
+                Err(WireError::Io { source, .. }) if gone(&source) && attempts < ATTEMPTS => std::thread::yield_now(),
                 taken => return taken,
             }
         }
@@ -54,7 +56,7 @@ impl FileLock {
 
     /// Locks a file, made where it is not there; none when it is locked against that.
     fn take(path: PathBuf, kind: libc::c_int) -> Result<Option<Self>, WireError> {
-        loop {
+        for _ in 0..ATTEMPTS {
             let file = create_private(&path, false).map_err(|e| match e.raw_os_error() {
                 Some(libc::ELOOP) => foreign(&path, "is a symbolic link".into()),
                 Some(libc::EACCES | libc::EPERM) => foreign(&path, "may not be opened by this user".into()),
@@ -79,7 +81,10 @@ impl FileLock {
                 Err(error) if error.kind() == io::ErrorKind::NotFound => {}
                 Err(error) => return Err(WireError::io(&path, "cannot be looked at", error)),
             }
+            std::thread::yield_now();
         }
+        let error = io::Error::other(format!("another file is at its path after each of {ATTEMPTS} attempts"));
+        Err(WireError::io(&path, "cannot be locked", error))
     }
 
     /// Removes the file while it is still locked: whoever opened it finds that it is not the one at the path.

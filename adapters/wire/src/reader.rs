@@ -159,11 +159,6 @@ impl<F: ReadAt> RingReader<F> {
         &self.header
     }
 
-    /// Where it is.
-    pub fn path(&self) -> &Path {
-        &self.path
-    }
-
     /// Reads the oldest step that was not read yet and is still there: its components, one behind the other, x fastest, in native f32. Where the producer
     /// overtakes the reading, the newest one instead, which will be there for longest. `values` keeps its memory from call to call.
     ///
@@ -293,11 +288,6 @@ impl<F: ReadAt> RingReader<F> {
     /// Whether the producer has closed the ring: what is read of it afterwards is all that it will ever hold.
     pub fn is_closed(&self) -> Result<bool, WireError> {
         Ok(self.word(STATE)? == ENDED)
-    }
-
-    /// Steps published so far.
-    pub fn published(&self) -> Result<u64, WireError> {
-        self.word(PUBLISHED)
     }
 
     fn slot(&self, number: u64) -> u64 {
