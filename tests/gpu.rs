@@ -21,6 +21,8 @@ mod answers;
 mod audit;
 #[path = "gpu/device.rs"]
 mod device;
+#[path = "gpu/live.rs"]
+mod live;
 #[path = "gpu/lost.rs"]
 mod lost;
 #[path = "gpu/network.rs"]

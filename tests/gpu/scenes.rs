@@ -35,13 +35,18 @@ pub fn device(settings: GpuSettings) -> Device {
 /// All frames of a scene with further `keys`.
 pub fn frames(scene: &str, keys: &[String], options: &RunOptions) -> Vec<Frame> {
     let scene = SceneFile::parse(Path::new("a test"), scene, keys).unwrap();
+    frames_of(Setup::new(scene.settings()).unwrap(), options)
+}
+
+/// All frames of a run.
+pub fn frames_of(setup: Setup, options: &RunOptions) -> Vec<Frame> {
     let mut frames = Vec::new();
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
             frames.push(frame);
         }
     };
-    run(Setup::new(scene.settings()).unwrap(), options, &mut sink, &AtomicBool::new(false)).unwrap();
+    run(setup, options, &mut sink, &AtomicBool::new(false)).unwrap();
     frames
 }
 
