@@ -183,7 +183,10 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
         match appended {
             Ok(removed) => {
                 if removed > 0 && statistics.records_removed == 0 {
-                    tracing::warn!("{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so", folder.path().display());
+                    tracing::warn!(
+                        "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so",
+                        folder.path().display()
+                    );
                 }
                 statistics.records_written += 1;
                 statistics.records_removed += removed;

@@ -329,8 +329,11 @@ fn put_back(path: &Path, previous: &Path) -> io::Result<()> {
 
 /// Files that a run writes, as far as they are there.
 fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut files: Vec<PathBuf> =
-        [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"].iter().map(|f| path.join(f)).filter(|f| f.exists()).collect();
+    let mut files: Vec<PathBuf> = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"]
+        .iter()
+        .map(|f| path.join(f))
+        .filter(|f| f.exists())
+        .collect();
     let scene = path.join(SCENE);
     if scene.exists() && is_ours(&scene)? {
         files.push(scene);

@@ -125,7 +125,12 @@ impl PublishSettings {
         require((0.1..=3600.0).contains(&self.stall_seconds), "publish.stall_seconds", self.stall_seconds, "a number from 0.1 to 3600")?;
         require(self.keep != Some(0), "publish.keep", 0, "at least 1, or no key to keep all frames")?;
         let records = self.records_bytes.unwrap_or(LEAST_RECORDS);
-        require(records >= LEAST_RECORDS, "publish.records_bytes", records, "at least 1048576, or no key for no cap (of a live run 1073741824)")
+        require(
+            records >= LEAST_RECORDS,
+            "publish.records_bytes",
+            records,
+            "at least 1048576, or no key for no cap (of a live run 1073741824)",
+        )
     }
 }
 
