@@ -7,6 +7,7 @@
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python. What is missing is installed where apt is (gfortran, openmpi-bin,
 #    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv alone
+# make live-figures   takes the figures of docs/live.md that need no GPU and prints their tables; some 20 minutes, with SHORT=1 a minute or two that show only that they run
 # make header   writes the C header anew from the library's source; a test holds the two to each other
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes docs/performance.md
 CARGO ?= cargo
@@ -30,7 +31,7 @@ ADAPTERS := out/adapters
 PREFIX ?= /usr/local
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter
+.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -157,6 +158,10 @@ test-adapters: packages python-packages adapter-packages adapters
 	  echo "NOT RUN: the tests of the Python package, since its wheel was not built"; fi
 	$(CARGO) build --release --bin ridgewatch --example live_window
 	scripts/live-mpi-check
+
+live-figures: packages adapters
+	$(CARGO) build --release --bin ridgewatch --example subscriber --example live_window
+	scripts/live-figures $(if $(SHORT),--short)
 
 bench: packages
 	$(CARGO) bench
