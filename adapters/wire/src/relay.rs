@@ -19,6 +19,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 mod follower;
+mod lookup;
 mod news;
 mod pace;
 
