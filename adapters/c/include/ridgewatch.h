@@ -91,7 +91,7 @@ rw_status rw_describe_block(rw_description *description, uint32_t index, uint32_
 // that it tells the others. Steps of two starts are then never put together, whatever their blocks are. 0 (default): none.
 rw_status rw_describe_start(rw_description *description, uint64_t start);
 
-// Unit of the times, for people; default "s".
+// Unit of the times, for people, 64 bytes at most; default "s".
 rw_status rw_describe_time_unit(rw_description *description, const char *unit);
 
 // Steps that the ring holds; default 4, at least 2. Its memory is that many copies of the block, 4 bytes a value.

@@ -378,7 +378,7 @@ pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, star
     unsafe { describe(description, change) }
 }
 
-/// Unit of the times, for people; default "s".
+/// Unit of the times, for people, 64 bytes at most; default "s".
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, unit: *const c_char) -> Status {
     let change = |d: &mut RwDescription| {

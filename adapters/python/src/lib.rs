@@ -65,7 +65,12 @@ enum Held {
 }
 
 impl Array {
-    fn of<T: BufferElement>(buffer: PyBuffer<T>, element: Element, reversed: bool, held: impl FnOnce(PyBuffer<T>) -> Held) -> PyResult<Self> {
+    fn of<T: BufferElement>(
+        buffer: PyBuffer<T>,
+        element: Element,
+        reversed: bool,
+        held: impl FnOnce(PyBuffer<T>) -> Held,
+    ) -> PyResult<Self> {
         let count = buffer.dimensions();
         if !(2..=3).contains(&count) {
             return Err(PyValueError::new_err(format!("an array of {count} dimensions; accepted: 2 or 3")));
@@ -76,7 +81,9 @@ impl Array {
             shape[k] = buffer.shape()[axis] as u64;
             let bytes = buffer.strides()[axis];
             if bytes % size_of::<T>() as isize != 0 {
-                return Err(PyValueError::new_err("the array's strides are no whole numbers of its elements"));
+                let found =
+                    format!("an array with a stride of {bytes} bytes; accepted: whole numbers of its elements of {} bytes", size_of::<T>());
+                return Err(PyValueError::new_err(found));
             }
             strides[k] = bytes / size_of::<T>() as isize;
         }
@@ -89,7 +96,13 @@ impl Array {
         }
         match PyBuffer::<f64>::get(given) {
             Ok(buffer) => Self::of(buffer, Element::F64, reversed, Held::F64),
-            Err(_) => Err(PyTypeError::new_err("accepted: NumPy arrays of float32 or float64")),
+            Err(_) => {
+                let found = match given.getattr("dtype") {
+                    Ok(dtype) => format!("an array of {dtype}"),
+                    Err(_) => format!("an object of type {}", given.get_type().name()?),
+                };
+                Err(PyTypeError::new_err(format!("{found}; accepted: NumPy arrays of float32 or float64")))
+            }
         }
     }
 }
@@ -143,7 +156,8 @@ impl Publisher {
         let mut description = Description { start, ..Description::whole(geometry, axes, time_unit) };
         if let Some((index, count, offset, extent)) = block {
             if offset.len() != dimensions || extent.len() != dimensions {
-                return Err(PyValueError::new_err(format!("block: accepted: {dimensions} offsets and extents")));
+                let found = format!("a block of {} offsets and {} extents", offset.len(), extent.len());
+                return Err(PyValueError::new_err(format!("{found}; accepted: {dimensions} of both, one an axis")));
             }
             let of = |numbers: &[u64], beyond| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(beyond));
             description.block = BlockExtent { index, count, offset: of(&offset, 0), extent: of(&extent, 1) };
@@ -179,12 +193,15 @@ impl Publisher {
         }
         let arrays = given.into_iter().map(|array| Array::new(array, self.reversed)).collect::<PyResult<Vec<_>>>()?;
         let (extent, first) = (producer.description().block.extent, &arrays[0]);
-        for array in &arrays {
+        for (name, array) in ["u", "v", "w"].into_iter().zip(&arrays) {
             if array.shape != extent {
                 return Err(PyValueError::new_err(format!("an array of {:?} nodes along x, y, z; accepted: {extent:?}", array.shape)));
             }
             if array.strides != first.strides || array.element != first.element {
-                return Err(PyValueError::new_err("the components differ in dtype or strides; accepted: the same for all"));
+                let dtype = |array: &Array| if array.element == Element::F32 { "float32" } else { "float64" };
+                let of = |array: &Array| format!("{} with strides {:?}", dtype(array), &array.strides[..self.dimensions]);
+                let found = format!("components that differ: {name} is {}", of(array));
+                return Err(PyValueError::new_err(format!("{found}; accepted: that of u, {}", of(first))));
             }
         }
         let (addresses, element, strides): (Vec<usize>, _, _) = (arrays.iter().map(|a| a.address).collect(), first.element, first.strides);
