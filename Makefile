@@ -7,7 +7,8 @@
 # make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python. What is missing is installed where apt is (gfortran, openmpi-bin,
-#    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy and pytest go into out/adapters/venv alone
+#    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv alone
+# make live-figures   takes the figures of docs/live.md that need no GPU and prints their tables; some 20 minutes, with SHORT=1 a minute or two that show only that they run
 # make header   writes the C header anew from the library's source; a test holds the two to each other
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes what was measured into
 #    docs/; it fails where something was not run or failed
@@ -20,6 +21,8 @@ CMAKE_VERSION := 3.31.6
 # The compiler of the GPU kernels, for the test that they compile; of the CUDA version that cudarc is bound to.
 NVRTC := target/nvrtc
 NVRTC_VERSION := 13.0.88
+# Whose stubtest holds the Python package's types to the module.
+MYPY_VERSION := 2.4.1
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
 # The collection of real archives that tests/archive_real.rs reads.
@@ -30,7 +33,7 @@ ADAPTERS := out/adapters
 PREFIX ?= /usr/local
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter
+.PHONY: all demo test test-data test-reader test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -128,9 +131,10 @@ adapters:
 python-adapter: $(ADAPTERS)/venv/installed
 	$(ADAPTERS)/venv/bin/maturin build --release --quiet -m adapters/python/Cargo.toml --target-dir target/python --out $(ADAPTERS)/wheel
 
-$(ADAPTERS)/venv/installed:
+# Anew where what is installed may have changed.
+$(ADAPTERS)/venv/installed: Makefile
 	$(PYTHON) -m venv $(ADAPTERS)/venv
-	$(ADAPTERS)/venv/bin/pip install --quiet 'maturin>=1.7,<2' numpy pytest
+	$(ADAPTERS)/venv/bin/pip install --quiet 'maturin>=1.7,<2' numpy pytest mypy==$(MYPY_VERSION)
 	touch $@
 
 install-adapters: adapters
@@ -149,17 +153,22 @@ test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-adapter
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release -p ridgewatch-adapter --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes; else \
-	  echo "NOT RUN: a ring on a full file system, files of another user, since these tests need root"; fi
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes && $(CARGO) test --release --test publish_full_disk -- --ignored; else \
+	  echo "NOT RUN: a ring or a run folder on a full file system, files of another user, since these tests need root"; fi
 	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release -p ridgewatch-wire --test follow -- --ignored gigabytes; else \
 	  echo "NOT RUN: a relay of steps of 2 GB, since that test needs 16 GB of memory"; fi
 	@$(MAKE) --no-print-directory install-adapters PREFIX=$(CURDIR)/$(ADAPTERS)/installed
 	scripts/adapters-installed $(ADAPTERS)/installed
 	@if ls $(ADAPTERS)/wheel/*.whl >/dev/null 2>&1; then \
-	  $(ADAPTERS)/venv/bin/pip install --quiet --force-reinstall --no-deps $(ADAPTERS)/wheel/*.whl && $(ADAPTERS)/venv/bin/pytest -q adapters/python/tests; else \
+	  $(ADAPTERS)/venv/bin/pip install --quiet --force-reinstall --no-deps $(ADAPTERS)/wheel/*.whl && $(ADAPTERS)/venv/bin/pytest -q adapters/python/tests && \
+	  $(ADAPTERS)/venv/bin/python -m mypy.stubtest ridgewatch_adapter; else \
 	  echo "NOT RUN: the tests of the Python package, since its wheel was not built"; fi
 	$(CARGO) build --release --bin ridgewatch --example live_window
 	scripts/live-mpi-check
+
+live-figures: packages adapters
+	$(CARGO) build --release --bin ridgewatch --example subscriber --example live_window
+	scripts/live-figures $(if $(SHORT),--short)
 
 bench: packages
 	$(CARGO) bench

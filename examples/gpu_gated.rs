@@ -272,7 +272,8 @@ fn main() {
     );
     println!("| answers | slide | {} | slide itself, ms |", SHOWN.map(|n| (n + 1).to_string()).join(" | "));
     println!("|---|---|{}---|", "---|".repeat(SHOWN.len()));
-    scene.time.frames_per_slide = FRAMES_A_SLIDE;
+    scene.render.method = Method::Gated;
+    (scene.time.warmup_frames, scene.time.frames_per_slide) = (LEARNING, FRAMES_A_SLIDE);
     scene.time.slides = Some(SLIDES);
     scene.source.snapshots = Some(12 + SLIDES - 1);
     let mut lines = Vec::new();
@@ -294,6 +295,7 @@ fn main() {
             ..RunOptions::default()
         };
         let report = run(Setup::new(scene.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
+        assert_eq!(seen.len(), LEARNING + SLIDES * FRAMES_A_SLIDE);
         let settling: Vec<(FrameRecord, u64, usize)> = seen.drain(..LEARNING).collect();
         let settling: Vec<&FrameRecord> = settling.iter().map(|s| &s.0).collect();
         lines.push(format!(

@@ -226,6 +226,13 @@ RW_FN uint32_t pack(float low, float high) {
     return both;
 }
 
+// Halves of max(0, x), the ReLU. NaN stays NaN, as on the CPU, so that a diverged network is seen (fmaxf would make it 0).
+RW_FN uint32_t pack_relu(float low, float high) {
+    uint32_t both;
+    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
+    return both;
+}
+
 // d += a b, of 16x16 with 16x8.
 RW_FN void multiply(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t b1) {
     asm("mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, {%0, %1, %2, %3};"
@@ -403,20 +410,18 @@ template <int OUT> RW_FN void backward(Sums<OUT>& sums, const Rows<WIDTH_BLOCKS>
     }
 }
 
-RW_FN float rectify(float x) { return max_(x, 0.0f); }
-
-// The next layer's rows: positive sums, the others 0.
+// The next layer's rows.
 RW_FN void activate(Rows<WIDTH_BLOCKS>& rows, const Sums<2 * WIDTH_BLOCKS>& sums) {
     RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
         RW_UNROLL for (int part = 0; part < 4; ++part) {
             const float(&from)[4] = sums.block[2 * n + (part >> 1)];
-            rows.block[n][part] = pack(rectify(from[2 * (part & 1)]), rectify(from[2 * (part & 1) + 1]));
+            rows.block[n][part] = pack_relu(from[2 * (part & 1)], from[2 * (part & 1) + 1]);
         }
     }
 }
 
 // `from` where the activation passed it, as rows.
-RW_FN void gate(Rows<WIDTH_BLOCKS>& delta, const Rows<WIDTH_BLOCKS>& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
+RW_FN void relu_mask(Rows<WIDTH_BLOCKS>& delta, const Rows<WIDTH_BLOCKS>& passed, const Sums<2 * WIDTH_BLOCKS>& from) {
     RW_UNROLL for (int n = 0; n < WIDTH_BLOCKS; ++n) {
         RW_UNROLL for (int part = 0; part < 4; ++part) {
             const float(&sums)[4] = from.block[2 * n + (part >> 1)];
@@ -472,13 +477,13 @@ RW_FN void tangent_forward(float (&outputs)[4], const Rows<ENCODED_BLOCKS>& enco
         Sums<2 * WIDTH_BLOCKS> sums;
         clear(sums);
         add_product(sums, encoded, weights.first);
-        gate(rows, passed[0], sums);
+        relu_mask(rows, passed[0], sums);
     }
     RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) {
         Sums<2 * WIDTH_BLOCKS> sums;
         clear(sums);
         add_product(sums, rows, weights.hidden[layer - 1]);
-        gate(rows, passed[layer], sums);
+        relu_mask(rows, passed[layer], sums);
     }
     RW_UNROLL for (int k = 0; k < 4; ++k) outputs[k] = 0.0f;
     add_head(outputs, rows, weights);

@@ -216,13 +216,6 @@ template <int PARTS, class Begin, class End> RW_FN void multiply_tile(Tile& tile
     __syncthreads();
 }
 
-// Halves of two sums where they are positive, else 0.
-RW_FN uint32_t pack_positive(float low, float high) {
-    uint32_t both;
-    asm("cvt.rn.relu.f16x2.f32 %0, %1, %2;" : "=r"(both) : "f"(high), "f"(low));
-    return both;
-}
-
 // The bit of a block's word that says whether the lower of a pair of values is not 0; that of the upper is 16 above it.
 RW_FN constexpr int passed_bit(int n, int half) { return 16 - 2 * N + 2 * n + half; }
 
@@ -243,7 +236,7 @@ RW_FN void forward_tile(Tile& tile, Stream& stream, int depth, const float* __re
             uint32_t bits = 0;
             RW_UNROLL for (int n = 0; n < N; ++n) {
                 RW_UNROLL for (int half = 0; half < 2; ++half) {
-                    const uint32_t pair = pairs[m][n][half] = pack_positive(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
+                    const uint32_t pair = pairs[m][n][half] = pack_relu(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
                     // Halves of positive sums and 0 carry into the sign's place unless they are 0.
                     bits = bits >> 1 | (pair + 0x7fff7fffu & 0x80008000u);
                 }

@@ -187,7 +187,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
                     sums.block[n][k] = sum;
                 }
             }
-            gate(delta, hidden[HIDDEN - 1], sums);
+            relu_mask(delta, hidden[HIDDEN - 1], sums);
         }
         // The hidden layers, last to second.
         RW_UNROLL for (int layer = HIDDEN - 1; layer > 0; --layer) {
@@ -198,7 +198,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
             middle[layer - 1].add(&work.in[0][0], IN_STRIDE, &work.delta[0][0], STRIDE);
             Sums<2 * WIDTH_BLOCKS> sums;
             backward(sums, delta, work.weights.hidden[layer - 1]);
-            gate(delta, hidden[layer - 1], sums);
+            relu_mask(delta, hidden[layer - 1], sums);
         }
         // The first layer, and the tables below it.
         __syncthreads();

@@ -3,7 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use ridgewatch::engine::{Frame, FrameRecord};
-use ridgewatch::publish::{Output, PublishSettings, RunFolder, read_exr};
+use ridgewatch::publish::{ExrFrames, Output, PublishSettings, RunFolder, read_exr};
 use ridgewatch::render::Film;
 use std::path::Path;
 use std::process::Command;
@@ -59,7 +59,7 @@ fn a_full_disk_is_counted_and_the_run_goes_on() {
     let run = disk.0.path().join("run");
     let ballast = disk.0.path().join("ballast");
     std::fs::write(&ballast, vec![1u8; 600 << 10]).unwrap();
-    let settings = PublishSettings { endpoint: None, preview: false, ..Default::default() };
+    let settings = PublishSettings { endpoint: None, preview: false, exr: ExrFrames::Every, ..Default::default() };
     let mut output = Output::start(&settings, Some(RunFolder::create(&run, false).unwrap())).unwrap();
     // One fits beside the ballast, nineteen do not.
     for number in 0..20 {

@@ -51,7 +51,13 @@ fn every_scene_reads_back_as_it_is() {
     for set in [
         &["surrogate.kind=network", "network.encoding=frequency", "network.target=flow_map", "network.jacobian_weight=0.3"][..],
         &["surrogate.kind=network", "network.loss=published", "network.mean_penalty=0.7", "network.inputs=[\"start\"]"],
-        &["surrogate.kind=table", "network.size=auto", "trust.trace_budget=0.1", "publish.keep_bytes=1000000"],
+        &[
+            "surrogate.kind=table",
+            "network.size=auto",
+            "trust.trace_budget=0.1",
+            "publish.keep_bytes=1000000",
+            "publish.records_bytes=2000000",
+        ],
         &[
             "flow.integrator=dormand_prince",
             "flow.precision=f64",

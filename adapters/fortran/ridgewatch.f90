@@ -21,6 +21,14 @@ module ridgewatch
   integer, parameter :: rw_ok = 0, rw_off = 1, rw_argument = 2, rw_in_use = 3, rw_no_space = 4, rw_foreign = 5, rw_system = 6, &
                         rw_forked = 7, rw_internal = 8
 
+  character(3), parameter :: names = "uvw"
+
+  !> Words of a refusal of this module's own, put together in place: a solver's step takes no memory, not even to be refused.
+  type :: words
+    character(kind=c_char, len=300) :: text
+    integer :: length = 0
+  end type
+
   !> A grid while it is described, then an open ring.
   type :: rw_publisher
     private
@@ -148,6 +156,10 @@ module ridgewatch
       import
       type(c_ptr) :: c_error
     end function
+    subroutine c_set_error(text) bind(c, name="rw_set_error")
+      import
+      character(kind=c_char), intent(in) :: text(*)
+    end subroutine
     function c_strlen(text) bind(c, name="strlen")
       import
       type(c_ptr), value :: text
@@ -181,6 +193,83 @@ contains
     if (present(status)) status = found
   end subroutine
 
+  subroutine add(self, piece)
+    type(words), intent(inout) :: self
+    character(*), intent(in) :: piece
+    integer :: fits
+    fits = min(len(piece), len(self%text) - 1 - self%length)
+    self%text(self%length + 1:self%length + fits) = piece(:fits)
+    self%length = self%length + fits
+  end subroutine
+
+  subroutine add_number(self, number)
+    type(words), intent(inout) :: self
+    integer(int64), intent(in) :: number
+    character(20) :: digits
+    integer(int64) :: rest
+    integer :: first
+    ! The remainder has the number's sign, which the most negative one has no opposite of.
+    rest = number
+    first = len(digits) + 1
+    do
+      first = first - 1
+      digits(first:first) = achar(iachar("0") + int(abs(mod(rest, 10_int64))))
+      rest = rest / 10
+      if (rest == 0) exit
+    end do
+    if (number < 0) call add(self, "-")
+    call add(self, digits(first:))
+  end subroutine
+
+  !> Numbers with a sign between them.
+  subroutine add_numbers(self, numbers, between)
+    type(words), intent(inout) :: self
+    integer(int64), intent(in) :: numbers(:)
+    character(*), intent(in) :: between
+    integer :: k
+    do k = 1, size(numbers)
+      if (k > 1) call add(self, between)
+      call add_number(self, numbers(k))
+    end do
+  end subroutine
+
+  !> Refuses a call before it reaches the library: rw_message() has the words, as if it had been the library.
+  subroutine refuse(found, why, status)
+    integer, intent(in) :: found
+    type(words), intent(inout) :: why
+    integer, intent(out), optional :: status
+    why%text(why%length + 1:why%length + 1) = c_null_char
+    call c_set_error(why%text)
+    call give(found, status)
+  end subroutine
+
+  !> No memory for so many bytes.
+  subroutine refuse_memory(bytes, status)
+    integer(int64), intent(in) :: bytes
+    integer, intent(out), optional :: status
+    type(words) :: why
+    call add(why, "no memory for ")
+    call add_number(why, bytes)
+    call add(why, " bytes")
+    call refuse(rw_system, why, status)
+  end subroutine
+
+  !> Whether a grid that is described has the axis; where none is described, the library says so.
+  function has_axis(self, axis, status)
+    class(rw_publisher), intent(in) :: self
+    integer, intent(in) :: axis
+    integer, intent(out), optional :: status
+    logical :: has_axis
+    type(words) :: why
+    has_axis = .not. c_associated(self%description) .or. (axis >= 1 .and. axis <= self%dimensions)
+    if (has_axis) return
+    call add(why, "`axis` is ")
+    call add_number(why, int(axis, int64))
+    call add(why, "; accepted: 1 to ")
+    call add_number(why, int(self%dimensions, int64))
+    call refuse(rw_argument, why, status)
+  end function
+
   !> Begins the description of a grid of 2 or 3 dimensions; an open ring is closed.
   subroutine publisher_begin(self, dimensions, status)
     class(rw_publisher), intent(inout) :: self
@@ -208,6 +297,7 @@ contains
     integer, intent(out), optional :: status
     real(real64) :: repeats
     integer :: found
+    if (.not. has_axis(self, axis, status)) return
     repeats = 0
     if (present(period)) repeats = period
     found = c_uniform(self%description, int(axis - 1, c_int32_t), first, last, int(nodes, c_int64_t), repeats)
@@ -225,11 +315,12 @@ contains
     real(real64) :: repeats
     real(real64), allocatable :: packed(:)
     integer :: failed, found
+    if (.not. has_axis(self, axis, status)) return
     repeats = 0
     if (present(period)) repeats = period
     allocate (packed(size(coordinates)), stat=failed)
     if (failed /= 0) then
-      call give(rw_system, status)
+      call refuse_memory(8 * size(coordinates, kind=int64), status)
       return
     end if
     packed(:) = coordinates
@@ -253,8 +344,14 @@ contains
     integer, intent(out), optional :: status
     integer(c_int64_t) :: offset(3), nodes(3)
     integer :: found
-    if (.not. c_associated(self%description) .or. size(first) < self%dimensions .or. size(extent) < self%dimensions) then
-      call give(rw_argument, status)
+    type(words) :: why
+    if (size(first) < self%dimensions .or. size(extent) < self%dimensions) then
+      call add(why, "`first` and `extent` have ")
+      call add_numbers(why, int([size(first), size(extent)], int64), " and ")
+      call add(why, " numbers; accepted: ")
+      call add_number(why, int(self%dimensions, int64))
+      call add(why, ", one a dimension")
+      call refuse(rw_argument, why, status)
       return
     end if
     offset = 0
@@ -329,7 +426,7 @@ contains
     if (present(ring)) then
       allocate (path(len_trim(ring) + 1), stat=found)
       if (found /= 0) then
-        call give(rw_system, status)
+        call refuse_memory(len_trim(ring, kind=int64) + 1, status)
         return
       end if
       do i = 1, len_trim(ring)
@@ -350,13 +447,74 @@ contains
     class(rw_publisher), intent(inout) :: self
     integer, intent(out), optional :: status
     integer :: found
-    found = rw_off
-    if (c_associated(self%field)) found = c_close(self%field)
-    if (found == rw_ok) self%field = c_null_ptr
+    ! First, so that the words are those of the ring's end.
     call c_free(self%description)
     self%description = c_null_ptr
+    found = c_close(self%field)
+    if (found == rw_ok) self%field = c_null_ptr
     call give(found, status)
   end subroutine
+
+  !> Whether arrays of these shapes, one a component, are those of the open ring.
+  function takes(self, shapes, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: shapes(:, :)
+    integer, intent(out), optional :: status
+    logical :: takes
+    type(words) :: why
+    integer :: c, dimensions
+    takes = .false.
+    if (.not. c_associated(self%field)) then
+      call refuse(rw_off, why, status)
+      return
+    end if
+    dimensions = size(shapes, 1)
+    if (dimensions /= self%dimensions) then
+      call add(why, "components have ")
+      call add_number(why, int(dimensions, int64))
+      call add(why, " dimensions; accepted: ")
+      call add_number(why, int(self%dimensions, int64))
+      call refuse(rw_argument, why, status)
+      return
+    end if
+    do c = 1, size(shapes, 2)
+      if (any(shapes(:, c) /= self%extent(:dimensions))) then
+        call add(why, "`")
+        call add(why, names(c:c))
+        call add(why, "` has ")
+        call add_numbers(why, shapes(:, c), " x ")
+        call add(why, " nodes; accepted: ")
+        call add_numbers(why, self%extent(:dimensions), " x ")
+        call add(why, ", as the ring was opened")
+        call refuse(rw_argument, why, status)
+        return
+      end if
+    end do
+    takes = .true.
+  end function
+
+  !> Whether the components' strides are the same.
+  function agree(strides, status)
+    integer(c_int64_t), intent(in) :: strides(:, :)
+    integer, intent(out), optional :: status
+    logical :: agree
+    type(words) :: why
+    integer :: c
+    agree = .true.
+    do c = 2, size(strides, 2)
+      if (all(strides(:, c) == strides(:, 1))) cycle
+      agree = .false.
+      call add(why, "`")
+      call add(why, names(c:c))
+      call add(why, "` has strides ")
+      call add_numbers(why, strides(:, c), ", ")
+      call add(why, "; accepted: ")
+      call add_numbers(why, strides(:, 1), ", ")
+      call add(why, ", as `u`")
+      call refuse(rw_argument, why, status)
+      return
+    end do
+  end function
 
   ! Strides of an array section are the distances of its elements' addresses: no copy is made of it. An extent of 1 has no distance.
 
@@ -366,31 +524,19 @@ contains
     real(real64), intent(in) :: time
     real(real32), intent(in), target :: u(:,:), v(:,:)
     integer, intent(out), optional :: status
-    integer(c_int64_t) :: strides(3)
-    if (.not. c_associated(self%field)) then
-      call give(rw_off, status)
-      return
-    end if
-    if (self%dimensions /= 2 .or. any(shape(u) /= self%extent(:2)) .or. any(shape(v) /= self%extent(:2))) then
-      call give(rw_argument, status)
-      return
-    end if
+    integer(int64) :: shapes(2, 2)
+    integer(c_int64_t) :: strides(2, 2)
+    shapes(:, 1) = shape(u, kind=int64)
+    shapes(:, 2) = shape(v, kind=int64)
+    if (.not. takes(self, shapes, status)) return
     strides = 1
-    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 4
-    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 4
-    if (size(v, 1) > 1) then
-      if (strides(1) /= (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 2) > 1) then
-      if (strides(2) /= (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 4
+    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 4
+    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 4
+    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 4
+    if (.not. agree(strides, status)) return
+    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, &
+                            strides(:, 1)), status)
   end subroutine
 
   subroutine publish_2_real64(self, step, time, u, v, status)
@@ -399,31 +545,19 @@ contains
     real(real64), intent(in) :: time
     real(real64), intent(in), target :: u(:,:), v(:,:)
     integer, intent(out), optional :: status
-    integer(c_int64_t) :: strides(3)
-    if (.not. c_associated(self%field)) then
-      call give(rw_off, status)
-      return
-    end if
-    if (self%dimensions /= 2 .or. any(shape(u) /= self%extent(:2)) .or. any(shape(v) /= self%extent(:2))) then
-      call give(rw_argument, status)
-      return
-    end if
+    integer(int64) :: shapes(2, 2)
+    integer(c_int64_t) :: strides(2, 2)
+    shapes(:, 1) = shape(u, kind=int64)
+    shapes(:, 2) = shape(v, kind=int64)
+    if (.not. takes(self, shapes, status)) return
     strides = 1
-    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 8
-    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 8
-    if (size(v, 1) > 1) then
-      if (strides(1) /= (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 2) > 1) then
-      if (strides(2) /= (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, strides), status)
+    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 8
+    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 8
+    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 8
+    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 8
+    if (.not. agree(strides, status)) return
+    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, &
+                            strides(:, 1)), status)
   end subroutine
 
   subroutine publish_3_real32(self, step, time, u, v, w, status)
@@ -432,58 +566,25 @@ contains
     real(real64), intent(in) :: time
     real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
     integer, intent(out), optional :: status
-    integer(c_int64_t) :: strides(3)
-    if (.not. c_associated(self%field)) then
-      call give(rw_off, status)
-      return
-    end if
-    if (self%dimensions /= 3 .or. any(shape(u) /= self%extent(:3)) .or. any(shape(v) /= self%extent(:3)) &
-        .or. any(shape(w) /= self%extent(:3))) then
-      call give(rw_argument, status)
-      return
-    end if
+    integer(int64) :: shapes(3, 3)
+    integer(c_int64_t) :: strides(3, 3)
+    shapes(:, 1) = shape(u, kind=int64)
+    shapes(:, 2) = shape(v, kind=int64)
+    shapes(:, 3) = shape(w, kind=int64)
+    if (.not. takes(self, shapes, status)) return
     strides = 1
-    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(u, 3) > 1) strides(3) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(v, 1) > 1) then
-      if (strides(1) /= (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 2) > 1) then
-      if (strides(2) /= (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 3) > 1) then
-      if (strides(3) /= (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 1) > 1) then
-      if (strides(1) /= (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 2) > 1) then
-      if (strides(2) /= (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 3) > 1) then
-      if (strides(3) /= (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 4) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
-        1)), strides), status)
+    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(u, 3) > 1) strides(3, 1) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 4
+    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 4
+    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 4
+    if (size(v, 3) > 1) strides(3, 2) = (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 4
+    if (size(w, 1) > 1) strides(1, 3) = (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 4
+    if (size(w, 2) > 1) strides(2, 3) = (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 4
+    if (size(w, 3) > 1) strides(3, 3) = (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 4
+    if (.not. agree(strides, status)) return
+    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, 1)), &
+                            strides(:, 1)), status)
   end subroutine
 
   subroutine publish_3_real64(self, step, time, u, v, w, status)
@@ -492,58 +593,25 @@ contains
     real(real64), intent(in) :: time
     real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
     integer, intent(out), optional :: status
-    integer(c_int64_t) :: strides(3)
-    if (.not. c_associated(self%field)) then
-      call give(rw_off, status)
-      return
-    end if
-    if (self%dimensions /= 3 .or. any(shape(u) /= self%extent(:3)) .or. any(shape(v) /= self%extent(:3)) &
-        .or. any(shape(w) /= self%extent(:3))) then
-      call give(rw_argument, status)
-      return
-    end if
+    integer(int64) :: shapes(3, 3)
+    integer(c_int64_t) :: strides(3, 3)
+    shapes(:, 1) = shape(u, kind=int64)
+    shapes(:, 2) = shape(v, kind=int64)
+    shapes(:, 3) = shape(w, kind=int64)
+    if (.not. takes(self, shapes, status)) return
     strides = 1
-    if (size(u, 1) > 1) strides(1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(u, 2) > 1) strides(2) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(u, 3) > 1) strides(3) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(v, 1) > 1) then
-      if (strides(1) /= (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 2) > 1) then
-      if (strides(2) /= (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(v, 3) > 1) then
-      if (strides(3) /= (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 1) > 1) then
-      if (strides(1) /= (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 2) > 1) then
-      if (strides(2) /= (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    if (size(w, 3) > 1) then
-      if (strides(3) /= (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 8) then
-        call give(rw_argument, status)
-        return
-      end if
-    end if
-    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, &
-        1)), strides), status)
+    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(u, 3) > 1) strides(3, 1) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 8
+    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 8
+    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 8
+    if (size(v, 3) > 1) strides(3, 2) = (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 8
+    if (size(w, 1) > 1) strides(1, 3) = (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 8
+    if (size(w, 2) > 1) strides(2, 3) = (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 8
+    if (size(w, 3) > 1) strides(3, 3) = (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 8
+    if (.not. agree(strides, status)) return
+    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, 1)), &
+                            strides(:, 1)), status)
   end subroutine
 
   ! Steps that are counted in 32 bits.

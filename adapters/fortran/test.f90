@@ -40,11 +40,20 @@ program test
   ! Wrong shapes, wrong rank, different strides: refused, and nothing is read.
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
   call want(status == rw_argument, 4)
+  call says("`u` has 3 x 3 x 2 nodes; accepted: 4 x 3 x 2, as the ring was opened", 40)
+  call publisher%publish(3, 2d0, u32, v32, w32(:, 2:, :), status)
+  call want(status == rw_argument, 41)
+  call says("`w` has 4 x 2 x 2 nodes; accepted: 4 x 3 x 2, as the ring was opened", 42)
   plane = 0
   call publisher%publish(3, 2d0, plane, plane, status)
   call want(status == rw_argument, 5)
+  call says("components have 2 dimensions; accepted: 3", 43)
   call publisher%publish(3, 2d0, u64(1:4, 2:6:2, :), v64(1:4, 1:3, :), w64(1:4, 1:3, :), status)
   call want(status == rw_argument, 6)
+  call says("`v` has strides 1, 6, 48; accepted: 1, 12, 48, as `u`", 44)
+  call publisher%publish(3, 2d0, u64(4:1:-1, 2:6:2, :), v64(1:4, 2:6:2, :), w64(4:1:-1, 2:6:2, :), status)
+  call want(status == rw_argument, 45)
+  call says("`v` has strides 1, 12, 48; accepted: -1, 12, 48, as `u`", 46)
   ! What is described now is that of the next opening: smaller arrays are too small still.
   call publisher%uniform(1, 0d0, 2d0, 3)
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
@@ -55,9 +64,20 @@ program test
   ! No grid has five dimensions; whoever passes over that reads and writes nothing of five.
   call second%begin(5, status)
   call want(status == rw_argument, 35)
+  call says("`dimensions` is 5; accepted: 2 or 3", 47)
   call second%block(0, 1, [1, 1, 1, 1, 1], [2, 2, 2, 2, 2], status)
   call want(status == rw_argument, 36)
+  call says("`description` is null; accepted: what rw_describe returned", 48)
   call second%begin(2)
+  call second%uniform(3, 0d0, 1d0, 4, status=status)
+  call want(status == rw_argument, 49)
+  call says("`axis` is 3; accepted: 1 to 2", 50)
+  call second%rectilinear(-2, [0d0, 1d0], status=status)
+  call want(status == rw_argument, 51)
+  call says("`axis` is -2; accepted: 1 to 2", 52)
+  call second%block(0, 1, [1, 1], [2], status)
+  call want(status == rw_argument, 53)
+  call says("`first` and `extent` have 2 and 1 numbers; accepted: 2, one a dimension", 54)
   call second%uniform(1, 0d0, 1d0, 4)
   call second%uniform(2, 0d0, 1d0, 4)
   call second%open(status)
@@ -65,6 +85,7 @@ program test
   call want(status == rw_in_use .and. index(message, "another producer") > 0, 7)
   call second%publish(0, 0d0, plane, plane, status)
   call want(status == rw_off, 8)
+  call says("", 55)
   call second%close()
   call publisher%close(status)
   call want(status == rw_ok, 9)
@@ -119,6 +140,15 @@ program test
   call want(status == rw_ok, 23)
 
 contains
+
+  !> The words of the last refusal, whoever refused.
+  subroutine says(expected, line)
+    character(*), intent(in) :: expected
+    integer, intent(in) :: line
+    character(:), allocatable :: found
+    found = rw_message()
+    call want(found == expected .and. len(found) == len(expected), line)
+  end subroutine
 
   subroutine half(of, index)
     type(rw_publisher), intent(inout) :: of

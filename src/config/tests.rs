@@ -218,11 +218,13 @@ fn a_live_run_neither_waits_for_the_disk_nor_fills_it_unless_told() {
     let told = |overrides: &[&str]| {
         let overrides: Vec<String> = overrides.iter().chain(&["time.tau=1"]).map(|s| (*s).to_owned()).collect();
         let publish = SceneFile::for_live(&overrides).unwrap().publish_settings();
-        (publish.keep, publish.keep_bytes, publish.when_full)
+        (publish.keep, publish.keep_bytes, publish.records_bytes, publish.when_full)
     };
-    assert_eq!(told(&[]), (Some(100), None, Some(Drop)));
-    assert_eq!(told(&["publish.keep=7", "publish.when_full=wait"]), (Some(7), None, Some(Wait)));
-    assert_eq!(told(&["publish.keep_bytes=1000000"]), (None, Some(1_000_000), Some(Drop)));
+    let gib = Some(1 << 30);
+    assert_eq!(told(&[]), (Some(100), None, gib, Some(Drop)));
+    assert_eq!(told(&["publish.keep=7", "publish.when_full=wait"]), (Some(7), None, gib, Some(Wait)));
+    assert_eq!(told(&["publish.keep_bytes=1000000"]), (None, Some(1_000_000), gib, Some(Drop)));
+    assert_eq!(told(&["publish.records_bytes=2000000"]), (Some(100), None, Some(2_000_000), Some(Drop)));
     let replayed = SceneFile::parse(Path::new("scene.toml"), GYRE, &[]).unwrap();
     assert_eq!(replayed.publish_settings(), replayed.publish);
 }

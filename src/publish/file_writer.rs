@@ -171,7 +171,7 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
             Job::Whole(frame) => &frame.record,
             Job::Record(record) => record,
         };
-        let appended = folder.append_record(record);
+        let appended = folder.append_record(record, settings.records_bytes);
         let pictured = match &job {
             Job::Whole(frame) if settings.exr != ExrFrames::None || settings.preview => Some(folder.write_pictures(frame, settings)),
             _ => None,
@@ -181,7 +181,16 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
         let statistics = &mut state.statistics;
         let mut trouble = None;
         match appended {
-            Ok(()) => statistics.records_written += 1,
+            Ok(removed) => {
+                if removed > 0 && statistics.records_removed == 0 {
+                    tracing::warn!(
+                        "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so",
+                        folder.path().display()
+                    );
+                }
+                statistics.records_written += 1;
+                statistics.records_removed += removed;
+            }
             Err(error) => {
                 statistics.records_lost += 1;
                 trouble = Some(error);
@@ -254,6 +263,20 @@ mod tests {
         let (statistics, records) = run(WhenFull::Wait, 40, 64);
         assert_eq!((statistics.pictures_written, statistics.records_written), (40, 40));
         assert_eq!(records, (0..40).collect::<Vec<u64>>());
+    }
+
+    #[test]
+    fn records_beyond_their_cap_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        // A few lines a file.
+        let settings = PublishSettings { records_bytes: Some(16 << 10), exr: ExrFrames::None, preview: false, ..Default::default() };
+        let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), settings).unwrap();
+        (0..100).for_each(|n| writer.frame(frame(n, 1)));
+        let (_, statistics) = writer.finish();
+        let older = std::fs::read_to_string(folder.path().join("records-1.jsonl")).unwrap();
+        let left = (older.lines().count() + recorded(folder.path()).len()) as u64;
+        assert_eq!((statistics.records_written, statistics.records_removed, statistics.records_lost), (100, 100 - left, 0));
+        assert!((8..=24).contains(&left), "{left}");
     }
 
     #[test]

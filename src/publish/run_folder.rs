@@ -1,4 +1,4 @@
-//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `records.jsonl`, `summary.json`.
+//! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `records.jsonl` (and `records-1.jsonl`), `summary.json`.
 
 use super::scene::{is_ours, refuse_foreign_scene, write_scene};
 use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
@@ -12,6 +12,8 @@ use std::path::{Path, PathBuf};
 const FRAMES: &str = "frames";
 /// Records, one JSON object a line.
 const RECORDS: &str = "records.jsonl";
+/// Those before, of a run whose records have come to their cap.
+const OLDER_RECORDS: &str = "records-1.jsonl";
 /// Holds the files of the run that is about to be replaced.
 const PREVIOUS: &str = ".previous";
 /// What the run is of.
@@ -41,6 +43,8 @@ pub struct RunFolder {
     records: File,
     /// Length of `records.jsonl` up to its last complete line.
     complete: u64,
+    /// Lines in it, and in `records-1.jsonl`.
+    lines: [u64; 2],
     /// Pictures that are there, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
@@ -144,6 +148,7 @@ impl RunFolder {
             path: path.to_owned(),
             records,
             complete: 0,
+            lines: [0; 2],
             kept: VecDeque::new(),
             kept_bytes: 0,
             previous: Some(aside).filter(|a| a.exists()),
@@ -170,20 +175,24 @@ impl RunFolder {
         self.kept_bytes
     }
 
-    /// Appends one line to `records.jsonl`. After an error the file still ends with a complete line.
-    pub fn append_record(&mut self, record: &FrameRecord) -> io::Result<()> {
+    /// Appends one line to `records.jsonl`; where that would take it beyond half of `most_bytes`, the file becomes `records-1.jsonl` first, in the place of
+    /// the one before. Returns how many records went with that. After an error the file still ends with a complete line.
+    pub fn append_record(&mut self, record: &FrameRecord, most_bytes: Option<u64>) -> io::Result<u64> {
         let mut line = serde_json::to_vec(record)?;
         line.push(b'\n');
         self.trim()?;
+        let full = most_bytes.is_some_and(|most| self.complete > 0 && self.complete + line.len() as u64 > most / 2);
+        let removed = if full { self.begin_records_anew()? } else { 0 };
         match self.records.write_all(&line) {
             Ok(()) => {
                 self.complete += line.len() as u64;
+                self.lines[0] += 1;
                 if let Some(previous) = self.previous.take()
                     && let Err(error) = fs::remove_dir_all(&previous)
                 {
                     tracing::warn!("{}: cannot be removed: {error}", previous.display());
                 }
-                Ok(())
+                Ok(removed)
             }
             Err(error) => {
                 // If this fails as well, the next append tries again before it writes.
@@ -191,6 +200,24 @@ impl RunFolder {
                 Err(error)
             }
         }
+    }
+
+    /// Makes `records.jsonl` the older file; returns how many records that cost. An attempt that failed half-way is gone on with.
+    fn begin_records_anew(&mut self) -> io::Result<u64> {
+        let (path, older) = (self.path.join(RECORDS), self.path.join(OLDER_RECORDS));
+        let removed = match fs::rename(&path, &older) {
+            Ok(()) => {
+                let [newer, removed] = self.lines;
+                self.lines = [0, newer];
+                removed
+            }
+            // It was renamed before, or somebody took it away.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => 0,
+            Err(error) => return Err(error),
+        };
+        self.records = OpenOptions::new().append(true).create_new(true).open(&path)?;
+        self.complete = 0;
+        Ok(removed)
     }
 
     /// Cuts off what a failed append left behind.
@@ -302,8 +329,11 @@ fn put_back(path: &Path, previous: &Path) -> io::Result<()> {
 
 /// Files that a run writes, as far as they are there.
 fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut files: Vec<PathBuf> =
-        [RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"].iter().map(|f| path.join(f)).filter(|f| f.exists()).collect();
+    let mut files: Vec<PathBuf> = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"]
+        .iter()
+        .map(|f| path.join(f))
+        .filter(|f| f.exists())
+        .collect();
     let scene = path.join(SCENE);
     if scene.exists() && is_ours(&scene)? {
         files.push(scene);
@@ -334,7 +364,7 @@ fn occupied(path: &Path) -> io::Result<Option<String>> {
 /// Whether a file of a run is one that nobody could miss: of a run that failed before its first frame.
 fn is_empty(file: &Path) -> bool {
     match file.file_name().and_then(|name| name.to_str()) {
-        Some(RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
+        Some(RECORDS | OLDER_RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
         Some(name) => !is_picture(name),
         None => false,
     }
@@ -360,7 +390,7 @@ mod tests {
         fs::write(folder.path().join(SUMMARY), "{}").unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
         assert!(!folder.path().join(SUMMARY).exists());
-        run.append_record(&frame(0).record).unwrap();
+        run.append_record(&frame(0).record, None).unwrap();
         drop(run);
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
     }
@@ -370,7 +400,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let picture = folder.path().join(FRAMES).join("frame_000000.png");
         let mut run = RunFolder::create(folder.path(), false).unwrap();
-        run.append_record(&frame(0).record).unwrap();
+        run.append_record(&frame(0).record, None).unwrap();
         fs::write(&picture, b"picture").unwrap();
         drop(run);
         let records = fs::read(folder.path().join(RECORDS)).unwrap();
@@ -398,7 +428,7 @@ mod tests {
         assert!(second.put_back().unwrap() && picture.exists());
         drop(second);
         let mut run = RunFolder::create(folder.path(), true).unwrap();
-        run.append_record(&frame(0).record).unwrap();
+        run.append_record(&frame(0).record, None).unwrap();
         assert!(!run.put_back().unwrap() && !picture.exists() && !folder.path().join(PREVIOUS).exists());
     }
 
@@ -432,6 +462,36 @@ mod tests {
     }
 
     #[test]
+    fn records_take_no_more_than_their_cap_and_those_that_go_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        let numbers = |name: &str| -> Vec<u64> {
+            let text = fs::read_to_string(folder.path().join(name)).unwrap_or_default();
+            text.lines().map(|line| serde_json::from_str::<FrameRecord>(line).unwrap().frame).collect()
+        };
+        run.append_record(&frame(100).record, None).unwrap();
+        let line = fs::metadata(folder.path().join(RECORDS)).unwrap().len();
+        // Three lines a file, numbers of as many digits.
+        let cap = Some(2 * (3 * line + line / 2));
+        let removed: Vec<u64> = (101..112).map(|n| run.append_record(&frame(n).record, cap).unwrap()).collect();
+        assert_eq!(removed, [0, 0, 0, 0, 0, 3, 0, 0, 3, 0, 0]);
+        assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![106, 107, 108], vec![109, 110, 111]));
+        // A file that cannot be begun is a record lost, and told; nothing else is lost by it.
+        let (records, away) = (folder.path().join(RECORDS), folder.path().join("away"));
+        fs::rename(folder.path().join(OLDER_RECORDS), &away).unwrap();
+        fs::create_dir(folder.path().join(OLDER_RECORDS)).unwrap();
+        assert!(run.append_record(&frame(112).record, cap).is_err() && records.exists());
+        fs::remove_dir(folder.path().join(OLDER_RECORDS)).unwrap();
+        assert_eq!(run.append_record(&frame(113).record, cap).unwrap(), 3);
+        assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![109, 110, 111], vec![113]));
+        // Both are of the run: no other takes the folder, one that takes its place takes theirs.
+        fs::remove_file(&records).unwrap();
+        assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
+        drop(RunFolder::create(folder.path(), true).unwrap());
+        assert!(!folder.path().join(OLDER_RECORDS).exists());
+    }
+
+    #[test]
     fn each_slide_keeps_the_exr_of_its_newest_frame() {
         let folder = tempfile::tempdir().unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
@@ -461,7 +521,7 @@ mod tests {
     fn an_older_run_is_refused_and_overwritten_only_on_demand() {
         let folder = tempfile::tempdir().unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
-        run.append_record(&frame(0).record).unwrap();
+        run.append_record(&frame(0).record, None).unwrap();
         run.write_pictures(&frame(0), &PublishSettings::default()).unwrap();
         for foreign in ["notes.txt", "frames/frame_best.png", "frames/frame_000000.tif"] {
             fs::write(folder.path().join(foreign), "mine").unwrap();
@@ -472,7 +532,7 @@ mod tests {
         for expected in ["run", "run-2", "run-3"] {
             let vacant = RunFolder::vacant(&inner).unwrap();
             assert_eq!(vacant, folder.path().join(expected));
-            RunFolder::create(&vacant, false).unwrap().append_record(&frame(0).record).unwrap();
+            RunFolder::create(&vacant, false).unwrap().append_record(&frame(0).record, None).unwrap();
         }
         // A run without a frame is no run.
         fs::write(inner.join(RECORDS), "").unwrap();
@@ -499,9 +559,9 @@ mod tests {
     fn a_torn_line_is_cut_off_before_the_next() {
         let folder = tempfile::tempdir().unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
-        run.append_record(&frame(0).record).unwrap();
+        run.append_record(&frame(0).record, None).unwrap();
         run.records.write_all(b"{\"frame\":1,\"ti").unwrap();
-        run.append_record(&frame(2).record).unwrap();
+        run.append_record(&frame(2).record, None).unwrap();
         let text = fs::read_to_string(folder.path().join(RECORDS)).unwrap();
         let frames: Vec<u64> = text.lines().map(|l| serde_json::from_str::<FrameRecord>(l).unwrap().frame).collect();
         assert_eq!(frames, [0, 2]);

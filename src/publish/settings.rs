@@ -71,6 +71,9 @@ pub struct PublishSettings {
     pub keep: Option<usize>,
     /// Bytes that the pictures in the run folder may take; None sets no cap. The newest frame always stays.
     pub keep_bytes: Option<u64>,
+    /// Bytes that the records in the run folder may take: the newest half of them at least stays. None sets no cap, but of a live run see
+    /// [`PublishSettings::of_live_run`].
+    pub records_bytes: Option<u64>,
     /// Whether a PNG of each frame is written.
     pub preview: bool,
     /// Of which frames an EXR is written.
@@ -88,6 +91,7 @@ impl Default for PublishSettings {
             stall_seconds: 2.0,
             keep: None,
             keep_bytes: None,
+            records_bytes: None,
             preview: true,
             exr: ExrFrames::Slide,
             when_full: None,
@@ -97,20 +101,36 @@ impl Default for PublishSettings {
 
 /// Newest frames whose pictures stay of a live run, which may go on for weeks, unless told otherwise.
 const LIVE_FRAMES: usize = 100;
+/// Bytes of its records: some 700,000 of them.
+const LIVE_RECORDS: u64 = 1 << 30;
+/// Least cap on the bytes of records, which are a few kilobytes each.
+const LEAST_RECORDS: u64 = 1 << 20;
 
 impl PublishSettings {
     /// These of a run that follows a simulation: what is not set neither waits for the disk nor fills it.
     pub fn of_live_run(self) -> Self {
         // Who caps the bytes has set a bound.
         let bounded = self.keep.is_some() || self.keep_bytes.is_some();
-        Self { keep: if bounded { self.keep } else { Some(LIVE_FRAMES) }, when_full: self.when_full.or(Some(WhenFull::Drop)), ..self }
+        Self {
+            keep: if bounded { self.keep } else { Some(LIVE_FRAMES) },
+            records_bytes: self.records_bytes.or(Some(LIVE_RECORDS)),
+            when_full: self.when_full.or(Some(WhenFull::Drop)),
+            ..self
+        }
     }
 
     /// Checks ranges that the types do not.
     pub fn check(&self) -> Result<(), Refused> {
         count("publish.frames_in_flight", self.frames_in_flight, 1, 64)?;
         require((0.1..=3600.0).contains(&self.stall_seconds), "publish.stall_seconds", self.stall_seconds, "a number from 0.1 to 3600")?;
-        require(self.keep != Some(0), "publish.keep", 0, "at least 1, or no key to keep all frames")
+        require(self.keep != Some(0), "publish.keep", 0, "at least 1, or no key to keep all frames")?;
+        let records = self.records_bytes.unwrap_or(LEAST_RECORDS);
+        require(
+            records >= LEAST_RECORDS,
+            "publish.records_bytes",
+            records,
+            "at least 1048576, or no key for no cap (of a live run 1073741824)",
+        )
     }
 }
 
@@ -143,8 +163,9 @@ mod tests {
             PublishSettings { frames_in_flight: 0, ..Default::default() },
             PublishSettings { stall_seconds: f64::NAN, ..Default::default() },
             PublishSettings { keep: Some(0), ..Default::default() },
+            PublishSettings { records_bytes: Some(1000), ..Default::default() },
         ];
-        for (settings, key) in bad.iter().zip(["frames_in_flight", "stall_seconds", "keep"]) {
+        for (settings, key) in bad.iter().zip(["frames_in_flight", "stall_seconds", "keep", "records_bytes"]) {
             assert!(settings.check().unwrap_err().to_string().contains(key));
         }
         PublishSettings::default().check().unwrap();

@@ -70,8 +70,10 @@ impl Totals {
 /// are written at all.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FileStatistics {
-    /// Lines in `records.jsonl`.
+    /// Records written.
     pub records_written: u64,
+    /// Of them, removed later by `records_bytes`: the others are the lines of `records-1.jsonl` and `records.jsonl`.
+    pub records_removed: u64,
     /// Records that the disk refused or that found the queue full.
     pub records_lost: u64,
     /// Frames whose pictures were written.

@@ -198,8 +198,9 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         let last = frames_of_a_slide(&found) - 1;
         // The first frame is answered by what the run began with.
         assert!(ours[last] > ours[0] + 5.0 && theirs[last] > theirs[0] + 5.0, "{name}: both learn: {ours:?} and {theirs:?}");
-        // On the CPU, runs of other seeds end up to 3 dB apart.
-        assert!(ours[last] > theirs[last] - 4.0, "{name}: as much: {ours:?} and {theirs:?}");
-        assert!(ours[ours.len() - 1] > ours[0] + 5.0, "{name}: after a slide too: {ours:?}");
+        // On the CPU, runs of other seeds end up to 3 dB apart; the last frame is one behind a slide.
+        for at in [last, ours.len() - 1] {
+            assert!(ours[at] > theirs[at] - 4.0, "{name}: as much: {ours:?} and {theirs:?}");
+        }
     }
 }

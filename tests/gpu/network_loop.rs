@@ -49,20 +49,25 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
     let folder = tempfile::tempdir().unwrap();
     let gpu = device(GpuSettings::default());
     let file = |name: &str| folder.path().join(name);
+    let (count, steps) = if small() { (2, 10) } else { (6, 60) };
     let learned = |device: &Device, from: Option<&str>, to: &str| {
         let options = RunOptions { device: device.clone(), checkpoint: Some(file(to)), ..RunOptions::default() };
-        let mut keys = vec!["surrogate.kind=\"network\"".to_owned(), "time.frames_per_slide=6".to_owned()];
+        let mut keys = vec![
+            "surrogate.kind=\"network\"".to_owned(),
+            format!("time.frames_per_slide={count}"),
+            format!("training.steps_per_frame={steps}"),
+        ];
         keys.extend(from.map(|from| format!("training.resume=\"{}\"", file(from).display())));
         let frames = frames(SCENE, &keys, &options);
         for frame in &frames {
             let learned = frame.record.training.clone().unwrap();
-            assert_eq!((learned.steps, learned.rollbacks), (60, 0));
+            assert_eq!((learned.steps, learned.rollbacks), (steps, 0));
             assert_eq!(learned.device_seconds.is_some(), matches!(device, Device::Gpu { .. }));
             assert!(frame.record.warnings.is_empty(), "{:?}", frame.record.warnings);
         }
         let psnr = |frame: &Frame| frame.record.surrogate_psnr.unwrap();
         // The first frame is answered by what the run began with.
-        (psnr(&frames[0]), psnr(&frames[5]))
+        (psnr(&frames[0]), psnr(&frames[count - 1]))
     };
     let (gpu_first, gpu_last) = learned(&gpu, None, "gpu");
     let (cpu_first, cpu_last) = learned(&Device::CPU, None, "cpu");
@@ -71,6 +76,10 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
     measured!(
         "what a network knows, dB: GPU {gpu_first:.2} to {gpu_last:.2}, then CPU {on_cpu:.2} to {on_cpu_last:.2}; CPU {cpu_first:.2} to {cpu_last:.2}, then GPU {on_gpu:.2} to {on_gpu_last:.2}"
     );
+    if small() {
+        println!("not held against the CPU's: so few steps say nothing");
+        return;
+    }
     assert!(gpu_last > gpu_first + 5.0 && cpu_last > cpu_first + 5.0, "both learn");
     assert!((gpu_last - cpu_last).abs() < 1.0, "as much");
     // A checkpoint is of the end of a run, whose last frame was answered by the network before its last 60 steps.
@@ -138,8 +147,9 @@ samples = 4
 #[ignore = "needs a GPU"]
 fn a_run_whose_network_diverges_goes_on() {
     let options = RunOptions { device: device(GpuSettings::default()), ..RunOptions::default() };
-    let keys = ["network.learning_rate=1".to_owned(), "surrogate.kind=\"network\"".to_owned()];
-    let frames = frames(ANSWERED, &keys, &options);
+    let mut keys = vec!["network.learning_rate=1", "surrogate.kind=\"network\""];
+    keys.extend(if small() { &["training.steps_per_frame=20", "time.frames_per_slide=2"][..] } else { &[] });
+    let frames = frames(ANSWERED, &keys.into_iter().map(str::to_owned).collect::<Vec<_>>(), &options);
     let learned: Vec<_> = frames.iter().map(|frame| frame.record.training.clone().unwrap()).collect();
     let [rollbacks, lost] = [learned.iter().map(|l| l.rollbacks).sum::<u64>(), learned.iter().map(|l| l.lost_steps).sum()];
     measured!("a rate of 1: {rollbacks} rollbacks, {lost} steps lost");
@@ -151,8 +161,8 @@ fn a_run_whose_network_diverges_goes_on() {
         assert!(record.warnings.len() == usize::from(diverged), "{:?}", record.warnings);
         assert!(record.warnings.iter().all(|warning| warning.contains("training diverged")), "{:?}", record.warnings);
     }
-    let [first, last] = [&frames[0], &frames[5]].map(|frame| frame.record.surrogate_psnr.unwrap());
-    assert!(last > first + 5.0, "{first} dB, then {last}");
+    let [first, last] = [&frames[0], &frames[frames.len() - 1]].map(|frame| frame.record.surrogate_psnr.unwrap());
+    assert!(small() || last > first + 5.0, "{first} dB, then {last}");
 }
 
 /// A double gyre of which about half is traced after some frames, the rest answered by a network above a coarse table.
@@ -271,7 +281,14 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
 fn without_memory_for_training_frames_stay_on_the_device() {
     // A ring of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
     // And the published 16x512, whose layers' values and their gradients for 65,536 samples are 1 GiB each.
-    let published = ["network.encoding=\"frequency\"", "network.hidden_layers=16", "network.width=512", "network.batch=1024"];
+    // A rate that so many layers bear: what is told is of memory alone.
+    let published = [
+        "network.encoding=\"frequency\"",
+        "network.hidden_layers=16",
+        "network.width=512",
+        "network.batch=1024",
+        "network.learning_rate=1e-4",
+    ];
     let cases: [(u64, &str, &[&str]); 3] = [
         (512, "samples", &["training.ring=67108864"]),
         (192, "network", &["network.levels=8", "network.log2_table=21"]),

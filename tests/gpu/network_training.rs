@@ -1,9 +1,10 @@
 //! Training on the device: gradients of networks in the middle of training, Adam, what is learned, and what happens when a loss is no number.
 
-use super::network::{SAMPLES, cases, gradients, larger_cases, predict, prepare, step, stored, training};
+use super::network::{SAMPLES, cases, gradients, predict, prepare, prepared, step, stored, training};
 use super::network_support::reference::{Kernel, Reference, Rounding, labels, norm};
 use super::network_support::{DoubleGyre, traced, uniform_points};
 use super::scenes::*;
+use super::small;
 use burn::backend::Flex;
 use burn::module::Param;
 use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
@@ -26,15 +27,14 @@ use std::sync::Arc;
 #[test]
 #[ignore = "needs a GPU"]
 fn gradients_in_training_are_the_references() {
-    for case in cases().into_iter().chain(larger_cases()) {
-        let (model, objective, samples) = prepare(&case);
+    for (case, (model, objective, samples)) in prepared() {
         // The reference's gradient is of each sample alone.
         let objective = Objective { mean_penalty: 0.0, ..objective };
         let model = Model { table_moments: None, layer_moments: None, ..model };
         let kernel = if is_fused(&model.shape, gpu().shared_memory()) { Kernel::Fused } else { Kernel::Batched };
         let mut device = training(&model, &objective);
         let pool = device.upload(&samples, None).unwrap();
-        let loss = device.train_steps(&pool, None, &[step(SAMPLES, 1e-9)]).unwrap()[0];
+        let loss = device.train_steps(&pool, None, &[step(samples.points.len(), 1e-9)]).unwrap()[0];
         let found = gradients(&stored(&device, &model));
 
         let reference = Reference::in_halves(&model);
@@ -232,8 +232,9 @@ fn a_loss_that_is_no_number_is_rolled_back() {
         network.predict(&points, &mut values);
         (learned, values)
     };
-    let (learned, before) = predictions(&SampleRing::holding(&samples), 600.0, 100);
-    assert_eq!((learned.steps, learned.rollbacks, learned.lost_steps), (100, 0, 0));
+    let steps = if small() { 20 } else { 100 };
+    let (learned, before) = predictions(&SampleRing::holding(&samples), 600.0, steps);
+    assert_eq!((learned.steps, learned.rollbacks, learned.lost_steps), (steps, 0, 0));
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples };
     let (learned, after) = predictions(&SampleRing::holding(&poison), 2.0, 20);
     assert!(learned.rollbacks > 0 && learned.steps == 0 && learned.lost_steps > 0, "{learned:?}");

@@ -64,6 +64,9 @@ uint32_t rw_version(void);
 // Why the last call of this thread failed; empty when none did. Valid until the thread's next call.
 const char *rw_error(void);
 
+// Makes this text what `rw_error` returns: for modules of other languages, which refuse what they do not pass on. Null: none. Takes no memory.
+void rw_set_error(const char *text);
+
 // Begins a description of a grid of 2 or 3 dimensions, whose velocity has as many components. Null when there is no memory or the
 // dimensions are wrong.
 rw_description *rw_describe(uint32_t dimensions);

@@ -10,7 +10,7 @@
 #![allow(clippy::missing_safety_doc)]
 
 use ridgewatch_wire::{
-    AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, WireError, even,
+    AXIS_NODES, AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, TEXT, WireError, even,
 };
 use std::cell::RefCell;
 use std::ffi::{CStr, c_char};
@@ -82,7 +82,8 @@ thread_local! {
 /// Why a call came to nothing.
 enum Failure {
     Off,
-    Argument(&'static str),
+    /// An argument that cannot be; the words are in [`ERROR`] already, since the calls after opening take no memory for them.
+    Argument,
     Wire(WireError),
 }
 
@@ -96,7 +97,7 @@ impl Failure {
     fn status(&self) -> Status {
         match self {
             Failure::Off => Status::RwOff,
-            Failure::Argument(_) => Status::RwArgument,
+            Failure::Argument => Status::RwArgument,
             Failure::Wire(error) => match error {
                 WireError::InUse { .. } => Status::RwInUse,
                 WireError::NoSpace { .. } | WireError::FileSize { .. } => Status::RwNoSpace,
@@ -138,9 +139,18 @@ fn tell(text: std::fmt::Arguments) {
     });
 }
 
-/// Most bytes that one call takes beside coordinates: texts, paths, the handles, the words of an error. Less than from where malloc maps memory of its own, so
-/// that what was asked for and given back is there for what follows.
+/// Refuses an argument: what was found, and what is accepted.
+fn refused(argument: &str, found: impl std::fmt::Display, accepted: std::fmt::Arguments) -> Failure {
+    tell(format_args!("`{argument}` is {found}; accepted: {accepted}"));
+    Failure::Argument
+}
+
+/// Most bytes that one call takes beside coordinates: texts, paths, the handles, the words of an error; however many blocks there are, since those of a
+/// folder are looked at one by one. Less than from where malloc maps memory of its own, so that what was asked for and given back is there for what follows.
 const SMALL: usize = 1 << 16;
+
+/// Longest path of a ring, in bytes: the system's, whose copies [`SMALL`] is for.
+const PATH: usize = 4095;
 
 /// Asks for memory.
 fn room<T>(count: usize) -> Result<Vec<T>, WireError> {
@@ -175,7 +185,7 @@ fn guarded(body: impl FnOnce() -> Result<(), Failure>) -> Status {
         Ok(Err(failure)) => {
             match &failure {
                 Failure::Off => tell(format_args!("")),
-                Failure::Argument(what) => tell(format_args!("{what}")),
+                Failure::Argument => {}
                 Failure::Wire(error) => tell(format_args!("{error}")),
             }
             failure.status()
@@ -199,6 +209,14 @@ pub extern "C" fn rw_error() -> *const c_char {
     ERROR.try_with(|error| error.as_ptr().cast::<c_char>().cast_const()).unwrap_or(c"".as_ptr())
 }
 
+/// Makes this text what `rw_error` returns: for modules of other languages, which refuse what they do not pass on. Null: none. Takes no memory.
+#[unsafe(no_mangle)]
+pub unsafe extern "C" fn rw_set_error(text: *const c_char) {
+    // SAFETY: the caller's promise.
+    let text = if text.is_null() { c"" } else { unsafe { CStr::from_ptr(text) } };
+    tell(format_args!("{}", text.to_str().unwrap_or("a text that is not UTF-8")));
+}
+
 /// Begins a description of a grid of 2 or 3 dimensions, whose velocity has as many components. Null when there is no memory or the
 /// dimensions are wrong.
 #[unsafe(no_mangle)]
@@ -206,7 +224,7 @@ pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     let mut made = std::ptr::null_mut();
     guarded_with_room(|| {
         if !(2..=3).contains(&dimensions) {
-            return Err(Failure::Argument("dimensions: accepted: 2 or 3"));
+            return Err(refused("dimensions", dimensions, format_args!("2 or 3")));
         }
         made = Box::into_raw(Box::new(RwDescription {
             geometry: Geometry::Cartesian,
@@ -234,11 +252,15 @@ pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
     });
 }
 
+fn no_description() -> Failure {
+    refused("description", "null", format_args!("what rw_describe returned"))
+}
+
 /// # Safety
 /// `description` is null or points to a description that nobody else uses.
 unsafe fn describe(description: *mut RwDescription, change: impl FnOnce(&mut RwDescription) -> Result<(), Failure>) -> Status {
     // SAFETY: the caller's promise.
-    guarded_with_room(|| change(unsafe { description.as_mut() }.ok_or(Failure::Argument("description: null"))?))
+    guarded_with_room(|| change(unsafe { description.as_mut() }.ok_or_else(no_description)?))
 }
 
 const NAMES: [&str; 3] = ["x", "y", "z"];
@@ -255,13 +277,12 @@ fn set_axis(
     period: f64,
 ) -> Result<(), Failure> {
     let given = axis_of(axis, copied(coordinates)?, (period != 0.0).then_some(period));
-    let place = description.axes.get_mut(axis as usize).ok_or(Failure::Argument("axis: accepted: below the number of dimensions"))?;
+    let dimensions = description.axes.len();
+    let place = description.axes.get_mut(axis as usize);
+    let place = place.ok_or_else(|| refused("axis", axis, format_args!("0 to {}, in {dimensions} dimensions", dimensions - 1)))?;
     *place = Some(given);
     Ok(())
 }
-
-/// Longest axis that is accepted.
-const AXIS_NODES: u64 = 1 << 20;
 
 /// An axis (0: x, 1: y, 2: z) of evenly spaced nodes of the global grid. `period`: length after which the axis repeats, 0: it does not.
 #[unsafe(no_mangle)]
@@ -287,8 +308,11 @@ pub unsafe extern "C" fn rw_describe_rectilinear(
     period: f64,
 ) -> Status {
     let change = |d: &mut RwDescription| {
-        if coordinates.is_null() || nodes > AXIS_NODES {
-            return Err(Failure::Argument("coordinates: accepted: at most 1048576 numbers"));
+        if coordinates.is_null() {
+            return Err(refused("coordinates", "null", format_args!("the address of {nodes} numbers")));
+        }
+        if nodes > AXIS_NODES {
+            return Err(refused("nodes", nodes, format_args!("2 to {AXIS_NODES}")));
         }
         // SAFETY: the caller's promise, for a number of nodes that was checked.
         let coordinates = unsafe { std::slice::from_raw_parts(coordinates, nodes as usize) };
@@ -320,10 +344,12 @@ pub unsafe extern "C" fn rw_describe_block(
     extent: *const u64,
 ) -> Status {
     let change = |d: &mut RwDescription| {
-        if offset.is_null() || extent.is_null() {
-            return Err(Failure::Argument("offset, extent: null"));
-        }
         let dimensions = d.axes.len();
+        for (name, numbers) in [("offset", offset), ("extent", extent)] {
+            if numbers.is_null() {
+                return Err(refused(name, "null", format_args!("the address of {dimensions} numbers")));
+            }
+        }
         let of = |numbers: *const u64, beyond: u64| {
             std::array::from_fn(|k| {
                 if k >= dimensions {
@@ -357,14 +383,15 @@ pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, star
 pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, unit: *const c_char) -> Status {
     let change = |d: &mut RwDescription| {
         if unit.is_null() {
-            return Err(Failure::Argument("unit: null"));
+            return Err(refused("unit", "null", format_args!("a text")));
         }
         // SAFETY: the caller's promise.
-        let unit = unsafe { CStr::from_ptr(unit) };
-        let unit = unit.to_str().map_err(|_| Failure::Argument("unit: not UTF-8"))?;
-        let mut copy = room(unit.len())?;
-        copy.extend_from_slice(unit.as_bytes());
-        d.time_unit = String::from_utf8(copy).map_err(|_| Failure::Argument("unit: not UTF-8"))?;
+        let unit = unsafe { CStr::from_ptr(unit) }.to_bytes();
+        if unit.len() > TEXT {
+            return Err(refused("unit", format_args!("{} bytes long", unit.len()), format_args!("at most {TEXT} bytes")));
+        }
+        let text = str::from_utf8(unit).map_err(|_| refused("unit", format_args!("\"{}\"", unit.escape_ascii()), format_args!("UTF-8")))?;
+        d.time_unit = text.to_owned();
         Ok(())
     };
     // SAFETY: the caller's promise.
@@ -401,7 +428,7 @@ pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milli
 pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
     guarded_with_room(|| {
         // SAFETY: the caller's promise.
-        let field = unsafe { field.as_mut() }.ok_or(Failure::Argument("field: null"))?;
+        let field = unsafe { field.as_mut() }.ok_or_else(|| refused("field", "null", format_args!("the address of a pointer")))?;
         *field = std::ptr::null_mut();
         let ring = if ring.is_null() {
             PathBuf::from(std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).ok_or(Failure::Off)?)
@@ -410,10 +437,16 @@ pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDesc
             // SAFETY: the caller's promise.
             PathBuf::from(std::ffi::OsStr::from_bytes(unsafe { CStr::from_ptr(ring) }.to_bytes()))
         };
+        let bytes = ring.as_os_str().len();
+        if bytes > PATH {
+            return Err(refused("ring", format_args!("a path of {bytes} bytes"), format_args!("at most {PATH} bytes")));
+        }
         // SAFETY: the caller's promise.
-        let given = unsafe { description.as_ref() }.ok_or(Failure::Argument("description: null"))?;
+        let given = unsafe { description.as_ref() }.ok_or_else(no_description)?;
+        let axes = given.axes.len();
         let copy = |(axis, given): (usize, &Option<AxisDescription>)| {
-            let given = given.as_ref().ok_or(Failure::Argument("description: an axis is missing"))?;
+            let missing = || refused("description", format_args!("without axis {axis}"), format_args!("all of its {} axes", axes));
+            let given = given.as_ref().ok_or_else(missing)?;
             Ok(axis_of(axis as u32, copied(given.coordinates.iter().copied())?, given.period))
         };
         let axes = given.axes.iter().enumerate().map(copy).collect::<Result<Vec<_>, Failure>>()?;
@@ -448,7 +481,7 @@ unsafe fn publish(
         let mut values = Field::packed(components, element, field.extent);
         if let Some(strides) = strides {
             if strides.is_null() {
-                return Err(Failure::Argument("strides: null"));
+                return Err(refused("strides", "null", format_args!("the address of {} numbers", field.dimensions)));
             }
             for k in 0..field.dimensions {
                 // SAFETY: a stride a dimension, by the caller's promise.

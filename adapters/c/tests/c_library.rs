@@ -213,6 +213,8 @@ const FAULTS: &str = r#"
 #include <ridgewatch.h>
 #define WANT(x) do { if (!(x)) { fprintf(stderr, "line %d: %s (%s)\n", __LINE__, #x, rw_error()); exit(1); } } while (0)
 
+#define WANT_WORDS(x, words) WANT((x) == RW_ARGUMENT && !strcmp(rw_error(), words))
+
 /* Every request for memory of this process, the library's with them. */
 static atomic_ulong requests;
 extern void *__libc_malloc(size_t), *__libc_calloc(size_t, size_t), *__libc_realloc(void *, size_t), *__libc_memalign(size_t, size_t);
@@ -234,18 +236,27 @@ static void *publish(void *name) {
 
 int main(int argc, char **argv) {
     WANT(argc == 2);
-    WANT(!rw_describe(1) && strstr(rw_error(), "2 or 3"));
+    WANT(!rw_describe(1) && !strcmp(rw_error(), "`dimensions` is 1; accepted: 2 or 3"));
     rw_description *d = rw_describe(2);
     WANT(d);
-    WANT(rw_describe_uniform(NULL, 0, 0, 1, 8, 0) == RW_ARGUMENT);
-    WANT(rw_describe_uniform(d, 2, 0, 1, 8, 0) == RW_ARGUMENT);
-    WANT(rw_describe_rectilinear(d, 0, NULL, 8, 0) == RW_ARGUMENT);
-    WANT(rw_describe_time_unit(d, NULL) == RW_ARGUMENT);
+    const uint64_t ones[2] = {1, 1};
+    WANT_WORDS(rw_describe_uniform(NULL, 0, 0, 1, 8, 0), "`description` is null; accepted: what rw_describe returned");
+    WANT_WORDS(rw_describe_uniform(d, 2, 0, 1, 8, 0), "`axis` is 2; accepted: 0 to 1, in 2 dimensions");
+    WANT_WORDS(rw_describe_rectilinear(d, 0, NULL, 8, 0), "`coordinates` is null; accepted: the address of 8 numbers");
+    WANT_WORDS(rw_describe_rectilinear(d, 0, &(double){0}, 1 << 21, 0), "`nodes` is 2097152; accepted: 2 to 1048576");
+    WANT_WORDS(rw_describe_time_unit(d, NULL), "`unit` is null; accepted: a text");
+    WANT_WORDS(rw_describe_time_unit(d, "h\xff"), "`unit` is \"h\\xff\"; accepted: UTF-8");
+    static char long_text[5000];
+    memset(long_text, '/', sizeof long_text - 1);
+    WANT_WORDS(rw_describe_time_unit(d, long_text), "`unit` is 4999 bytes long; accepted: at most 64 bytes");
     WANT(rw_describe_start(NULL, 1) == RW_ARGUMENT && rw_describe_start(d, UINT64_MAX) == RW_OK);
-    WANT(rw_describe_block(d, 0, 1, NULL, NULL) == RW_ARGUMENT);
-    WANT(rw_open(argv[1], d, &field) == RW_ARGUMENT && strstr(rw_error(), "axis is missing") && !field);
-    WANT(rw_open(argv[1], NULL, &field) == RW_ARGUMENT);
-    WANT(rw_open(argv[1], d, NULL) == RW_ARGUMENT);
+    WANT_WORDS(rw_describe_block(d, 0, 1, NULL, ones), "`offset` is null; accepted: the address of 2 numbers");
+    WANT_WORDS(rw_describe_block(d, 0, 1, ones, NULL), "`extent` is null; accepted: the address of 2 numbers");
+    WANT_WORDS(rw_open(argv[1], d, &field), "`description` is without axis 0; accepted: all of its 2 axes");
+    WANT_WORDS(rw_open(argv[1], NULL, &field), "`description` is null; accepted: what rw_describe returned");
+    WANT_WORDS(rw_open(argv[1], d, NULL), "`field` is null; accepted: the address of a pointer");
+    WANT_WORDS(rw_open(long_text, d, &field), "`ring` is a path of 4999 bytes; accepted: at most 4095 bytes");
+    WANT(!field);
     WANT(rw_describe_uniform(d, 0, 0, 1, 8, 0) == RW_OK && !*rw_error());
     WANT(rw_describe_uniform(d, 1, 1, 0, 8, 0) == RW_OK);
     WANT(rw_open(argv[1], d, &field) == RW_ARGUMENT && strstr(rw_error(), "ascending"));
@@ -275,6 +286,7 @@ int main(int argc, char **argv) {
     WANT(rw_publish_f32(field, 0, NAN, plane, plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "NaN; accepted: a finite number"));
     WANT(rw_publish_f32(field, 0, 0, NULL, plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "not null"));
     WANT(rw_publish_f32(field, 0, 0, (float *)((char *)plane + 2), plane, NULL) == RW_ARGUMENT && strstr(rw_error(), "divisible by 4"));
+    WANT_WORDS(rw_publish_strided_f32(field, 0, 0, plane, plane, NULL, NULL), "`strides` is null; accepted: the address of 2 numbers");
     WANT(atomic_load(&requests) == before);
     WANT(rw_open(argv[1], d, &second) == RW_IN_USE && atomic_load(&requests) > before);
     pthread_t threads[4];
@@ -329,11 +341,13 @@ fn where_memory_is_out_calls_fail_and_nothing_is_aborted() {
 
 const OUT_OF_MEMORY: &str = r#"
 #define _DEFAULT_SOURCE
+#include <fcntl.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/resource.h>
+#include <sys/stat.h>
 #include <sys/wait.h>
 #include <unistd.h>
 #include <ridgewatch.h>
@@ -373,6 +387,34 @@ static int refused(const char *ring) {
     return rw_close(field) == RW_OK ? 0 : ODD + 5;
 }
 
+/* A ring for which there is no room, where producers of so many blocks have left their names: all of them are looked at. */
+static int huge(const char *ring, int others) {
+    char path[300];
+    snprintf(path, sizeof path, "%s", ring);
+    if (mkdir(path, 0700)) return ODD;
+    for (int block = 1; block <= others; block++) {
+        snprintf(path, sizeof path, "%s/block-%05d.lock", ring, block);
+        const int file = open(path, O_CREAT | O_WRONLY, 0600);
+        if (file < 0 || close(file)) return ODD + 1;
+    }
+    rw_description *d = rw_describe(3);
+    rw_field *field;
+    for (int axis = 0; axis < 3; axis++) if (!d || rw_describe_uniform(d, axis, 0, 1, 1 << 13, 0)) return ODD + 2;
+    /* Then so much is given back, in pieces and one after another. */
+    limit_to(32 << 20);
+    fill();
+    for (int i = 0; i < 160; i++) free(pieces[i]);
+    const int status = rw_open(ring, d, &field);
+    for (int block = 1; block <= others; block++) {
+        snprintf(path, sizeof path, "%s/block-%05d.lock", ring, block);
+        remove(path);
+    }
+    snprintf(path, sizeof path, "%s/followers.lock", ring);
+    remove(path);
+    rmdir(ring);
+    return status == RW_NO_SPACE && !field ? 0 : ODD + 3 + status;
+}
+
 /* A description of 4 MiB, a block of 8 nodes. */
 static int attempt(const char *ring) {
     rw_description *d = rw_describe(3);
@@ -398,6 +440,12 @@ int main(int argc, char **argv) {
     if (first < 0 || waitpid(first, &end, 0) != first || end) {
         fprintf(stderr, "a step that was refused without memory: status %x\n", end);
         return 5;
+    }
+    const pid_t second = fork();
+    if (!second) _exit(huge(argv[1], 40000));
+    if (second < 0 || waitpid(second, &end, 0) != second || end) {
+        fprintf(stderr, "no room among 40000 blocks, little memory: status %x\n", end);
+        return 6;
     }
     for (int filled = 0; filled < 2; filled++)
         for (long room = 0; room < 24L << 20; room += filled ? (room < 1 << 20 ? 8 << 10 : 1 << 20) : 128 << 10) {

@@ -4,11 +4,11 @@ use crate::WireError;
 use crate::bytes::{Parser, Writer};
 
 /// Longest axis, in nodes.
-const AXIS_NODES: u64 = 1 << 20;
+pub const AXIS_NODES: u64 = 1 << 20;
 /// Longest name or unit, in bytes.
-const TEXT: usize = 64;
+pub const TEXT: usize = 64;
 /// Most blocks of a decomposed domain.
-const BLOCKS: u32 = 1 << 16;
+pub(crate) const BLOCKS: u32 = 1 << 16;
 
 /// How coordinates become lengths.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -53,9 +53,7 @@ impl AxisDescription {
             return Err(WireError::field("axis.coordinates", format_args!("{} after {}", turn[1], turn[0]), "strictly ascending numbers"));
         }
         for (field, text) in [("axis.name", &self.name), ("axis.unit", &self.unit)] {
-            if text.len() > TEXT || text.chars().any(char::is_control) {
-                return Err(WireError::field(field, format_args!("{text:?}"), format!("at most {TEXT} bytes without control characters")));
-            }
+            check_text(field, text)?;
         }
         let reach = self.coordinates[self.coordinates.len() - 1] - self.coordinates[0];
         match self.period {
@@ -88,6 +86,18 @@ impl AxisDescription {
         let axis = Self { name, unit, coordinates, period: (period != 0.0).then_some(period) };
         axis.check()?;
         Ok(axis)
+    }
+}
+
+/// Names and units. One that is too long is not repeated.
+fn check_text(field: &'static str, text: &str) -> Result<(), WireError> {
+    let accepted = || format!("at most {TEXT} bytes without control characters");
+    if text.len() > TEXT {
+        return Err(WireError::field(field, format_args!("{} bytes long", text.len()), accepted()));
+    }
+    match text.chars().any(char::is_control) {
+        true => Err(WireError::field(field, format_args!("{text:?}"), accepted())),
+        false => Ok(()),
     }
 }
 
@@ -202,10 +212,7 @@ impl Description {
                 return Err(WireError::field("latitude", format_args!("{south} to {north}"), "-90 to 90 degrees"));
             }
         }
-        if self.time_unit.len() > TEXT || self.time_unit.chars().any(char::is_control) {
-            let accepted = format!("at most {TEXT} bytes without control characters");
-            return Err(WireError::field("time_unit", format_args!("{:?}", self.time_unit), accepted));
-        }
+        check_text("time_unit", &self.time_unit)?;
         let shape = self.shape();
         // 2^20 nodes an axis at most: no overflow.
         let bytes = shape.iter().product::<u64>() as u128 * 4 * self.components() as u128;

@@ -30,7 +30,7 @@ mod system;
 pub use assemble::{Assembler, Incomplete, Step};
 pub use choice::LEAD;
 pub use copy::{Element, Field};
-pub use description::{AxisDescription, BlockExtent, Description, Geometry, Limits, even};
+pub use description::{AXIS_NODES, AxisDescription, BlockExtent, Description, Geometry, Limits, TEXT, even};
 pub use error::WireError;
 pub use follow::{Event, RingFollower};
 pub use header::{Header, MAGIC, VERSION};

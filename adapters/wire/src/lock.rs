@@ -1,5 +1,6 @@
 //! Who publishes under a name, and who follows: locks that the system takes back when their holder ends, however it ends.
 
+use crate::description::BLOCKS;
 use crate::header::MARKS;
 use crate::system::{create_private, foreign};
 use crate::{WireError, block_path, followers_path, lock_path, part_path, system};
@@ -162,8 +163,8 @@ pub(crate) struct Dead {
 
 impl Dead {
     /// Its files that take room.
-    pub fn files(&self) -> [PathBuf; 2] {
-        [self.ring.clone(), self.part.clone()]
+    pub fn files(&self) -> [&Path; 2] {
+        [&self.ring, &self.part]
     }
 
     /// Removes it, the ring by `remove`.
@@ -174,10 +175,10 @@ impl Dead {
     }
 }
 
-/// What producers that have ended left in a folder.
+/// What producers that have ended left in a folder, one after another: of however many there are, one takes memory and descriptors at a time.
 pub(crate) fn dead(ring: &Path) -> impl Iterator<Item = Dead> {
     let of = |block| Some(Dead { ring: block_path(ring, block), part: part_path(ring, block), name: NameLock::take(ring, block).ok()?? });
-    blocks(ring).into_iter().filter_map(of)
+    blocks(ring).filter_map(of)
 }
 
 /// Removes the rings of producers that have ended, and the folder when it is empty, where nobody follows. Somebody else who does so is waited for, so
@@ -259,18 +260,18 @@ impl Drop for Following {
     }
 }
 
-/// The blocks of which a ring, a part of one or a lock is in the folder, ascending; at most 65536 are looked for.
-pub fn blocks(ring: &Path) -> Vec<u32> {
-    let Ok(entries) = std::fs::read_dir(ring) else { return Vec::new() };
+/// The blocks of which a ring, a part of one or a lock is in the folder, ascending. Takes no more memory for more of them.
+pub fn blocks(ring: &Path) -> impl Iterator<Item = u32> + use<> {
+    // A bit a block.
+    let mut there = [0u64; BLOCKS as usize / 64];
     let number = |name: &str| {
         let name = name.strip_prefix("block-").or(name.strip_prefix(".block-"))?;
         let digits = [".ring", ".part", ".lock"].iter().find_map(|end| name.strip_suffix(end))?;
-        (digits.len() == 5).then(|| digits.parse().ok()).flatten()
+        (digits.len() == 5).then(|| digits.parse::<u32>().ok()).flatten()
     };
-    let names = entries.take(1 << 18).flatten().filter_map(|e| e.file_name().to_str().and_then(number));
-    let mut blocks: Vec<u32> = names.collect();
-    blocks.sort_unstable();
-    blocks.dedup();
-    blocks.truncate(1 << 16);
-    blocks
+    let entries = std::fs::read_dir(ring).into_iter().flatten().take(1 << 18).flatten();
+    for block in entries.filter_map(|entry| entry.file_name().to_str().and_then(number)).filter(|block| *block < BLOCKS) {
+        there[block as usize / 64] |= 1 << (block % 64);
+    }
+    (0..BLOCKS).filter(move |block| there[*block as usize / 64] >> (block % 64) & 1 == 1)
 }

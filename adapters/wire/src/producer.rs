@@ -5,7 +5,6 @@ use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, OPEN, O
 use crate::lock::{Dead, NameLock, dead, is_followed, sweep};
 use crate::system::{self, Map, create_private, open_private, room_with, taken};
 use crate::{Description, Limits, WireError, block_path, part_path};
-use std::collections::VecDeque;
 use std::fs::File;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt};
 use std::path::{Path, PathBuf};
@@ -142,7 +141,7 @@ impl Producer {
         let _ = std::fs::remove_file(&part);
         let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be made", e))?;
         let mut left = None;
-        Map::create(&file, &path, bytes, || left.get_or_insert_with(|| Left::enough(ring, &path, &file, bytes)).give_up_one())
+        Map::create(&file, &path, bytes, || left.get_or_insert_with(|| left_over(ring, &path, &file, bytes)).give_up_one())
     }
 
     /// What is published.
@@ -274,29 +273,26 @@ impl Drop for Producer {
 }
 
 /// Rings of producers that have ended, to be given up for the room that they take.
-struct Left {
+struct Left<Others> {
     /// The one whose name this producer has.
     own: Option<PathBuf>,
-    others: VecDeque<Dead>,
+    others: Option<Others>,
 }
 
-impl Left {
-    /// Those of a folder; none where a file of so many bytes would not fit even without them.
-    fn enough(ring: &Path, own: &Path, file: &File, bytes: u64) -> Self {
-        let others: VecDeque<Dead> = dead(ring).collect();
-        let size = |path: &Path| std::fs::symlink_metadata(path).map_or(0, |about| taken(&about));
-        let freed = size(own) + others.iter().flat_map(Dead::files).map(|path| size(&path)).sum::<u64>();
-        match room_with(file, freed) {
-            Ok(room) if room >= bytes => Self { own: Some(own.to_owned()), others },
-            _ => Self { own: None, others: VecDeque::new() },
-        }
-    }
+/// Those of a folder; none where a file of so many bytes would not fit even without them. One whose name somebody takes meanwhile is left alone.
+fn left_over(ring: &Path, own: &Path, file: &File, bytes: u64) -> Left<impl Iterator<Item = Dead>> {
+    let size = |path: &Path| std::fs::symlink_metadata(path).map_or(0, |about| taken(&about));
+    let freed = size(own) + dead(ring).map(|dead| dead.files().iter().map(|path| size(path)).sum::<u64>()).sum::<u64>();
+    let enough = room_with(file, freed).is_ok_and(|room| room >= bytes);
+    Left { own: enough.then(|| own.to_owned()), others: enough.then(|| dead(ring)) }
+}
 
+impl<Others: Iterator<Item = Dead>> Left<Others> {
     /// Gives one up; whether there was one.
     fn give_up_one(&mut self) -> bool {
         match self.own.take().filter(|own| own.exists()) {
             Some(own) => give_up(&own),
-            None => match self.others.pop_front() {
+            None => match self.others.as_mut().and_then(Iterator::next) {
                 Some(dead) => dead.remove(give_up),
                 None => return false,
             },

@@ -15,9 +15,11 @@ use std::net::{Shutdown, SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 mod follower;
+mod lookup;
 mod news;
 mod pace;
 
@@ -142,7 +144,7 @@ pub fn serve(
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
     let relay = Arc::new(Relay::new(ring, key, counts, stop, tell));
-    let mut threads: Vec<std::thread::JoinHandle<()>> = Vec::new();
+    let mut threads: Vec<JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
         relay.say_rest();
@@ -164,10 +166,7 @@ pub fn serve(
                 continue;
             }
         };
-        let relay = relay.clone();
-        let work = move || relay.connection(&stream, peer);
-        let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
-        threads.extend(started.map_err(broken));
+        threads.extend(relay.attend(stream, peer, std::thread::Builder::new()));
     }
     for thread in threads {
         let _ = thread.join();
@@ -206,6 +205,13 @@ impl Relay {
     /// Says together what came too fast to be said one by one.
     fn say_rest(&self) {
         [&self.sent_away, &self.lost, &self.left, &self.refused].into_iter().filter_map(News::due).for_each(|words| (self.tell)(words));
+    }
+
+    /// Gives one that came a thread. Where there is none for it, it is sent away: later ones may fare better.
+    fn attend(self: &Arc<Self>, stream: TcpStream, peer: SocketAddr, thread: std::thread::Builder) -> Option<JoinHandle<()>> {
+        let relay = self.clone();
+        let started = thread.name("ridgewatch-relay".into()).spawn(move || relay.connection(&stream, peer));
+        started.map_err(|e| self.refuse(peer, format!("no thread could be started for it: {e}"))).ok()
     }
 
     /// One that came, until it goes.
@@ -407,6 +413,24 @@ mod tests {
         });
         drop(producer);
         assert!(!ring.exists());
+    }
+
+    #[test]
+    fn a_follower_for_whom_no_thread_can_be_had_is_told_and_sent_away() {
+        let (told, hear) = std::sync::mpsc::channel();
+        let told = Mutex::new(told);
+        let tell = move |words| told.lock().unwrap().send(words).unwrap();
+        let (counts, key) = (Arc::<RelayCounts>::default(), Key::random().unwrap());
+        let relay = Arc::new(Relay::new(Path::new("/dev/shm"), &key, &counts, &Arc::default(), Arc::new(tell)));
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+        let (stream, peer) = listener.accept().unwrap();
+        // No address space has room for such a stack.
+        assert!(relay.attend(stream, peer, std::thread::Builder::new().stack_size(1 << 60)).is_none());
+        let words = hear.try_recv().unwrap();
+        assert!(words.starts_with(&format!("{peer} was sent away: no thread could be started for it: ")), "{words}");
+        assert_eq!(counts.refused.load(Ordering::Relaxed), 1);
+        assert_eq!(client.read(&mut [0]).unwrap(), 0, "hung up");
     }
 
     #[test]

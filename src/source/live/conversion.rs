@@ -3,6 +3,11 @@
 use crate::field::{Grid, Snapshot};
 use crate::source::SourceError;
 use std::sync::Arc;
+use std::sync::mpsc::{RecvTimeoutError, sync_channel};
+use std::time::Duration;
+
+/// How often whoever waits for work of the pool looks up.
+const LOOK_UP: Duration = Duration::from_millis(100);
 
 /// Threads that convert, at most: as many as keep the memory busy.
 const CONVERTERS: usize = 4;
@@ -28,14 +33,31 @@ impl Conversion {
         Ok(Self { grid, pool, made: Vec::new(), spare: None })
     }
 
-    /// The snapshot of components, one behind the other.
-    pub fn snapshot(&mut self, time: f64, values: &[f32]) -> Arc<Snapshot> {
+    /// The snapshot of components, one behind the other. `beat` is called again and again meanwhile.
+    pub fn snapshot(&mut self, time: f64, values: &[f32], beat: &mut dyn FnMut()) -> Arc<Snapshot> {
         self.reclaim();
         let (u, rest) = values.split_at(self.grid.nodes());
         let (v, w) = rest.split_at(self.grid.nodes());
         let (grid, nodes) = (self.grid.clone(), self.spare.take().unwrap_or_default());
-        let made = Arc::new(self.pool.install(|| Snapshot::from_components_into(nodes, time, grid, u, v, w)));
+        let made = Arc::new(self.beside(|| Snapshot::from_components_into(nodes, time, grid, u, v, w), beat));
         self.made.push(made.clone());
+        made
+    }
+
+    /// Does `work` in the pool, and calls `beat` on this thread, again and again, until it is done.
+    pub fn beside<T: Send>(&self, work: impl FnOnce() -> T + Send, beat: &mut dyn FnMut()) -> T {
+        let (done, wait) = sync_channel(1);
+        let made = self.pool.in_place_scope(|scope| {
+            scope.spawn(move |_| drop(done.send(work())));
+            loop {
+                match wait.recv_timeout(LOOK_UP) {
+                    Ok(made) => return Some(made),
+                    Err(RecvTimeoutError::Timeout) => beat(),
+                    Err(RecvTimeoutError::Disconnected) => return None,
+                }
+            }
+        });
+        let Some(made) = made else { unreachable!("the scope has passed the panic of `work` on") };
         made
     }
 
@@ -47,6 +69,14 @@ impl Conversion {
                 Err(held) => self.made.push(held),
             }
         }
+    }
+}
+
+#[cfg(test)]
+impl Conversion {
+    /// All of its threads have something else to do for so long.
+    pub fn occupy(&self, time: Duration) {
+        self.pool.spawn_broadcast(move |_| std::thread::sleep(time));
     }
 }
 
@@ -66,7 +96,7 @@ mod tests {
         let mut held = std::collections::VecDeque::new();
         let mut places = std::collections::BTreeSet::new();
         for step in 0..20 {
-            let made = conversion.snapshot(step as f64, &values(step));
+            let made = conversion.snapshot(step as f64, &values(step), &mut || ());
             places.insert(made.nodes.as_ptr() as usize);
             held.push_back((step, made));
             if held.len() > 3 {
@@ -76,7 +106,18 @@ mod tests {
         }
         assert!(places.len() <= 4, "{places:?}: three are held, one is made");
         held.clear();
-        conversion.snapshot(20.0, &values(20));
+        conversion.snapshot(20.0, &values(20), &mut || ());
         assert_eq!(conversion.made.len(), 1, "nothing is kept for its own sake");
+    }
+
+    #[test]
+    fn a_panic_of_the_work_is_passed_on() {
+        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
+        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+        let conversion = Conversion::new(grid).unwrap();
+        let work = || -> u8 { panic!("as no conversion should") };
+        let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| conversion.beside(work, &mut || ())));
+        assert_eq!(panicked.unwrap_err().downcast_ref(), Some(&"as no conversion should"));
+        assert_eq!(conversion.beside(|| 7, &mut || ()), 7);
     }
 }

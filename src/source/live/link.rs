@@ -71,6 +71,13 @@ impl Link {
         }
     }
 
+    /// Says that somebody is there, where that was not said for a second: between the pieces of what takes long. A relay hears it from a thread of its own.
+    pub fn beat(&mut self) {
+        if let Link::Ring(ring) = self {
+            ring.beat();
+        }
+    }
+
     /// Says that somebody is there, without taking anything.
     pub fn hold(&mut self) {
         if let Link::Ring(ring) = self {

@@ -20,6 +20,9 @@ const BESIDE: u64 = 2;
 const WARNINGS: usize = 16;
 /// Late steps in a row after which the simulation is taken to have been set back.
 const SET_BACK: u32 = 3;
+/// Bytes of a step from which on producers are told while one of its blocks is put into it: even memory that is new to the process is written faster than that
+/// in a second. (While a step is converted they always are.)
+const LARGE: usize = 256 << 20;
 /// How often a thread that holds back looks up.
 const LOOK_UP: Duration = Duration::from_millis(50);
 
@@ -83,6 +86,19 @@ struct State {
 }
 
 impl State {
+    fn new(tau: f64) -> Self {
+        Self {
+            window: Window::new(tau),
+            begun_at: None,
+            moved: 0,
+            begun: false,
+            warnings: Vec::new(),
+            more_warnings: 0,
+            live: LiveRecord::default(),
+            ended: false,
+        }
+    }
+
     fn warn(&mut self, text: String) {
         tracing::info!("{text}");
         if self.warnings.len() < WARNINGS { self.warnings.push(text) } else { self.more_warnings += 1 }
@@ -125,6 +141,10 @@ struct Shared {
 }
 
 impl Shared {
+    fn new(tau: f64) -> Self {
+        Self { state: Mutex::new(State::new(tau)), changed: Condvar::new(), stop: AtomicBool::new(false), listener: OnceLock::new() }
+    }
+
     fn lock(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap_or_else(|broken| broken.into_inner())
     }
@@ -154,18 +174,7 @@ impl LiveWindow {
             });
         }
         let room = room as usize;
-        let state = State {
-            window: Window::new(tau),
-            begun_at: None,
-            moved: 0,
-            begun: false,
-            warnings: Vec::new(),
-            more_warnings: 0,
-            live: LiveRecord::default(),
-            ended: false,
-        };
-        let shared = Shared { state: Mutex::new(state), changed: Condvar::new(), stop: AtomicBool::new(false), listener: OnceLock::new() };
-        let shared = Arc::new(shared);
+        let shared = Arc::new(Shared::new(tau));
         let conversion = Conversion::new(live.grid.clone())?;
         let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), stride);
         let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
@@ -250,13 +259,15 @@ struct Reader {
     thinning: Thinning,
     stride: usize,
     late: u32,
+    /// [`LARGE`].
+    large: usize,
 }
 
 impl Reader {
     fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
         let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
         let assembler = Assembler::new(&live.description, limit, PENDING);
-        Self { live, shared, assembler, conversion, thinning, stride, late: 0 }
+        Self { live, shared, assembler, conversion, thinning, stride, late: 0, large: LARGE }
     }
 
     fn run(&mut self) {
@@ -272,7 +283,8 @@ impl Reader {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
                 Some(Event::Step { block, generation, step, time, published, missed }) => {
                     self.shared.lock().live.missed_blocks += missed;
-                    let whole = self.assembler.block(block, generation, step, time, published, &mut values);
+                    let whole =
+                        self.assemble(&mut values, |assembler, values| assembler.block(block, generation, step, time, published, values));
                     self.tell_incomplete();
                     match whole {
                         Ok(Some(whole)) => self.whole(whole),
@@ -287,6 +299,15 @@ impl Reader {
             }
             self.tell_incomplete();
         }
+    }
+
+    /// Lets `take` put a block into its step; the step where it is whole.
+    fn assemble<T: Send>(&mut self, values: &mut Vec<f32>, take: impl FnOnce(&mut Assembler, &mut Vec<f32>) -> T + Send) -> T {
+        let Self { live, assembler, conversion, .. } = self;
+        if 4 * live.grid.nodes() * live.description.components() < self.large {
+            return take(assembler, values);
+        }
+        conversion.beside(|| take(assembler, values), &mut || live.link.beat())
     }
 
     /// Waits while a slide is due that was not taken; whether it did.
@@ -324,11 +345,12 @@ impl Reader {
         }
         state.live.steps += 1;
         let keep = self.thinning.keeps(time, &state.window);
-        // Conversion and the measurement take their time: frames are made meanwhile.
+        // Conversion and the measurement take their time: frames are made meanwhile, and producers are told that somebody follows.
         drop(state);
-        let kept = keep.then(|| self.conversion.snapshot(time, &values));
+        let mut convert = || self.conversion.snapshot(time, &values, &mut || self.live.link.beat());
+        let kept = keep.then(&mut convert);
         if !keep {
-            self.thinning.left_out(time, || self.conversion.snapshot(time, &values));
+            self.thinning.left_out(time, convert);
         }
         self.assembler.recycle(values);
         if let Some(kept) = &kept {
@@ -408,4 +430,43 @@ impl Reader {
 fn since(moment: f64) -> f64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
     (now - moment).max(0.0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::source::live::LiveSettings;
+    use ridgewatch_wire::{AxisDescription, Description, Geometry, Policy, Producer};
+
+    #[test]
+    fn producers_hear_of_the_follower_while_a_step_is_taken_in() {
+        let ring = std::path::PathBuf::from("/dev/shm").join(format!("rw-converting-{}", std::process::id()));
+        let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, 2);
+        let description = Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
+        let producer = Producer::open(&ring, description, 2, Policy::NewestWins).unwrap();
+        let settings = LiveSettings { ring: Some(ring.clone()), ..Default::default() };
+        let live = Live::connect(&settings, &AtomicBool::new(false), &mut |_| ()).unwrap().unwrap();
+        let conversion = Conversion::new(live.grid().clone()).unwrap();
+        let mut reader = Reader::new(live, Arc::new(Shared::new(1.0)), conversion, Thinning::new(1.0, 14), 1);
+        // The first follower's mark.
+        let heartbeat = || {
+            let (file, mut bytes) = (std::fs::File::open(ridgewatch_wire::block_path(&ring, 0)).unwrap(), [0; 8]);
+            std::os::unix::fs::FileExt::read_exact_at(&file, &mut bytes, 4096 + 8).unwrap();
+            u64::from_ne_bytes(bytes)
+        };
+        // As if the threads that convert had so much to do.
+        let long = Duration::from_millis(1500);
+        let opened = heartbeat();
+        reader.conversion.occupy(long);
+        reader.whole(Step { step: 0, time: 0.0, published: 1, anew: true, values: vec![0.5; 8] });
+        let converted = heartbeat();
+        assert!(converted > opened, "while a step is converted");
+        assert_eq!(reader.shared.lock().window.newest(), Some(0.0));
+        reader.large = 0;
+        reader.conversion.occupy(long);
+        reader.assemble(&mut Vec::new(), |_, _| ());
+        assert!(heartbeat() > converted, "while a block is put into a large step");
+        drop((reader, producer));
+        assert!(!ring.exists());
+    }
 }

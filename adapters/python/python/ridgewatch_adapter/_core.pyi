@@ -1,23 +1,27 @@
 from collections.abc import Sequence
+from os import PathLike
 from types import TracebackType
-from typing import Literal, Self
+from typing import Literal, Self, final
 
 import numpy as np
 import numpy.typing as npt
 
-Field = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+__all__ = ["Publisher", "RidgewatchError"]
+
+_Field = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 class RidgewatchError(Exception):
     """The ring could not be opened, or a step was refused; raised with strict=True only."""
 
+@final
 class Publisher:
-    def __init__(
-        self,
+    def __new__(
+        cls,
         x: npt.ArrayLike,
         y: npt.ArrayLike,
         z: npt.ArrayLike | None = None,
         *,
-        ring: str | None = None,
+        ring: str | PathLike[str] | None = None,
         periods: Sequence[float | None] | None = None,
         radius: float | None = None,
         block: tuple[int, int, Sequence[int], Sequence[int]] | None = None,
@@ -27,7 +31,7 @@ class Publisher:
         time_unit: str = "s",
         order: Literal["zyx", "xyz"] = "zyx",
         strict: bool = False,
-    ) -> None:
+    ) -> Self:
         """Opens a ring for the global grid of these coordinates (ascending; uneven ones are welcome).
 
         ring: its folder; without it that of RIDGEWATCH_RING, and nothing is published where that is not set.
@@ -43,7 +47,7 @@ class Publisher:
         nothing is published, and such a step is left out. Arguments of a wrong shape or type raise ValueError or TypeError in any case.
         """
 
-    def publish(self, step: int, time: float, u: Field, v: Field, w: Field | None = None) -> bool:
+    def publish(self, step: int, time: float, u: _Field, v: _Field, w: _Field | None = None) -> bool:
         """Copies a step into the ring; False where publishing is off or the step was refused. The arrays have one shape, dtype and strides.
 
         Threads may publish at once, and other threads of Python run meanwhile: let none of them write into the arrays.

@@ -1,5 +1,6 @@
 //! The other end: what a relay sends.
 
+use super::lookup::{self, Lookup};
 use super::pace::{PATIENCE, Paced, greet};
 use super::{IDLE, PULSE};
 use crate::follow::Event;
@@ -7,7 +8,7 @@ use crate::message::{Ask, ConnectionFile, Facts, Kind, Session};
 use crate::{Description, Limits, WireError};
 use std::collections::BTreeMap;
 use std::io::{BufReader, ErrorKind};
-use std::net::{SocketAddr, TcpStream, ToSocketAddrs};
+use std::net::{SocketAddr, TcpStream};
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -128,10 +129,10 @@ struct Left;
 impl Receiving {
     /// Connects, receives, and does so again until nobody listens.
     fn run(&mut self) -> Result<(), Left> {
-        let mut reached = Instant::now();
+        let (mut reached, mut lookup) = (Instant::now(), Lookup::new(lookup::system));
         while !self.stop.load(Ordering::Relaxed) {
             let found = (self.place)();
-            let connected = found.and_then(|found| connect(&found, &self.stop));
+            let connected = found.and_then(|found| connect(&found, &mut |name| lookup.find(name, PATIENCE), &self.stop));
             let error = match connected {
                 Ok((stream, session)) => {
                     self.told.clear();
@@ -250,12 +251,15 @@ impl Receiving {
     }
 }
 
-/// A session with the relay at a place.
-fn connect(place: &ConnectionFile, stop: &AtomicBool) -> Result<(TcpStream, Session), WireError> {
+/// A session with the relay at a place, whose name `find` looks up.
+fn connect(
+    place: &ConnectionFile,
+    find: &mut dyn FnMut(&str) -> std::io::Result<Vec<SocketAddr>>,
+    stop: &AtomicBool,
+) -> Result<(TcpStream, Session), WireError> {
     let address = place.address.as_str();
     let broken = |e| WireError::io(Path::new(address), "cannot be reached", e);
-    let found: Vec<SocketAddr> = address.to_socket_addrs().map_err(broken)?.collect();
-    let stream = reach(&found).map_err(broken)?;
+    let stream = find(address).and_then(|found| reach(&found)).map_err(broken)?;
     let session = greet(&stream, stop, |paced| Session::connect(paced, &place.key))?;
     Ok((stream, session))
 }

@@ -38,20 +38,20 @@ fn the_end_is_told_and_the_last_follower_sweeps_up() {
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     publish(&producer, 7, 1.0).unwrap();
     drop(producer);
-    assert_eq!(blocks(&folder.0), [0], "its last step waits for the follower");
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "its last step waits for the follower");
     let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
     let mut buffer = Vec::new();
     assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 7);
     assert_eq!(reader.read(&mut buffer).unwrap(), Read::Ended);
     let other = Following::begin(&folder.0).unwrap();
     drop(following);
-    assert_eq!(blocks(&folder.0), [0], "another follows still");
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "another follows still");
     drop(other);
     assert!(!folder.0.exists());
     // A living producer keeps its ring when the last follower goes.
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     drop(Following::begin(&folder.0).unwrap());
-    assert_eq!(blocks(&folder.0), [0]);
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0]);
     publish(&producer, 1, 0.0).unwrap();
 }
 

@@ -130,7 +130,7 @@ fn what_a_producer_left_that_was_killed_while_it_opened_goes_with_the_last_follo
         std::fs::write(folder.0.join(name), "half").unwrap();
         std::fs::set_permissions(folder.0.join(name), PermissionsExt::from_mode(0o600)).unwrap();
     }
-    assert_eq!(blocks(&folder.0), [3, 4]);
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [3, 4]);
     drop(following);
     assert!(!folder.0.exists(), "{:?}", std::fs::read_dir(&folder.0).unwrap().flatten().collect::<Vec<_>>());
 }
@@ -292,7 +292,7 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     // More than half of what is there, in as many blocks as the next or in more, with nobody who follows.
     for count in [1, 3] {
         killed(&ring, count);
-        assert_eq!(blocks(&ring).len() as u32, count);
+        assert_eq!(blocks(&ring).count() as u32, count);
         drop(open().unwrap());
     }
     // And with somebody who has it open, and has not read it, as a sidecar that was stopped.
