@@ -153,7 +153,7 @@ mod tests {
 
     impl Surrogate for Told {
         fn freeze(&self) -> std::sync::Arc<dyn Predict> {
-            unimplemented!("nothing is rendered")
+            unreachable!("nothing is rendered")
         }
         fn learns(&self) -> bool {
             true
@@ -163,7 +163,7 @@ mod tests {
         }
         fn window_slid(&mut self, _: &dyn Tracer) {}
         fn draft(&self) -> Draft {
-            unimplemented!("nothing is written")
+            unreachable!("nothing is written")
         }
         fn load(&mut self, _: &std::path::Path) -> Result<(), CheckpointError> {
             Ok(())
