@@ -1,6 +1,7 @@
 # make demo    installs what is missing, builds, replays the sliding double gyre, says where the pictures are
 # make test    the whole suite, and that the GPU kernels compile (NVRTC is fetched into target/); what needs real archives runs where they are
 # make test-data   that part alone; RIDGEWATCH_DATA=folder says where they are
+# make test-reader   networks read with NumPy
 # make test-long   what takes minutes: subscribers that stall for a minute, in Rust and in Python
 # make vendored    builds with HDF5 and NetCDF inside, where their libraries cannot be had or the program is to run elsewhere
 # make adapters   builds the C library, the Fortran module and, where pip and the network are there, the Python wheel, into out/adapters
@@ -9,7 +10,8 @@
 #    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv alone
 # make live-figures   takes the figures of docs/live.md that need no GPU and prints their tables; some 20 minutes, with SHORT=1 a minute or two that show only that they run
 # make header   writes the C header anew from the library's source; a test holds the two to each other
-# make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes docs/performance.md
+# make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes what was measured into
+#    docs/; it fails where something was not run or failed
 CARGO ?= cargo
 PACKAGES := pkg-config libhdf5-dev libnetcdf-dev g++
 PYTHON ?= python3
@@ -31,7 +33,7 @@ ADAPTERS := out/adapters
 PREFIX ?= /usr/local
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -81,9 +83,13 @@ test: packages python-packages
 	  echo "NOT RUN: the tests on real archives, since $(RIDGEWATCH_DATA) is not there (set RIDGEWATCH_DATA)"; \
 	elif $(MAKE) --no-print-directory .venv/installed; then $(MAKE) --no-print-directory test-data; else \
 	  echo "NOT RUN: the tests on real archives, since their Python packages could not be fetched (needs the network)"; fi
+	@if $(MAKE) --no-print-directory .venv/installed; then $(MAKE) --no-print-directory test-reader; else \
+	  echo "NOT RUN: the tests of the NumPy reader of networks, since NumPy could not be fetched (needs the network)"; fi
 
 test-data: packages .venv/installed
 	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
+
+test-reader: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test network_reader -- --ignored
 
 test-long: packages .venv/installed
@@ -102,7 +108,8 @@ $(NVRTC)/done: | python-packages
 gpu-check: packages
 	scripts/gpu-check-prepare .gpu/check
 	@if nvidia-smi >/dev/null 2>&1; then \
-	  OUT=out/gpu-check .gpu/check/run && scripts/gpu-check-write out/gpu-check; else \
+	  status=0; OUT=out/gpu-check .gpu/check/run || status=$$?; \
+	  scripts/gpu-check-write out/gpu-check && exit $$status; else \
 	  echo "no GPU here: take .gpu/check to one, start .gpu/check/run there, and give what it leaves to scripts/gpu-check-write"; fi
 
 header:

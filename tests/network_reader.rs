@@ -1,4 +1,4 @@
-//! `examples/evaluate_network.py` gives what the program predicts, from the checkpoint alone. Needs Python with NumPy (`make test-data` has it).
+//! `examples/evaluate_network.py` gives what the program predicts, from the checkpoint alone. Needs Python with NumPy (`make test-reader` has it).
 
 #![allow(clippy::unwrap_used)]
 
@@ -35,7 +35,7 @@ fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<
 }
 
 #[test]
-#[ignore = "needs Python with NumPy (`make test-data` has it)"]
+#[ignore = "needs Python with NumPy (`make test-reader` has it)"]
 fn numpy_reproduces_predictions_from_a_checkpoint() {
     let folder = tempfile::tempdir().unwrap();
     let tracer = DoubleGyre::new(0.0, 3.0, 30);
@@ -44,6 +44,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     let other = traced(&later, uniform_points(4, 4000), false);
     let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 3, width: 24, octaves: 4, batch: 1024, ..hash.clone() };
+    let published = NetworkSettings { loss: Loss::Published, ..hash.clone() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
     let both = NetworkSettings { inputs: vec![Input::Duration, Input::Start], ..start.clone() };
     let of_both = NetworkSettings { inputs: both.inputs.clone(), start_range: both.start_range, ..frequency.clone() };
@@ -51,6 +52,7 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
         ("hash", Kind::Network, &hash, ""),
         ("frequency", Kind::Network, &frequency, ""),
         ("residual", Kind::Residual, &hash, ""),
+        ("published", Kind::Network, &published, ""),
         ("start", Kind::Network, &start, "2.5"),
         ("start and duration", Kind::Network, &both, "2.5 1.2"),
         ("start and duration, frequency", Kind::Network, &of_both, "2.5 1.2"),
@@ -82,19 +84,17 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
 }
 
 #[test]
-#[ignore = "needs Python with NumPy (`make test-data` has it)"]
+#[ignore = "needs Python with NumPy (`make test-reader` has it)"]
 fn what_the_reader_does_not_take_it_says() {
     let folder = tempfile::tempdir().unwrap();
     let tracer = DoubleGyre::new(0.0, 3.0, 30);
     let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
-    let published = NetworkSettings { loss: Loss::Published, ..hash.clone() };
     let flow_map = NetworkSettings { target: Target::FlowMap, ..hash.clone() };
     for (name, network, kind, times, told) in [
         ("no start", &start, Kind::Network, "", "points have 3 columns; this network takes 4: x y z start"),
         ("a time too many", &hash, Kind::Network, "2.5", "points have 4 columns; this network takes 3: x y z"),
-        ("published", &published, Kind::Network, "", "is not mean_square"),
-        ("flow map", &flow_map, Kind::Network, "", "its target not ftle"),
+        ("flow map", &flow_map, Kind::Network, "", "its target is not ftle"),
         ("table", &hash, Kind::Table, "", "no network"),
     ] {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };

@@ -151,6 +151,7 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples.clone() };
     let learned = calm.learn(&SampleRing::holding(&poison), f64::INFINITY, 20);
     assert!(learned.rollbacks > 0 && learned.steps == 0, "{learned:?}");
+    assert_eq!(learned.loss, None, "all of its steps diverged");
     assert_eq!(rms(&*calm, &held_out), before);
 }
 

@@ -244,8 +244,7 @@ impl TracedNodes for BackedNodes {
         };
         let values = self.health.ask(|| self.device.values()).or_else(anew);
         values.unwrap_or_else(|| {
-            // The run is about to end: by the failure, or behind its last frame, where a checkpoint alone asks, and no run goes on from the
-            // values of a table.
+            // The run is about to end: by the failure, or behind its last frame, where a checkpoint alone asks, which is not written then.
             tracing::warn!("the values of a table went with the device");
             vec![f32::NAN; self.nodes.iter().product()]
         })

@@ -106,7 +106,6 @@ pub(super) fn train(
     const SLICE_STEPS: u64 = 32;
     let start = Instant::now();
     let mut sum = Learned::default();
-    let mut losses = (0.0, 0.0);
     while !stop.load(Ordering::Relaxed) {
         let (seconds, steps) = match settings.steps_per_frame {
             Some(steps) if sum.steps >= steps => break,
@@ -124,28 +123,67 @@ pub(super) fn train(
             }
         };
         let slice = live.learn(ring, seconds, steps);
-        sum.dropped += slice.dropped;
-        sum.rollbacks += slice.rollbacks;
-        sum.lost_steps += slice.lost_steps;
-        sum.device_seconds = slice.device_seconds.map(|seconds| seconds + sum.device_seconds.unwrap_or(0.0)).or(sum.device_seconds);
-        sum.warnings.extend(slice.warnings);
-        if slice.steps == 0 {
+        let learns = slice.steps > 0;
+        sum = sum.and(slice);
+        if !learns {
             break;
         }
-        sum.steps += slice.steps;
-        sum.samples += slice.samples;
-        if let Some(loss) = slice.loss.filter(|loss| loss.is_finite()) {
-            losses = (losses.0 + loss * slice.steps as f64, losses.1 + slice.steps as f64);
-        }
     }
-    sum.loss = (losses.1 > 0.0).then(|| losses.0 / losses.1);
-    sum.seconds = start.elapsed().as_secs_f64();
-    sum
+    Learned { seconds: start.elapsed().as_secs_f64(), ..sum }
 }
 
 #[cfg(test)]
 mod tests {
-    use super::Turns;
+    use super::*;
+    use crate::flow::Tracer;
+    use crate::surrogate::{CheckpointError, Draft, Predict};
+
+    /// Learns what it is told to have learned, slice after slice, and then nothing.
+    struct Told(std::vec::IntoIter<Learned>);
+
+    impl Predict for Told {
+        fn name(&self) -> &'static str {
+            "network"
+        }
+        fn predict(&self, _: &[[f32; 3]], _: &mut [f32]) {}
+        fn bytes(&self) -> usize {
+            0
+        }
+    }
+
+    impl Surrogate for Told {
+        fn freeze(&self) -> std::sync::Arc<dyn Predict> {
+            unreachable!("nothing is rendered")
+        }
+        fn learns(&self) -> bool {
+            true
+        }
+        fn learn(&mut self, _: &SampleRing, _: f64, _: u64) -> Learned {
+            self.0.next().unwrap_or_default()
+        }
+        fn window_slid(&mut self, _: &dyn Tracer) {}
+        fn draft(&self) -> Draft {
+            unreachable!("nothing is written")
+        }
+        fn load(&mut self, _: &std::path::Path) -> Result<(), CheckpointError> {
+            Ok(())
+        }
+    }
+
+    /// Samples that are left out stay where they are, and every slice finds them; a slice that was rolled back has a loss all the same.
+    #[test]
+    fn slices_add_up() {
+        let slice = |steps, samples, loss, dropped| Learned { steps, samples, loss, dropped, ..Learned::default() };
+        let rolled_back = Learned { lost_steps: 90, rollbacks: 1, ..slice(0, 200, Some(6.0), 3) };
+        let slices = vec![slice(32, 300, Some(1.0), 3), slice(8, 500, Some(2.0), 2), rolled_back];
+        let settings = TrainingSettings { steps_per_frame: Some(1000), ..TrainingSettings::default() };
+        let (ring, stop) = (SampleRing::new(1), AtomicBool::new(false));
+        let sum = train(&mut Told(slices.into_iter()), &ring, &settings, Until::Seconds(1.0), &stop);
+        assert_eq!((sum.steps, sum.lost_steps, sum.samples, sum.rollbacks, sum.dropped), (40, 90, 1000, 1, 3));
+        // (300 * 1 + 500 * 2 + 200 * 6) / 1000.
+        assert_eq!(sum.loss, Some(2.5));
+        assert!(sum.seconds > 0.0);
+    }
 
     /// However long frames take and however late a turn ends, training gets its share of the time.
     #[test]

@@ -34,6 +34,7 @@ pub use settings::{FlowSettings, StepsSetting};
 #[cfg(feature = "cuda")]
 pub(crate) use sphere::poles;
 pub use steps::Chosen;
+pub(crate) use stretch::log_stretch;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
 pub(crate) use velocity::{angle_slack, bounds};
@@ -261,7 +262,7 @@ pub trait Tracer: Send + Sync {
 pub trait TracedNodes: std::fmt::Debug + Send + Sync {
     /// Nodes whose trace was not finite; they hold 0.
     fn not_finite(&self) -> usize;
-    /// All of them, x fastest, brought to the host.
+    /// All of them, x fastest, brought to the host; NaN where the device is lost, and nobody is left to trace them anew.
     fn values(&self) -> Vec<f32>;
     /// Interpolates multilinearly at unit points; false where the device cannot, and `out` then holds anything.
     fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool;

@@ -48,15 +48,16 @@ impl Draft {
         if let Some(table) = &mut self.table {
             table.leave_device();
         }
+        let lost = |what| move |source| CheckpointError::Lost { path: path.into(), what, source };
         let mut checkpoint = Checkpoint::new(self.kind);
         for (key, text) in &self.notes {
             checkpoint.note(key, text.clone());
         }
         if let Some(table) = &self.table {
-            table.entries(&mut checkpoint);
+            table.entries(&mut checkpoint).map_err(lost("the values of its table"))?;
         }
         if let Some(network) = &self.network {
-            network.entries(&mut checkpoint).map_err(|lost| CheckpointError::Lost { path: path.into(), source: lost })?;
+            network.entries(&mut checkpoint).map_err(lost("the copy of its network"))?;
         }
         checkpoint.write(path)
     }

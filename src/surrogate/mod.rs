@@ -81,9 +81,10 @@ pub struct Learned {
     pub lost_steps: u64,
     /// Samples used, with repetition.
     pub samples: u64,
-    /// Mean training loss over the steps taken, lost ones included (none when no step was taken).
+    /// Mean training loss over the steps taken, lost ones included, but for those at which it diverged (none where no step is left).
     pub loss: Option<f64>,
-    /// Non-finite samples dropped.
+    /// Samples of the ring that were left out, since they are not finite; of several calls that of the one with the most, since each finds
+    /// them anew. Labels that were traced on a device and stay there are left out there, and not counted.
     pub dropped: u64,
     /// Times the weights were rolled back because the loss diverged.
     pub rollbacks: u64,
@@ -98,9 +99,10 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Both together: counts and seconds add up, losses are averaged over their steps.
+    /// Both together: steps, samples and seconds add up, losses are averaged over their samples.
     pub fn and(self, other: Learned) -> Learned {
-        let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.steps + l.lost_steps)));
+        // Not over steps: those that a call lost may be an earlier one's.
+        let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.samples)));
         let weight = (mine.1 + theirs.1) as f64;
         let loss = mine.0 * mine.1 as f64 + theirs.0 * theirs.1 as f64;
         Learned {
@@ -108,7 +110,7 @@ impl Learned {
             lost_steps: self.lost_steps + other.lost_steps,
             samples: self.samples + other.samples,
             loss: (weight > 0.0).then(|| loss / weight),
-            dropped: self.dropped + other.dropped,
+            dropped: self.dropped.max(other.dropped),
             rollbacks: self.rollbacks + other.rollbacks,
             seconds: self.seconds + other.seconds,
             device_seconds: self.device_seconds.map(|mine| mine + other.device_seconds.unwrap_or(0.0)).or(other.device_seconds),
@@ -234,10 +236,12 @@ pub enum CheckpointError {
         expected: String,
     },
     /// Nothing was written.
-    #[error("checkpoint {path}: {source} before its copy had come back")]
+    #[error("checkpoint {path}: {source} before {what} had come back; nothing is written")]
     Lost {
         /// The file.
         path: std::path::PathBuf,
+        /// Of the surrogate, in words.
+        what: &'static str,
         /// What trained.
         source: DeviceLost,
     },

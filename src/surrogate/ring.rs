@@ -1,7 +1,7 @@
 //! The bounded memory of traced samples: newest wins, and labels of a window that has slid on are set aside until a re-test says that
 //! they still hold.
 
-use super::network::mix;
+use super::network::draw;
 use super::{Samples, fresh_stamp};
 use std::ops::Range;
 
@@ -27,7 +27,6 @@ pub struct SampleRing {
     /// Labels of an earlier window.
     stale: Samples,
     pushed: u64,
-    dropped_stale: u64,
     /// Another number whenever samples were moved, which no other ring has.
     epoch: u64,
     /// Times of samples that say nothing of time; none where nobody asks for times.
@@ -38,16 +37,7 @@ impl SampleRing {
     /// An empty ring of at least one sample.
     pub fn new(capacity: usize) -> Self {
         let empty = Samples::default();
-        Self {
-            capacity: capacity.max(1),
-            fresh: empty.clone(),
-            next: 0,
-            stale: empty,
-            pushed: 0,
-            dropped_stale: 0,
-            epoch: fresh_stamp(),
-            now: None,
-        }
+        Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, epoch: fresh_stamp(), now: None }
     }
 
     /// A full ring of these samples.
@@ -114,11 +104,6 @@ impl SampleRing {
         self.pushed
     }
 
-    /// Stale samples dropped because their labels no longer held.
-    pub fn dropped_stale(&self) -> u64 {
-        self.dropped_stale
-    }
-
     /// Takes samples in; stale ones make room first, then the oldest fresh ones. Arrivals and Jacobians are kept when every sample has them; a
     /// push without them, or with them for the first time, starts the ring anew, since half of a flow map cannot be trained on.
     pub fn push(&mut self, samples: &Samples) {
@@ -150,7 +135,6 @@ impl SampleRing {
 
     /// The window slid: all labels are set aside. What had been set aside before is dropped.
     pub fn mark_stale(&mut self) {
-        self.dropped_stale += self.stale.len() as u64;
         self.stale = std::mem::take(&mut self.fresh);
         self.next = 0;
         self.epoch = fresh_stamp();
@@ -171,7 +155,6 @@ impl SampleRing {
         let same = self.fresh.is_empty() || shape(&self.fresh) == shape(&stale);
         let keep = share_holding >= KEEP_STALE && same && !stale.is_empty();
         if !keep {
-            self.dropped_stale += stale.len() as u64;
             return false;
         }
         let room = (self.capacity - self.fresh.len()).min(stale.len());
@@ -179,25 +162,8 @@ impl SampleRing {
             append(&mut self.fresh, &stale, index, None);
         }
         self.epoch = fresh_stamp();
-        self.dropped_stale += (stale.len() - room) as u64;
         true
     }
-
-    /// `count` fresh samples drawn with repetition: a function of the ring's contents, the seed and the counter only.
-    pub fn batch(&self, count: usize, seed: u64, counter: u64) -> Samples {
-        let mut batch = Samples::default();
-        if self.fresh.is_empty() {
-            return batch;
-        }
-        for i in 0..count {
-            append(&mut batch, &self.fresh, draw(seed, counter + i as u64, self.fresh.len()), None);
-        }
-        batch
-    }
-}
-
-fn draw(seed: u64, counter: u64, count: usize) -> usize {
-    ((u128::from(mix(seed, counter)) * count as u128) >> 64) as usize
 }
 
 fn shape(samples: &Samples) -> [bool; 2] {
@@ -262,32 +228,19 @@ mod tests {
             let mut ring = SampleRing::new(10);
             ring.push(&numbered(0..8));
             ring.mark_stale();
-            assert!(ring.is_empty() && ring.batch(4, 1, 0).is_empty());
+            assert!(ring.is_empty() && ring.stale().len() == 8);
             ring.push(&numbered(50..55));
             ring
         };
         // Room for ten: five fresh ones push three of the eight stale ones out.
         let (mut ring, mut dropped) = (half_stale(), half_stale());
         assert_eq!((ring.len(), ring.stale().len()), (5, 5));
-        assert!(labels(&ring.batch(64, 1, 0)).iter().all(|&l| l >= 50));
+        assert_eq!(labels(ring.samples()), (50..55).collect::<Vec<_>>());
         assert_eq!(ring.probe(100, 1, 0).len(), 5);
         assert!(!dropped.revalidate(0.94));
-        assert_eq!((dropped.len(), dropped.dropped_stale()), (5, 5));
+        assert_eq!((dropped.len(), dropped.stale().len()), (5, 0));
         assert!(ring.revalidate(0.96));
         assert_eq!(ring.len(), 10);
-    }
-
-    #[test]
-    fn batches_are_a_function_of_seed_and_counter() {
-        let mut ring = SampleRing::new(1000);
-        ring.push(&numbered(0..1000));
-        let (a, b, c) = (ring.batch(300, 7, 40), ring.batch(300, 7, 40), ring.batch(300, 7, 340));
-        assert_eq!(a.log_stretch, b.log_stretch);
-        assert_ne!(a.log_stretch, c.log_stretch);
-        assert_eq!(ring.batch(100, 7, 140).log_stretch, a.log_stretch[100..200]);
-        let mean = ring.batch(100_000, 7, 0).log_stretch.iter().sum::<f32>() / 1e5;
-        // The mean of 1e5 uniform draws from 0..999 has a deviation of 0.91; five of them.
-        assert!((mean - 499.5).abs() < 4.6, "{mean}");
     }
 
     #[test]

@@ -2,7 +2,7 @@
 
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
-use super::{CheckpointError, Draft, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
+use super::{CheckpointError, DeviceLost, Draft, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
 use crate::flow::{Extras, Traced, TracedNodes, Tracer};
 use rayon::prelude::*;
 use std::path::Path;
@@ -157,10 +157,17 @@ impl Table {
         }
     }
 
-    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
+    /// Adds notes and values, unless those went with the device that held them.
+    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceLost> {
+        let values = self.values();
+        // Nodes without a value hold 0.
+        if values.iter().any(|value| value.is_nan()) {
+            return Err(DeviceLost);
+        }
         checkpoint.note("table.nodes", format!("{:?}", self.nodes));
         checkpoint.note("table.not_finite", self.not_finite.to_string());
-        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], self.values()));
+        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], values));
+        Ok(())
     }
 
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {

@@ -358,12 +358,11 @@ impl Trainer {
             learned.samples += (found.len() * count) as u64;
             let mut diverged = false;
             for (loss, (_, averaged)) in found.into_iter().zip(&planned) {
-                counted += 1;
                 diverged = self.progress.diverges(loss, *first_of_call.get_or_insert(loss), *averaged);
                 if diverged {
                     break;
                 }
-                losses += loss;
+                (losses, counted) = (losses + loss, counted + 1);
                 self.progress.observe(loss, *averaged);
             }
             learned.loss = (counted > 0).then(|| losses / counted as f64);

@@ -176,7 +176,7 @@ impl TrustMap {
         self.just_slid = true;
     }
 
-    /// Forgets everything: tau, direction or the transfer function changed.
+    /// Forgets everything: another surrogate has taken the place of the one that was measured.
     pub fn reset(&mut self) {
         self.cells.fill(Cell::default());
         self.audited.fill(Cell::default());

@@ -29,7 +29,7 @@ pub use architecture::{Architecture, Layer, Level};
 pub(crate) use architecture::{GRID_INPUTS, HASH};
 pub use model::Model;
 pub use module::Network;
-pub(crate) use module::{mix, uniform};
+pub(crate) use module::{draw, uniform};
 pub use objective::{Objective, Scale, signed_exp, signed_log};
 pub use operation::FusedNetwork;
 pub(crate) use predictor::Predictor;
@@ -72,7 +72,9 @@ pub enum Target {
 pub enum Loss {
     /// Mean square of the log-stretch.
     MeanSquare,
-    /// Mean |sign(y) ln(1+|y|) - yhat|^2 with y = FTLE, plus the penalty on the difference of the batch means in linear scale.
+    /// Mean |sign(y) ln(1+|y|) - yhat|^2 with y = FTLE, plus the penalty on the difference of the batch means in linear scale (Xi, Luan and
+    /// Tao, Neural Monte Carlo rendering of finite-time Lyapunov exponent fields, Visual Intelligence 1, 2023, doi
+    /// 10.1007/s44267-023-00014-x; the sign is ours, since FTLE below -1 have no ln(1+y)).
     Published,
 }
 
@@ -118,7 +120,7 @@ pub struct NetworkSettings {
     pub target: Target,
     /// Loss.
     pub loss: Loss,
-    /// Weight of the published penalty on the difference of the batch means.
+    /// Weight of the penalty on the difference of the batch means, of [`Loss::Published`].
     pub mean_penalty: f32,
     /// Adam's rate; None: 1e-2 for hash grids, 1e-3 for frequency encodings (published: 1e-4, for a day of training).
     pub learning_rate: Option<f32>,

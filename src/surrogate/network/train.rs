@@ -6,7 +6,7 @@ use super::architecture::Architecture;
 use super::encode::LINE;
 use super::lanes::{Aligned, prefetch};
 use super::model::{Loan, Model};
-use super::module::{Network, mix};
+use super::module::{Network, draw};
 use super::objective::{Objective, signed_exp};
 use super::tile::{self, Batch, MOST_SAMPLES, OUT, Weights};
 use super::{Loss, Target};
@@ -44,8 +44,7 @@ impl Pick<'_> {
             Pick::InOrder => position,
             Pick::Random { seed, counter, among, hold_out } => {
                 let count = among.map_or(samples, <[u32]>::len);
-                // Multiply-shift: the bias of 2^-64 * count is far below anything that training could notice.
-                let drawn = ((u128::from(mix(seed, counter + position as u64)) * count as u128) >> 64) as usize;
+                let drawn = draw(seed, counter + position as u64, count);
                 let at = |drawn: usize| among.map_or(drawn, |among| among[drawn] as usize);
                 match at(drawn) {
                     // The next one stands in; after the last, or in a list with gaps, that may be a held-out one too: one draw of very many.
@@ -278,8 +277,8 @@ fn split<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
     front
 }
 
-/// The published penalty on the difference of the batch means in linear scale, and the factor of exp|output| in its gradient. It needs the mean
-/// over the whole batch before any gradient, hence a forward pass of its own; only this loss pays for it.
+/// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`Loss::Published`]), and the factor of exp|output|
+/// in its gradient. It needs the mean over the whole batch before any gradient, hence a forward pass of its own; only this loss pays for it.
 fn mean_penalty(
     shape: &Architecture,
     objective: &Objective,

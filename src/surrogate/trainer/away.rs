@@ -207,7 +207,9 @@ impl Trainer {
     /// Takes in what has come back.
     pub(super) fn take_in(&mut self) {
         let Some(away) = &mut self.away else { return };
-        let Some(returning) = away.returning.take() else { return };
+        let Some(mut returning) = away.returning.take() else { return };
+        // Before looking for what has come: who brings it lets go behind that.
+        let is_brought = Arc::get_mut(&mut returning).is_none();
         match returning.arrived() {
             Some(_) if std::mem::take(&mut away.is_disowned) => {}
             Some(Ok(numbers)) => {
@@ -218,8 +220,8 @@ impl Trainer {
                 drop(std::thread::Builder::new().spawn(move || drop(stale)));
             }
             Some(Err(DeviceLost)) => {}
-            // Somebody brings it, or is about to.
-            None if Arc::strong_count(&returning) > 1 => away.returning = Some(returning),
+            // Somebody brings it, or is about to, or just has.
+            None if is_brought => away.returning = Some(returning),
             None => {}
         }
     }
