@@ -8,7 +8,7 @@
 # make install-adapters PREFIX=...   puts them (header, libraries, module, pkg-config file) where a solver's build finds them
 # make test-adapters   their tests against compilers: gfortran, mpicc, Python. What is missing is installed where apt is (gfortran, openmpi-bin,
 #    libopenmpi-dev, python3-venv), or named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv alone
-# make live-figures   takes the figures of docs/live.md that need no GPU and prints their tables; some 20 minutes, with SHORT=1 a minute or two that show only that they run
+# make live-figures   takes the figures of docs/live.md that need no GPU and prints their tables; some 20 minutes, with SHORT=1 a few that show only that they run
 # make header   writes the C header anew from the library's source; a test holds the two to each other
 # make gpu-check   packs tests and benchmarks for a machine with a GPU and, where there is one, runs them and writes what was measured into
 #    docs/; it fails where something was not run or failed
