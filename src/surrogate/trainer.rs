@@ -13,16 +13,16 @@ use super::{
     fresh_stamp,
 };
 use crate::flow::Tracer;
-use away::{Away, Latest, Mean, Sent};
+use device_copy::DeviceCopy;
+use on_device::{Latest, Mean, OnDevice, Sent};
 use progress::Progress;
-use returning::Returning;
 use std::sync::{Arc, OnceLock};
 use std::time::Instant;
 
-mod away;
+mod device_copy;
+mod on_device;
 mod progress;
 mod restart;
-mod returning;
 #[cfg(test)]
 mod tests;
 
@@ -77,7 +77,7 @@ pub(super) struct Trainer {
     kept: Option<Kept>,
     /// Who trains it on a device, and there it is once it has begun.
     offload: Option<Arc<dyn Offload>>,
-    away: Option<Away>,
+    on_device: Option<OnDevice>,
 }
 
 /// A network as it was.
@@ -174,7 +174,7 @@ impl Trainer {
             fused: None,
             kept: None,
             offload: None,
-            away: None,
+            on_device: None,
         })
     }
 
@@ -190,7 +190,7 @@ impl Trainer {
 
     /// Optimizer steps taken so far.
     fn steps(&self) -> usize {
-        self.away.as_ref().map_or_else(|| self.model.steps(), |away| away.steps)
+        self.on_device.as_ref().map_or_else(|| self.model.steps(), |on_device| on_device.steps)
     }
 
     /// Writes the log-stretch (or the residual's part of it) at each point.
@@ -206,7 +206,7 @@ impl Trainer {
             let predictor = Arc::new(Predictor::new(&self.model.shape, &average.layers));
             (average, predictor)
         };
-        match self.away.as_ref().map(|away| away.frozen(here)) {
+        match self.on_device.as_ref().map(|on_device| on_device.frozen(here)) {
             Some(Ok(Latest::There(frozen))) => on_device = Some(frozen),
             Some(Ok(Latest::Here(mean))) => (average, predictor) = mean,
             // What it predicts then is here already: what came back last.
@@ -231,15 +231,15 @@ impl Trainer {
         }
         self.disown_kept();
         self.progress.window_slid();
-        if let Some(away) = &mut self.away {
-            away.training.forget_labels();
+        if let Some(on_device) = &mut self.on_device {
+            on_device.training.forget_labels();
         }
     }
 
     /// The table below is about to be traced anew: its copy with the device goes first, so that they never need memory together.
     pub(super) fn let_go_of_base(&mut self) {
-        if let Some(away) = &mut self.away {
-            away.training.let_go_of_base();
+        if let Some(on_device) = &mut self.on_device {
+            on_device.training.let_go_of_base();
         }
     }
 
@@ -248,9 +248,9 @@ impl Trainer {
         self.disown_kept();
         let head = &self.model.shape.layers[self.model.shape.layers.len() - 1];
         let output = head.weights..head.biases + head.outputs;
-        if let Some(away) = &mut self.away {
-            away.frozen = OnceLock::new();
-            if away.training.zero_layers(output.clone()).is_ok() {
+        if let Some(on_device) = &mut self.on_device {
+            on_device.frozen = OnceLock::new();
+            if on_device.training.zero_layers(output.clone()).is_ok() {
                 return;
             }
             self.lose_device();
@@ -268,7 +268,7 @@ impl Trainer {
         let mut before = None;
         let mut trained = self.train(ring, base, start, seconds, max_steps, &mut learned);
         if let Err(NotTaken::NoRoom(why) | NotTaken::NoRoomForBase(why)) = &trained
-            && let Ok(seconds_there) = self.come_back()
+            && let Ok(seconds_there) = self.move_back()
         {
             before = Some(seconds_there).filter(|&seconds| seconds > 0.0);
             learned.steps = self.steps().saturating_sub(began) as u64;
@@ -283,7 +283,7 @@ impl Trainer {
             learned.steps = self.steps().saturating_sub(began) as u64;
             learned.lost_steps += reached.saturating_sub(self.steps()) as u64;
         }
-        learned.device_seconds = self.away.as_mut().map(|away| away.training.device_seconds()).or(before);
+        learned.device_seconds = self.on_device.as_mut().map(|on_device| on_device.training.device_seconds()).or(before);
         learned.seconds = start.elapsed().as_secs_f64();
         learned
     }
@@ -305,23 +305,23 @@ impl Trainer {
         }
         // Its mean and deviation go with it for good, so not before there are any.
         if self.standardised {
-            self.go_away(ring.capacity(), learned);
+            self.move_to_device(ring.capacity(), learned);
         }
         let sieved;
-        let Brought { usable, dropped } = if let Some(away) = &mut self.away {
-            if let Some(why) = away.full.get() {
+        let Brought { usable, dropped } = if let Some(on_device) = &mut self.on_device {
+            if let Some(why) = on_device.full.get() {
                 return Err(NotTaken::NoRoom(why.clone()));
             }
-            match away.training.bring(ring, base) {
-                Err(NotTaken::NoRoomForBase(why)) if away.idle_calls < IDLE_CALLS => {
-                    if away.idle_calls == 0 {
+            match on_device.training.bring(ring, base) {
+                Err(NotTaken::NoRoomForBase(why)) if on_device.idle_calls < IDLE_CALLS => {
+                    if on_device.idle_calls == 0 {
                         learned.warnings.push(format!("the network learns nothing for up to {IDLE_CALLS} turns of training: {why}"));
                     }
-                    away.idle_calls += 1;
+                    on_device.idle_calls += 1;
                     return Ok(());
                 }
                 brought => {
-                    away.idle_calls = 0;
+                    on_device.idle_calls = 0;
                     brought?
                 }
             }
@@ -391,10 +391,10 @@ impl Trainer {
     /// Steps to take before the clock is looked at again, with so many seconds left.
     fn group(&self, left: f64) -> u64 {
         let [most, first] = GROUP;
-        match &self.away {
+        match &self.on_device {
             None => 1,
-            Some(away) if away.step_seconds == 0.0 => first,
-            Some(away) => ((left / away.step_seconds) as u64).clamp(1, most),
+            Some(on_device) if on_device.step_seconds == 0.0 => first,
+            Some(on_device) => ((left / on_device.step_seconds) as u64).clamp(1, most),
         }
     }
 
@@ -415,13 +415,13 @@ impl Trainer {
 
     /// Takes the steps, wherever the network is; the loss of each, before it.
     fn take(&mut self, planned: &[(PlannedStep, u64)], labels: Labels<'_>) -> Result<Vec<f64>, NotTaken> {
-        if let Some(away) = &mut self.away {
+        if let Some(on_device) = &mut self.on_device {
             let begin = Instant::now();
             let steps: Vec<PlannedStep> = planned.iter().map(|(step, _)| *step).collect();
-            away.frozen = OnceLock::new();
-            let losses = away.training.steps(&steps)?;
-            away.steps += steps.len();
-            away.step_seconds = begin.elapsed().as_secs_f64() / steps.len() as f64;
+            on_device.frozen = OnceLock::new();
+            let losses = on_device.training.steps(&steps)?;
+            on_device.steps += steps.len();
+            on_device.step_seconds = begin.elapsed().as_secs_f64() / steps.len() as f64;
             return Ok(losses);
         }
         let Self { model, objective, average, fused, settings, .. } = self;
@@ -437,13 +437,13 @@ impl Trainer {
     /// After the last step of a call: what predicts is up to date, and every minute or so it comes back from where it is trained.
     fn settle(&mut self, learned: &mut Learned) -> Result<(), DeviceLost> {
         let restart = self.settings.averaging == 0.0 || self.progress.averaged < AVERAGE_EVERY;
-        if let Some(away) = &mut self.away {
+        if let Some(on_device) = &mut self.on_device {
             if restart {
-                away.training.restart_average()?;
+                on_device.training.restart_average()?;
             }
             self.take_in();
-            let Some(away) = &self.away else { return Ok(()) };
-            let due = away.fetched_at.elapsed().as_secs_f64() >= away.apart();
+            let Some(on_device) = &self.on_device else { return Ok(()) };
+            let due = on_device.fetched_at.elapsed().as_secs_f64() >= on_device.apart();
             return if due { self.fetch(learned) } else { Ok(()) };
         }
         if restart {
@@ -456,8 +456,8 @@ impl Trainer {
     /// Copies the present weights as what to come back to.
     fn keep(&mut self) -> Result<(), NotTaken> {
         let (steps, progress) = (self.steps(), self.progress);
-        if let Some(away) = &mut self.away {
-            away.training.keep()?;
+        if let Some(on_device) = &mut self.on_device {
+            on_device.training.keep()?;
             self.kept = Some(Kept { steps, progress, here: None, is_stale: false });
             return Ok(());
         }
@@ -486,11 +486,11 @@ impl Trainer {
     fn roll_back(&mut self) -> Result<(), DeviceLost> {
         let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
         let Some(kept) = self.kept.as_ref().filter(|kept| !kept.is_stale) else { return Ok(()) };
-        match (&mut self.away, &kept.here) {
-            (Some(away), _) => {
-                away.training.roll_back()?;
-                (away.steps, away.frozen) = (kept.steps, OnceLock::new());
-                away.is_disowned = away.returning.is_some();
+        match (&mut self.on_device, &kept.here) {
+            (Some(on_device), _) => {
+                on_device.training.roll_back()?;
+                (on_device.steps, on_device.frozen) = (kept.steps, OnceLock::new());
+                on_device.is_disowned = on_device.device_copy.is_some();
             }
             (None, Some((state, average))) => {
                 self.model.set_state(state.clone(), kept.steps);
@@ -505,13 +505,13 @@ impl Trainer {
     /// The network as it is now, wherever it is; as it last came back, where the device is lost.
     fn present(&self) -> (Model, Arc<Average>, Progress) {
         let (mut model, last) = (self.model.clone(), self.average.clone());
-        let Some(away) = &self.away else { return (model, last, self.progress) };
+        let Some(on_device) = &self.on_device else { return (model, last, self.progress) };
         let mut average = Average::clone(&last);
-        let returning = away.returning.as_ref().filter(|_| !away.is_disowned);
-        match (away.training.fetch(&mut model, &mut average), returning.and_then(|r| Some((r.progress, r.arrived()?)))) {
+        let device_copy = on_device.device_copy.as_ref().filter(|_| !on_device.is_disowned);
+        match (on_device.training.fetch(&mut model, &mut average), device_copy.and_then(|r| Some((r.progress, r.ready()?)))) {
             (Ok(()), _) => (model, Arc::new(average), self.progress),
             (Err(DeviceLost), Some((progress, Ok(numbers)))) => (numbers.model.clone(), numbers.average.clone(), progress),
-            (Err(DeviceLost), _) => (self.model.clone(), last, away.fetched),
+            (Err(DeviceLost), _) => (self.model.clone(), last, on_device.fetched),
         }
     }
 }

@@ -188,16 +188,15 @@ impl<'a> Reference<'a> {
             self.add_gradient(&mut to, row(samples.points[i], samples.times[i]), target, kernel, &mut rounding.of(i));
             to
         };
-        let mut all = (0..samples.len()).into_par_iter().with_min_len(50).fold(zeros, of_one).reduce(zeros, sum);
+        let mut all = (0..samples.len()).into_par_iter().with_min_len(samples.len().div_ceil(16)).fold(zeros, of_one).reduce(zeros, sum);
         all.iter_mut().for_each(|g| *g /= samples.len() as f64);
         all
     }
 
-    /// Adds the gradient of one sample's squared error.
-    fn add_gradient(&self, to: &mut [f64], row: Row, target: f64, kernel: Kernel, rounding: &mut Rounding) {
-        let (shape, between, x) = (self.shape, self.between, self.inputs(row));
-        // What goes into each layer. ReLU passes what is not 0 after it was rounded.
-        let mut values = vec![self.encoded(&x).swap_remove(0)];
+    /// What goes into each layer, and the outputs last. ReLU passes what is not 0 after it was rounded.
+    fn values(&self, x: &[f32], rounding: &mut Rounding) -> Vec<Vec<f64>> {
+        let (shape, between) = (self.shape, self.between);
+        let mut values = vec![self.encoded(x).swap_remove(0)];
         values[0].iter_mut().for_each(|v| *v = between(*v + rounding.off(v.abs())));
         for (number, layer) in shape.layers.iter().enumerate() {
             let mut sums = self.layers[layer.biases..layer.biases + layer.outputs].to_vec();
@@ -214,6 +213,19 @@ impl<'a> Reference<'a> {
             }
             values.push(sums);
         }
+        values
+    }
+
+    /// The only output at each point, its sums off by `rounding`.
+    pub fn rounded_outputs(&self, rows: &[Row], rounding: Rounding) -> Vec<f64> {
+        let of_one = |(i, row): (usize, &Row)| self.values(&self.inputs(*row), &mut rounding.of(i))[self.shape.layers.len()][0];
+        rows.par_iter().enumerate().map(of_one).collect()
+    }
+
+    /// Adds the gradient of one sample's squared error.
+    fn add_gradient(&self, to: &mut [f64], row: Row, target: f64, kernel: Kernel, rounding: &mut Rounding) {
+        let (shape, between, x) = (self.shape, self.between, self.inputs(row));
+        let values = self.values(&x, rounding);
         let slope = 2.0 * (values[shape.layers.len()][0] - target);
         let (tables, layers) = to.split_at_mut(self.tables.len());
         // With respect to the sums of the layer at hand: as it is, and as it is multiplied.
@@ -276,7 +288,7 @@ impl Rounding {
 }
 
 /// What the output is to be.
-fn target(objective: &Objective, log_stretch: f32) -> f64 {
+pub fn target(objective: &Objective, log_stretch: f32) -> f64 {
     let s = f64::from(log_stretch);
     match objective.loss {
         Loss::MeanSquare => (s - f64::from(objective.scale.mean[0])) / f64::from(objective.scale.deviation[0]),

@@ -89,14 +89,14 @@ impl LabelPool {
 }
 
 /// What learns from the labels of one frame.
-pub(super) struct Pupil<'a> {
+pub(super) struct LabelSink<'a> {
     pool: &'a LabelPool,
     domain: &'a Domain,
     base: Option<&'a DeviceTable>,
     times: [f32; 2],
 }
 
-impl DeviceLearns for Pupil<'_> {
+impl DeviceLearns for LabelSink<'_> {
     unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError> {
         let (writer, mut samples) = (&self.pool.writer, self.pool.samples());
         let labels = match writer.target() {
@@ -339,8 +339,8 @@ impl CudaNetwork {
     }
 
     /// Who learns from what a frame traces at these unit times, beyond `base`.
-    pub(super) fn pupil<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>, times: [f32; 2]) -> Option<Pupil<'a>> {
-        self.pool.as_ref().map(|pool| Pupil { pool, domain, base, times })
+    pub(super) fn label_sink<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>, times: [f32; 2]) -> Option<LabelSink<'a>> {
+        self.pool.as_ref().map(|pool| LabelSink { pool, domain, base, times })
     }
 
     pub(super) fn network(&self) -> &DeviceNetwork {

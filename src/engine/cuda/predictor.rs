@@ -1,6 +1,6 @@
 //! What predicts on the device what a surrogate predicts: tables and networks that are there, and copies of those that are not.
 
-use super::offload::{CudaNetwork, LabelPool, Pupil};
+use super::offload::{CudaNetwork, LabelPool, LabelSink};
 use super::{CudaTracer, DeviceError, DeviceLearns, DeviceNetwork, DevicePredict, DeviceTable, Gpu, NetworkAbove};
 use crate::field::Domain;
 use crate::flow::Tracer;
@@ -57,13 +57,13 @@ impl TableCopy {
 pub(super) enum Predictor<'a> {
     Table(&'a DeviceTable),
     /// And who learns from what is traced, where the network is trained here.
-    Network(NetworkAbove<'a>, Option<Pupil<'a>>),
+    Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
 }
 
 impl Predictor<'_> {
-    pub(super) fn pupil(&self) -> Option<&dyn DeviceLearns> {
+    pub(super) fn label_sink(&self) -> Option<&dyn DeviceLearns> {
         match self {
-            Self::Network(_, Some(pupil)) => Some(pupil),
+            Self::Network(_, Some(sink)) => Some(sink),
             _ => None,
         }
     }
@@ -119,8 +119,8 @@ impl Predictors {
             Some((table, share)) => Some((below.of(gpu, tracer.domain(), table)?, share)),
             None => None,
         };
-        let pupil = there.and_then(|there| there.pupil(tracer.domain(), base.map(|(table, _)| table), state.times));
-        Ok(Some(Predictor::Network(network.above(base).at(state.times), pupil)))
+        let sink = there.and_then(|there| there.label_sink(tracer.domain(), base.map(|(table, _)| table), state.times));
+        Ok(Some(Predictor::Network(network.above(base).at(state.times), sink)))
     }
 }
 

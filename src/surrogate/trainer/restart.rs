@@ -3,7 +3,7 @@
 use super::super::checkpoint::{Checkpoint, Entry};
 use super::super::network::{Average, Model};
 use super::super::{CheckpointError, DeviceLost};
-use super::{Progress, Returning, Sent, Trainer};
+use super::{DeviceCopy, Progress, Sent, Trainer};
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -15,7 +15,7 @@ pub(in crate::surrogate) struct NetworkDraft {
 
 enum Source {
     Here(Box<Model>, Arc<Average>),
-    Returning(Arc<Returning>),
+    DeviceCopy(Arc<DeviceCopy>),
 }
 
 impl NetworkDraft {
@@ -26,7 +26,7 @@ impl NetworkDraft {
         }
         let (model, average) = match &self.numbers {
             Source::Here(model, average) => (&**model, &**average),
-            Source::Returning(returning) => returning.bring().map(|numbers| (&numbers.model, &*numbers.average))?,
+            Source::DeviceCopy(device_copy) => device_copy.fetch().map(|numbers| (&numbers.model, &*numbers.average))?,
         };
         checkpoint.note("network.steps", model.steps().to_string());
         let (entries, features) = (model.shape.table_entries(), model.shape.features);
@@ -59,16 +59,16 @@ impl Trainer {
     /// The same without waiting, where the device has room for a copy; otherwise with the reason. None while an earlier one is on its way.
     pub(in crate::surrogate) fn draft_behind(&mut self) -> Option<(NetworkDraft, Option<String>)> {
         let begin = Instant::now();
-        if self.away.is_none() {
+        if self.on_device.is_none() {
             return Some((self.draft(), None));
         }
         match self.send_for() {
             Ok(Sent::Before) => None,
-            Ok(Sent::For(returning)) => {
-                if let Some(away) = &mut self.away {
-                    (away.fetched_at, away.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
+            Ok(Sent::For(device_copy)) => {
+                if let Some(on_device) = &mut self.on_device {
+                    (on_device.fetched_at, on_device.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
                 }
-                Some((NetworkDraft { notes: self.notes(self.progress), numbers: Source::Returning(returning) }, None))
+                Some((NetworkDraft { notes: self.notes(self.progress), numbers: Source::DeviceCopy(device_copy) }, None))
             }
             Ok(Sent::NoRoom(why)) => Some((self.draft(), Some(why))),
             // What came back last; training goes on from that too.
@@ -153,7 +153,7 @@ impl Trainer {
         self.model.set_state(state, steps);
         self.objective.scale = scale;
         // Where a device trains it, it goes over again with the next step.
-        (self.progress, self.standardised, self.kept, self.away) = (progress, standardised, None, None);
+        (self.progress, self.standardised, self.kept, self.on_device) = (progress, standardised, None, None);
         self.average = Arc::new(Average { tables, layers });
         self.pack();
         Ok(())

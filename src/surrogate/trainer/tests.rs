@@ -99,7 +99,7 @@ fn a_network_that_is_waited_for_every_minute_is_told_of_once() {
     let told: Vec<Vec<String>> = (0..4)
         .map(|call| {
             if call >= 2 {
-                trainer.away.as_mut().unwrap().fetched_at -= Duration::from_secs(61);
+                trainer.on_device.as_mut().unwrap().fetched_at -= Duration::from_secs(61);
             }
             trainer.learn(&ring, None, f64::INFINITY, 3).warnings
         })

@@ -1,8 +1,8 @@
-//! A network that is away: a device trains it. How it goes there, how what it has learned comes back, and what is left where the device is lost.
+//! A network that a device trains: how it goes there, how what it has learned comes back, and what is left where the device is lost.
 
 use super::super::network::{Average, Predictor};
 use super::super::{Copied, DeviceLost, Learned, NotTaken, OffloadedNetwork, OffloadedTraining};
-use super::returning::{Numbers, Returning};
+use super::device_copy::{DeviceCopy, Numbers};
 use super::{Progress, Trainer, trained_here};
 use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
@@ -16,7 +16,7 @@ const FETCH_APART: f64 = 100.0;
 const FETCH_LIMIT: Duration = Duration::from_secs(5);
 
 /// A network that a device trains.
-pub(super) struct Away {
+pub(super) struct OnDevice {
     pub(super) training: Box<dyn OffloadedTraining>,
     /// Optimizer steps taken so far, those before it went there included.
     pub(super) steps: usize,
@@ -26,10 +26,10 @@ pub(super) struct Away {
     pub(super) fetched_at: Instant,
     pub(super) fetch_seconds: f64,
     /// On its way back, for the thread here, or for a checkpoint.
-    pub(super) returning: Option<Arc<Returning>>,
+    pub(super) device_copy: Option<Arc<DeviceCopy>>,
     /// It holds weights that were rolled back since.
     pub(super) is_disowned: bool,
-    brings: Option<JoinHandle<()>>,
+    fetcher: Option<JoinHandle<()>>,
     /// Wall-clock seconds of a step, as of the latest ones; 0 before the first.
     pub(super) step_seconds: f64,
     /// What it predicts since the latest step.
@@ -42,11 +42,11 @@ pub(super) struct Away {
     told_of_waiting: bool,
 }
 
-impl Drop for Away {
+impl Drop for OnDevice {
     /// The device had better not be closed under a copy; but one that hangs is not waited for.
     fn drop(&mut self) {
         let begin = Instant::now();
-        while self.brings.as_ref().is_some_and(|thread| !thread.is_finished()) && begin.elapsed() < FETCH_LIMIT {
+        while self.fetcher.as_ref().is_some_and(|thread| !thread.is_finished()) && begin.elapsed() < FETCH_LIMIT {
             std::thread::sleep(Duration::from_millis(1));
         }
     }
@@ -66,14 +66,14 @@ pub(super) type Mean = (Arc<Average>, Arc<Predictor>);
 
 /// What sending for a network came to.
 pub(super) enum Sent {
-    For(Arc<Returning>),
+    For(Arc<DeviceCopy>),
     /// What was sent for before is still on its way.
     Before,
     /// The device has no memory for a copy; why.
     NoRoom(String),
 }
 
-impl Away {
+impl OnDevice {
     /// Seconds after which it comes back again.
     pub(super) fn apart(&self) -> f64 {
         FETCH_EVERY.max(FETCH_APART * self.fetch_seconds)
@@ -98,8 +98,8 @@ impl Away {
 
 impl Trainer {
     /// Brings the network to the device that is to train it, once; where that does not take it, training stays here.
-    pub(super) fn go_away(&mut self, ring: usize, learned: &mut Learned) {
-        if self.away.is_some() {
+    pub(super) fn move_to_device(&mut self, ring: usize, learned: &mut Learned) {
+        if self.on_device.is_some() {
             return;
         }
         let Some(offload) = &self.offload else { return };
@@ -115,15 +115,15 @@ impl Trainer {
             }
         };
         self.kept = None;
-        self.away = Some(Away {
+        self.on_device = Some(OnDevice {
             training,
             steps: self.model.steps(),
             fetched: self.progress,
             fetched_at: Instant::now(),
             fetch_seconds: 0.0,
-            returning: None,
+            device_copy: None,
             is_disowned: false,
-            brings: None,
+            fetcher: None,
             step_seconds: 0.0,
             frozen: OnceLock::new(),
             full: OnceLock::new(),
@@ -133,18 +133,18 @@ impl Trainer {
     }
 
     /// Goes on here, with all that was learned: the device works, but lacks memory. Device seconds of steps, not yet told.
-    pub(super) fn come_back(&mut self) -> Result<f64, DeviceLost> {
+    pub(super) fn move_back(&mut self) -> Result<f64, DeviceLost> {
         self.fetch_now()?;
-        let seconds = self.away.as_mut().map_or(0.0, |away| away.training.device_seconds());
-        (self.offload, self.kept, self.away) = (None, None, None);
+        let seconds = self.on_device.as_mut().map_or(0.0, |on_device| on_device.training.device_seconds());
+        (self.offload, self.kept, self.on_device) = (None, None, None);
         Ok(seconds)
     }
 
     /// Brings back what a device has learned, and waits for it.
     fn fetch_now(&mut self) -> Result<(), DeviceLost> {
-        let Some(away) = &mut self.away else { return Ok(()) };
-        away.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
-        away.fetched = self.progress;
+        let Some(on_device) = &mut self.on_device else { return Ok(()) };
+        on_device.training.fetch(&mut self.model, Arc::make_mut(&mut self.average))?;
+        on_device.fetched = self.progress;
         self.pack();
         Ok(())
     }
@@ -154,8 +154,8 @@ impl Trainer {
         self.offload = None;
         self.kept = None;
         self.take_in();
-        if let Some(away) = self.away.take() {
-            self.progress = Progress { drawn: self.progress.drawn, ..away.fetched };
+        if let Some(on_device) = self.on_device.take() {
+            self.progress = Progress { drawn: self.progress.drawn, ..on_device.fetched };
         }
     }
 
@@ -164,12 +164,12 @@ impl Trainer {
         let begin = Instant::now();
         let mut waited_for = None;
         match self.send_for()? {
-            Sent::For(returning) => {
+            Sent::For(device_copy) => {
                 let name = "ridgewatch-fetch".to_owned();
                 // What fails there is told where it happens. Without a thread nothing comes back this time.
-                let brings = std::thread::Builder::new().name(name).spawn(move || drop(returning.bring().cloned())).ok();
-                if let Some(away) = &mut self.away {
-                    away.brings = brings;
+                let fetcher = std::thread::Builder::new().name(name).spawn(move || drop(device_copy.fetch().cloned())).ok();
+                if let Some(on_device) = &mut self.on_device {
+                    on_device.fetcher = fetcher;
                 }
             }
             Sent::Before => return Ok(()),
@@ -178,13 +178,13 @@ impl Trainer {
                 waited_for = Some(why);
             }
         }
-        let Some(away) = &mut self.away else { return Ok(()) };
-        (away.fetched_at, away.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
-        if let Some(why) = waited_for.filter(|_| !std::mem::replace(&mut away.told_of_waiting, true)) {
+        let Some(on_device) = &mut self.on_device else { return Ok(()) };
+        (on_device.fetched_at, on_device.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
+        if let Some(why) = waited_for.filter(|_| !std::mem::replace(&mut on_device.told_of_waiting, true)) {
             learned.warnings.push(format!(
                 "training waited {:.2} s for the network to come back from the GPU, this time and every {:.0} s or so: {why}",
-                away.fetch_seconds,
-                away.apart()
+                on_device.fetch_seconds,
+                on_device.apart()
             ));
         }
         Ok(())
@@ -193,35 +193,35 @@ impl Trainer {
     /// Has the device copy what it has learned.
     pub(super) fn send_for(&mut self) -> Result<Sent, DeviceLost> {
         self.take_in();
-        let Some(away) = self.away.as_mut().filter(|away| away.returning.is_none()) else { return Ok(Sent::Before) };
-        Ok(match away.training.copy()? {
+        let Some(on_device) = self.on_device.as_mut().filter(|on_device| on_device.device_copy.is_none()) else { return Ok(Sent::Before) };
+        Ok(match on_device.training.copy()? {
             Copied::NoRoom(why) => Sent::NoRoom(why),
             Copied::There(copy) => {
-                let returning = Returning::new(copy, self.model.clone(), self.progress);
-                away.is_disowned = false;
-                Sent::For(away.returning.insert(returning).clone())
+                let device_copy = DeviceCopy::new(copy, self.model.clone(), self.progress);
+                on_device.is_disowned = false;
+                Sent::For(on_device.device_copy.insert(device_copy).clone())
             }
         })
     }
 
     /// Takes in what has come back.
     pub(super) fn take_in(&mut self) {
-        let Some(away) = &mut self.away else { return };
-        let Some(mut returning) = away.returning.take() else { return };
-        // Before looking for what has come: who brings it lets go behind that.
-        let is_brought = Arc::get_mut(&mut returning).is_none();
-        match returning.arrived() {
-            Some(_) if std::mem::take(&mut away.is_disowned) => {}
+        let Some(on_device) = &mut self.on_device else { return };
+        let Some(mut device_copy) = on_device.device_copy.take() else { return };
+        // Before looking for what has come: whoever fetches it lets go of it afterwards.
+        let is_fetched_elsewhere = Arc::get_mut(&mut device_copy).is_none();
+        match device_copy.ready() {
+            Some(_) if std::mem::take(&mut on_device.is_disowned) => {}
             Some(Ok(numbers)) => {
                 let Numbers { model, average, predictor } = numbers.clone();
                 let stale = (std::mem::replace(&mut self.model, model), std::mem::replace(&mut self.average, average));
-                (self.predictor, away.fetched) = (predictor, returning.progress);
+                (self.predictor, on_device.fetched) = (predictor, device_copy.progress);
                 // To give hundreds of megabytes back to the system takes as long as a frame.
                 drop(std::thread::Builder::new().spawn(move || drop(stale)));
             }
             Some(Err(DeviceLost)) => {}
-            // Somebody brings it, or is about to, or just has.
-            None if is_brought => away.returning = Some(returning),
+            // Somebody fetches it, or is about to, or just has.
+            None if is_fetched_elsewhere => on_device.device_copy = Some(device_copy),
             None => {}
         }
     }

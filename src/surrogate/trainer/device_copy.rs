@@ -14,7 +14,7 @@ pub(super) struct Numbers {
 }
 
 /// A copy that a device made, and its numbers once somebody has brought them back.
-pub(super) struct Returning {
+pub(super) struct DeviceCopy {
     /// How far the network was.
     pub(super) progress: Progress,
     /// With a network of its shape.
@@ -22,13 +22,13 @@ pub(super) struct Returning {
     numbers: OnceLock<Result<Numbers, DeviceLost>>,
 }
 
-impl Returning {
+impl DeviceCopy {
     pub(super) fn new(copy: Box<dyn OffloadedCopy>, shaped: Model, progress: Progress) -> Arc<Self> {
         Arc::new(Self { progress, copy: Mutex::new(Some((copy, shaped))), numbers: OnceLock::new() })
     }
 
     /// Brings the numbers back, or waits for the thread that is about to.
-    pub(super) fn bring(&self) -> Result<&Numbers, DeviceLost> {
+    pub(super) fn fetch(&self) -> Result<&Numbers, DeviceLost> {
         let bring = || {
             let taken = self.copy.lock().unwrap_or_else(PoisonError::into_inner).take();
             // Taken before, by a thread that did not come to its end.
@@ -42,7 +42,7 @@ impl Returning {
     }
 
     /// The numbers, where they are back.
-    pub(super) fn arrived(&self) -> Option<Result<&Numbers, DeviceLost>> {
+    pub(super) fn ready(&self) -> Option<Result<&Numbers, DeviceLost>> {
         self.numbers.get().map(|numbers| numbers.as_ref().map_err(|lost| *lost))
     }
 }
