@@ -166,7 +166,7 @@ test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) build --release --bin ridgewatch --example live_window
 	scripts/live-mpi-check
 
-live-figures: packages adapters
+live-figures: packages adapter-packages adapters
 	$(CARGO) build --release --bin ridgewatch --example subscriber --example live_window
 	scripts/live-figures $(if $(SHORT),--short)
 

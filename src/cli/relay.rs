@@ -57,10 +57,11 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let (stop, counts) = (Arc::new(AtomicBool::new(false)), Arc::new(RelayCounts::default()));
     let runtime =
         tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
+    let connection = ConnectionFile { address: format!("{host}:{port}"), key: key.clone() };
     let served = runtime.block_on(async {
         // Before the file is there, so that no signal leaves it behind.
         let signals = super::replay::watch_signals(stop.clone(), Arc::default()).map(tokio::spawn);
-        ConnectionFile { address: format!("{host}:{port}"), key: key.clone() }.write(&options.connection)?;
+        connection.write(&options.connection)?;
         messages::note(format_args!(
             "relaying {} at {host}:{port}; on the other node: ridgewatch attach {}",
             ring.display(),
@@ -75,7 +76,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         anyhow::Ok(served)
     })?;
     // Whoever reads it later would wait for nobody.
-    let _ = std::fs::remove_file(&options.connection);
+    connection.remove(&options.connection);
     served.context("the relay stopped unexpectedly")??;
     if common.json {
         let count = |c: &std::sync::atomic::AtomicU64| c.load(Ordering::Relaxed);

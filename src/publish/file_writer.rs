@@ -181,21 +181,21 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
         let statistics = &mut state.statistics;
         let mut trouble = None;
         match appended {
-            Ok(removed) => {
-                if removed > 0 && statistics.records_removed == 0 {
-                    tracing::warn!(
-                        "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so",
-                        folder.path().display()
-                    );
-                }
-                statistics.records_written += 1;
-                statistics.records_removed += removed;
-            }
+            Ok(()) => statistics.records_written += 1,
             Err(error) => {
                 statistics.records_lost += 1;
                 trouble = Some(error);
             }
         }
+        // Whether the record could be written then or not.
+        let removed = folder.records_removed();
+        if removed > 0 && statistics.records_removed == 0 {
+            tracing::warn!(
+                "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so",
+                folder.path().display()
+            );
+        }
+        statistics.records_removed = removed;
         match pictured {
             Some(Ok(written)) => {
                 statistics.pictures_written += 1;

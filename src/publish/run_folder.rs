@@ -45,6 +45,8 @@ pub struct RunFolder {
     complete: u64,
     /// Lines in it, and in `records-1.jsonl`.
     lines: [u64; 2],
+    /// Records of files that newer ones took the places of.
+    records_removed: u64,
     /// Pictures that are there, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
@@ -149,6 +151,7 @@ impl RunFolder {
             records,
             complete: 0,
             lines: [0; 2],
+            records_removed: 0,
             kept: VecDeque::new(),
             kept_bytes: 0,
             previous: Some(aside).filter(|a| a.exists()),
@@ -176,13 +179,15 @@ impl RunFolder {
     }
 
     /// Appends one line to `records.jsonl`; where that would take it beyond half of `most_bytes`, the file becomes `records-1.jsonl` first, in the place of
-    /// the one before. Returns how many records went with that. After an error the file still ends with a complete line.
-    pub fn append_record(&mut self, record: &FrameRecord, most_bytes: Option<u64>) -> io::Result<u64> {
+    /// the one before. After an error the file still ends with a complete line.
+    pub fn append_record(&mut self, record: &FrameRecord, most_bytes: Option<u64>) -> io::Result<()> {
         let mut line = serde_json::to_vec(record)?;
         line.push(b'\n');
         self.trim()?;
         let full = most_bytes.is_some_and(|most| self.complete > 0 && self.complete + line.len() as u64 > most / 2);
-        let removed = if full { self.begin_records_anew()? } else { 0 };
+        if full {
+            self.begin_records_anew()?;
+        }
         match self.records.write_all(&line) {
             Ok(()) => {
                 self.complete += line.len() as u64;
@@ -192,7 +197,7 @@ impl RunFolder {
                 {
                     tracing::warn!("{}: cannot be removed: {error}", previous.display());
                 }
-                Ok(removed)
+                Ok(())
             }
             Err(error) => {
                 // If this fails as well, the next append tries again before it writes.
@@ -202,22 +207,26 @@ impl RunFolder {
         }
     }
 
-    /// Makes `records.jsonl` the older file; returns how many records that cost. An attempt that failed half-way is gone on with.
-    fn begin_records_anew(&mut self) -> io::Result<u64> {
+    /// Records that went with files in whose place newer ones were put.
+    pub fn records_removed(&self) -> u64 {
+        self.records_removed
+    }
+
+    /// Makes `records.jsonl` the older file. An attempt that failed half-way is gone on with.
+    fn begin_records_anew(&mut self) -> io::Result<()> {
         let (path, older) = (self.path.join(RECORDS), self.path.join(OLDER_RECORDS));
-        let removed = match fs::rename(&path, &older) {
+        match fs::rename(&path, &older) {
             Ok(()) => {
-                let [newer, removed] = self.lines;
-                self.lines = [0, newer];
-                removed
+                self.records_removed += self.lines[1];
+                self.lines = [0, self.lines[0]];
             }
             // It was renamed before, or somebody took it away.
-            Err(error) if error.kind() == io::ErrorKind::NotFound => 0,
+            Err(error) if error.kind() == io::ErrorKind::NotFound => self.lines[0] = 0,
             Err(error) => return Err(error),
-        };
+        }
         self.records = OpenOptions::new().append(true).create_new(true).open(&path)?;
         self.complete = 0;
-        Ok(removed)
+        Ok(())
     }
 
     /// Cuts off what a failed append left behind.
@@ -473,8 +482,11 @@ mod tests {
         let line = fs::metadata(folder.path().join(RECORDS)).unwrap().len();
         // Three lines a file, numbers of as many digits.
         let cap = Some(2 * (3 * line + line / 2));
-        let removed: Vec<u64> = (101..112).map(|n| run.append_record(&frame(n).record, cap).unwrap()).collect();
-        assert_eq!(removed, [0, 0, 0, 0, 0, 3, 0, 0, 3, 0, 0]);
+        let mut appended = |n| {
+            run.append_record(&frame(n).record, cap).unwrap();
+            run.records_removed()
+        };
+        assert_eq!((101..112).map(&mut appended).collect::<Vec<_>>(), [0, 0, 0, 0, 0, 3, 3, 3, 6, 6, 6]);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![106, 107, 108], vec![109, 110, 111]));
         // A file that cannot be begun is a record lost, and told; nothing else is lost by it.
         let (records, away) = (folder.path().join(RECORDS), folder.path().join("away"));
@@ -482,7 +494,8 @@ mod tests {
         fs::create_dir(folder.path().join(OLDER_RECORDS)).unwrap();
         assert!(run.append_record(&frame(112).record, cap).is_err() && records.exists());
         fs::remove_dir(folder.path().join(OLDER_RECORDS)).unwrap();
-        assert_eq!(run.append_record(&frame(113).record, cap).unwrap(), 3);
+        run.append_record(&frame(113).record, cap).unwrap();
+        assert_eq!(run.records_removed(), 9);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![109, 110, 111], vec![113]));
         // Both are of the run: no other takes the folder, one that takes its place takes theirs.
         fs::remove_file(&records).unwrap();

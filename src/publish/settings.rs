@@ -103,7 +103,7 @@ impl Default for PublishSettings {
 const LIVE_FRAMES: usize = 100;
 /// Bytes of its records: some 700,000 of them.
 const LIVE_RECORDS: u64 = 1 << 30;
-/// Least cap on the bytes of records, which are a few kilobytes each.
+/// Least cap on the bytes of records, which are one or two kilobytes each.
 const LEAST_RECORDS: u64 = 1 << 20;
 
 impl PublishSettings {

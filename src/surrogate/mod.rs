@@ -74,7 +74,8 @@ impl Samples {
 /// What one call of [`Surrogate::learn`] did.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
-    /// Optimizer steps taken, without those lost by roll-backs.
+    /// Optimizer steps taken, without those that the same call lost by roll-backs; a frame may have several calls, of which a later one may lose an earlier
+    /// one's steps: these count here and in `lost_steps`.
     pub steps: u64,
     /// Optimizer steps taken and lost by roll-backs, or with a device: those of earlier calls too that had not come back from it.
     #[serde(default)]
@@ -99,7 +100,7 @@ pub struct Learned {
 }
 
 impl Learned {
-    /// Both together: steps, samples and seconds add up, losses are averaged over their samples.
+    /// Both together: steps, samples and seconds add up, losses are averaged with the samples of their calls as weights.
     pub fn and(self, other: Learned) -> Learned {
         // Not over steps: those that a call lost may be an earlier one's.
         let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.samples)));

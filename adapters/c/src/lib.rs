@@ -103,7 +103,7 @@ impl Failure {
                 WireError::NoSpace { .. } | WireError::FileSize { .. } => Status::RwNoSpace,
                 WireError::Foreign { .. } => Status::RwForeign,
                 WireError::Forked { .. } => Status::RwForked,
-                WireError::Io { .. } | WireError::NoMemory { .. } => Status::RwSystem,
+                WireError::Io { .. } | WireError::NoMemory { .. } | WireError::NotInMemory { .. } => Status::RwSystem,
                 _ => Status::RwArgument,
             },
         }

@@ -33,6 +33,14 @@ pub enum WireError {
         /// The process's limit.
         limit: u64,
     },
+    /// What is written there may have to wait for a disk or a server.
+    #[error("{}: the file system (type {found:#x}) is none that lies in memory, so that a simulation could wait for it; accepted: a folder in tmpfs or ramfs, such as /dev/shm", path.display())]
+    NotInMemory {
+        /// The ring.
+        path: PathBuf,
+        /// The file system's type, as `statfs` says it.
+        found: u64,
+    },
     /// Another producer has it.
     #[error("{}: another producer publishes under this name (process {pid})", path.display())]
     InUse {

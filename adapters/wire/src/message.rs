@@ -99,6 +99,13 @@ impl ConnectionFile {
         std::fs::rename(part, path).map_err(|e| WireError::io(path, "cannot be put in its place", e))
     }
 
+    /// Removes the file where it is still this one: another relay may have put its own in its place.
+    pub fn remove(&self, path: &Path) {
+        if Self::read(path).is_ok_and(|there| there == *self) {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+
     /// Reads it.
     ///
     /// # Errors

@@ -74,7 +74,7 @@ impl Producer {
     /// killed run left is replaced. All memory is taken here.
     ///
     /// # Errors
-    /// A description that cannot be; a folder or file that is not this user's alone; a living producer of the same name (after a second); no room; a file
+    /// A description that cannot be; a folder or file that is not this user's alone, or not in memory (tmpfs, ramfs); a living producer of the same name (after a second); no room; a file
     /// that is longer than the process may make; no memory.
     pub fn open(ring: &Path, description: Description, slots: u32, policy: Policy) -> Result<Self, WireError> {
         description.check(&Limits { step_bytes: u64::MAX })?;

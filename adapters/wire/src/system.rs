@@ -137,6 +137,26 @@ fn reserve(end: libc::off_t, mut allocate: impl FnMut(libc::off_t, libc::off_t) 
     0
 }
 
+/// Whether a file is in memory. A mapping of one on a disk or a server would make who writes into it wait for its pages to be written back, or end the
+/// process where they cannot be.
+fn check_in_memory(file: &File, path: &Path) -> Result<(), WireError> {
+    // SAFETY: all of its fields are integers.
+    let mut about: libc::statfs = unsafe { std::mem::zeroed() };
+    // SAFETY: the descriptor is open, and `about` outlives the call.
+    if unsafe { libc::fstatfs(file.as_raw_fd(), &mut about) } != 0 {
+        return Err(WireError::io(path, "its file system cannot be looked at", io::Error::last_os_error()));
+    }
+    // Of 32 bits, whatever the sign that the system's type gives them.
+    match about.f_type as u32 {
+        TMPFS | RAMFS => Ok(()),
+        found => Err(WireError::NotInMemory { path: path.to_owned(), found: u64::from(found) }),
+    }
+}
+
+/// Types of file systems as linux/magic.h has them.
+const TMPFS: u32 = 0x0102_1994;
+const RAMFS: u32 = 0x8584_58f6;
+
 /// Bytes that a file could take at most if these were freed besides: what the file system has left for this user, and what the file has already.
 pub(crate) fn room_with(file: &File, freed: u64) -> io::Result<u64> {
     // SAFETY: all of its fields are integers.
@@ -170,8 +190,9 @@ impl Map {
     /// asked, each time that it is so, until it says that there is nothing to be done.
     ///
     /// # Errors
-    /// `NoSpace`: there is no room. Never leaves pages that could fail when they are written.
+    /// `NotInMemory`: the file lies on a disk or a server. `NoSpace`: there is no room. Never leaves pages that could fail when they are written.
     pub fn create(file: &File, path: &Path, length: u64, mut make_room: impl FnMut() -> bool) -> Result<Self, WireError> {
+        check_in_memory(file, path)?;
         let no_space = || WireError::NoSpace { path: path.to_owned(), needed: length };
         let most = file_size_limit().map_err(|e| WireError::io(path, "no limit of its length can be had", e))?;
         if length > most {

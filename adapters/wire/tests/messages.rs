@@ -161,6 +161,12 @@ fn connection_files_are_private_and_checked() {
     file.write(&path).unwrap();
     assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
     assert_eq!(ConnectionFile::read(&path).unwrap(), file);
+    // Another relay's is left where it is.
+    ConnectionFile { key: Key::random().unwrap(), ..file.clone() }.remove(&path);
+    assert_eq!(ConnectionFile::read(&path).unwrap(), file);
+    file.remove(&path);
+    assert!(!path.exists());
+    file.write(&path).unwrap();
     let text = std::fs::read_to_string(&path).unwrap();
     for (changed, expected) in [
         (text.replace("connection = 1", "connection = 2"), "the connection file has version 2; this is version 1"),

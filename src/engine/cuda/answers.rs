@@ -79,7 +79,7 @@ pub struct Panel<'a> {
     /// Who answers where the gate trusts it; none: RK4 answers everywhere.
     pub surrogate: Option<&'a dyn DevicePredict>,
     /// Who learns from what is traced, on the device; none: nobody does.
-    pub pupil: Option<&'a dyn DeviceLearns>,
+    pub label_sink: Option<&'a dyn DeviceLearns>,
     /// Where the surrogate is trusted.
     pub gate: &'a Gate,
     /// Device seconds of tracing from which the surrogate answers everywhere.
@@ -190,7 +190,7 @@ impl Division {
             pad: 0,
         };
         Ok(Divided {
-            labels: Labels::new(&gpu, panel.keep, if panel.pupil.is_some() { HELD_BACK } else { 0 }, panel.arrivals)?,
+            labels: Labels::new(&gpu, panel.keep, if panel.label_sink.is_some() { HELD_BACK } else { 0 }, panel.arrivals)?,
             split: &self.split,
             join: &self.join,
             memory,
@@ -285,9 +285,9 @@ impl Divided<'_> {
         // SAFETY: as above, at their back.
         unsafe { self.panel.tracer.trace(lists.points + 12 * back, traced, &out) }?;
         let tracing = gpu.mark()?;
-        if let Some(pupil) = self.panel.pupil {
+        if let Some(label_sink) = self.panel.label_sink {
             // SAFETY: as above.
-            unsafe { pupil.learn_from(lists.points + 12 * back, &out, traced) }?;
+            unsafe { label_sink.learn_from(lists.points + 12 * back, &out, traced) }?;
         }
         let (labels, emptied) = self.labels.offer(traced, stored, lists.lengths + 8)?;
         if emptied {

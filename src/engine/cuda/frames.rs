@@ -119,7 +119,7 @@ impl CudaFrames {
             domain: tracer.domain(),
             land: tracer.land(),
             surrogate: predictor.as_ref().map(|predictor| predictor as &dyn DevicePredict),
-            pupil: predictor.as_ref().and_then(Predictor::label_sink),
+            label_sink: predictor.as_ref().and_then(Predictor::label_sink),
             gate: asked.gate,
             trace_budget: asked.trace_budget,
             keep: asked.keep,

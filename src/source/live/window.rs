@@ -282,7 +282,10 @@ impl Reader {
             match self.live.link.poll(&mut values, &|block, generation| assembler.is_ahead(block, generation)) {
                 Some(Event::Opened { description, generation }) => self.opened(&description, generation),
                 Some(Event::Step { block, generation, step, time, published, missed }) => {
-                    self.shared.lock().live.missed_blocks += missed;
+                    {
+                        let live = &mut self.shared.lock().live;
+                        live.missed_blocks = live.missed_blocks.saturating_add(missed);
+                    }
                     let whole =
                         self.assemble(&mut values, |assembler, values| assembler.block(block, generation, step, time, published, values));
                     self.tell_incomplete();

@@ -182,6 +182,10 @@ impl Objective {
                 jacobian[row][along] = f64::from(unit * self.extent[row] / self.extent[along]);
             }
         }
+        // The largest of eigenvalues passes NaN over.
+        if jacobian.as_flattened().iter().any(|slope| slope.is_nan()) {
+            return f32::NAN;
+        }
         // A map that takes everything to one point has no stretch; what is finite may be averaged.
         log_stretch(&jacobian).max(0.5 * f64::MIN_POSITIVE.ln()) as f32
     }
@@ -197,6 +201,16 @@ mod tests {
             assert!((signed_exp(signed_log(y)) - y).abs() <= 4.0 * f32::EPSILON * y.abs().max(1.0));
             assert_eq!(signed_log(-y), -signed_log(y));
         }
+    }
+
+    #[test]
+    fn the_stretch_of_a_map_that_is_no_number_is_none() {
+        let settings = NetworkSettings { target: Target::FlowMap, ..NetworkSettings::default() };
+        let shape = Architecture::new(&settings, &[0, 1], [1.0; 3]).unwrap();
+        let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
+        assert!(objective.log_stretch_of_map(2, |_, _| f32::NAN).is_nan());
+        let to_one_point = objective.log_stretch_of_map(2, |along, row| if along == row { -1.0 } else { 0.0 });
+        assert!(to_one_point.is_finite() && to_one_point < -300.0, "{to_one_point}");
     }
 
     /// Of maps that hardly stretch, along two axes nearly alike: a log-stretch near 0 shows what the eigenvalue loses.

@@ -203,6 +203,21 @@ fn what_cannot_be_there_at_all_takes_nothing_from_who_follows() {
     assert!(!folder.0.exists());
 }
 
+#[test]
+fn a_ring_on_a_disk_is_refused() {
+    let kind = |place: &str| std::process::Command::new("stat").args(["-f", "-c", "%T", place]).output().map(|out| out.stdout);
+    let on_disk =
+        |place: &&&str| kind(place).is_ok_and(|kind| !kind.is_empty() && !kind.starts_with(b"tmpfs") && !kind.starts_with(b"ramfs"));
+    let Some(disk) = [env!("CARGO_TARGET_TMPDIR"), "/var/tmp"].iter().find(on_disk) else {
+        let _ = std::io::Write::write_all(&mut std::io::stderr(), b"NOT RUN: a ring on a disk, since no folder here lies on one\n");
+        return;
+    };
+    let ring = Path::new(disk).join(format!("rw-test-disk-{}", std::process::id()));
+    let error = Producer::open(&ring, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::NotInMemory { .. }), "{error}");
+    assert!(error.to_string().contains("/dev/shm") && !ring.exists(), "{error}");
+}
+
 /// A small file system that is gone when the test ends.
 struct SmallDisk(PathBuf);
 
