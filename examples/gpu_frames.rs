@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::engine::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, Traced, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, Traced, Tuning};
 use ridgewatch::field::Window;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::flow::{

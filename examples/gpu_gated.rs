@@ -7,14 +7,13 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
+use ridgewatch::backend::cuda::{CudaAccelerator, Gpu, GpuSettings};
+use ridgewatch::backend::{Device, Storage, stratified_points};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{CudaAccelerator, Gpu, GpuSettings};
-use ridgewatch::engine::{
-    CheckpointRecord, Device, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, Storage, run, stratified_points, trace,
-};
 use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
+use ridgewatch::run::{CheckpointRecord, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, run, trace};
 use ridgewatch::surrogate::Kind;
 use ridgewatch::surrogate::network::Encoding;
 use ridgewatch::trust::Strata;

@@ -44,7 +44,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 #[cfg(feature = "cuda")]
 mod bench {
-    use ridgewatch::engine::cuda::{
+    use ridgewatch::backend::cuda::{
         Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
         Outputs, SnapshotStore, Storage, Tuning,
     };

@@ -3,12 +3,13 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
+use ridgewatch::backend::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
+use ridgewatch::backend::{Device, Storage};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
-use ridgewatch::engine::{Accelerator, Device, DeviceRenderer, Event, FrameRecord, Health, RunOptions, Setup, Storage, run};
 use ridgewatch::field::Snapshot;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::flow::{FlowMap, Tracer, VelocitySource};
+use ridgewatch::run::{Accelerator, DeviceRenderer, Event, FrameRecord, Health, RunOptions, Setup, run};
 use ridgewatch::source::MemorySource;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;

@@ -13,7 +13,7 @@ use burn::optim::{AdamConfig, GradientsParams, Optimizer};
 use burn::tensor::backend::Backend;
 use burn::tensor::{Tensor, TensorData};
 use burn_cuda::{Cuda, CudaDevice};
-use ridgewatch::engine::cuda::{DevicePredict, DeviceTraining, Gpu, GpuSettings};
+use ridgewatch::backend::cuda::{DevicePredict, DeviceTraining, Gpu, GpuSettings};
 use ridgewatch::field::Domain;
 use ridgewatch::surrogate::network::{Architecture, Encoding, Model, Network, NetworkSettings, Objective};
 use std::error::Error;

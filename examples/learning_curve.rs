@@ -7,7 +7,7 @@
 #![allow(clippy::print_stdout)]
 
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{self, Event, RunOptions, Setup};
+use ridgewatch::run::{self, Event, RunOptions, Setup};
 use ridgewatch::surrogate::Kind;
 use std::error::Error;
 use std::path::Path;
@@ -33,7 +33,7 @@ fn curve(mut scene: SceneFile, kind: Kind, nodes: Option<[usize; 3]>, seconds: f
             }
         }
     };
-    let report = engine::run(Setup::new(scene.settings())?, &options, &mut print, &AtomicBool::new(false))?;
+    let report = run::run(Setup::new(scene.settings())?, &options, &mut print, &AtomicBool::new(false))?;
     println!("          {} bytes, {} optimizer steps", report.surrogate_bytes, report.train_steps);
     Ok(report.surrogate_bytes)
 }

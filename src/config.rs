@@ -7,10 +7,11 @@ mod error;
 
 pub use error::ConfigError;
 
-use crate::engine::{DeviceSettings, Settings, TimeSettings, TrainingSettings};
+use crate::backend::DeviceSettings;
 use crate::flow::{FlowSettings, Integrator, StepsSetting};
 use crate::publish::PublishSettings;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, TransferSettings};
+use crate::run::{Settings, TimeSettings, TrainingSettings};
 use crate::setting::Refused;
 use crate::source::live::LiveSettings;
 use crate::source::{ArchiveSettings, DomainSettings, SourceKind, SourceSettings};

@@ -2,13 +2,13 @@
 //! by other tools: `make test-data`.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
-use ridgewatch::engine::FrameRecord;
 use ridgewatch::field::{Geometry, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
 use ridgewatch::publish::read_exr;
 use ridgewatch::render::Film;
+use ridgewatch::run::FrameRecord;
 use ridgewatch::source::{Archive, ArchiveSettings, Metric, SnapshotSource, inspect};
 use std::io::Write;
 use std::path::{Path, PathBuf};

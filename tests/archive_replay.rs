@@ -5,7 +5,7 @@
 mod netcdf_fixture;
 
 use netcdf_fixture::{Fixture, NETCDF4, f32s, fill};
-use ridgewatch::engine::FrameRecord;
+use ridgewatch::run::FrameRecord;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 

@@ -6,8 +6,8 @@ mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{Event, FrameRecord, RunOptions, RunReport, Setup, run};
 use ridgewatch::flow::Tracer;
+use ridgewatch::run::{Event, FrameRecord, RunOptions, RunReport, Setup, run};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{Kind, SampleRing, Surrogate, SurrogateSettings, build};
 use std::os::unix::fs::MetadataExt;

@@ -4,8 +4,8 @@
 #![cfg(feature = "cuda")]
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::engine::cuda::compile::{Request, SOURCES};
-use ridgewatch::engine::cuda::{Tiling, is_fused, network_defines};
+use ridgewatch::backend::cuda::compile::{Request, SOURCES};
+use ridgewatch::backend::cuda::{Tiling, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings, Target};
 
 /// Macros in which the gridded kernel is compiled here.

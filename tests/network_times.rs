@@ -6,10 +6,10 @@ mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{Event, FrameRecord, RunOptions, Setup, run};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::run::{Event, FrameRecord, RunOptions, Setup, run};
 use ridgewatch::surrogate::network::{Input, NetworkSettings, Times};
 use ridgewatch::surrogate::{Kind, Predict, SampleRing, Samples, SurrogateSettings, build};
 use std::path::Path;

@@ -5,8 +5,8 @@
 mod network_support;
 
 use network_support::{DoubleGyre, traced, uniform_points};
-use ridgewatch::engine::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::flow::Tracer;
+use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings};
 use ridgewatch::surrogate::{Kind, Learned, SampleRing, SurrogateSettings, build};

@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch::engine::{Frame, FrameRecord};
 use ridgewatch::publish::{ExrFrames, Output, PublishSettings, RunFolder, read_exr};
 use ridgewatch::render::Film;
+use ridgewatch::run::{Frame, FrameRecord};
 use std::process::Command;
 use std::sync::Arc;
 use std::time::{Duration, Instant};

@@ -2,11 +2,11 @@
 
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::engine::{Frame, FrameRecord};
 use ridgewatch::publish::{
     FRAME_TOPIC, FrameHeader, Output, Payload, PublishError, PublishSettings, Publisher, RECORD_TOPIC, RunFolder, Summary, decode_exr,
 };
 use ridgewatch::render::Film;
+use ridgewatch::run::{Frame, FrameRecord};
 use std::sync::Arc;
 use std::time::Duration;
 use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};

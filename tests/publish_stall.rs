@@ -2,9 +2,9 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch::engine::{Frame, FrameRecord};
 use ridgewatch::publish::{FRAME_TOPIC, FrameHeader, Payload, PublishSettings, PublishStatistics, Publisher, peak_memory_bytes};
 use ridgewatch::render::Film;
+use ridgewatch::run::{Frame, FrameRecord};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};

@@ -2,7 +2,7 @@
 //! GPU, held to the reference on machines without one. Needs a C++ compiler (`c++`, or what CXX names).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
-use ridgewatch::engine::{residuals, stratified_points};
+use ridgewatch::backend::{residuals, stratified_points};
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
@@ -518,7 +518,7 @@ fn the_same_labels_are_kept() {
     for shift in [0_u32, 1, 5, 32] {
         let mut input = bytes(&[shift, points.len() as u32]);
         input.extend(bytes(&points));
-        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::engine::cuda::keeps_label(p, shift))).collect();
+        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::backend::cuda::keeps_label(p, shift))).collect();
         assert!(ask("labels", &input) == expected, "1 in 2^{shift}");
     }
 }

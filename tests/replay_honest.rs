@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::engine::FrameRecord;
+use ridgewatch::run::FrameRecord;
 use std::process::Command;
 
 /// Fixed numbers of training steps and fixed seeds: the run is the same on every machine but for rounding.

@@ -3,8 +3,8 @@
 #![allow(clippy::unwrap_used)]
 
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{Event, RunOptions, Setup, run};
 use ridgewatch::field::Snapshot;
+use ridgewatch::run::{Event, RunOptions, Setup, run};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex, Weak};

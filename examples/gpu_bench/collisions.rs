@@ -1,7 +1,7 @@
 //! The points that a frame's waves ask about.
 
 use cudarc::driver::result;
-use ridgewatch::engine::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, Traced};
+use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, Traced};
 use ridgewatch::flow::{Extras, Tracer};
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
 use std::error::Error;

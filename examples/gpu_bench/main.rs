@@ -27,8 +27,8 @@ mod collisions;
 #[cfg(feature = "cuda")]
 mod bench {
     use super::collisions::Collisions;
-    use ridgewatch::engine::Storage;
-    use ridgewatch::engine::cuda::{
+    use ridgewatch::backend::Storage;
+    use ridgewatch::backend::cuda::{
         Buffer, CudaTracer, DeviceError, DevicePredict, DeviceTable, DeviceTracer, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::analytic::Analytic;

@@ -1,10 +1,11 @@
 //! Audit points: drawn evenly over the domain and traced whatever the gate says.
 
-use super::answers::push_sample;
-use crate::flow::{Extras, Traced, Tracer};
+use super::DeviceError;
+use super::router::push_sample;
+use crate::flow::{Extras, Traced};
 use crate::render::Transfer;
 use crate::render::rng::{philox, unit};
-use crate::surrogate::{Predict, Samples};
+use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata, TrustedError};
 use rayon::prelude::*;
 
@@ -57,17 +58,20 @@ pub struct Audit {
 }
 
 /// Traces `unit` points; samples come with `extras`.
-pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], extras: Extras) -> Audit {
-    let domain = tracer.domain();
+///
+/// # Errors
+/// The tracer's device fails.
+pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Audit, DeviceError> {
+    let domain = tracer.flow().domain();
     let points: Vec<[f32; 3]> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
     let mut traced = Traced::default();
-    tracer.trace(&points, extras, &mut traced);
+    tracer.trace(&points, extras, &mut traced)?;
     // Sums are those of the chunks in order, on any number of threads.
     let parts: Vec<(Samples, Vec<usize>, f64)> = (points.par_chunks(CHUNK).enumerate())
         .map(|(chunk, points)| {
             let (mut samples, mut numbers, mut lived) = (Samples::default(), Vec::new(), 0.0);
             for (i, &point) in (chunk * CHUNK..).zip(points) {
-                if !tracer.is_void(point) {
+                if !tracer.flow().is_void(point) {
                     push_sample(&mut samples, domain, point, &traced, i, extras);
                     numbers.push(i);
                     lived += f64::from(traced.lived[i]);
@@ -87,17 +91,20 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], extras: Extras) -> Audit {
         lived += part_lived;
     }
     let lived_share = lived / samples.len().max(1) as f64;
-    Audit { samples, numbers, drawn: points.len(), lived_share }
+    Ok(Audit { samples, numbers, drawn: points.len(), lived_share })
 }
 
 /// Residuals of `surrogate` on traced samples that it has not seen, NaN where the trace gave no number. `tau` turns log-stretch into FTLE
 /// for the ramp.
-pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer, tau: f64) -> Vec<Residual> {
+///
+/// # Errors
+/// The surrogate's device fails.
+pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer, tau: f64) -> Result<Vec<Residual>, DeviceError> {
     let mut predicted = vec![0.0; samples.len()];
-    surrogate.predict(&samples.points, &mut predicted);
+    surrogate.predict(&samples.points, &mut predicted)?;
     let ramp = |s: f32| transfer.ramp(s / tau as f32);
     let pairs = predicted.par_iter().zip(&samples.log_stretch).zip(&samples.points);
-    pairs
+    Ok(pairs
         .with_min_len(CHUNK)
         .map(|((&predicted, &traced), &point)| {
             if !traced.is_finite() {
@@ -108,7 +115,7 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
             let log_stretch = if predicted.is_finite() { predicted - traced } else { traced.abs() };
             Residual { point, optical, log_stretch }
         })
-        .collect()
+        .collect())
 }
 
 /// Error over the audit points in cells that the gate trusts.
@@ -153,24 +160,29 @@ pub struct AuditFindings {
     pub errors: Option<Audited>,
 }
 
-/// Draws, traces and holds `surrogate` to what was traced, on the CPU (the tracer's device may be another).
-pub fn audit(request: AuditRequest<'_>, tracer: &dyn Tracer, surrogate: Option<&dyn Predict>) -> AuditFindings {
+/// Draws and traces audit points, and measures the surrogate on them, on the CPU. The tracer's device may be another.
+///
+/// # Errors
+/// A device fails.
+pub fn audit(request: &AuditRequest<'_>, tracer: &dyn Trace, surrogate: Option<&dyn Predict>) -> Result<AuditFindings, DeviceError> {
     let unit = stratified_points(&request.strata, request.seed, request.stream);
-    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, request.samples.unwrap_or_default());
-    AuditFindings {
+    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, request.samples.unwrap_or_default())?;
+    let in_order = |surrogate: &dyn Predict| -> Result<Audited, DeviceError> {
+        let mut in_order = vec![(f32::NAN, f32::NAN); drawn];
+        let residuals = residuals(surrogate, &samples, request.transfer, tracer.flow().tau())?;
+        for (number, residual) in numbers.into_iter().zip(residuals) {
+            in_order[number] = (residual.optical, residual.log_stretch);
+        }
+        Ok(Audited::in_order(&in_order, request.strata.clone()))
+    };
+    Ok(AuditFindings {
         drawn,
         points: samples.len(),
         lived_share,
         peak: samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max),
-        errors: surrogate.map(|surrogate| {
-            let mut in_order = vec![(f32::NAN, f32::NAN); drawn];
-            for (number, residual) in numbers.into_iter().zip(residuals(surrogate, &samples, request.transfer, tracer.tau())) {
-                in_order[number] = (residual.optical, residual.log_stretch);
-            }
-            Audited::in_order(&in_order, request.strata)
-        }),
+        errors: surrogate.map(in_order).transpose()?,
         samples: if request.samples.is_some() { samples } else { Samples::default() },
-    }
+    })
 }
 
 #[cfg(test)]

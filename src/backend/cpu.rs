@@ -1,134 +1,127 @@
-//! Who makes a frame's film: the CPU's renderer, or a GPU's where every query can be answered there.
+//! The CPU backend: plain Rust on all threads. It never fails, so every frame can be made here.
 
-#[cfg(feature = "cuda")]
-use super::accelerator::{DeviceRenderer, Health};
-use super::answers::Answers;
 use super::audit::{AuditFindings, AuditRequest, audit};
-use super::{Device, EngineError};
-use crate::flow::Tracer;
-use crate::render::{Film, RenderStats, Renderer};
-use crate::surrogate::Predict;
+use super::interruptible::Interruptible;
+use super::router::QueryRouter;
+use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Surrogate, SurrogateRequest};
+use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use crate::render::Renderer;
+use crate::source::Listener;
+use crate::surrogate::{
+    CheckpointError, CheckpointState, FrozenHybrid, Host, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, Trace, build,
+};
+use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
-/// Makes the films of a run.
-pub(super) trait FrameRenderer: Send + Sync {
-    /// Renders samples 0 to `samples` of every pixel. `answers`, which ask `tracer`, answer the queries, or at least are told how many were
-    /// answered. Setting `stop` ends the frame after the wave in progress.
-    fn render(
-        &mut self,
-        renderer: &mut Renderer,
-        picture: u64,
-        samples: usize,
-        tracer: &dyn Tracer,
-        answers: &mut Answers<'_>,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), EngineError>;
+/// The CPU.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct Cpu;
 
-    /// Gives copies of tables back that are about to be traced anew.
-    fn let_go_of_tables(&mut self) {}
+impl Backend for Cpu {
+    type Tracer = Box<dyn Tracer>;
+    type Surrogate = HostSurrogate;
+    type Samples = Samples;
 
-    /// Draws and traces a frame's audit points and holds the surrogate to them.
-    fn audit(
-        &mut self,
-        request: AuditRequest<'_>,
-        tracer: &dyn Tracer,
-        surrogate: Option<&dyn Predict>,
-    ) -> Result<AuditFindings, EngineError>;
-}
-
-/// What renders on `device`. A GPU on which the kernels do not load has failed, with the CPU behind it.
-pub(super) fn frame_renderer(device: &Device) -> Box<dyn FrameRenderer> {
-    match device {
-        Device::Cpu { .. } => Box::new(OnCpu),
-        #[cfg(feature = "cuda")]
-        Device::Gpu { gpu, .. } => match gpu.renderer() {
-            Ok(device) => Box::new(OnGpu { device, health: gpu.health().clone() }),
-            Err(error) => {
-                gpu.health().fail(error);
-                Box::new(OnCpu)
-            }
-        },
+    fn name(&self) -> String {
+        "cpu".into()
     }
-}
 
-/// Walks on the CPU; traces wherever the tracer does.
-struct OnCpu;
+    fn prefetch(&self) -> Option<Listener> {
+        None
+    }
 
-impl FrameRenderer for OnCpu {
-    fn render(
-        &mut self,
-        renderer: &mut Renderer,
-        picture: u64,
-        samples: usize,
-        _: &dyn Tracer,
-        answers: &mut Answers<'_>,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), EngineError> {
-        Ok(renderer.render(picture, answers, samples, progress, stop)?)
+    fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<Self::Tracer, BackendError> {
+        Ok(cpu_tracer(velocity.clone(), map, t0)?)
+    }
+
+    fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &Self::Tracer) -> Result<HostSurrogate, BackendError> {
+        let tracer = Interruptible::new(tracer, request.stop);
+        Ok(build(request.settings, request.network, request.domain, request.seed, &tracer)?)
+    }
+
+    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
+        let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
+        render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer)
     }
 
     fn audit(
         &mut self,
-        request: AuditRequest<'_>,
-        tracer: &dyn Tracer,
-        surrogate: Option<&dyn Predict>,
-    ) -> Result<AuditFindings, EngineError> {
-        Ok(audit(request, tracer, surrogate))
+        request: &AuditRequest<'_>,
+        tracer: &Self::Tracer,
+        surrogate: Option<&FrozenOf<Self>>,
+    ) -> Result<AuditFindings, DeviceError> {
+        audit(request, tracer, surrogate.map(|surrogate| surrogate as &dyn Predict))
+    }
+
+    fn replan(&mut self, _: &DeviceError, _: &Self::Tracer, _: &mut Option<HostSurrogate>) -> Result<Option<String>, DeviceError> {
+        Ok(None)
     }
 }
 
-/// Makes films on the GPU where it can do so alone; otherwise, where its memory lacks, and once it fails, as on the CPU.
-#[cfg(feature = "cuda")]
-struct OnGpu {
-    device: Box<dyn DeviceRenderer>,
-    health: std::sync::Arc<Health>,
+/// A frame that the CPU renders. Another device may trace and predict for it.
+pub struct HostFrame<'a> {
+    tracer: &'a dyn Trace,
+    surrogate: Option<&'a dyn Predict>,
+    routing: Routing<'a>,
+    picture: u64,
+    samples: usize,
+    progress: Option<&'a (dyn Fn(f32) + Sync)>,
+    stop: &'a AtomicBool,
 }
 
-#[cfg(feature = "cuda")]
-impl FrameRenderer for OnGpu {
-    fn render(
-        &mut self,
-        renderer: &mut Renderer,
-        picture: u64,
-        samples: usize,
-        tracer: &dyn Tracer,
-        answers: &mut Answers<'_>,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), EngineError> {
-        if self.health.works() {
-            match self.device.render(renderer, picture, samples, tracer, answers, progress, stop) {
-                Ok(Some(done)) => return Ok(done),
-                Ok(None) => {}
-                // The same frame on the CPU: same majorants, same random numbers. The cycle hears why after it.
-                Err(EngineError::Device(error)) => self.health.fail_unless_refused(*error, "the CPU walked a frame"),
-                Err(error) => return Err(error),
-            }
-        }
-        self.health.check()?;
-        OnCpu.render(renderer, picture, samples, tracer, answers, progress, stop)
+impl<'a> HostFrame<'a> {
+    /// The frame of a job of any backend.
+    pub fn of<B: Backend>(job: &FrameJob<'a, B>, tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>) -> Self {
+        let &FrameJob { routing, picture, samples, progress, stop, .. } = job;
+        Self { tracer, surrogate, routing, picture, samples, progress, stop }
     }
+}
 
-    fn let_go_of_tables(&mut self) {
-        self.device.let_go_of_tables();
+/// Renders a frame on the CPU.
+///
+/// # Errors
+/// The device that traces or predicts fails; `renderer` is then unspecified.
+pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
+    let mut router = QueryRouter::new(frame.tracer, frame.surrogate, frame.routing);
+    let (film, stats) = renderer
+        .render(frame.picture, &mut router, frame.samples, frame.progress.map(|report| report as &dyn Fn(f32)), frame.stop)
+        .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
+    let (tally, samples) = router.finish()?;
+    Ok(Rendered { film, stats, tally, samples })
+}
+
+impl Surrogate for HostSurrogate {
+    type Tracer = Box<dyn Tracer>;
+    type Frozen = FrozenHybrid<Host>;
+
+    fn freeze(&self) -> Result<Self::Frozen, DeviceError> {
+        self.freeze()
     }
-
-    fn audit(
-        &mut self,
-        request: AuditRequest<'_>,
-        tracer: &dyn Tracer,
-        surrogate: Option<&dyn Predict>,
-    ) -> Result<AuditFindings, EngineError> {
-        if let Some(surrogate) = surrogate.filter(|_| self.health.works()) {
-            match self.device.audit(&request, tracer, surrogate) {
-                Ok(Some(done)) => return Ok(done),
-                Ok(None) => {}
-                Err(error) => self.health.fail_unless_refused(error, "the CPU drew the points of an audit"),
-            }
-        }
-        self.health.check()?;
-        OnCpu.audit(request, tracer, surrogate)
+    fn learns(&self) -> bool {
+        self.learns()
+    }
+    fn trains_on_device(&self) -> bool {
+        false
+    }
+    fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError> {
+        self.learn(buffer, seconds, max_steps)
+    }
+    fn window_slid(&mut self, tracer: &Box<dyn Tracer>, stop: &AtomicBool) -> Result<(), DeviceError> {
+        self.window_slid(&Interruptible::new(tracer, stop))
+    }
+    fn checkpoint(&self) -> Result<CheckpointState, DeviceError> {
+        self.checkpoint()
+    }
+    fn checkpoint_async(&mut self) -> Result<Option<CheckpointState>, DeviceError> {
+        self.checkpoint_async()
+    }
+    fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
+        self.load(path)
+    }
+    fn bytes(&self) -> usize {
+        self.bytes()
+    }
+    fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
+        self.to_host(from)
     }
 }

@@ -1,18 +1,18 @@
-//! Where to compute: what `--device` says, what it comes to on this machine, and the tracers there.
+//! The device that a run computes on: the option `--device`, the table `[device]`, and the device that they select on this machine.
 
-use super::EngineError;
 #[cfg(feature = "cuda")]
-use super::accelerator::Accelerator;
-#[cfg(feature = "cuda")]
-use super::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
-use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use super::cuda::{CudaTracer, Gpu, GpuSettings, SnapshotStore, Tuning};
+use super::{BackendError, DeviceError};
+use crate::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use crate::setting::{Refused, require};
-use crate::source::Listener;
-use crate::surrogate::Offload;
+#[cfg(feature = "cuda")]
+use crate::surrogate::Trace;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;
+#[cfg(feature = "cuda")]
 use std::sync::Arc;
+use std::time::Instant;
 use thiserror::Error;
 
 /// What was asked for.
@@ -129,22 +129,31 @@ impl DeviceSettings {
     }
 }
 
-/// A device, opened.
+/// The device that was selected.
 #[derive(Debug, Clone)]
 pub enum Device {
-    /// The CPU, with the reason why no GPU is used; none where the CPU was asked for.
+    /// The CPU, with the reason why no GPU is used; `None` if the CPU was asked for.
     Cpu {
         /// In words.
         why: Option<String>,
     },
     /// A GPU.
     #[cfg(feature = "cuda")]
-    Gpu {
-        /// The device.
-        gpu: Arc<dyn Accelerator>,
-        /// Whether the CPU does what this device cannot.
-        may_fall_back: bool,
-    },
+    Cuda(CudaDevice),
+}
+
+/// An opened GPU, and how a run uses it.
+#[cfg(feature = "cuda")]
+#[derive(Debug, Clone)]
+pub struct CudaDevice {
+    /// The device.
+    pub gpu: Arc<Gpu>,
+    /// How the velocity window is held.
+    pub storage: Storage,
+    /// What happens when the device is lost.
+    pub when_lost: WhenLost,
+    /// Whether the CPU computes if the first slide does not fit the device: the device was chosen automatically.
+    pub may_fall_back: bool,
 }
 
 impl Default for Device {
@@ -157,174 +166,104 @@ impl Device {
     /// The CPU, by choice.
     pub const CPU: Self = Self::Cpu { why: None };
 
-    /// Opens what was asked for. `auto` never fails.
+    /// Opens the device that was asked for. `auto` never fails.
     ///
     /// # Errors
-    /// `cuda:N` that cannot be used.
+    /// `cuda:N` cannot be used.
     #[cfg(feature = "cuda")]
-    pub fn open(choice: DeviceChoice, settings: &DeviceSettings) -> Result<Self, EngineError> {
+    pub fn open(choice: DeviceChoice, settings: &DeviceSettings) -> Result<Self, DeviceError> {
         let ordinal = match choice {
             DeviceChoice::Cpu => return Ok(Self::CPU),
             DeviceChoice::Auto => 0,
             DeviceChoice::Cuda(n) => n,
         };
-        let wanted = GpuSettings {
-            memory_cap: settings.memory_mib.map(|mib| mib << 20),
-            cache: None,
-            polite: settings.polite,
-            when_lost: settings.when_lost,
-            poison: false,
-        };
-        match Gpu::open(ordinal, &wanted) {
+        let memory_cap = settings.memory_mib.map(|mib| mib << 20);
+        match Gpu::open(ordinal, &GpuSettings { memory_cap, cache: None, polite: settings.polite, poison: false }) {
             Ok(gpu) => {
-                let gpu = Arc::new(CudaAccelerator::new(gpu, settings.storage));
-                Ok(Self::Gpu { gpu, may_fall_back: choice == DeviceChoice::Auto })
+                let may_fall_back = choice == DeviceChoice::Auto;
+                Ok(Self::Cuda(CudaDevice { gpu, storage: settings.storage, when_lost: settings.when_lost, may_fall_back }))
             }
             Err(why) if choice == DeviceChoice::Auto => Ok(Self::Cpu { why: Some(why.to_string()) }),
-            Err(why) => Err(why.into()),
+            Err(why) => Err(why),
         }
     }
 
-    /// Opens what was asked for. `auto` never fails.
+    /// Opens the device that was asked for. `auto` never fails.
     ///
     /// # Errors
-    /// `cuda:N`, since this build has no GPU engine.
+    /// `cuda:N`, since this build has no CUDA backend.
     #[cfg(not(feature = "cuda"))]
-    pub fn open(choice: DeviceChoice, _: &DeviceSettings) -> Result<Self, EngineError> {
+    pub fn open(choice: DeviceChoice, _: &DeviceSettings) -> Result<Self, DeviceError> {
         match choice {
             DeviceChoice::Cpu => Ok(Self::CPU),
             DeviceChoice::Auto => Ok(Self::Cpu { why: Some("built without the feature `cuda`".into()) }),
-            DeviceChoice::Cuda(_) => Err(EngineError::NoCuda),
+            DeviceChoice::Cuda(_) => Err(DeviceError::NotBuilt),
         }
     }
 
-    /// For records: `cpu` or `cuda:0 NVIDIA H200`.
-    pub fn name(&self) -> String {
+    /// Whether it is a GPU.
+    pub fn is_gpu(&self) -> bool {
+        !matches!(self, Self::Cpu { .. })
+    }
+
+    /// Whether the CPU computes if the first slide does not fit the device.
+    pub fn may_fall_back(&self) -> bool {
         match self {
-            Self::Cpu { .. } => "cpu".into(),
+            Self::Cpu { .. } => true,
             #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } if !gpu.health().works() => "cpu".into(),
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => gpu.name(),
+            Self::Cuda(device) => device.may_fall_back,
         }
     }
 
-    /// What work on the device failed with, in words, since which the CPU does it.
-    pub fn failure(&self) -> Option<String> {
+    /// What happens when the device is lost.
+    pub fn when_lost(&self) -> WhenLost {
         match self {
-            Self::Cpu { .. } => None,
+            Self::Cpu { .. } => WhenLost::Cpu,
             #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => gpu.health().failure().map(|error| error.to_string()),
+            Self::Cuda(device) => device.when_lost,
         }
     }
 
-    /// Warnings of what the CPU did for want of the device's memory, each once.
-    pub fn shortages(&self) -> Vec<String> {
-        match self {
-            Self::Cpu { .. } => Vec::new(),
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => gpu.health().shortages(),
-        }
-    }
-
-    /// Ends a run whose device is lost, where that is wanted.
+    /// Traces seeds at `t0` once. If the device cannot and the settings allow it, the CPU does, and a note says why.
     ///
     /// # Errors
-    /// What the device failed with.
-    pub fn check(&self) -> Result<(), EngineError> {
+    /// A flow map that no tracer accepts; a device that fails, if the CPU must not take over.
+    pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Result<TracedOnce, BackendError> {
+        let (mut traced, mut note) = (Traced::default(), None);
+        let mut begun = Instant::now();
         match self {
+            Self::Cpu { .. } => {}
             #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => Ok(gpu.health().check()?),
-            Self::Cpu { .. } => Ok(()),
-        }
-    }
-
-    /// What trains networks on it; none where the CPU does.
-    pub(super) fn offload(&self) -> Option<Arc<dyn Offload>> {
-        match self {
-            Self::Cpu { .. } => None,
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => gpu.offload().filter(|_| gpu.health().works()),
-        }
-    }
-
-    /// Who should hear of snapshots as they are read, so that they are on the device when the window wants them.
-    pub(super) fn listener(&self) -> Option<Listener> {
-        match self {
-            Self::Cpu { .. } => None,
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => {
-                // The I/O thread may outlive the run, and must not keep the device open.
-                let gpu = Arc::downgrade(gpu);
-                Some(Box::new(move |snapshot| {
-                    if let Some(gpu) = gpu.upgrade().filter(|gpu| gpu.health().works()) {
-                        gpu.expect(snapshot);
+            Self::Cuda(CudaDevice { gpu, storage, when_lost, may_fall_back }) => {
+                let tuning = Tuning { storage: *storage, ..Tuning::default() };
+                let tracer = CudaTracer::new(&SnapshotStore::new(gpu), gpu, velocity.clone(), map, t0, tuning);
+                begun = Instant::now();
+                match tracer.and_then(|tracer| Ok(tracer.trace(seeds, Extras::default(), &mut traced).map(|()| tracer)?)) {
+                    Ok(tracer) => return Ok(TracedOnce { flow: tracer.into_host(), traced, seconds: begun.elapsed().as_secs_f64(), note }),
+                    Err(BackendError::Device(error)) if if error.is_fault() { *when_lost == WhenLost::Cpu } else { *may_fall_back } => {
+                        note = Some(format!("traced on the CPU: {error}"));
                     }
-                }))
+                    Err(error) => return Err(error),
+                }
             }
         }
-    }
-
-    /// A tracer for seeds at `t0`, and what should be told about it.
-    ///
-    /// # Errors
-    /// What [`cpu_tracer`] refuses; what a GPU that was asked for by name cannot do.
-    pub fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
-        match self {
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, may_fall_back } if gpu.health().works() => match gpu.tracer(source.clone(), map, t0) {
-                Ok(tracer) => {
-                    gpu.health().take_up();
-                    Ok((tracer, None))
-                }
-                Err(CudaTracerError::Flow(error)) => Err(error.into()),
-                Err(CudaTracerError::Device(error)) if error.is_fault() => {
-                    gpu.health().fail(error);
-                    self.check()?;
-                    Ok((cpu_tracer(source, map, t0)?, None))
-                }
-                Err(CudaTracerError::Device(error)) if *may_fall_back && !gpu.health().in_use() => {
-                    Ok((cpu_tracer(source, map, t0)?, Some(format!("traced on the CPU: {error}"))))
-                }
-                Err(CudaTracerError::Device(error)) => Err(error.into()),
-            },
-            _ => Ok((cpu_tracer(source, map, t0)?, None)),
-        }
-    }
-
-    /// The same behind the first one: memory for it that a GPU lacks then makes it the CPU's, `instead` in words; a window that no longer
-    /// fits ends work on the GPU, as every failure does, and [`WhenLost`] says what follows.
-    ///
-    /// # Errors
-    /// What [`cpu_tracer`] refuses; the failure, where it is to end the run.
-    #[cfg_attr(not(feature = "cuda"), allow(unused_variables))] // no other device refuses
-    pub(super) fn next_tracer(
-        &self,
-        source: VelocitySource,
-        map: &FlowMap,
-        t0: f64,
-        instead: &'static str,
-    ) -> Result<(Box<dyn Tracer>, Option<String>), EngineError> {
-        match self {
-            #[cfg(feature = "cuda")]
-            Self::Gpu { gpu, .. } => match self.tracer(source.clone(), map, t0) {
-                Err(EngineError::Device(error)) => {
-                    gpu.health().fail_unless_refused(*error, instead);
-                    self.check()?;
-                    Ok((cpu_tracer(source, map, t0)?, None))
-                }
-                result => result,
-            },
-            Self::Cpu { .. } => self.tracer(source, map, t0),
-        }
+        let flow = cpu_tracer(velocity.clone(), map, t0)?;
+        begun = begun.max(Instant::now());
+        Tracer::trace(&*flow, seeds, Extras::default(), &mut traced);
+        Ok(TracedOnce { flow, traced, seconds: begun.elapsed().as_secs_f64(), note })
     }
 }
 
-#[cfg(feature = "cuda")]
-impl From<DeviceError> for EngineError {
-    fn from(error: DeviceError) -> Self {
-        EngineError::Device(Box::new(error))
-    }
+/// Seeds that were traced.
+pub struct TracedOnce {
+    /// The flow map on the CPU.
+    pub flow: Box<dyn Tracer>,
+    /// The results.
+    pub traced: Traced,
+    /// Wall-clock seconds of tracing.
+    pub seconds: f64,
+    /// Why the CPU traced in place of the device.
+    pub note: Option<String>,
 }
 
 #[cfg(test)]
@@ -348,6 +287,5 @@ mod tests {
         if matches!(device, Device::Cpu { .. }) {
             assert!(Device::open(DeviceChoice::Cuda(0), &DeviceSettings::default()).is_err());
         }
-        assert_eq!(device.failure(), None);
     }
 }

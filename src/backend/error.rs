@@ -1,7 +1,5 @@
-//! Why a GPU cannot be used, or no longer.
+//! Reasons why a device cannot be used, or cannot be used any longer. A leaf: every room may name it.
 
-use cudarc::driver::result::DriverError;
-use cudarc::driver::sys::CUresult;
 use thiserror::Error;
 
 /// Why a GPU cannot be used, or no longer.
@@ -107,6 +105,9 @@ pub enum DeviceError {
         /// Bytes left.
         left: u64,
     },
+    /// A GPU was asked for.
+    #[error("built without the feature `cuda`; accepted: --device auto, cpu")]
+    NotBuilt,
     /// Not on the GPU.
     #[error("not on the GPU: {what}")]
     Unsupported {
@@ -116,42 +117,19 @@ pub enum DeviceError {
 }
 
 impl DeviceError {
-    /// A failed driver call.
-    pub fn driver(doing: &'static str) -> impl Fn(DriverError) -> Self {
-        move |error| match error.0 {
-            CUresult::CUDA_ERROR_OUT_OF_MEMORY => Self::DriverOutOfMemory { doing },
-            code => Self::Driver {
-                doing,
-                reason: error.error_string().map_or_else(|_| format!("{code:?}"), |text| text.to_string_lossy().into_owned()),
-            },
-        }
-    }
-
-    /// Whether a driver call failed: faults of kernels, resets and lost cards, all of which leave the context unusable, cannot be told from
-    /// the rest for certain, so that no more is asked of a device after any of them. All other errors are refusals of what was asked for.
+    /// Whether the device is lost: a driver call failed. Faults of kernels, resets and lost cards leave the context unusable and cannot be told from
+    /// other failures with certainty, so the device is not used after any of them. All other errors refuse one request.
     pub fn is_fault(&self) -> bool {
         matches!(self, Self::Driver { .. })
     }
 
-    /// Whether memory was wanted that is not there now. It may be later: frames, slides and other programs give theirs back.
+    /// Whether memory is short now. It may be free later: frames, slides and other programs give theirs back.
     pub fn is_out_of_memory(&self) -> bool {
         matches!(self, Self::OutOfMemory { .. } | Self::DriverOutOfMemory { .. })
     }
 
-    /// Whether the device works, and does not do this one thing now or at all: others can do it instead.
+    /// Whether the device works but cannot do this one thing, now or at all.
     pub fn is_refusal(&self) -> bool {
         self.is_out_of_memory() || matches!(self, Self::Unsupported { .. } | Self::Compile { .. })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_driver_without_memory_is_no_fault() {
-        let error = DeviceError::driver("loading kernels")(DriverError(CUresult::CUDA_ERROR_OUT_OF_MEMORY));
-        assert!(error.is_out_of_memory() && error.is_refusal() && !error.is_fault(), "{error}");
-        assert!(error.to_string().starts_with("loading kernels: "), "{error}");
     }
 }

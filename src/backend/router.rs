@@ -1,44 +1,45 @@
-//! Answers the renderer's queries: the surrogate where the gate trusts it, RK4 elsewhere.
+//! Routes a frame's log-stretch queries on the CPU, and keeps labels of the traced ones.
+//!
+//! The rule, on every backend: a query on missing cells has no value. A query in a cell that the gate trusts is answered by the surrogate, any other
+//! query by tracing. Once the frame's tracing budget is spent, the surrogate answers everywhere, and these answers are counted. Without a surrogate
+//! every query is traced. `kernels/rendering/answer.cu` applies the same rule on a GPU.
 
+use super::DeviceError;
 use crate::field::Domain;
-use crate::flow::{Extras, Traced, Tracer};
+use crate::flow::{Extras, Traced};
 use crate::render::LogStretch;
-use crate::surrogate::{Predict, Samples};
+use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::Gate;
 use std::time::Instant;
 
-/// Whom to ask, and what was found out on the way.
-pub struct Answers<'a> {
-    tracer: &'a dyn Tracer,
-    surrogate: Option<&'a dyn Predict>,
-    gate: &'a Gate,
-    /// Time after which even untrusted cells are answered by the surrogate.
-    trace_budget: Option<f64>,
-    keep: usize,
-    stride: usize,
-    since_kept: usize,
-    extras: Extras,
-    /// Traced queries, kept evenly over the frame (fewer than `keep`), with the log-stretch that was traced.
-    pub samples: Samples,
-    /// Figures of the frame so far.
-    pub tally: Tally,
-    traced: Traced,
-    scratch: Scratch,
-}
-
-/// Whom [`Answers`] asks, beside the tracer.
+/// What decides who answers a frame's queries, and which labels are kept.
 #[derive(Clone, Copy)]
-pub struct Asked<'a> {
-    /// Where the gate trusts it; none: the tracer is asked everywhere.
-    pub surrogate: Option<&'a dyn Predict>,
+pub struct Routing<'a> {
     /// Where the surrogate is trusted.
     pub gate: &'a Gate,
-    /// Seconds of tracing after which the surrogate is asked everywhere.
+    /// Seconds of tracing after which the surrogate answers everywhere.
     pub trace_budget: Option<f64>,
-    /// Traced samples to keep: fewer than so many.
+    /// Fewer than so many traced queries are kept as labels.
     pub keep: usize,
-    /// What is kept with each of them.
+    /// What is kept with each label.
     pub extras: Extras,
+}
+
+/// Answers the queries of one frame.
+pub struct QueryRouter<'a> {
+    tracer: &'a dyn Trace,
+    surrogate: Option<&'a dyn Predict>,
+    routing: Routing<'a>,
+    stride: usize,
+    since_kept: usize,
+    /// Traced queries, kept evenly over the frame (fewer than `keep`).
+    pub samples: Samples,
+    /// Counts and times of the frame so far.
+    pub tally: Tally,
+    /// The first failure of a device. Later queries have no value.
+    failure: Option<DeviceError>,
+    traced: Traced,
+    scratch: Scratch,
 }
 
 /// Counts and times of one frame's answers.
@@ -67,55 +68,44 @@ struct Scratch {
     values: Vec<f32>,
 }
 
-impl<'a> Answers<'a> {
-    /// Answers by RK4 alone where `surrogate` is none. At most `keep` traced samples are kept for training.
-    pub fn new(tracer: &'a dyn Tracer, surrogate: Option<&'a dyn Predict>, gate: &'a Gate, trace_budget: Option<f64>, keep: usize) -> Self {
+impl<'a> QueryRouter<'a> {
+    /// A router that traces everything if `surrogate` is `None`.
+    pub fn new(tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>, routing: Routing<'a>) -> Self {
         Self {
             tracer,
             surrogate,
-            gate,
-            trace_budget,
-            keep,
+            routing,
             stride: 1,
             since_kept: 0,
-            extras: Extras::default(),
             samples: Samples::default(),
             tally: Tally::default(),
+            failure: None,
             traced: Traced::default(),
             scratch: Scratch::default(),
         }
     }
 
-    /// Keeps these with each sample, for surrogates that learn the flow map.
-    pub fn with_extras(mut self, extras: Extras) -> Self {
-        self.extras = extras;
-        self
-    }
-
-    /// Whom to ask, for an engine that asks them itself.
-    pub fn asked(&self) -> Asked<'a> {
-        Asked { surrogate: self.surrogate, gate: self.gate, trace_budget: self.trace_budget, keep: self.keep, extras: self.extras }
-    }
-
-    /// Takes in the figures and samples of a frame whose queries were answered without this.
-    pub fn answered_elsewhere(&mut self, tally: Tally, samples: Samples) {
-        self.tally = tally;
-        self.samples = samples;
+    /// Counts, times and labels of the frame.
+    ///
+    /// # Errors
+    /// The device failed during the frame.
+    pub fn finish(self) -> Result<(Tally, Samples), DeviceError> {
+        self.failure.map_or(Ok((self.tally, self.samples)), Err)
     }
 
     fn domain(&self) -> &'a Domain {
-        self.tracer.domain()
+        self.tracer.flow().domain()
     }
 
     fn budget_spent(&self) -> bool {
-        self.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget)
+        self.routing.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget)
     }
 
     /// Every stride-th traced query is kept; when there is no more room, every other one is let go and the stride doubles, so that
     /// what is kept is spread evenly over the frame.
     fn keep_samples(&mut self, count: usize) {
         let domain = self.domain();
-        let extras = self.extras;
+        let extras = self.routing.extras;
         for i in 0..count {
             self.since_kept += 1;
             if self.since_kept < self.stride {
@@ -123,7 +113,7 @@ impl<'a> Answers<'a> {
             }
             self.since_kept = 0;
             push_sample(&mut self.samples, domain, self.scratch.points[i], &self.traced, i, extras);
-            if self.samples.len() >= self.keep {
+            if self.samples.len() >= self.routing.keep {
                 halve(&mut self.samples);
                 self.stride *= 2;
             }
@@ -165,58 +155,69 @@ pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3
     }
 }
 
-impl LogStretch for Answers<'_> {
-    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+impl QueryRouter<'_> {
+    fn route(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) -> Result<(), DeviceError> {
         self.tally.queries += points.len() as u64;
         let domain = self.domain();
-        let mut scratch = std::mem::take(&mut self.scratch);
+        let spent = self.budget_spent();
+        let Self { tracer, surrogate, routing, tally, scratch, .. } = self;
         scratch.to_trace.clear();
         scratch.to_predict.clear();
-        let spent = self.budget_spent();
         for (i, &point) in points.iter().enumerate() {
-            if self.tracer.is_void(point) {
+            if tracer.flow().is_void(point) {
                 log_stretch[i] = f32::NAN;
                 traced[i] = false;
-                self.tally.missing += 1;
-            } else if self.surrogate.is_none() {
+                tally.missing += 1;
+            } else if surrogate.is_none() {
                 scratch.to_trace.push(i as u32);
-            } else if self.gate.trusts(domain.to_unit(point)) {
+            } else if routing.gate.trusts(domain.to_unit(point)) {
                 scratch.to_predict.push(i as u32);
             } else if spent {
-                self.tally.over_budget += 1;
+                tally.over_budget += 1;
                 scratch.to_predict.push(i as u32);
             } else {
                 scratch.to_trace.push(i as u32);
             }
         }
-        if let Some(surrogate) = self.surrogate.filter(|_| !scratch.to_predict.is_empty()) {
+        if let Some(surrogate) = surrogate.filter(|_| !scratch.to_predict.is_empty()) {
             let start = Instant::now();
             scratch.unit.clear();
             scratch.unit.extend(scratch.to_predict.iter().map(|&i| domain.to_unit(points[i as usize])));
             scratch.values.resize(scratch.unit.len(), 0.0);
-            surrogate.predict(&scratch.unit, &mut scratch.values);
+            surrogate.predict(&scratch.unit, &mut scratch.values)?;
             for (&i, &value) in scratch.to_predict.iter().zip(&scratch.values) {
                 log_stretch[i as usize] = value;
                 traced[i as usize] = false;
             }
-            self.tally.predict_seconds += start.elapsed().as_secs_f64();
+            tally.predict_seconds += start.elapsed().as_secs_f64();
         }
         if !scratch.to_trace.is_empty() {
             let start = Instant::now();
             scratch.points.clear();
             scratch.points.extend(scratch.to_trace.iter().map(|&i| points[i as usize]));
-            self.tracer.trace(&scratch.points, self.extras, &mut self.traced);
+            tracer.trace(&scratch.points, routing.extras, &mut self.traced)?;
             for (k, &i) in scratch.to_trace.iter().enumerate() {
                 log_stretch[i as usize] = self.traced.log_stretch[k];
                 traced[i as usize] = true;
             }
-            self.tally.traced += scratch.to_trace.len() as u64;
-            self.tally.trace_seconds += start.elapsed().as_secs_f64();
+            tally.traced += scratch.to_trace.len() as u64;
+            tally.trace_seconds += start.elapsed().as_secs_f64();
+            if self.routing.keep > 1 {
+                self.keep_samples(self.scratch.to_trace.len());
+            }
         }
-        let any_traced = !scratch.to_trace.is_empty();
-        self.scratch = scratch;
-        if any_traced && self.keep > 1 {
-            self.keep_samples(self.scratch.to_trace.len());
+        Ok(())
+    }
+}
+
+impl LogStretch for QueryRouter<'_> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        if self.failure.is_none() {
+            self.failure = self.route(points, log_stretch, traced).err();
+        }
+        if self.failure.is_some() {
+            log_stretch.fill(f32::NAN);
+            traced.fill(false);
         }
     }
 }

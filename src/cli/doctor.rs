@@ -72,7 +72,7 @@ fn cpu() -> Cpu {
 
 #[cfg(feature = "cuda")]
 fn gpu() -> Gpu {
-    use ridgewatch::engine::cuda::{Gpu as Opened, GpuSettings, nvrtc_version, probe};
+    use ridgewatch::backend::cuda::{Gpu as Opened, GpuSettings, nvrtc_version, probe};
     let found = match probe() {
         Ok(found) => found,
         Err(why) => return Gpu { usable: false, found: Vec::new(), why_not: Some(why.to_string()) },

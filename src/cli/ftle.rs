@@ -2,12 +2,15 @@
 
 use super::{Common, Usage, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{Device, EngineError, Plan, Setup, Slide};
+use ridgewatch::backend::{Device, TracedOnce};
+use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::run::{EngineError, Plan, Setup, Slide};
 use ridgewatch::setting::word;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// Options of `ftle`.
 #[derive(Debug, clap::Args)]
@@ -104,14 +107,14 @@ struct Convergence {
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
     let faulty = |error| located(&scene, error, EngineError::refused);
-    let Setup { plan, mut feed, notes, .. } = super::open(&scene)?;
+    let Setup { plan, mut slides, notes } = super::open(&scene)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
         super::check_folder(out)?;
     }
     let mut slide = None;
     for _ in 0..=options.slide {
-        slide = feed.next_slide().map_err(faulty)?;
+        slide = slides.next_slide(&AtomicBool::new(false)).map_err(faulty)?;
         if slide.is_none() {
             bail!(Usage(format!("--slide {}: the source has fewer slides", options.slide)));
         }
@@ -133,8 +136,6 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
 }
 
 fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Result<Report> {
-    let (tracer, told) = device.tracer(slide.velocity.clone(), &plan.map, slide.time)?;
-    told.iter().for_each(messages::note);
     let mut grid = options.grid.0;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}
@@ -155,17 +156,11 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         let [x, y, z] = grid;
         bail!(Usage(format!("--grid {x}x{y}x{z}: accepted: at most 2^27 seeds in all")));
     }
-    let seeds = seeds(&*tracer, grid);
-    let begun = std::time::Instant::now();
-    let mut traced = Traced::default();
+    let seeds = seeds(&plan.domain, grid);
     let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
-    tracer.trace(&seeds, Extras::default(), &mut traced);
-    device.check()?;
-    if let Some(failure) = device.failure() {
-        messages::note(format!("work on the GPU has ended, the CPU went on: {failure}"));
-    }
-    device.shortages().into_iter().for_each(messages::note);
-    let seconds = begun.elapsed().as_secs_f64();
+    let TracedOnce { flow: tracer, traced, seconds, note } =
+        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(EngineError::from)?;
+    note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
     let ftle: Vec<f64> =
         unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
@@ -211,9 +206,9 @@ fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
     tracer.chosen().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
 }
 
-fn seeds(tracer: &dyn Tracer, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
+fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
     let at = |i: usize, n: usize| if n > 1 { i as f32 / (n - 1) as f32 } else { 0.5 };
-    (0..nx * ny * nz).map(|i| tracer.domain().from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
+    (0..nx * ny * nz).map(|i| domain.from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
 }
 
 /// FTLE of a closed form that is the same everywhere; none where there is no such form.

@@ -3,7 +3,7 @@
 use super::{Common, Usage, located, print_json, print_text};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::TimeSpan;
+use ridgewatch::run::TimeSpan;
 use ridgewatch::setting::word;
 use ridgewatch::source::{SourceError, SourceKind};
 use std::path::PathBuf;

@@ -16,10 +16,11 @@ mod synthesize;
 
 use anyhow::{Context, Result, bail};
 use clap::{Args, Parser, Subcommand};
+use ridgewatch::backend::{Device, DeviceChoice};
 use ridgewatch::config::{ConfigError, SceneFile};
-use ridgewatch::engine::{Device, DeviceChoice, EngineError, Setup};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
+use ridgewatch::run::{EngineError, Setup};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::SourceError;
 use ridgewatch::surrogate::Kind;

@@ -2,8 +2,8 @@
 
 use super::{Common, Usage, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{EngineError, open_snapshots};
 use ridgewatch::field::{Axis, Geometry, Grid, Snapshot};
+use ridgewatch::run::{EngineError, open_snapshots};
 use ridgewatch::source::SnapshotSource;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Policy, Producer};
 use std::path::PathBuf;

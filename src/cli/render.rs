@@ -2,9 +2,9 @@
 
 use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions};
 use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
 use ridgewatch::render::Method;
+use ridgewatch::run::{self, EngineError, Event, Frame, RunOptions};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
@@ -87,7 +87,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             picture = Some(frame);
         }
     };
-    engine::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, EngineError::refused))?;
+    run::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, EngineError::refused))?;
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {

@@ -3,9 +3,9 @@
 use super::{Common, Interrupted, Usage, check_learns, located, messages, print_json, print_text, scene};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder};
 use ridgewatch::render::Method;
+use ridgewatch::run::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
@@ -148,7 +148,7 @@ async fn frames(
     let worker = tokio::task::spawn_blocking(move || {
         let mut bar = messages::progress(None);
         let mut last: Option<Arc<FrameRecord>> = None;
-        let run = || engine::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
+        let run = || run::run(setup, &run_options, &mut |event| show(event, &mut bar, &mut last, &mut output), &stop);
         // A fault of ours must not cost the frames that are already made.
         let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
         let result = result.and_then(|result| result.map_err(|error| located(&scene, error, EngineError::refused)));

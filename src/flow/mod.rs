@@ -245,27 +245,6 @@ pub trait Tracer: Send + Sync {
     fn is_void(&self, _seed: [f32; 3]) -> bool {
         false
     }
-    /// The tracer itself, for an engine that knows its own ones again; none for others.
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        None
-    }
     /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
-    /// Traces the nodes of a regular grid over the unit domain on a device that keeps what it traced; none: nobody does, and the nodes are
-    /// seeds like others. Node i of n along an axis lies at i / (n - 1); one node along z in two dimensions.
-    fn trace_nodes(&self, _nodes: [usize; 3]) -> Option<std::sync::Arc<dyn TracedNodes>> {
-        None
-    }
-}
-
-/// The log-stretch at the nodes of a regular grid, held by the device that traced it.
-pub trait TracedNodes: std::fmt::Debug + Send + Sync {
-    /// Nodes whose trace was not finite; they hold 0.
-    fn not_finite(&self) -> usize;
-    /// All of them, x fastest, brought to the host; NaN where the device is lost, and nobody is left to trace them anew.
-    fn values(&self) -> Vec<f32>;
-    /// Interpolates multilinearly at unit points; false where the device cannot, and `out` then holds anything.
-    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool;
-    /// What the device made, for an engine that knows its own.
-    fn as_any(&self) -> &dyn std::any::Any;
 }

@@ -2,7 +2,7 @@
 //! all f32, sorted by name, ZIP-compressed without loss.
 
 use super::{PublishError, run_folder::write_whole};
-use crate::{engine::FrameRecord, render::Film};
+use crate::{render::Film, run::FrameRecord};
 use exr::meta::MetaData;
 use exr::prelude::*;
 use std::io::{Cursor, Read};

@@ -1,7 +1,7 @@
 //! The thread that writes the run folder, behind a short queue.
 
 use super::{ExrFrames, FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
-use crate::engine::{Frame, FrameRecord};
+use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;

@@ -1,7 +1,7 @@
 //! Between the cycle and the socket: the newest frame, the records that wait, and what is on its way.
 
 use super::PublishStatistics;
-use crate::engine::{Frame, FrameRecord};
+use crate::run::{Frame, FrameRecord};
 use bytes::Bytes;
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};

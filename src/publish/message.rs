@@ -1,7 +1,7 @@
 //! What a published message says: topics, header, payload.
 
 use super::{Payload, encode_exr, jpeg, png, preview};
-use crate::engine::{Frame, FrameRecord};
+use crate::run::{Frame, FrameRecord};
 use serde::{Deserialize, Serialize};
 
 /// First part of a message with a picture.

@@ -3,7 +3,7 @@
 use super::file_writer::FileWriter;
 use super::summary::{Summary, Totals, peak_memory_bytes};
 use super::{PublishError, PublishSettings, Publisher, RunFolder};
-use crate::engine::Frame;
+use crate::run::Frame;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 

@@ -2,7 +2,7 @@
 
 use super::scene::{is_ours, refuse_foreign_scene, write_scene};
 use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
-use crate::engine::{Frame, FrameRecord};
+use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};

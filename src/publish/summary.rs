@@ -1,7 +1,7 @@
 //! What `summary.json` says at the end of a run.
 
 use super::PublishStatistics;
-use crate::engine::FrameRecord;
+use crate::run::FrameRecord;
 use serde::{Deserialize, Serialize};
 
 /// `summary.json`.

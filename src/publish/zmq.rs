@@ -10,7 +10,7 @@ use super::guard::{guard, private_listener};
 use super::mailbox::{Kind, Mailbox, State};
 use super::message::{FRAME_TOPIC, RECORD_TOPIC, encode_frame};
 use super::{Payload, PublishError, PublishSettings};
-use crate::engine::{Frame, FrameRecord};
+use crate::run::{Frame, FrameRecord};
 use bytes::Bytes;
 use serde::{Deserialize, Serialize};
 use std::collections::HashSet;

@@ -8,7 +8,8 @@ use super::Transfer;
 use super::parameters::SeenInCells;
 use crate::field::Domain;
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU32};
 
 /// Ramp above the highest value seen that a cell's bound always keeps: what no sample showed must stay reachable, or it would be
 /// invisible rather than noisy.
@@ -52,6 +53,13 @@ struct Watch {
     missing: AtomicBool,
 }
 
+impl Clone for Watch {
+    fn clone(&self) -> Self {
+        let (count, highest) = (self.count.load(Relaxed), self.highest.load(Relaxed));
+        Self { count: count.into(), highest: highest.into(), missing: self.missing.load(Relaxed).into() }
+    }
+}
+
 /// Maps floats to integers of the same order (no NaN).
 fn ordered(value: f32) -> u32 {
     let bits = value.to_bits();
@@ -63,7 +71,7 @@ fn from_ordered(image: u32) -> f32 {
 }
 
 /// Bounds on the extinction, x fastest, then y, then z.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct MajorantGrid {
     cells: [usize; 3],
     majorants: Vec<f32>,

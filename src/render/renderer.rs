@@ -48,7 +48,7 @@ pub struct RenderStats {
 }
 
 /// Renders frames of one scene. Keeps the majorants from frame to frame.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct Renderer {
     scene: Scene,
     domain: Domain,

@@ -1,67 +1,99 @@
-//! What a frame's audit points say of the surrogate it was rendered with, and what follows for trust, size and ring.
+//! The error of a frame's surrogate on its audit points, and the consequences for trust, size and replay buffer.
 
-use super::frame::Rendered;
+use super::cycle::{MAX_RENDER_RESIDUALS, Run};
+use super::frame::Work;
 use super::prepare::every;
-use super::{Cycle, RENDER_RESIDUALS};
-use crate::engine::answers::Tally;
-use crate::engine::audit;
-use crate::engine::stop::Interruptible;
-use crate::engine::{FrameRecord, TrustedError};
-use crate::flow::{Extras, Tracer};
-use crate::surrogate::Predict;
-use crate::trust::{Audited, Gate, Strata};
+use super::stop::RunEnd;
+use super::transaction::On;
+use super::{FrameRecord, TrustedError};
+use crate::backend::{AuditFindings, Backend, FrameSamples, Interruptible, Tally, audit, residuals, stratified_points, trusted_error};
+use crate::flow::Extras;
+use crate::surrogate::{Predict, Samples, Trace};
+use crate::trust::{Audited, Gate, Residual, Strata};
 use std::sync::atomic::Ordering;
 
-impl Cycle<'_> {
-    /// States the error of `front` from the audit points, which decided nothing in this frame, and only then lets them and the rendered
-    /// samples decide the next one.
-    pub(super) fn assess(&mut self, front: &dyn Predict, tracer: &dyn Tracer, gate: &Gate, work: &Rendered, record: &mut FrameRecord) {
-        let Some(audited) = &work.audit.errors else { return };
-        let tolerance = self.plan.scene.trust.tolerance;
-        record.trusted_share = gate.share();
-        record.trusted = audit::trusted_error(audited, gate);
-        self.peak = self.peak.max(work.audit.peak);
-        record.surrogate_psnr = audit::psnr(audited, self.peak);
-        record.over_tolerance = over_tolerance(&work.tally, record.trusted, audited, gate, tolerance);
-        if work.tally.over_budget > 0 {
-            record.warnings.push(format!(
-                "the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate",
-                work.tally.over_budget
-            ));
+/// The error of a frame's surrogate, before it counts.
+pub(super) struct Assessment {
+    trusted: Option<TrustedError>,
+    trusted_share: f64,
+    over_tolerance: Option<f64>,
+    /// Queries of untrusted cells that the surrogate answered.
+    over_budget: u64,
+    /// Residuals of the rendered samples.
+    rendered: Vec<Residual>,
+}
+
+/// States the error of `frozen` from the audit points, which decided nothing in this frame.
+pub(super) fn assess<S: FrameSamples>(
+    run: &Run<'_>,
+    frozen: &dyn Predict,
+    tracer: &dyn Trace,
+    gate: &Gate,
+    work: &Work<S>,
+) -> Result<Option<Assessment>, RunEnd> {
+    let Some(audited) = &work.audit.errors else { return Ok(None) };
+    let (samples, tally) = (work.rendered.samples.on_host(), &work.rendered.tally);
+    let trusted = trusted_error(audited, gate);
+    let some = every(samples, samples.len().div_ceil(MAX_RENDER_RESIDUALS).max(1));
+    let (transfer, tau) = (run.renderer.transfer(), tracer.flow().tau());
+    Ok(Some(Assessment {
+        trusted,
+        trusted_share: gate.share(),
+        over_tolerance: over_tolerance(tally, trusted, audited, gate, run.plan.scene.trust.tolerance),
+        over_budget: tally.over_budget,
+        rendered: run.threads.render().install(|| residuals(frozen, &some, transfer, tau))?,
+    }))
+}
+
+impl Run<'_> {
+    /// Records the assessment, and lets the audit points and the rendered samples decide the next frame.
+    pub(super) fn take_in<B: Backend>(
+        &mut self,
+        on: &On<B>,
+        assessment: Assessment,
+        findings: &AuditFindings,
+        samples: Samples,
+        record: &mut FrameRecord,
+    ) {
+        let Some(audited) = &findings.errors else { return };
+        let Assessment { trusted, trusted_share, over_tolerance, over_budget, rendered } = assessment;
+        let learning = &mut self.learning;
+        learning.peak = learning.peak.max(findings.peak);
+        (record.trusted, record.trusted_share, record.over_tolerance) = (trusted, trusted_share, over_tolerance);
+        record.surrogate_psnr = audit::psnr(audited, learning.peak);
+        if over_budget > 0 {
+            record
+                .warnings
+                .push(format!("the tracing budget was spent: {over_budget} queries of untrusted cells were answered by the surrogate"));
         }
-        let some = every(&work.samples, work.samples.len().div_ceil(RENDER_RESIDUALS).max(1));
-        let transfer = self.renderer.transfer();
-        let rendered = self.threads.render().install(|| audit::residuals(front, &some, transfer, tracer.tau()));
-        self.trust.decay();
-        self.trust.observe(Some(audited), &rendered);
-        if let Some(sizing) = &mut self.sizing {
-            // Over the whole domain: where nothing is trusted, the size is what is to be blamed.
-            let everywhere = audit::trusted_error(audited, &Gate::uniform(true));
-            self.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, tolerance));
+        learning.trust.decay();
+        learning.trust.observe(Some(audited), &rendered);
+        if let Some(sizing) = &mut learning.sizing {
+            // Over the whole domain: where nothing is trusted, the size is to blame.
+            let everywhere = trusted_error(audited, &Gate::uniform(true));
+            learning.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, self.plan.scene.trust.tolerance));
         }
-        if self.learns() {
-            self.ring.push(&work.samples);
-            self.ring.push(&work.audit.samples);
-        }
+        self.keep_samples(on, &samples);
+        self.keep_samples(on, &findings.samples);
     }
 
-    /// The error of `front` in the trusted region on fresh points, where it was asked for; none when a stop cut it short, since it would
+    /// Error of `frozen` in the trusted region on fresh points, if it was asked for; `None` if a stop cut the measurement short, since it would
     /// stand on the points that come first.
-    pub(super) fn verify(&self, front: &dyn Predict, tracer: &dyn Tracer, gate: &Gate) -> Option<TrustedError> {
+    pub(super) fn verify(&self, frozen: &dyn Predict, tracer: &dyn Trace, gate: &Gate) -> Result<Option<TrustedError>, RunEnd> {
         if self.options.verify_points == 0 {
-            return None;
+            return Ok(None);
         }
-        let cells = self.trust.shape();
+        let cells = self.learning.trust.shape();
         let per_cell = self.options.verify_points.div_ceil(cells.iter().product());
         let strata = Strata::even(cells, per_cell as u32);
-        let unit = audit::stratified_points(&strata, self.plan.scene.seed, 2 * self.frame + 1);
+        let unit = stratified_points(&strata, self.plan.scene.seed, 2 * self.progress.frame + 1);
         let interruptible = Interruptible::new(tracer, self.stop);
         let verified = self.threads.render().install(|| {
-            let fresh = audit::trace(&interruptible, &unit, Extras::default());
-            let residuals = audit::residuals(front, &fresh.samples, self.renderer.transfer(), tracer.tau());
-            audit::trusted_error(&Audited::of(&residuals, strata), gate)
-        });
-        verified.filter(|_| !self.stop.load(Ordering::Relaxed))
+            let fresh = audit::trace(&interruptible, &unit, Extras::default())?;
+            let residuals = residuals(frozen, &fresh.samples, self.renderer.transfer(), tracer.flow().tau())?;
+            Ok::<_, RunEnd>(trusted_error(&Audited::of(&residuals, strata), gate))
+        })?;
+        Ok(verified.filter(|_| !self.stop.load(Ordering::Relaxed)))
     }
 }
 

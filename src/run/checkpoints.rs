@@ -1,7 +1,8 @@
 //! Checkpoints of a run, written beside it: at most one at a time, by a thread of its own, while frames go on.
 
 use super::record::CheckpointRecord;
-use crate::surrogate::{CheckpointError, Draft, Surrogate};
+use crate::backend::{DeviceError, Surrogate};
+use crate::surrogate::{CheckpointError, CheckpointState};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
@@ -65,31 +66,34 @@ impl Checkpoints {
     }
 
     /// Begins one after `frame`, where one is due. Seconds that the loop stood still for it, and what should be said of it.
-    pub(super) fn after_frame(&mut self, frame: u64, live: &mut dyn Surrogate) -> (f64, Option<String>) {
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(super) fn after_frame<S: Surrogate>(&mut self, frame: u64, live: &mut S) -> Result<(f64, Option<String>), DeviceError> {
         if self.every.is_none_or(|seconds| self.due.elapsed().as_secs_f64() < seconds) {
-            return (0.0, None);
+            return Ok((0.0, None));
         }
         if let Some(writing) = &mut self.writing {
             self.due = Instant::now();
             writing.record.postponed += 1;
             self.totals.postponed += 1;
-            return (0.0, None);
+            return Ok((0.0, None));
         }
         let begun = Instant::now();
         // Otherwise an earlier copy is on its way, and it is due after the next frame.
-        let Some(draft) = live.draft_behind() else { return (0.0, None) };
+        let Some(state) = live.checkpoint_async()? else { return Ok((0.0, None)) };
         self.due = begun;
         let copy_seconds = begun.elapsed().as_secs_f64();
         self.totals.longest_copy_seconds = self.totals.longest_copy_seconds.max(copy_seconds);
-        let told = draft.not_behind().map(|why| format!("the frames waited {copy_seconds:.2} s for a checkpoint: {why}"));
+        let told = state.wait_reason().map(|why| format!("the frames waited {copy_seconds:.2} s for a checkpoint: {why}"));
         let record = CheckpointRecord { frame: Some(frame), copy_seconds, behind: told.is_none(), ..CheckpointRecord::default() };
-        self.write(record, begun, draft);
-        (copy_seconds, told)
+        self.write(record, begun, state);
+        Ok((copy_seconds, told))
     }
 
-    fn write(&mut self, record: CheckpointRecord, begun: Instant, draft: Draft) {
+    fn write(&mut self, record: CheckpointRecord, begun: Instant, state: CheckpointState) {
         let path = self.path.clone();
-        self.start(record, begun, move || draft.write(&path));
+        self.start(record, begun, move || state.write(&path));
     }
 
     fn start(&mut self, record: CheckpointRecord, begun: Instant, write: impl FnOnce() -> Result<u64, CheckpointError> + Send + 'static) {
@@ -160,14 +164,15 @@ impl Checkpoints {
     ///
     /// # Errors
     /// What keeps it from being written. What became of the one before is told, and counted.
-    pub(super) fn finish(&mut self, frame: Option<u64>, live: &dyn Surrogate) -> Result<(), CheckpointError> {
+    pub(super) fn finish<S: Surrogate>(&mut self, frame: Option<u64>, live: &S) -> Result<(), CheckpointError> {
         if let Err(hangs @ CheckpointError::Hangs { .. }) = self.wait() {
             return Err(hangs);
         }
         let begun = Instant::now();
-        let draft = live.draft();
+        let lost = |source| CheckpointError::Lost { path: self.path.clone(), what: "its numbers", source };
+        let state = live.checkpoint().map_err(lost)?;
         let copy_seconds = begun.elapsed().as_secs_f64();
-        self.write(CheckpointRecord { frame, copy_seconds, ..CheckpointRecord::default() }, begun, draft);
+        self.write(CheckpointRecord { frame, copy_seconds, ..CheckpointRecord::default() }, begun, state);
         self.wait()
     }
 }
@@ -178,12 +183,15 @@ mod tests {
     use crate::field::Domain;
     use crate::field::analytic::Analytic;
     use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
-    use crate::surrogate::Table;
+    use crate::surrogate::network::NetworkSettings;
+    use crate::surrogate::{HostSurrogate, Kind, SurrogateSettings, build};
     use std::sync::mpsc::Sender;
 
-    fn table() -> Table {
+    fn table() -> HostSurrogate {
         let source = VelocitySource::Analytic(Analytic::Saddle { rate: 1.0 }, Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)));
-        Table::trace(&*cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap(), [3, 3, 1])
+        let tracer = cpu_tracer(source, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
+        let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some([3, 3, 1]) };
+        build(&settings, &NetworkSettings::default(), tracer.domain(), 0, &tracer).unwrap()
     }
 
     /// One that is due after every frame and writes until told what it came to.
@@ -201,7 +209,7 @@ mod tests {
         let (mut checkpoints, end) = slow(folder.path());
         let mut table = table();
         for frame in 1..=5 {
-            assert_eq!(checkpoints.after_frame(frame, &mut table), (0.0, None), "nothing is waited for");
+            assert_eq!(checkpoints.after_frame(frame, &mut table).unwrap(), (0.0, None), "nothing is waited for");
             let record = checkpoints.look().unwrap();
             assert_eq!((record.frame, record.bytes, record.postponed), (Some(0), None, frame));
         }
@@ -210,7 +218,7 @@ mod tests {
         assert!(result.is_ok() && record.bytes == Some(77) && record.postponed == 5, "{record:?}");
         assert_eq!(checkpoints.look(), None, "told once");
         // The next one.
-        checkpoints.after_frame(6, &mut table);
+        checkpoints.after_frame(6, &mut table).unwrap();
         let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(result.is_ok() && record.frame == Some(6) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()));
         checkpoints.finish(Some(7), &table).unwrap();
@@ -232,7 +240,7 @@ mod tests {
         assert_eq!((checkpoints.totals.written, checkpoints.totals.failed), (1, 1), "the one before is counted");
         // What cannot be written is an error at the end, and in a record while frames go on.
         let mut nowhere = Checkpoints::new(folder.path().join("no/such/weights"), Some(0.0));
-        nowhere.after_frame(0, &mut table());
+        nowhere.after_frame(0, &mut table()).unwrap();
         let (record, _) = nowhere.hear(DISK_LIMIT).unwrap();
         assert!(record.failed.unwrap().contains("no/such/weights"));
         assert!(matches!(nowhere.finish(Some(1), &table()), Err(CheckpointError::Io { .. })));

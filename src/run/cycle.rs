@@ -1,24 +1,25 @@
 //! The cycle: slide, render with the weights of the cycle before, test, then train.
 //!
 //! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames before. Where a
-//! GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are held against
-//! the frozen weights, which have not seen them, before they go to the ring.
-
-mod assess;
-mod frame;
-mod prepare;
+//! GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are tested against
+//! the frozen weights, which have not seen them, before they go to the replay buffer.
 
 use super::checkpoints::{CheckpointTotals, Checkpoints};
-use super::feed::{Feed, Slide};
-use super::frames::{FrameRenderer, frame_renderer};
+use super::prepare;
+use super::record::Frame;
 use super::setup::{Plan, Setup};
-use super::stop::{Halt, Interruptible, heed};
-use super::training::{Threads, Turns};
-use super::{Device, EngineError, Frame, Settings, TransferRecord};
+use super::slides::{Slide, Slides};
+use super::stop::{RunEnd, check_stop};
+use super::training::{Threads, TrainingBudget};
+use super::transaction::{On, Recovering, Session, transaction, with};
+use super::{EngineError, Settings, TransferRecord};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{Chosen, FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
-use crate::render::{Method, Renderer};
+use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::network::{Size, Times};
-use crate::surrogate::{Learned, Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
+use crate::surrogate::{Learned, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
 use crate::trust::TrustMap;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -35,9 +36,9 @@ pub struct RunOptions {
     pub threads: usize,
     /// Where to write the trained surrogate at the end.
     pub checkpoint: Option<PathBuf>,
-    /// Writes it also while the run goes on, when so many seconds have gone by since the last time: what is killed goes on from there.
+    /// Writes it also while the run goes on, when so many seconds have passed since the last time: a killed run goes on from there.
     pub checkpoint_seconds: Option<f64>,
-    /// What traces.
+    /// The device that computes.
     pub device: Device,
 }
 
@@ -73,354 +74,466 @@ pub struct RunReport {
     pub worked: f64,
     /// Optimizer steps.
     pub train_steps: u64,
-    /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
+    /// Runge-Kutta steps a path; `None` if each path chooses its own, or before there was a tracer.
     pub integration_steps: Option<usize>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
     pub integration_difference: Option<f64>,
-    /// The transfer function in force; none before there was one.
+    /// The transfer function in force; `None` before there was one.
     pub transfer: Option<TransferRecord>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
-    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no size is tried in vain twice.
+    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no useless size is tried twice.
     pub sizes: Vec<String>,
-    /// Whether the snapshots are close enough in time; none for closed forms.
+    /// Whether the snapshots are close enough in time; `None` for closed forms.
     pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
     pub window_bytes: usize,
-    /// What became of the checkpoints; none where none was asked for.
+    /// What became of the checkpoints; `None` if none was asked for.
     pub checkpoints: Option<CheckpointTotals>,
-    /// What was met behind the last frame, whose record tells of all before.
+    /// Warnings since the last frame, whose record has all before.
     pub warnings: Vec<String>,
 }
 
 /// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
 const COARSE_IN_TIME: f64 = 0.25;
-/// A frame keeps at most one in so many of the ring's places, so that the ring remembers several frames.
-const KEEP_A_FRAME: usize = 4;
 /// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
-const RENDER_RESIDUALS: usize = 1 << 16;
+pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
 
-/// The state that goes from frame to frame.
-struct Cycle<'a> {
-    plan: &'a Plan,
-    options: &'a RunOptions,
-    threads: Threads,
-    frames: Box<dyn FrameRenderer>,
-    renderer: Renderer,
-    transfer: TransferRecord,
-    trust: TrustMap,
-    ring: SampleRing,
-    /// The times that are inputs of the network, and where the window of the ring's labels begins.
-    times: Times,
-    start: f64,
-    live: Option<Box<dyn Surrogate>>,
-    /// What it is built from, with the data's own nodes.
-    surrogate: SurrogateSettings,
-    /// Finds its size, with `size = "auto"`.
-    sizing: Option<Sizing>,
-    /// The size that the next frame should have.
-    resize: Option<Resize>,
-    frame: u64,
-    /// Points traced since the last frame to prepare the next.
-    probed: u64,
-    /// Frames that were no warm-up.
-    pictures: u64,
-    /// Whether a lost device was told of.
-    told_of_failure: bool,
-    /// Whether it was told that particles do not live.
-    told_of_deaths: bool,
-    /// What was learned after the last frame had gone out; the next one's record tells of it.
-    learned_meanwhile: Option<Learned>,
-    /// What training has of the device beside a simulation.
-    turns: Turns,
-    report: &'a mut RunReport,
-    /// Set from outside when the run should end.
-    stop: &'a AtomicBool,
-    /// Largest log-stretch that audit points of this slide have met.
-    peak: f32,
-    began: Instant,
+/// The receiver of a run's events.
+pub(super) type Sink<'a> = dyn FnMut(Event) + Send + 'a;
+
+/// What a run owns on the host, whichever backend computes.
+pub(super) struct Run<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) options: &'a RunOptions,
+    pub(super) threads: Threads,
+    pub(super) stop: &'a AtomicBool,
+    pub(super) began: Instant,
+    pub(super) report: &'a mut RunReport,
+    pub(super) renderer: Renderer,
+    pub(super) transfer: TransferRecord,
+    pub(super) learning: Learning,
+    pub(super) progress: RunProgress,
     /// Where checkpoints are asked for.
-    checkpoints: Option<Checkpoints>,
-    /// Seconds that the loop stood still since the last frame for one, and what the next record should say of it.
-    stood_still: (f64, Option<String>),
+    pub(super) checkpoints: Option<Checkpoints>,
 }
 
-/// Where a frame stands in the run.
+/// What a run has learned, beside the surrogate itself.
+pub(super) struct Learning {
+    pub(super) trust: TrustMap,
+    pub(super) buffer: ReplayBuffer,
+    /// The times that are inputs of the network, and where the window of the buffer's labels begins.
+    pub(super) times: Times,
+    pub(super) start: f64,
+    /// What the surrogate is built from, with the data's own nodes.
+    pub(super) settings: SurrogateSettings,
+    /// Finds its size, with `size = "auto"`.
+    pub(super) sizing: Option<Sizing>,
+    /// The size that the next frame should have.
+    pub(super) resize: Option<Resize>,
+    /// Training's share of a device beside a simulation.
+    pub(super) budget: TrainingBudget,
+    /// What was learned after the last frame had gone out, or in a frame that failed; the next record tells it.
+    pub(super) unreported: Learned,
+    /// Largest log-stretch that audit points of this slide have met.
+    pub(super) peak: f32,
+}
+
+impl Learning {
+    /// Adds what was learned to the next record.
+    pub(super) fn report(&mut self, learned: Learned) {
+        self.unreported = std::mem::take(&mut self.unreported).and(learned);
+    }
+
+    /// What was learned since the last frame; `None` if nothing was trained.
+    pub(super) fn unreported_since_last_frame(&mut self) -> Option<Learned> {
+        Some(std::mem::take(&mut self.unreported)).filter(|learned| *learned != Learned::default())
+    }
+}
+
+/// How far a run is, and what its next record should say.
+#[derive(Default)]
+pub(super) struct RunProgress {
+    pub(super) frame: u64,
+    /// Frames that were no warm-up.
+    pub(super) pictures: u64,
+    /// Points traced since the last frame to prepare the next.
+    pub(super) preparation_traces: u64,
+    /// Whether it was told that particles do not live.
+    pub(super) has_warned_of_deaths: bool,
+    pub(super) warnings: Vec<String>,
+    /// Seconds that the loop stood still since the last frame for a checkpoint.
+    pub(super) checkpoint_pause: f64,
+}
+
+impl Recovering for Run<'_> {
+    fn when_lost(&self) -> WhenLost {
+        self.options.device.when_lost()
+    }
+    fn warn(&mut self, warning: String) {
+        self.progress.warnings.push(warning);
+    }
+    fn pool(&self) -> &rayon::ThreadPool {
+        self.threads.render()
+    }
+    fn stop(&self) -> &AtomicBool {
+        self.stop
+    }
+}
+
+/// A run and where it computes.
+pub(super) struct Cycle<'a, B: Backend> {
+    pub(super) run: Run<'a>,
+    pub(super) session: Session<B>,
+    /// The flow map with the number of steps that the first slide settled, so that frames compare.
+    pub(super) map: FlowMap,
+}
+
+/// Where a frame stands in its slide.
 #[derive(Clone, Copy)]
-struct Place {
-    warmup: bool,
+pub(super) struct FramePlace {
+    pub(super) is_warmup: bool,
     /// Seconds that preparing the slide took, for its first frame.
-    preparing: f64,
+    pub(super) preparing: f64,
 }
 
 /// Runs the whole scene. `sink` gets every event. Setting `stop` ends the run after the current frame; where none is in progress
 /// (while the window fills, tables are traced, or cells are probed) within about a second.
-pub fn run(setup: Setup, options: &RunOptions, sink: &mut (dyn FnMut(Event) + Send), stop: &AtomicBool) -> Result<RunReport, EngineError> {
+///
+/// # Errors
+/// What keeps the run from starting or going on.
+pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &AtomicBool) -> Result<RunReport, EngineError> {
+    match &options.device {
+        Device::Cpu { .. } => run_on(Cpu, setup, options, sink, stop),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => run_on(Cuda::new(&device.gpu, device.storage), setup, options, sink, stop),
+    }
+}
+
+/// The same on any backend. The options' device says what happens if it is lost.
+///
+/// # Errors
+/// As for [`run`].
+pub fn run_on<B: Backend>(
+    backend: B,
+    setup: Setup,
+    options: &RunOptions,
+    sink: &mut Sink<'_>,
+    stop: &AtomicBool,
+) -> Result<RunReport, EngineError> {
     let mut report = RunReport::default();
-    match drive(setup, options, sink, stop, &mut report) {
-        Ok(()) | Err(Halt::TimeIsUp) => {}
-        Err(Halt::Stopped) => report.interrupted = true,
-        Err(Halt::Failed(error)) => {
-            // A lost device is the cause of what failed behind it.
-            options.device.check()?;
-            return Err(error);
-        }
+    match drive(backend, setup, options, sink, stop, &mut report) {
+        Ok(()) | Err(RunEnd::TimeIsUp) => {}
+        Err(RunEnd::Stopped) => report.interrupted = true,
+        Err(RunEnd::Device(error)) => return Err(EngineError::Device(Box::new(error))),
+        Err(RunEnd::Failed(error)) => return Err(error),
     }
     Ok(report)
 }
 
-fn drive(
+fn drive<B: Backend>(
+    backend: B,
     setup: Setup,
     options: &RunOptions,
-    sink: &mut (dyn FnMut(Event) + Send),
+    sink: &mut Sink<'_>,
     stop: &AtomicBool,
     report: &mut RunReport,
-) -> Result<(), Halt> {
+) -> Result<(), RunEnd> {
     let began = Instant::now();
-    let Setup { plan, mut feed, slides, notes } = setup;
+    let Setup { plan, mut slides, notes } = setup;
     let time = &plan.scene.time;
-    let frames = slides.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    let frames = slides.expected().map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
     let threads = Threads::new(options.threads, &plan.scene)?;
-    if let Some(listener) = options.device.listener() {
-        feed.tell(listener);
+    if let Some(listener) = backend.prefetch() {
+        slides.listen(listener);
     }
-    let first = feed.next_slide_unless(stop)?;
-    heed(stop)?;
+    let first = slides.next_slide(stop)?;
+    check_stop(stop)?;
     let mut slide = first.ok_or(EngineError::EndedEarly)?;
     let begun = Instant::now();
-    let (tracer, told) = threads.render().install(|| options.device.tracer(slide.velocity.clone(), &plan.map, slide.time))?;
-    slide.warnings.extend(told);
-    heed(stop)?;
-    // The number of steps is settled once, on the first slide, so that frames compare.
-    let map = match fixed_steps(&*tracer) {
+    let mut beginning = Beginning { options, threads: &threads, stop, warnings: Vec::new() };
+    let mut session = begin(backend, &plan, &slide, &mut beginning)?;
+    check_stop(stop)?;
+    let map = match with!(&session, on => fixed_steps(on.tracer().flow())) {
         Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
         None => plan.map.clone(),
     };
-    let mut cycle = Cycle::new(&plan, options, threads, &Interruptible::new(&*tracer, stop), &slide, began, stop, report)?;
-    sink(Event::Note(cycle.colours()));
-    let ended = cycle.first_slide(&*tracer, &map, &mut slide, begun, sink).and_then(|()| {
-        // They hold the first window, here and on the device.
-        drop((tracer, slide));
-        cycle.later_slides(&mut feed, &map, begun, sink)
-    });
+    let settled = loop {
+        let settled = with!(&session, on => {
+            let tracer = on.tracer();
+            threads.render().install(|| prepare::settled_scene(&plan, tracer, &slide, stop))
+        });
+        match settled {
+            Err(RunEnd::Device(error)) => session.recover(error, &slide, &map, &mut beginning)?,
+            settled => break settled?,
+        }
+    };
+    slide.warnings.append(&mut beginning.warnings);
+    let run = with!(&session, on => Run::new(&plan, options, threads, settled, on.tracer().flow(), &slide, (began, stop), report))?;
+    sink(Event::Note(run.colours()));
+    let mut cycle = Cycle { run, session, map };
+    let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
     // What was learned is kept whether or not the run was stopped.
     match ended {
-        Err(Halt::Failed(error)) => Err(Halt::Failed(error)),
-        ended => cycle.finish().map_err(Halt::Failed).and(ended),
+        Err(RunEnd::Failed(error)) => Err(RunEnd::Failed(error)),
+        ended => cycle.finish().map_err(RunEnd::Failed).and(ended),
     }
 }
 
-impl<'a> Cycle<'a> {
+/// What a recovery needs before there is a run.
+struct Beginning<'a> {
+    options: &'a RunOptions,
+    threads: &'a Threads,
+    stop: &'a AtomicBool,
+    warnings: Vec<String>,
+}
+
+impl Recovering for Beginning<'_> {
+    fn when_lost(&self) -> WhenLost {
+        self.options.device.when_lost()
+    }
+    fn warn(&mut self, warning: String) {
+        self.warnings.push(warning);
+    }
+    fn pool(&self) -> &rayon::ThreadPool {
+        self.threads.render()
+    }
+    fn stop(&self) -> &AtomicBool {
+        self.stop
+    }
+}
+
+/// The first slide on the backend, or on the CPU if the device cannot take it and the options allow that.
+fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut Beginning<'_>) -> Result<Session<B>, RunEnd> {
+    let pool = beginning.threads.render();
+    let error = match pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time)) {
+        Ok(tracer) => return Ok(Session::Device(On { backend, tracer: Some(tracer), surrogate: None })),
+        Err(BackendError::Device(error)) => error,
+        Err(error) => return Err(error.into()),
+    };
+    let device = &beginning.options.device;
+    let goes_on = if error.is_fault() { device.when_lost() == WhenLost::Cpu } else { device.may_fall_back() };
+    if !goes_on {
+        return Err(EngineError::Device(Box::new(error)).into());
+    }
+    let mut backend = Cpu;
+    let tracer = pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time))?;
+    beginning.warnings.push(format!("traced on the CPU: {error}"));
+    Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None }))
+}
+
+impl<'a> Run<'a> {
     fn new(
         plan: &'a Plan,
         options: &'a RunOptions,
         threads: Threads,
-        tracer: &dyn Tracer,
+        settled: Scene,
+        flow: &dyn Tracer,
         first: &Slide,
-        began: Instant,
-        stop: &'a AtomicBool,
+        (began, stop): (Instant, &'a AtomicBool),
         report: &'a mut RunReport,
-    ) -> Result<Self, Halt> {
+    ) -> Result<Self, RunEnd> {
         let scene = &plan.scene;
-        let settled = threads.render().install(|| prepare::settled_scene(plan, tracer, first));
-        heed(stop)?;
-        let settled = settled?;
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
-        report.transfer = Some(transfer);
-        let surrogate = match &first.velocity {
+        let settings = match &first.velocity {
             VelocitySource::Window(window) => {
-                let most = if first.live.is_some() { most_live_nodes(scene, &options.device) } else { usize::MAX };
+                let most = if first.live.is_some() { max_live_nodes(scene, &options.device) } else { usize::MAX };
                 window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape(), most))
             }
             VelocitySource::Analytic(..) => None,
         };
-        let surrogate = surrogate.unwrap_or_else(|| scene.surrogate.clone());
-        let method = scene.render.method;
-        let mut sizing = None;
-        let mut live = if method == Method::Reference {
-            None
-        } else {
-            if scene.network.size == Size::Auto {
-                sizing = Some(Sizing::new(&surrogate, &scene.network, &plan.domain)?);
-            }
-            Some(threads.render().install(|| prepare::build(plan, &surrogate, sizing.as_ref(), tracer, &options.device))?)
-        };
-        heed(stop)?;
-        if let (Some(path), Some(surrogate)) = (&scene.training.resume, &mut live)
-            && surrogate.learns()
-        {
-            surrogate.load(path)?;
-            // Its table is that of another window, for all that is known.
-            threads.render().install(|| surrogate.window_slid(tracer));
-            heed(stop)?;
-        }
-        let times = Times::new(&scene.network, tracer.tau());
-        let mut ring = SampleRing::new(scene.training.ring);
+        let settings = settings.unwrap_or_else(|| scene.surrogate.clone());
+        let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
+        let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
+        let times = Times::new(&scene.network, flow.tau());
+        let mut buffer = ReplayBuffer::new(scene.training.ring);
         if !scene.network.inputs.is_empty() {
-            ring.set_now(times.unit(tracer.start(), tracer.tau()));
+            buffer.set_now(times.unit(flow.start(), flow.tau()));
         }
-        report.integration_steps = fixed_steps(tracer);
-        report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
-        Ok(Self {
-            plan,
-            options,
-            threads,
-            frames: frame_renderer(&options.device),
-            renderer,
-            transfer,
+        report.transfer = Some(transfer);
+        report.integration_steps = fixed_steps(flow);
+        report.integration_difference = flow.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
+        let learning = Learning {
             trust: TrustMap::new(&scene.trust, &plan.domain),
-            ring,
+            buffer,
             times,
-            start: tracer.start(),
-            surrogate,
+            start: flow.start(),
+            settings,
             sizing,
             resize: None,
-            live,
-            frame: 0,
-            probed: 0,
-            pictures: 0,
-            told_of_failure: false,
-            told_of_deaths: false,
-            learned_meanwhile: None,
-            turns: Turns::new(scene.training.share),
-            report,
-            stop,
+            budget: TrainingBudget::new(scene.training.share),
+            unreported: Learned::default(),
             peak: f32::NEG_INFINITY,
-            began,
-            checkpoints: options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds)),
-            stood_still: (0.0, None),
-        })
+        };
+        let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
+        let progress = RunProgress::default();
+        Ok(Self { plan, options, threads, stop, began, report, renderer, transfer, learning, progress, checkpoints })
+    }
+}
+
+impl<B: Backend> Cycle<'_, B> {
+    /// Renders the first slide, whose preparation began at `begun`, and all that follow.
+    fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+        self.prepare_first(&mut slide)?;
+        loop {
+            self.frames(&mut slide, begun, sink)?;
+            transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
+            // Both hold the window, here and on the device.
+            with!(&mut self.session, on => on.tracer = None);
+            drop(slide);
+            let next = slides.next_slide(self.run.stop)?;
+            check_stop(self.run.stop)?;
+            let Some(next) = next else { return Ok(()) };
+            (slide, begun) = (next, Instant::now());
+            self.begin_slide(&slide)?;
+            slide.warnings.extend(self.run.beyond_the_range(slide.time));
+            transaction!(self, &slide, run, on => run.probe(on, slide.index));
+        }
     }
 
-    /// Prepares the first slide, which was begun at `begun`, and renders its frames.
-    fn first_slide(
-        &mut self,
-        tracer: &dyn Tracer,
-        map: &FlowMap,
-        slide: &mut Slide,
-        begun: Instant,
-        sink: &mut (dyn FnMut(Event) + Send),
-    ) -> Result<(), Halt> {
-        slide.warnings.extend(self.uniform(tracer));
-        if let Some(chosen) = tracer.chosen().filter(|chosen| chosen.failed > 0) {
-            slide.warnings.push(format!(
-                "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
-                chosen.failed,
-                Chosen::POINTS
-            ));
+    fn prepare_first(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
+        if self.run.plan.scene.render.method != Method::Reference {
+            transaction!(self, slide, run, on => run.build_surrogate(on));
         }
-        if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
-            slide.warnings.push(format!(
-                "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
-                chosen.steps, chosen.difference
-            ));
+        if let Some(path) = &self.run.plan.scene.training.resume {
+            let loaded = with!(&mut self.session, on => match &mut on.surrogate {
+                Some(surrogate) if surrogate.learns() => surrogate.load(path).map(|()| true),
+                _ => Ok(false),
+            })?;
+            if loaded {
+                // Its table may be that of another window.
+                transaction!(self, slide, run, on => run.slide_surrogate(on));
+            }
         }
+        let flow_warnings = with!(&self.session, on => self.run.flow_warnings(on.tracer().flow()));
+        slide.warnings.extend(flow_warnings);
         if let VelocitySource::Window(window) = &slide.velocity {
-            let resolution = self.threads.render().install(|| time_resolution(window, map, slide.time))?;
+            let resolution = self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?;
             if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
                 slide.warnings.push(format!(
                     "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
                     100.0 * change / resolution.ftle_rms
                 ));
             }
-            self.report.time_resolution = Some(resolution);
+            self.run.report.time_resolution = Some(resolution);
         }
-        let offered = self.options.device.offload().is_some();
-        if offered && self.live.as_ref().is_some_and(|live| live.learns() && !live.is_offloaded()) {
-            let what = "the network is trained on the CPU: a GPU takes no network.jacobian_weight above 0, layers that its shared memory holds, and what its memory has room for";
-            slide.warnings.push(what.into());
-        }
-        slide.warnings.extend(self.beyond_the_range(slide.time));
-        self.pilot(tracer)?;
-        self.probe(tracer, slide.index)?;
-        self.frames(tracer, slide, begun, sink)
+        slide.warnings.extend(self.run.beyond_the_range(slide.time));
+        transaction!(self, slide, run, on => run.pilot(on));
+        transaction!(self, slide, run, on => run.probe(on, slide.index));
+        Ok(())
     }
 
-    /// Goes on until the source ends. The first slide, whose frames are made, was begun at `begun`.
-    fn later_slides(
-        &mut self,
-        feed: &mut Feed,
-        map: &FlowMap,
-        mut begun: Instant,
-        sink: &mut (dyn FnMut(Event) + Send),
-    ) -> Result<(), Halt> {
-        loop {
-            self.train_meanwhile(feed, begun.elapsed().as_secs_f64());
-            let next = feed.next_slide_unless(self.stop)?;
-            heed(self.stop)?;
-            let Some(mut slide) = next else { return Ok(()) };
-            begun = Instant::now();
-            let instead = "the CPU traced a slide";
-            let (tracer, told) = self.options.device.next_tracer(slide.velocity.clone(), map, slide.time, instead)?;
-            slide.warnings.extend(told);
-            self.slid(&*tracer)?;
-            slide.warnings.extend(self.beyond_the_range(slide.time));
-            self.probe(&*tracer, slide.index)?;
-            self.frames(&*tracer, &mut slide, begun, sink)?;
+    /// Takes the session to the next window: tables are traced anew, weights carry over, old labels must show that they still hold (unless the network
+    /// has the start time as an input), trust must be earned again.
+    fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        self.run.learning.peak = f32::NEG_INFINITY;
+        let rebuilds = self.run.learning.resize.is_some();
+        transaction!(self, slide, run, on => if rebuilds { run.rebuild_surrogate(on) } else { run.slide_surrogate(on) });
+        self.run.resized();
+        if with!(&self.session, on => on.surrogate.is_some()) {
+            transaction!(self, slide, run, on => run.slide_labels(on));
         }
+        let Run { renderer, threads, .. } = &mut self.run;
+        threads.render().install(|| renderer.window_slid());
+        Ok(())
     }
 
     /// The frames of one slide.
-    fn frames(&mut self, tracer: &dyn Tracer, slide: &mut Slide, begun: Instant, sink: &mut (dyn FnMut(Event) + Send)) -> Result<(), Halt> {
-        let time = &self.plan.scene.time;
+    fn frames(&mut self, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+        let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         for number in 0..warmups + time.frames_per_slide {
-            let place = Place { warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
-            if self.resized(&Interruptible::new(tracer, self.stop))? {
-                self.trust.reset();
-                self.probe(tracer, slide.index)?;
+            let place =
+                FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            if self.run.learning.resize.is_some() {
+                transaction!(self, slide, run, on => run.rebuild_surrogate(on));
+                self.run.resized();
+                self.run.learning.trust.reset();
+                transaction!(self, slide, run, on => run.probe(on, slide.index));
             }
-            let frame = self.frame(tracer, slide, place, sink)?;
+            let start = Instant::now();
+            transaction!(self, slide, run, on => run.learn_shorter(on, slide));
+            let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
+            slide.warnings.clear();
+            slide.waited = 0.0;
             sink(Event::Frame(frame));
-            self.checkpoint_if_due();
-            heed(self.stop)?;
-            if self.options.seconds.is_some_and(|seconds| self.began.elapsed().as_secs_f64() >= seconds) {
-                return Err(Halt::TimeIsUp);
+            transaction!(self, slide, run, on => run.checkpoint_if_due(on));
+            check_stop(self.run.stop)?;
+            if self.run.options.seconds.is_some_and(|seconds| self.run.began.elapsed().as_secs_f64() >= seconds) {
+                return Err(RunEnd::TimeIsUp);
             }
         }
         Ok(())
     }
 
-    /// A disk that refuses costs the checkpoint, not the run.
-    fn checkpoint_if_due(&mut self) {
-        if let (Some(checkpoints), Some(live)) = (&mut self.checkpoints, &mut self.live) {
-            self.stood_still = checkpoints.after_frame(self.frame - 1, &mut **live);
-        }
-    }
-
     fn finish(&mut self) -> Result<(), EngineError> {
-        let learned = self.learned_meanwhile.take().unwrap_or_default();
-        self.report.train_steps += learned.steps;
-        self.report.surrogate_bytes = self.live.as_ref().map_or(0, |l| l.bytes());
-        let last = match (&mut self.checkpoints, &self.live) {
-            (Some(checkpoints), Some(live)) => {
-                let last = checkpoints.finish(self.frame.checked_sub(1), &**live);
-                self.report.checkpoints = Some(checkpoints.totals().clone());
+        let run = &mut self.run;
+        let learned = std::mem::take(&mut run.learning.unreported);
+        run.report.train_steps += learned.steps;
+        run.report.surrogate_bytes = with!(&self.session, on => on.surrogate.as_ref().map_or(0, |surrogate| surrogate.bytes()));
+        let last_frame = run.progress.frame.checked_sub(1);
+        let last = match &mut run.checkpoints {
+            Some(checkpoints) => {
+                let last = with!(&self.session, on => match &on.surrogate {
+                    Some(surrogate) => checkpoints.finish(last_frame, surrogate),
+                    None => Ok(()),
+                });
+                run.report.checkpoints = Some(checkpoints.totals().clone());
                 last
             }
-            _ => Ok(()),
+            None => Ok(()),
         };
-        self.report.warnings = [learned.warnings, self.options.device.shortages()].concat();
+        run.report.warnings = [learned.warnings, std::mem::take(&mut run.progress.warnings)].concat();
         Ok(last?)
+    }
+}
+
+impl Run<'_> {
+    /// A disk that refuses costs the checkpoint, not the run.
+    fn checkpoint_if_due<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        if let (Some(checkpoints), Some(surrogate)) = (&mut self.checkpoints, &mut on.surrogate) {
+            let (pause, warning) = checkpoints.after_frame(self.progress.frame - 1, surrogate)?;
+            self.progress.checkpoint_pause = pause;
+            self.progress.warnings.extend(warning);
+        }
+        Ok(())
+    }
+
+    /// Warnings about the flow map of the first slide.
+    fn flow_warnings(&self, flow: &dyn Tracer) -> Vec<String> {
+        let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
+        if let Some(chosen) = flow.chosen().filter(|chosen| chosen.failed > 0) {
+            warnings.push(format!(
+                "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
+                chosen.failed,
+                Chosen::POINTS
+            ));
+        }
+        if let Some(chosen) = flow.chosen().filter(|chosen| !chosen.met) {
+            warnings.push(format!(
+                "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                chosen.steps, chosen.difference
+            ));
+        }
+        warnings
     }
 }
 
 /// Most nodes of a table that follows a simulation: every slide traces it anew while the simulation goes on. Where the CPU traces, one for each
 /// camera path of the slide's frames: with more, answering from the table would cost more than tracing.
-fn most_live_nodes(scene: &Settings, device: &Device) -> usize {
-    match device {
-        Device::Cpu { .. } => [scene.render.width, scene.render.height, scene.render.samples, scene.time.frames_per_slide]
-            .into_iter()
-            .fold(1, usize::saturating_mul),
-        #[cfg(feature = "cuda")]
-        Device::Gpu { .. } => usize::MAX,
+fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
+    if device.is_gpu() {
+        return usize::MAX;
     }
+    let frames = [scene.render.width, scene.render.height, scene.render.samples, scene.time.frames_per_slide];
+    frames.into_iter().fold(1, usize::saturating_mul)
 }
 
 /// Steps a path, unless each path chooses its own.
-fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
     Some(tracer.steps()).filter(|steps| *steps > 0)
 }

@@ -1,5 +1,6 @@
 //! Why a run could not start or go on.
 
+use crate::backend::{BackendError, DeviceError};
 use crate::flow::FlowError;
 use crate::render::RenderError;
 use crate::setting::Refused;
@@ -28,14 +29,9 @@ pub enum EngineError {
     /// A checkpoint.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The GPU that was asked for.
-    #[cfg(feature = "cuda")]
+    /// The device that was asked for, or that was lost.
     #[error(transparent)]
-    Device(Box<super::cuda::DeviceError>),
-    /// A GPU was asked for.
-    #[cfg(not(feature = "cuda"))]
-    #[error("built without the feature `cuda`; accepted: --device auto, cpu")]
-    NoCuda,
+    Device(Box<DeviceError>),
     /// A synthetic grid.
     #[error(transparent)]
     Axis(#[from] crate::field::AxisFault),
@@ -56,6 +52,16 @@ pub enum EngineError {
     /// The thread pool.
     #[error("cannot start worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
+}
+
+impl From<BackendError> for EngineError {
+    fn from(error: BackendError) -> Self {
+        match error {
+            BackendError::Flow(error) => error.into(),
+            BackendError::Surrogate(error) => error.into(),
+            BackendError::Device(error) => Self::Device(Box::new(error)),
+        }
+    }
 }
 
 impl EngineError {

@@ -1,47 +1,28 @@
-//! The work on a device, and the cycle that drives it.
+//! The cycle: slides of the window, each frame as one transaction on one backend, learning, assessing, checkpoints and records.
 //!
-//! In: [`Settings`]. Out: frames with their records. Calls `field`, `source`, `flow`, `surrogate`, `trust` and `render`.
+//! In: [`Settings`]. Out: frames with their records. Calls `source`, `backend` and what that calls. A frame's results take effect when it is whole; if
+//! the device fails, the frame is discarded and made again on the CPU.
 
-#[cfg(feature = "cuda")]
-mod accelerator;
-mod answers;
-mod audit;
+mod assess;
 mod checkpoints;
-#[cfg(feature = "cuda")]
-pub mod cuda;
 mod cycle;
-mod device;
 mod error;
-mod feed;
-mod frames;
+mod frame;
 mod memory;
+mod prepare;
 mod record;
 mod settings;
 mod setup;
+mod slides;
 mod stop;
 mod training;
+mod transaction;
 
 pub use crate::trust::TrustedError;
-#[cfg(feature = "cuda")]
-pub use accelerator::{Accelerator, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, Health};
-pub use answers::{Answers, Asked, Tally};
-pub use audit::{Audit, AuditFindings, AuditRequest, audit, residuals, stratified_points, trace, trusted_error};
 pub use checkpoints::CheckpointTotals;
-pub use cycle::{Event, RunOptions, RunReport, run};
-pub use device::{Device, DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
+pub use cycle::{Event, RunOptions, RunReport, run, run_on};
 pub use error::EngineError;
-pub use feed::{Feed, Slide, open_snapshots};
-pub use record::{CheckpointRecord, FrameRecord, StageSeconds, TransferRecord};
+pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
-
-/// A finished frame on its way out.
-#[derive(Debug, Clone)]
-pub struct Frame {
-    /// Its figures.
-    pub record: std::sync::Arc<FrameRecord>,
-    /// Its picture.
-    pub film: std::sync::Arc<crate::render::Film>,
-    /// `[contrast, brightness, gamma]` for previews.
-    pub tone_map: [f64; 3],
-}
+pub use slides::{Slide, Slides, open_snapshots};

@@ -1,19 +1,24 @@
 //! What comes before a slide's frames: sizes, tables, probes and the pilot.
 
-use super::{Cycle, KEEP_A_FRAME, RENDER_RESIDUALS};
-use crate::engine::answers::Answers;
-use crate::engine::audit;
-use crate::engine::feed::Slide;
-use crate::engine::setup::{Plan, assemble};
-use crate::engine::stop::{Halt, Interruptible, heed};
-use crate::engine::{Device, EngineError, TransferRecord};
+use super::cycle::{MAX_RENDER_RESIDUALS, Run};
+use super::setup::{Plan, assemble};
+use super::slides::Slide;
+use super::stop::{RunEnd, check_stop};
+use super::transaction::{On, present};
+use super::{EngineError, TransferRecord};
+use crate::backend::{
+    Backend, FrameJob, FrameSamples, Interruptible, Rendered, Routing, Surrogate, SurrogateRequest, audit, residuals, stratified_points,
+};
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
-use crate::render::Scene;
+use crate::render::{Method, Scene};
 use crate::surrogate::network::{Input, Target, uniform};
-use crate::surrogate::{Kind, Samples, Sizing, Surrogate, SurrogateError, SurrogateSettings};
-use crate::trust::{Audited, Gate, Strata};
+use crate::surrogate::{Kind, Samples, Trace};
+use crate::trust::{Audited, Gate, Residual, Strata};
 use rayon::prelude::*;
+use std::sync::atomic::AtomicBool;
 
+/// A frame keeps at most one in so many of the replay buffer's places, so that the buffer holds several frames.
+const FRAMES_IN_BUFFER: usize = 4;
 /// Random stream of the first probe, apart from those of audit points.
 const PROBE_STREAM: u64 = 1 << 62;
 /// Random streams of points at which shorter durations are traced.
@@ -26,51 +31,82 @@ const UNIFORM_SHARE: f64 = 0.01;
 /// Number of the pilot's picture.
 const PILOT_PICTURE: u64 = 1 << 41;
 
-impl Cycle<'_> {
-    /// Builds the surrogate anew where another size is due; whether it did. The samples in the ring train it.
-    pub(super) fn resized(&mut self, tracer: &dyn Tracer) -> Result<bool, Halt> {
-        let Some(resize) = self.resize.take() else { return Ok(false) };
-        self.frames.let_go_of_tables();
-        // So that two tables never need a device's memory together; kept until then, since it is what a stop would write.
-        if let Some(live) = &mut self.live {
-            live.leave_device();
-        }
-        let built = self.threads.render().install(|| build(self.plan, &self.surrogate, self.sizing.as_ref(), tracer, &self.options.device));
-        heed(self.stop)?;
-        let live = built?;
-        let text = format!("frame {}: {} ({:.2} MB)", self.frame, resize.why, live.bytes() as f64 / 1e6);
-        tracing::info!("{text}");
-        self.report.sizes.push(text);
-        self.live = Some(live);
-        Ok(true)
+impl Run<'_> {
+    /// Builds the surrogate at the present size.
+    pub(super) fn build_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        let (scene, learning) = (&self.plan.scene, &self.learning);
+        let plain = || (learning.settings.clone(), scene.network.clone());
+        let (settings, network) = learning.sizing.as_ref().map_or_else(plain, |sizing| sizing.settings(&learning.settings, &scene.network));
+        let request = SurrogateRequest {
+            settings: &settings,
+            network: &network,
+            domain: &self.plan.domain,
+            seed: scene.seed,
+            replay_buffer: scene.training.ring,
+            stop: self.stop,
+        };
+        let On { backend, tracer, surrogate } = on;
+        let tracer = present(tracer);
+        let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
+        check_stop(self.stop)?;
+        *surrogate = Some(built);
+        self.progress.warnings.extend(backend.warnings());
+        Ok(())
     }
 
-    /// The window moved: tables are traced anew, weights carry over, old labels must show that they still hold (unless the network knows of
-    /// which window they are), trust must be earned again.
-    pub(super) fn slid(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
-        let tracer = Interruptible::new(tracer, self.stop);
-        self.peak = f32::NEG_INFINITY;
-        self.frames.let_go_of_tables();
-        let resized = self.resized(&tracer)?;
-        if let Some(live) = &mut self.live {
-            if !resized {
-                self.threads.render().install(|| live.window_slid(&tracer));
-                heed(self.stop)?;
-            }
-            self.trust.window_slid();
-            let before = std::mem::replace(&mut self.start, tracer.start());
-            if !self.times.hold(before, self.start) {
-                self.ring.mark_stale();
-                let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
-                heed(self.stop)?;
-                self.ring.revalidate(holding);
-            }
-            if !self.plan.scene.network.inputs.is_empty() {
-                self.ring.set_now(self.times.unit(tracer.start(), tracer.tau()));
-            }
+    /// Builds the surrogate at another size. The samples in the replay buffer train it.
+    pub(super) fn rebuild_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        // Two tables must not need a device's memory together. The old surrogate stays until the new one is built, for a checkpoint after a stop.
+        if let Some(surrogate) = &mut on.surrogate {
+            surrogate.release()?;
         }
-        let renderer = &mut self.renderer;
-        self.threads.render().install(|| renderer.window_slid());
+        self.build_surrogate(on)?;
+        if let (Some(resize), Some(surrogate)) = (&self.learning.resize, &on.surrogate) {
+            let text = format!("frame {}: {} ({:.2} MB)", self.progress.frame, resize.why, surrogate.bytes() as f64 / 1e6);
+            tracing::info!("{text}");
+            self.report.sizes.push(text);
+        }
+        Ok(())
+    }
+
+    /// The size that was due is there.
+    pub(super) fn resized(&mut self) {
+        self.learning.resize = None;
+    }
+
+    /// Uploads the window of a slide and prepares its flow map.
+    pub(super) fn next_tracer<B: Backend>(&mut self, on: &mut On<B>, slide: &Slide, map: &FlowMap) -> Result<(), RunEnd> {
+        let On { backend, tracer, .. } = on;
+        *tracer = Some(self.threads.render().install(|| backend.tracer(&slide.velocity, map, slide.time))?);
+        Ok(())
+    }
+
+    /// Takes the surrogate to the session's window.
+    pub(super) fn slide_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        let On { tracer, surrogate, .. } = on;
+        if let Some(surrogate) = surrogate {
+            let tracer = present(tracer);
+            self.threads.render().install(|| surrogate.window_slid(tracer, self.stop))?;
+            check_stop(self.stop)?;
+        }
+        Ok(())
+    }
+
+    /// Takes trust and labels to the session's window: old labels are used on if a re-test says that they hold.
+    pub(super) fn slide_labels<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        let flow = on.tracer().flow();
+        let holds = self.learning.times.hold(self.learning.start, flow.start());
+        let share = if holds { None } else { Some(self.share_of_labels_that_hold(on)?) };
+        let learning = &mut self.learning;
+        learning.trust.window_slid();
+        learning.start = flow.start();
+        if let Some(share) = share {
+            learning.buffer.mark_stale();
+            learning.buffer.revalidate(share);
+        }
+        if !self.plan.scene.network.inputs.is_empty() {
+            learning.buffer.set_now(learning.times.unit(flow.start(), flow.tau()));
+        }
         Ok(())
     }
 
@@ -103,74 +139,94 @@ impl Cycle<'_> {
 
     /// What should be told of a window's start time.
     pub(super) fn beyond_the_range(&self, start: f64) -> Option<String> {
-        let [first, last] = self.times.starts.filter(|_| self.live.is_some() && !self.times.tells(start))?;
+        let [first, last] = self
+            .learning
+            .times
+            .starts
+            .filter(|_| self.plan.scene.render.method != Method::Reference && !self.learning.times.tells(start))?;
         Some(format!(
             "start time {start} lies beyond network.start_range, {first} to {last}: the network takes it for the nearer end, and labels of other windows are not kept"
         ))
     }
 
-    /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and held against the surrogate they earn
+    /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and tested against the surrogate they earn
     /// trust without tracing a whole frame. They decide the gate, so they say nothing about the error that is stated; audit points do.
-    pub(super) fn probe(&mut self, tracer: &dyn Tracer, slide: u64) -> Result<(), Halt> {
+    pub(super) fn probe<B: Backend>(&mut self, on: &mut On<B>, slide: u64) -> Result<(), RunEnd> {
         let scene = &self.plan.scene;
         let per_cell = scene.trust.min_samples.ceil() as usize;
-        let strata = Strata::even(self.trust.shape(), per_cell as u32);
-        let unit = audit::stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
+        let strata = Strata::even(self.learning.trust.shape(), per_cell as u32);
+        let unit = stratified_points(&strata, scene.seed, PROBE_STREAM + slide);
         let extras = self.label_extras();
-        let interruptible = Interruptible::new(tracer, self.stop);
-        let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
-        heed(self.stop)?;
-        let domain = tracer.domain();
+        let interruptible = Interruptible::new(on.tracer(), self.stop);
+        let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras))?;
+        check_stop(self.stop)?;
+        let residuals = self.residuals_of(on, &probe.samples)?;
+        // Nothing fails from here on.
+        let domain = on.tracer().flow().domain();
+        let renderer = &mut self.renderer;
         self.threads.render().install(|| {
             let points: Vec<[f32; 3]> = probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
-            self.renderer.observe(&points, &probe.samples.log_stretch);
+            renderer.observe(&points, &probe.samples.log_stretch);
         });
-        self.probed += probe.drawn as u64;
-        self.learn_of(tracer, &probe.samples, Some(&strata));
+        self.progress.preparation_traces += probe.drawn as u64;
+        if let Some(residuals) = residuals {
+            self.learning.trust.observe(Some(&Audited::of(&residuals, strata)), &[]);
+            self.keep_samples(on, &probe.samples);
+        }
         Ok(())
     }
 
-    /// A picture of one sample a pixel, by RK4 and for nobody's eyes: a renderer that has seen nothing walks with the largest majorant
-    /// everywhere and makes several times the queries, so that the first frame had better not be its first.
-    pub(super) fn pilot(&mut self, tracer: &dyn Tracer) -> Result<(), Halt> {
+    /// A picture of one sample a pixel, by RK4 and not shown: a renderer that has seen nothing walks with the largest majorant everywhere and
+    /// makes several times the queries, so that the first frame should not be its first.
+    pub(super) fn pilot<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let gate = Gate::uniform(false);
-        let interruptible = Interruptible::new(tracer, self.stop);
-        let mut answers = Answers::new(&interruptible, None, &gate, None, self.keep_a_frame()).with_extras(self.label_extras());
-        let (renderer, frames, stop) = (&mut self.renderer, &mut self.frames, self.stop);
-        self.threads.render().install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
-        heed(stop)?;
-        let (samples, traced) = (answers.samples, answers.tally.traced);
-        self.probed += traced;
-        self.learn_of(tracer, &samples, None);
+        let routing = Routing { gate: &gate, trace_budget: None, keep: self.labels_per_frame(on), extras: self.label_extras() };
+        let On { backend, tracer, .. } = &mut *on;
+        let job = FrameJob {
+            tracer: present(tracer),
+            surrogate: None,
+            routing,
+            picture: PILOT_PICTURE,
+            samples: 1,
+            progress: None,
+            stop: self.stop,
+        };
+        let mut renderer = self.renderer.clone();
+        let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer))?;
+        check_stop(self.stop)?;
+        let Rendered { tally, samples, .. } = rendered;
+        let residuals = self.residuals_of(on, samples.on_host())?;
+        self.renderer = renderer;
+        self.progress.preparation_traces += tally.traced;
+        if let Some(residuals) = residuals {
+            self.learning.trust.observe(None, &residuals);
+            self.keep_samples(on, &samples.commit());
+        }
         Ok(())
     }
 
-    /// Traced samples that a frame keeps, at most: what training can use of them, or what trust can where nothing is trained here. (A device
-    /// that trains learns from all that it traces.)
-    pub(super) fn keep_a_frame(&self) -> usize {
-        let ring = self.plan.scene.training.ring / KEEP_A_FRAME;
-        let trains_here = |live: &dyn Surrogate| live.learns() && !live.is_offloaded();
-        self.live.as_ref().map_or(0, |live| if trains_here(&**live) { ring } else { ring.min(RENDER_RESIDUALS) })
+    /// Traced samples that a frame keeps on the host, at most: as many as training can use, or as many as trust can use if the device trains (it learns
+    /// from all that it traces).
+    pub(super) fn labels_per_frame<B: Backend>(&self, on: &On<B>) -> usize {
+        let share = self.plan.scene.training.ring / FRAMES_IN_BUFFER;
+        let trains_here = |surrogate: &B::Surrogate| surrogate.learns() && !surrogate.trains_on_device();
+        on.surrogate.as_ref().map_or(0, |surrogate| if trains_here(surrogate) { share } else { share.min(MAX_RENDER_RESIDUALS) })
     }
 
-    /// Holds traced samples, drawn over the domain as `strata` says or otherwise, against the surrogate, then keeps them for training.
-    pub(super) fn learn_of(&mut self, tracer: &dyn Tracer, samples: &Samples, strata: Option<&Strata>) {
-        let Some(live) = &self.live else { return };
-        let front = live.freeze();
-        let some = every(samples, samples.len().div_ceil(RENDER_RESIDUALS).max(1));
-        let residuals = self.threads.render().install(|| audit::residuals(&*front, &some, self.renderer.transfer(), tracer.tau()));
-        match strata {
-            Some(strata) => self.trust.observe(Some(&Audited::of(&residuals, strata.clone())), &[]),
-            None => self.trust.observe(None, &residuals),
-        }
-        if self.learns() {
-            self.ring.push(samples);
-        }
+    /// Residuals of the surrogate on some of the samples; `None` without a surrogate.
+    fn residuals_of<B: Backend>(&self, on: &On<B>, samples: &Samples) -> Result<Option<Vec<Residual>>, RunEnd> {
+        let Some(surrogate) = &on.surrogate else { return Ok(None) };
+        let frozen = surrogate.freeze()?;
+        let some = every(samples, samples.len().div_ceil(MAX_RENDER_RESIDUALS).max(1));
+        let tau = on.tracer().flow().tau();
+        Ok(Some(self.threads.render().install(|| residuals(&frozen, &some, self.renderer.transfer(), tau))?))
     }
 
-    /// Whether the surrogate learns from samples.
-    pub(super) fn learns(&self) -> bool {
-        self.live.as_ref().is_some_and(|live| live.learns())
+    /// Keeps samples for training, if the surrogate learns.
+    pub(super) fn keep_samples<B: Backend>(&mut self, on: &On<B>, samples: &Samples) {
+        if on.surrogate.as_ref().is_some_and(Surrogate::learns) {
+            self.learning.buffer.push(samples);
+        }
     }
 
     /// What the network learns from beside the log-stretch.
@@ -180,71 +236,58 @@ impl Cycle<'_> {
         Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 }
     }
 
-    /// Labels of durations below tau, where those are an input of the network: one from each of some even parts of (0, tau], drawn anew for every
-    /// frame, at a point of each cell.
-    /// They come before the frame, so that the first optimizer step, by whose loss later ones are judged, has seen some.
-    pub(super) fn learn_shorter(&mut self, slide: &Slide, tracer: &dyn Tracer) -> Result<(), EngineError> {
+    /// Traces labels of durations below tau, if the duration is an input of the network: one from each of some even parts of (0, tau], drawn anew for every
+    /// frame, at a point of each cell. They come before the frame, so that the first optimizer step, by whose loss later ones are judged, sees some.
+    pub(super) fn learn_shorter<B: Backend>(&mut self, on: &mut On<B>, slide: &Slide) -> Result<(), RunEnd> {
         const DURATIONS: u64 = 16;
-        if !self.learns() || !self.plan.scene.network.inputs.contains(&Input::Duration) {
+        let learns = on.surrogate.as_ref().is_some_and(Surrogate::learns);
+        if !learns || !self.plan.scene.network.inputs.contains(&Input::Duration) {
             return Ok(());
         }
-        let (tau, seed) = (tracer.tau(), self.plan.scene.seed);
-        let strata = Strata::even(self.trust.shape(), 1);
+        let (flow, seed, extras) = (on.tracer().flow(), self.plan.scene.seed, self.label_extras());
+        let tau = flow.tau();
+        let strata = Strata::even(self.learning.trust.shape(), 1);
+        let mut found = Vec::new();
         for part in 0..DURATIONS {
-            let draw = DURATIONS * self.frame + part;
+            let draw = DURATIONS * self.progress.frame + part;
             let duration = tau * ((part + 1) as f64 - f64::from(uniform(seed, draw))) / DURATIONS as f64;
-            let steps = match tracer.steps() {
+            let steps = match on.tracer().flow().steps() {
                 0 => self.plan.map.steps,
                 steps => Steps::Fixed((steps as f64 * duration / tau).ceil() as usize),
             };
             let map = FlowMap { tau: duration, steps, ..self.plan.map.clone() };
-            let unit = audit::stratified_points(&strata, seed, SHORTER_STREAM + draw);
-            let extras = self.label_extras();
-            let instead = "the CPU traced shorter durations";
-            let (shorter, _) =
-                self.threads.render().install(|| self.options.device.next_tracer(slide.velocity.clone(), &map, slide.time, instead))?;
-            let interruptible = Interruptible::new(&*shorter, self.stop);
-            let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
-            found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];
-            self.probed += found.drawn as u64;
-            self.ring.push(&found.samples);
+            let unit = stratified_points(&strata, seed, SHORTER_STREAM + draw);
+            let backend = &mut on.backend;
+            let shorter = self.threads.render().install(|| backend.tracer(&slide.velocity, &map, slide.time))?;
+            let interruptible = Interruptible::new(&shorter, self.stop);
+            let mut traced = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras))?;
+            traced.samples.times = vec![self.learning.times.unit(slide.time, duration); traced.samples.len()];
+            found.push(traced);
+        }
+        for traced in found {
+            self.progress.preparation_traces += traced.drawn as u64;
+            self.learning.buffer.push(&traced.samples);
         }
         Ok(())
     }
 
-    /// Traces some of the old labels anew: the share whose ramp is within the tolerance of what the label says.
-    pub(super) fn share_of_labels_that_hold(&self, tracer: &dyn Tracer) -> f64 {
+    /// Traces some of the labels anew: the share whose ramp is within the tolerance of the label's.
+    fn share_of_labels_that_hold<B: Backend>(&self, on: &On<B>) -> Result<f64, RunEnd> {
         const PROBES: usize = 2048;
-        let stale = self.ring.stale();
-        let mut chosen = self.ring.probe(PROBES, self.plan.scene.seed, self.frame);
-        // Those of shorter durations are not what this tracer finds; they hold as long as these do.
-        chosen.retain(|&i| stale.times_of(i)[1] == 1.0);
-        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| tracer.domain().from_unit(stale.points[i])).collect();
+        let (labels, flow) = (self.learning.buffer.samples(), on.tracer().flow());
+        let mut chosen = self.learning.buffer.probe(PROBES, self.plan.scene.seed, self.progress.frame);
+        // Labels of shorter durations are not what this tracer finds; they hold as long as the others do.
+        chosen.retain(|&i| labels.times_of(i)[1] == 1.0);
+        let points: Vec<[f32; 3]> = chosen.iter().map(|&i| flow.domain().from_unit(labels.points[i])).collect();
         let mut traced = Traced::default();
-        tracer.trace(&points, Extras::default(), &mut traced);
-        let ramp = |s: f32| self.renderer.transfer().ramp(s / tracer.tau() as f32);
-        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(stale.log_stretch[i])).abs()) <= self.plan.scene.trust.tolerance;
+        let interruptible = Interruptible::new(on.tracer(), self.stop);
+        self.threads.render().install(|| interruptible.trace(&points, Extras::default(), &mut traced))?;
+        check_stop(self.stop)?;
+        let ramp = |s: f32| self.renderer.transfer().ramp(s / flow.tau() as f32);
+        let holds = |(&i, &s): (&usize, &f32)| f64::from((ramp(s) - ramp(labels.log_stretch[i])).abs()) <= self.plan.scene.trust.tolerance;
         let held = chosen.iter().zip(&traced.log_stretch).filter(|pair| holds(*pair)).count();
-        held as f64 / chosen.len().max(1) as f64
+        Ok(held as f64 / chosen.len().max(1) as f64)
     }
-}
-
-/// The surrogate at its size, trained on the device where that trains it.
-pub(super) fn build(
-    plan: &Plan,
-    settings: &SurrogateSettings,
-    sizing: Option<&Sizing>,
-    tracer: &dyn Tracer,
-    device: &Device,
-) -> Result<Box<dyn Surrogate>, SurrogateError> {
-    let scene = &plan.scene;
-    let plain = || (settings.clone(), scene.network.clone());
-    let (settings, network) = sizing.map_or_else(plain, |sizing| sizing.settings(settings, &scene.network));
-    let mut surrogate = crate::surrogate::build(&settings, &network, &plan.domain, scene.seed, tracer)?;
-    if let Some(offload) = device.offload() {
-        surrogate.offload(&offload);
-    }
-    Ok(surrogate)
 }
 
 pub(super) fn every(samples: &Samples, stride: usize) -> Samples {
@@ -257,20 +300,22 @@ pub(super) fn every(samples: &Samples, stride: usize) -> Samples {
 
 /// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
 /// for the whole run, so that colours compare.
-pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Tracer, slide: &Slide) -> Result<Scene, EngineError> {
+pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<Scene, RunEnd> {
     let file = &plan.scene;
     let mut scene = assemble(file, &plan.domain);
     if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
-        let unit = audit::stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
-        let labels = audit::trace(tracer, &unit, Extras::default()).samples.log_stretch;
-        let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).filter(|f| f.is_finite()).collect();
+        let unit = stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
+        let labels = audit::trace(&Interruptible::new(tracer, stop), &unit, Extras::default())?.samples.log_stretch;
+        check_stop(stop)?;
+        let tau = tracer.flow().tau() as f32;
+        let ftle: Vec<f32> = labels.iter().map(|s| s / tau).filter(|f| f.is_finite()).collect();
         if ftle.is_empty() {
-            return Err(EngineError::AllMissing {
+            return Err(RunEnd::Failed(EngineError::AllMissing {
                 points: unit.len(),
                 when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
-            });
+            }));
         }
         scene.transfer = scene.transfer.scaled_to(&ftle);
     }

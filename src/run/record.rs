@@ -153,3 +153,14 @@ pub struct StageSeconds {
     #[serde(default)]
     pub elapsed: f64,
 }
+
+/// A finished frame on its way out.
+#[derive(Debug, Clone)]
+pub struct Frame {
+    /// Its figures.
+    pub record: std::sync::Arc<FrameRecord>,
+    /// Its picture.
+    pub film: std::sync::Arc<crate::render::Film>,
+    /// `[contrast, brightness, gamma]` for previews.
+    pub tone_map: [f64; 3],
+}

@@ -1,6 +1,6 @@
 //! From a scene file to everything a run needs, checked before any work is done.
 
-use super::feed::{Feed, closed_form, no_domain, open_snapshots};
+use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
 use super::{EngineError, Settings, TimeSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
@@ -31,9 +31,7 @@ pub struct Setup {
     /// What is to be done.
     pub plan: Plan,
     /// The slides of the window.
-    pub feed: Feed,
-    /// Slides to come, where known.
-    pub slides: Option<u64>,
+    pub slides: Box<dyn Slides>,
     /// What should be told before work starts.
     pub notes: Vec<String>,
 }
@@ -145,17 +143,16 @@ impl Setup {
             notes.push("training.resume is not read: neither method reference nor a table goes on from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
-        let feed = match live {
-            Some(live) => Feed::live(&scene, live.follow(tau, scene.time.stride)?, direction),
-            None => Feed::open(&scene, snapshots, tau, direction)?,
+        let slides = match live {
+            Some(live) => live_slides(&scene, live.follow(tau, scene.time.stride)?, direction),
+            None => open_slides(&scene, snapshots, tau, direction)?,
         };
-        let slides = feed.expected_slides(times.as_deref(), tau);
         if let (Some(times), Some(grid)) = (&times, &grid) {
             notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), memory::available()));
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();
-        Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, feed, slides, notes })
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, slides, notes })
     }
 }
 

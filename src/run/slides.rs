@@ -1,4 +1,4 @@
-//! One velocity after another: the slides of the window.
+//! The slides of the window: one velocity after another, from a closed form, an archive or a running simulation.
 
 use super::{EngineError, Settings};
 use crate::field::analytic::Analytic;
@@ -35,55 +35,230 @@ pub struct Slide {
     pub waited: f64,
 }
 
-/// Where slides come from.
-pub enum Feed {
-    /// Closed form: the seed time moves.
-    Closed {
-        /// The flow.
-        flow: Analytic,
-        /// Its box.
-        domain: Domain,
-        /// Seed time of the first slide.
-        start: f64,
-        /// How far it moves.
-        step: f64,
-        /// Slides given so far.
-        given: u64,
-        /// Slides to give.
-        slides: u64,
-    },
-    /// Snapshots: the window moves.
-    Archive {
-        /// Read ahead by one I/O thread.
-        reader: ReadAhead,
-        /// Dates by time.
-        dates: Vec<(f64, Option<String>)>,
-        /// The sliding window.
-        window: Window,
-        /// Forward seeds start at the oldest time, backward ones at the newest.
-        direction: Direction,
-        /// Snapshots a slide.
-        stride: usize,
-        /// Slides given so far.
-        given: u64,
-        /// Slides to give at most.
-        slides: u64,
-        /// Snapshots taken in since the last slide.
-        taken: usize,
-        /// Warnings since the last slide.
-        warnings: Vec<String>,
-    },
-    /// A simulation that runs now: its window moves by itself.
-    Live {
-        /// The window.
-        window: LiveWindow,
-        /// Forward seeds start at the oldest time, backward ones at the newest.
-        direction: Direction,
-        /// Slides given so far.
-        given: u64,
-        /// Slides to give at most.
-        slides: u64,
-    },
+/// A source of slides.
+pub trait Slides: Send {
+    /// The next slide; `None` when the source has ended, or when `stop` is set, which is checked while snapshots are waited for.
+    ///
+    /// # Errors
+    /// The source fails.
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError>;
+
+    /// `listener` is called with snapshots as they are read: of an archive some slides before they are needed, of a simulation at once.
+    fn listen(&self, _listener: Listener) {}
+
+    /// Number of slides in all, if it is known.
+    fn expected(&self) -> Option<u64>;
+
+    /// Of a running simulation: whether the next window is not there yet. `None` for other sources.
+    fn is_awaited(&self) -> Option<bool> {
+        None
+    }
+}
+
+/// Counts slides up to a limit.
+struct Count {
+    given: u64,
+    most: u64,
+}
+
+impl Count {
+    fn new(scene: &Settings, default: u64) -> Self {
+        Self { given: 0, most: scene.time.slides.map_or(default, |n| n as u64) }
+    }
+
+    /// The number of the next slide.
+    fn next(&mut self) -> u64 {
+        self.given += 1;
+        self.given - 1
+    }
+
+    fn is_over(&self) -> bool {
+        self.given == self.most
+    }
+}
+
+/// The next item of a source that is read by another thread; `None` when it has ended or `stop` is set.
+fn wait_for<T>(stop: &AtomicBool, mut next: impl FnMut(Duration) -> Result<Option<T>, StillReading>) -> Option<T> {
+    while !stop.load(Ordering::Relaxed) {
+        if let Ok(item) = next(LOOK_UP) {
+            return item;
+        }
+    }
+    None
+}
+
+/// Where seeds of a window start: forward ones at the oldest time, backward ones at the newest.
+fn seed_time(window: &Window, direction: Direction) -> Result<f64, EngineError> {
+    let end = match direction {
+        Direction::Forward => window.oldest(),
+        Direction::Backward => window.newest(),
+    };
+    end.ok_or(EngineError::EndedEarly)
+}
+
+/// A closed form: the seed time moves.
+struct ClosedForm {
+    flow: Analytic,
+    domain: Domain,
+    start: f64,
+    step: f64,
+    count: Count,
+}
+
+impl Slides for ClosedForm {
+    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let index = self.count.next();
+        Ok(Some(Slide {
+            index,
+            time: self.start + self.step * index as f64,
+            date: None,
+            live: None,
+            velocity: VelocitySource::Analytic(self.flow.clone(), self.domain.clone()),
+            warnings: Vec::new(),
+            waited: 0.0,
+        }))
+    }
+
+    fn expected(&self) -> Option<u64> {
+        Some(self.count.most)
+    }
+}
+
+/// An archive: the window moves over its snapshots.
+struct ArchiveSlides {
+    /// Read ahead by one I/O thread.
+    reader: ReadAhead,
+    /// Dates by time.
+    dates: Vec<(f64, Option<String>)>,
+    window: Window,
+    direction: Direction,
+    /// Snapshots a slide.
+    stride: usize,
+    count: Count,
+    /// Snapshots that moved the window since the last slide.
+    taken: usize,
+}
+
+impl Slides for ArchiveSlides {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let mut warnings = Vec::new();
+        let Self { reader, window, taken, .. } = self;
+        while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
+            let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
+            let newest = window.newest();
+            match window.push(snapshot?) {
+                Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
+                Err(fault) => warnings.push(fault.to_string()),
+            }
+            *taken += usize::from(window.newest() != newest);
+        }
+        *taken = 0;
+        let time = seed_time(window, self.direction)?;
+        Ok(Some(Slide {
+            index: self.count.next(),
+            time,
+            date: self.dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone()),
+            live: None,
+            velocity: VelocitySource::Window(Arc::new(window.clone())),
+            warnings,
+            waited: start.elapsed().as_secs_f64(),
+        }))
+    }
+
+    fn listen(&self, listener: Listener) {
+        self.reader.tell(listener);
+    }
+
+    fn expected(&self) -> Option<u64> {
+        let times = &self.dates;
+        let first = times.iter().position(|(t, _)| t - times[0].0 >= self.window.span() * (1.0 - 1e-9))?;
+        Some(self.count.most.min(((times.len() - 1 - first) / self.stride + 1) as u64))
+    }
+}
+
+/// A running simulation: its window moves by itself.
+struct LiveSlides {
+    window: LiveWindow,
+    direction: Direction,
+    count: Count,
+}
+
+impl Slides for LiveSlides {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let Some(taken) = wait_for(stop, |limit| self.window.next_within(limit)) else { return Ok(None) };
+        let taken = taken?;
+        Ok(Some(Slide {
+            index: self.count.next(),
+            time: seed_time(&taken.window, self.direction)?,
+            date: None,
+            live: Some(taken.live),
+            velocity: VelocitySource::Window(Arc::new(taken.window)),
+            warnings: taken.warnings,
+            waited: start.elapsed().as_secs_f64(),
+        }))
+    }
+
+    fn listen(&self, listener: Listener) {
+        self.window.tell(listener);
+    }
+
+    fn expected(&self) -> Option<u64> {
+        Some(self.count.most).filter(|n| *n < u64::MAX)
+    }
+
+    fn is_awaited(&self) -> Option<bool> {
+        Some(self.window.is_waited_for())
+    }
+}
+
+/// The slides of a scene whose |tau| is known.
+///
+/// # Errors
+/// A closed form without a domain, or a source that does not span tau.
+pub(super) fn open_slides(
+    scene: &Settings,
+    snapshots: Option<Box<dyn SnapshotSource>>,
+    tau: f64,
+    direction: Direction,
+) -> Result<Box<dyn Slides>, EngineError> {
+    match (closed_form(&scene.source), snapshots) {
+        (Some(flow), _) => {
+            let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
+            let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
+            Ok(Box::new(ClosedForm { flow, domain, start: scene.time.start, step: scene.time.step, count: Count::new(scene, 1) }))
+        }
+        (None, Some(source)) => {
+            source.check_tau(tau)?;
+            let dates: Vec<_> = source.times().iter().map(|&t| (t, source.date(t))).collect();
+            let range = 0..dates.len();
+            Ok(Box::new(ArchiveSlides {
+                reader: read_ahead(source, range, DEFAULT_READ_AHEAD),
+                dates,
+                window: Window::new(tau),
+                direction,
+                stride: scene.time.stride,
+                count: Count::new(scene, u64::MAX),
+                taken: 0,
+            }))
+        }
+        (None, None) => Err(no_domain()),
+    }
+}
+
+/// The slides of a running simulation.
+pub(super) fn live_slides(scene: &Settings, window: LiveWindow, direction: Direction) -> Box<dyn Slides> {
+    Box::new(LiveSlides { window, direction, count: Count::new(scene, u64::MAX) })
 }
 
 /// The closed form that `[source]` describes; none for gridded kinds.
@@ -141,161 +316,3 @@ pub(super) fn no_domain() -> EngineError {
 
 /// Seed of the standard turbulence (design: 0 for development).
 const TURBULENCE_SEED: u64 = 0;
-
-impl Feed {
-    /// The feed of a scene whose |tau| is known.
-    pub fn open(scene: &Settings, snapshots: Option<Box<dyn SnapshotSource>>, tau: f64, direction: Direction) -> Result<Self, EngineError> {
-        let slides = scene.time.slides.map(|n| n as u64);
-        match (closed_form(&scene.source), snapshots) {
-            (Some(flow), _) => {
-                let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
-                let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
-                Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
-            }
-            (None, Some(source)) => {
-                let times = source.times();
-                source.check_tau(tau)?;
-                let dates = times.iter().map(|&t| (t, source.date(t))).collect();
-                let range = 0..times.len();
-                Ok(Feed::Archive {
-                    reader: read_ahead(source, range, DEFAULT_READ_AHEAD),
-                    dates,
-                    window: Window::new(tau),
-                    direction,
-                    stride: scene.time.stride,
-                    given: 0,
-                    slides: slides.unwrap_or(u64::MAX),
-                    taken: 0,
-                    warnings: Vec::new(),
-                })
-            }
-            (None, None) => Err(no_domain()),
-        }
-    }
-
-    /// `listener` hears of snapshots as they are read: of an archive some slides before they are needed, of a simulation as soon as they are
-    /// there.
-    pub fn tell(&self, listener: Listener) {
-        match self {
-            Feed::Closed { .. } => {}
-            Feed::Archive { reader, .. } => reader.tell(listener),
-            Feed::Live { window, .. } => window.tell(listener),
-        }
-    }
-
-    /// The next slide; none when the source has ended.
-    pub fn next_slide(&mut self) -> Result<Option<Slide>, EngineError> {
-        self.next_slide_unless(&AtomicBool::new(false))
-    }
-
-    /// The same; also none when `stop` is set, which is looked at while snapshots are waited for.
-    pub fn next_slide_unless(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
-        match self {
-            Feed::Closed { flow, domain, start, step, given, slides } => {
-                if *given == *slides {
-                    return Ok(None);
-                }
-                let time = *start + *step * *given as f64;
-                *given += 1;
-                Ok(Some(Slide {
-                    index: *given - 1,
-                    time,
-                    date: None,
-                    live: None,
-                    velocity: VelocitySource::Analytic(flow.clone(), domain.clone()),
-                    warnings: Vec::new(),
-                    waited: 0.0,
-                }))
-            }
-            Feed::Archive { reader, dates, window, direction, stride, given, slides, taken, warnings } => {
-                if *given == *slides {
-                    return Ok(None);
-                }
-                let start = Instant::now();
-                while !(window.is_full() && (*given == 0 || *taken >= *stride)) {
-                    let snapshot = loop {
-                        if stop.load(Ordering::Relaxed) {
-                            return Ok(None);
-                        }
-                        match reader.next_within(LOOK_UP) {
-                            Ok(Some(snapshot)) => break snapshot,
-                            Ok(None) => return Ok(None),
-                            Err(StillReading) => {}
-                        }
-                    };
-                    let newest = window.newest();
-                    match window.push(snapshot?) {
-                        Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
-                        Err(fault) => warnings.push(fault.to_string()),
-                    }
-                    // Only what moves the window counts toward its stride.
-                    *taken += usize::from(window.newest() != newest);
-                }
-                *taken = 0;
-                *given += 1;
-                let ends = match direction {
-                    Direction::Forward => window.oldest(),
-                    Direction::Backward => window.newest(),
-                };
-                let time = ends.ok_or(EngineError::EndedEarly)?;
-                Ok(Some(Slide {
-                    index: *given - 1,
-                    time,
-                    date: dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone()),
-                    live: None,
-                    velocity: VelocitySource::Window(Arc::new(window.clone())),
-                    warnings: std::mem::take(warnings),
-                    waited: start.elapsed().as_secs_f64(),
-                }))
-            }
-            Feed::Live { window, direction, given, slides } => {
-                if *given == *slides {
-                    return Ok(None);
-                }
-                let start = Instant::now();
-                let taken = loop {
-                    if stop.load(Ordering::Relaxed) {
-                        return Ok(None);
-                    }
-                    match window.next_within(LOOK_UP) {
-                        Ok(Some(taken)) => break taken?,
-                        Ok(None) => return Ok(None),
-                        Err(StillReading) => {}
-                    }
-                };
-                *given += 1;
-                let ends = match direction {
-                    Direction::Forward => taken.window.oldest(),
-                    Direction::Backward => taken.window.newest(),
-                };
-                Ok(Some(Slide {
-                    index: *given - 1,
-                    time: ends.ok_or(EngineError::EndedEarly)?,
-                    date: None,
-                    live: Some(taken.live),
-                    velocity: VelocitySource::Window(Arc::new(taken.window)),
-                    warnings: taken.warnings,
-                    waited: start.elapsed().as_secs_f64(),
-                }))
-            }
-        }
-    }
-
-    /// The feed of a simulation that runs now.
-    pub fn live(scene: &Settings, window: LiveWindow, direction: Direction) -> Self {
-        Feed::Live { window, direction, given: 0, slides: scene.time.slides.map_or(u64::MAX, |n| n as u64) }
-    }
-
-    /// Slides that will come in all, where that is known.
-    pub fn expected_slides(&self, times: Option<&[f64]>, tau: f64) -> Option<u64> {
-        match self {
-            Feed::Closed { slides, .. } => Some(*slides),
-            Feed::Live { slides, .. } => Some(*slides).filter(|n| *n < u64::MAX),
-            Feed::Archive { slides, stride, .. } => {
-                let times = times?;
-                let first = times.iter().position(|t| t - times[0] >= tau * (1.0 - 1e-9))?;
-                Some((*slides).min(((times.len() - 1 - first) / *stride + 1) as u64))
-            }
-        }
-    }
-}

@@ -1,8 +1,9 @@
 //! Which threads train while the others render, and for how long; where a device trains, for how long after the picture.
 
 use super::{EngineError, Settings, TrainingSettings};
+use crate::backend::{DeviceError, Surrogate};
 use crate::render::Method;
-use crate::surrogate::{Kind, Learned, SampleRing, Surrogate};
+use crate::surrogate::{Kind, Learned, ReplayBuffer};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -53,18 +54,18 @@ impl Threads {
 
 /// What training has of a device's time where a simulation is followed: so much of every second is due to it, and what it took is taken off.
 #[derive(Debug)]
-pub(super) struct Turns {
+pub(super) struct TrainingBudget {
     share: f64,
     /// Seconds that are due, and when they were counted.
     due: f64,
     counted: f64,
 }
 
-impl Turns {
+impl TrainingBudget {
     /// Most seconds that may become due: what was missed while nobody trained is not made up for.
-    const MOST: f64 = 1.0;
+    const MAX_DUE: f64 = 1.0;
     /// Fewer seconds are not worth a turn.
-    const LEAST: f64 = 0.01;
+    const MIN_TURN: f64 = 0.01;
 
     /// `share` of the time, from now on.
     pub(super) fn new(share: f64) -> Self {
@@ -73,9 +74,9 @@ impl Turns {
 
     /// Seconds that are due `now` (seconds since the beginning); none where they are not worth a turn yet.
     pub(super) fn due(&mut self, now: f64) -> Option<f64> {
-        self.due = (self.due + self.share * (now - self.counted)).min(Self::MOST);
+        self.due = (self.due + self.share * (now - self.counted)).min(Self::MAX_DUE);
         self.counted = now;
-        (self.due >= Self::LEAST).then_some(self.due)
+        (self.due >= Self::MIN_TURN).then_some(self.due)
     }
 
     /// Training took so many seconds of the device.
@@ -93,19 +94,23 @@ pub(super) enum Until<'a> {
     Seconds(f64),
 }
 
-/// Trains in slices until the end is reached or the run is to stop.
-pub(super) fn train(
-    live: &mut dyn Surrogate,
-    ring: &SampleRing,
+/// Trains in slices until the end is reached or the run is to stop. Adds to `learned` what the slices did.
+///
+/// # Errors
+/// The device fails; `learned` has the slices before.
+pub(super) fn train<S: Surrogate>(
+    live: &mut S,
+    buffer: &ReplayBuffer,
     settings: &TrainingSettings,
     until: Until<'_>,
     stop: &AtomicBool,
-) -> Learned {
+    learned: &mut Learned,
+) -> Result<(), DeviceError> {
     const SLICE: f64 = 0.1;
     /// Steps of a slice where their number is given: wall clock must not decide anything then.
     const SLICE_STEPS: u64 = 32;
     let start = Instant::now();
-    let mut sum = Learned::default();
+    let (mut sum, mut result) = (Learned::default(), Ok(()));
     while !stop.load(Ordering::Relaxed) {
         let (seconds, steps) = match settings.steps_per_frame {
             Some(steps) if sum.steps >= steps => break,
@@ -122,14 +127,21 @@ pub(super) fn train(
                 (left.min(SLICE), u64::MAX)
             }
         };
-        let slice = live.learn(ring, seconds, steps);
+        let slice = match live.learn(buffer, seconds, steps) {
+            Ok(slice) => slice,
+            Err(error) => {
+                result = Err(error);
+                break;
+            }
+        };
         let learns = slice.steps > 0;
         sum = sum.and(slice);
         if !learns {
             break;
         }
     }
-    Learned { seconds: start.elapsed().as_secs_f64(), ..sum }
+    *learned = std::mem::take(learned).and(Learned { seconds: start.elapsed().as_secs_f64(), ..sum });
+    result
 }
 
 #[cfg(test)]
@@ -189,7 +201,7 @@ mod tests {
     #[test]
     fn turns_are_a_share_of_the_time() {
         for (share, frame, longer) in [(0.25, 0.007, 1.0), (0.25, 0.2, 1.0), (0.75, 0.03, 1.5), (0.5, 0.4, 0.3)] {
-            let (mut turns, mut now, mut trained) = (Turns::new(share), 0.0, 0.0);
+            let (mut turns, mut now, mut trained) = (TrainingBudget::new(share), 0.0, 0.0);
             for _ in 0..20_000 {
                 now += frame;
                 while let Some(due) = turns.due(now) {
@@ -201,9 +213,9 @@ mod tests {
             }
             assert!((trained / now - share).abs() < 0.01, "{share} of frames of {frame} s: {}", trained / now);
         }
-        let mut none = Turns::new(0.0);
+        let mut none = TrainingBudget::new(0.0);
         assert_eq!(none.due(1e6), None);
-        let mut late = Turns::new(0.5);
-        assert_eq!(late.due(1e6), Some(Turns::MOST), "what was missed is not made up for");
+        let mut late = TrainingBudget::new(0.5);
+        assert_eq!(late.due(1e6), Some(TrainingBudget::MAX_DUE), "what was missed is not made up for");
     }
 }

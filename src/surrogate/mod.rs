@@ -1,35 +1,35 @@
-//! What remembers the log-stretch: a traced table, a network, or a network on a table.
+//! A memory of the log-stretch: a traced table, a network, or a network on a table.
 //!
-//! In: traced samples. Out: predictions with a known cost and size. Calls `flow` for its types only.
+//! In: traced samples. Out: predictions with a known cost and size. Calls `flow` and `field`.
 
+use crate::backend::DeviceError;
 use crate::field::Domain;
-use crate::flow::Tracer;
 use crate::setting::Refused;
 use network::NetworkSettings;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use trainer::Trainer;
 
 mod checkpoint;
-mod draft;
+mod checkpoint_state;
+mod device;
+mod host;
+mod hybrid;
 pub mod network;
-mod offload;
-mod residual;
-mod ring;
+mod replay_buffer;
 mod sizing;
 mod table;
 mod trainer;
 
-pub use draft::Draft;
-pub use offload::{Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
-pub use residual::ResidualNetwork;
-pub use ring::{KEEP_STALE, RingMark, SampleRing};
+pub use checkpoint_state::CheckpointState;
+pub use device::{DeviceTable, Download, HostNetwork, Labels, NetworkCopy, SurrogateDevice, SyncedSamples, Trace, Training};
+pub use host::{FrozenNetwork, Host, HostSurrogate, HostTraining, build};
+pub use hybrid::{FrozenHybrid, Hybrid, NetworkFrom};
+pub use replay_buffer::{BufferMark, KEEP_STALE, ReplayBuffer};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;
 
 /// A number that was not given before.
-fn fresh_stamp() -> u64 {
+pub(crate) fn fresh_stamp() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
@@ -71,7 +71,7 @@ impl Samples {
     }
 }
 
-/// What one call of [`Surrogate::learn`] did.
+/// What one call of [`Hybrid::learn`] did.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
     /// Optimizer steps taken, without those that the same call lost by roll-backs; a frame may have several calls, of which a later one may lose an earlier
@@ -120,77 +120,19 @@ impl Learned {
     }
 }
 
-/// Something that answers log-stretch queries and does not change: a surrogate, or what one was when it was frozen.
+/// Answers log-stretch queries and does not change.
 pub trait Predict: Send + Sync {
     /// `table`, `network` or `residual`.
     fn name(&self) -> &'static str;
+
     /// Writes the predicted log-stretch at each unit point into `out` (same length). Parallelises over rayon's current pool.
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]);
-    /// Memory of what prediction reads, in bytes.
+    ///
+    /// # Errors
+    /// The device that predicts fails or lacks memory; `out` is then unspecified.
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
+
+    /// Memory that prediction reads, bytes.
     fn bytes(&self) -> usize;
-    /// Itself, for engines that know how to predict on a device what this kind of surrogate predicts here; none: nobody does.
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        None
-    }
-    /// The network in it as numbers, for engines that evaluate networks on a device; none where there is none.
-    fn network(&self) -> Option<NetworkState<'_>> {
-        None
-    }
-}
-
-/// A network that does not change, and what it stands on.
-#[derive(Clone, Copy)]
-pub struct NetworkState<'a> {
-    /// Of these parameters, and no others in this process.
-    pub stamp: u64,
-    /// What is stored where.
-    pub shape: &'a network::Architecture,
-    /// What the outputs mean.
-    pub objective: &'a network::Objective,
-    /// Hash-grid tables; empty for the frequency encoding.
-    pub tables: &'a [f32],
-    /// Weights and biases of all layers.
-    pub layers: &'a [f32],
-    /// Start time and duration that it is asked for, in unit intervals.
-    pub times: [f32; 2],
-    /// The same network where a device trains it; the numbers here are then those that came back last.
-    pub on_device: Option<&'a dyn OffloadedNetwork>,
-    /// A table below, and the factor on the network above it.
-    pub base: Option<(&'a Table, f32)>,
-}
-
-/// A memory of the log-stretch over the domain, which learns between or beside frames.
-pub trait Surrogate: Predict {
-    /// What it would answer now, for good: frames are rendered with it while training goes on.
-    fn freeze(&self) -> Arc<dyn Predict>;
-    /// Whether `learn` does anything.
-    fn learns(&self) -> bool;
-    /// Trains on the ring's samples for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
-    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned;
-    /// Trains on a device from now on, where that takes it.
-    fn offload(&mut self, _to: &Arc<dyn Offload>) {}
-    /// Whether the latest steps were taken on a device.
-    fn is_offloaded(&self) -> bool {
-        false
-    }
-    /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over; a network with the start time as an input
-    /// goes on learning as before, and predicts for the new start.
-    fn window_slid(&mut self, tracer: &dyn Tracer);
-    /// Lets go of the table that a device holds, its values coming over: another surrogate is about to take this one's place.
-    fn leave_device(&mut self) {}
-    /// Everything needed to go on (weights, optimizer state, base table) as it is now. Where a device trains, its numbers are waited for.
-    fn draft(&self) -> Draft;
-    /// The same without waiting, to be written by another thread: where a device trains, it copies its numbers, which come back as they are
-    /// written. None while an earlier copy is still on its way. Where it has no room for a copy, its numbers are waited for, and the draft says so.
-    fn draft_behind(&mut self) -> Option<Draft> {
-        Some(self.draft())
-    }
-    /// Writes [`Surrogate::draft`] into the file.
-    fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {
-        self.draft().write(path).map(drop)
-    }
-    /// Restores what was written; a checkpoint of another shape is an error and changes nothing.
-    fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError>;
 }
 
 /// Why a surrogate cannot be built.
@@ -244,7 +186,7 @@ pub enum CheckpointError {
         /// Of the surrogate, in words.
         what: &'static str,
         /// What trained.
-        source: DeviceLost,
+        source: DeviceError,
     },
     /// The disk did not take it in time; what was there before stays.
     #[error("checkpoint {path}: not written within {seconds} seconds")]
@@ -274,6 +216,17 @@ pub enum Kind {
     Network,
     /// A coarse traced table plus a learned residual, zero at first.
     Residual,
+}
+
+impl Kind {
+    /// As written in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Table => "table",
+            Self::Network => "network",
+            Self::Residual => "residual",
+        }
+    }
 }
 
 /// `[surrogate]` of a scene file.
@@ -314,7 +267,7 @@ impl SurrogateSettings {
                 accepted: "none, or surrogate.kind = \"network\": a table knows one window and one duration".into(),
             });
         }
-        if self.kind == Kind::Residual { ResidualNetwork::check(network) } else { Ok(()) }
+        if self.kind == Kind::Residual { hybrid::check_residual(network) } else { Ok(()) }
     }
 
     /// Checks the nodes along as many axes as the flow varies along.
@@ -354,80 +307,6 @@ impl SurrogateSettings {
         let lengths = domain.lengths();
         let most = lengths[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
         Ok(std::array::from_fn(|axis| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
-    }
-}
-
-/// Builds the surrogate that the settings ask for; tables are traced at once. `seed` draws the network's first weights and its batches.
-pub fn build(
-    settings: &SurrogateSettings,
-    network: &NetworkSettings,
-    domain: &Domain,
-    seed: u64,
-    tracer: &dyn Tracer,
-) -> Result<Box<dyn Surrogate>, SurrogateError> {
-    Ok(match settings.kind {
-        Kind::Table => Box::new(Table::trace(tracer, settings.nodes(domain)?)),
-        Kind::Network => Box::new(Network { trainer: Trainer::new(network, tracer, seed, false)? }),
-        Kind::Residual => Box::new(ResidualNetwork::new(network, settings.nodes(domain)?, seed, tracer)?),
-    })
-}
-
-/// The network alone.
-struct Network {
-    trainer: Trainer,
-}
-
-impl Predict for Network {
-    fn name(&self) -> &'static str {
-        "network"
-    }
-
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.trainer.predict(points, out);
-    }
-
-    fn bytes(&self) -> usize {
-        self.trainer.bytes()
-    }
-}
-
-impl Surrogate for Network {
-    fn freeze(&self) -> Arc<dyn Predict> {
-        Arc::new(self.trainer.frozen())
-    }
-
-    fn learns(&self) -> bool {
-        true
-    }
-
-    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned {
-        self.trainer.learn(ring, None, seconds, max_steps)
-    }
-
-    fn offload(&mut self, to: &Arc<dyn Offload>) {
-        self.trainer.offload(to);
-    }
-
-    fn is_offloaded(&self) -> bool {
-        self.trainer.is_offloaded()
-    }
-
-    fn window_slid(&mut self, tracer: &dyn Tracer) {
-        self.trainer.window_slid(tracer);
-    }
-
-    fn draft(&self) -> Draft {
-        Draft::new(self.name(), None, Some(self.trainer.draft()))
-    }
-
-    fn draft_behind(&mut self) -> Option<Draft> {
-        let (network, waited_for) = self.trainer.draft_behind()?;
-        Some(Draft::new(self.name(), None, Some(network)).waited_for(waited_for))
-    }
-
-    fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError> {
-        let checkpoint = checkpoint::Checkpoint::read(path, "network")?;
-        self.trainer.restored(&checkpoint)
     }
 }
 

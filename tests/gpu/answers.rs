@@ -1,17 +1,18 @@
 //! Frames that a surrogate answers where it is trusted, and scenes with land: walked, predicted and traced on the GPU, against the CPU.
 
 use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
-use ridgewatch::engine::cuda::{
+use ridgewatch::backend::cuda::{
     CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs, Panel,
     SnapshotStore, Tuning, keeps_label,
 };
-use ridgewatch::engine::{Answers, Device, RunOptions, Tally, residuals, stratified_points, trace};
+use ridgewatch::backend::{Device, Tally, residuals, stratified_points};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
+use ridgewatch::run::{Answers, RunOptions, trace};
 use ridgewatch::surrogate::{Predict, Samples, Table};
 use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
 use std::cell::RefCell;

@@ -1,10 +1,11 @@
 //! Audits on the device against those on the host: the same points, and sums of the same bits from the same traces and predictions.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{Audits, CudaTracer, DeviceTable, Tuning};
-use ridgewatch::engine::{AuditRequest, audit, stratified_points};
+use ridgewatch::backend::cuda::{Audits, CudaTracer, DeviceTable, Tuning};
+use ridgewatch::backend::{AuditRequest, stratified_points};
 use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Precision, Tracer, VelocitySource};
 use ridgewatch::render::{Transfer, TransferSettings};
+use ridgewatch::run::audit;
 use ridgewatch::surrogate::{Predict, Table};
 use ridgewatch::trust::{CellErrors, Strata};
 
@@ -68,7 +69,7 @@ fn sums_are_the_host_s_bits() {
 #[ignore = "needs a GPU"]
 fn memory_is_kept_from_audit_to_audit() {
     let gpu = opened(Default::default());
-    let store = ridgewatch::engine::cuda::SnapshotStore::new(&gpu);
+    let store = ridgewatch::backend::cuda::SnapshotStore::new(&gpu);
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let tracer = CudaTracer::new(&store, &gpu, turbulence([40, 24, 24], 4), &map, 0.0, Tuning::default()).unwrap();
     let table = Table::trace(&tracer, [30, 20, 20]);

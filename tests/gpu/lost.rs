@@ -2,10 +2,11 @@
 //! a process of its own. (`tests/lost_device/` breaks a device at every call, without a GPU.)
 
 use crate::scenes::device;
+use ridgewatch::backend::Device;
+use ridgewatch::backend::cuda::GpuSettings;
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::GpuSettings;
-use ridgewatch::engine::{Device, EngineError, Event, Frame, RunOptions, Setup, run};
 use ridgewatch::publish::compare_films;
+use ridgewatch::run::{EngineError, Event, Frame, RunOptions, Setup, run};
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;

@@ -7,7 +7,7 @@ use super::small;
 use burn::backend::Flex;
 use burn::module::Param;
 use burn::tensor::{Tensor, TensorData};
-use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
+use ridgewatch::backend::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{

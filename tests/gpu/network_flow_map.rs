@@ -7,9 +7,10 @@ use super::network_support::{self, Case};
 use super::scenes::*;
 use super::small;
 use nalgebra::DMatrix;
-use ridgewatch::engine::cuda::{DeviceNetwork, GpuSettings};
-use ridgewatch::engine::{Device, Frame, RunOptions};
+use ridgewatch::backend::Device;
+use ridgewatch::backend::cuda::{DeviceNetwork, GpuSettings};
 use ridgewatch::field::Domain;
+use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Objective, Target, row};
 
 /// Of the cases that the CPU trains, those that are not plain; and what fills registers, and goes through the kernels in tiles.

@@ -3,9 +3,10 @@
 use super::network_support::{DoubleGyre, traced, uniform_points};
 use super::scenes::*;
 use super::small;
-use ridgewatch::engine::cuda::{CudaOffload, GpuSettings};
-use ridgewatch::engine::{Device, Frame, RunOptions, WhenLost};
+use ridgewatch::backend::cuda::{CudaOffload, GpuSettings};
+use ridgewatch::backend::{Device, WhenLost};
 use ridgewatch::flow::Tracer;
+use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, Offload, SampleRing, SurrogateSettings, build};
 use std::sync::Arc;

@@ -9,7 +9,7 @@ use burn::backend::Flex;
 use burn::module::Param;
 use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
-use ridgewatch::engine::cuda::{CudaOffload, DeviceNetwork, is_fused};
+use ridgewatch::backend::cuda::{CudaOffload, DeviceNetwork, is_fused};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{
     Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, row,

@@ -1,7 +1,7 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
 use crate::scenes::{gpu, opened, store, turbulence};
-use ridgewatch::engine::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, Traced, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, Traced, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{

@@ -1,8 +1,8 @@
 //! Flows that the tests trace, and the two ways to trace them.
 
+use ridgewatch::backend::Device;
+use ridgewatch::backend::cuda::{CudaAccelerator, CudaTracer, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{CudaAccelerator, CudaTracer, Gpu, GpuSettings, SnapshotStore, Storage, Tuning};
-use ridgewatch::engine::{Device, Event, Frame, RunOptions, Setup, run};
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
@@ -10,6 +10,7 @@ use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
     cpu_tracer,
 };
+use ridgewatch::run::{Event, Frame, RunOptions, Setup, run};
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
 use std::path::Path;

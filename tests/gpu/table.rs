@@ -1,7 +1,7 @@
 //! The table on the device against the CPU's.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, DeviceTable, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceTable, Tuning};
 use ridgewatch::flow::{Boundary, FlowMap, Precision, VelocitySource, cpu_tracer};
 use ridgewatch::surrogate::{Predict, Surrogate, Table};
 

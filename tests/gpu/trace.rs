@@ -1,7 +1,7 @@
 //! Tracing kernels against the CPU in f64.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, DeviceTracer, Outputs, Storage, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceTracer, Outputs, Storage, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource};

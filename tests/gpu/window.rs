@@ -1,7 +1,7 @@
 //! Snapshots on the device.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, CudaTracerError, DeviceError, GpuSettings, SnapshotStore, Storage, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, CudaTracerError, DeviceError, GpuSettings, SnapshotStore, Storage, Tuning};
 use ridgewatch::field::Window;
 use ridgewatch::flow::{Boundary, Extras, FlowMap, Interpolation, Precision, Steps, Traced, Tracer, VelocitySource};
 use std::sync::Arc;

@@ -3,14 +3,12 @@
 use burn::backend::Flex;
 use burn::module::{Param, ParamId};
 use burn::tensor::{Tensor, TensorData};
-use ridgewatch::engine::cuda::{CudaTracerError, DeviceError};
-use ridgewatch::engine::{
-    Accelerator, Answers, AuditFindings, AuditRequest, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, EngineError, Health, Tally,
-    WhenLost, audit,
-};
+use ridgewatch::backend::cuda::{CudaTracerError, DeviceError};
+use ridgewatch::backend::{AuditFindings, AuditRequest, Tally, WhenLost};
 use ridgewatch::field::{Domain, Snapshot};
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::{Film, LogStretch, RenderStats, Renderer};
+use ridgewatch::run::{Accelerator, Answers, Backed, DeviceNodes, DeviceRenderer, DeviceTrace, EngineError, Health, audit};
 use ridgewatch::surrogate::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Step};
 use ridgewatch::surrogate::{
     Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, Predict, RingMark, SampleRing,

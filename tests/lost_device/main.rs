@@ -7,11 +7,12 @@
 mod device;
 
 use device::{BATCH, Breaking, How, NAME, STEP_SECONDS, STEPS};
+use ridgewatch::backend::{Device, WhenLost};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{Device, EngineError, Event, FrameRecord, RunOptions, Setup, StageSeconds, WhenLost, run};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
+use ridgewatch::run::{EngineError, Event, FrameRecord, RunOptions, Setup, StageSeconds, run};
 use ridgewatch::surrogate::Learned;
 use std::collections::BTreeSet;
 use std::path::Path;

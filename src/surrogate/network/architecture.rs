@@ -160,6 +160,12 @@ impl Architecture {
         self.layers.iter().map(|layer| (layer.inputs + 1) * layer.outputs).sum()
     }
 
+    /// Parameters of the output layer, in the flat vector of layers.
+    pub(crate) fn output_layer(&self) -> std::ops::Range<usize> {
+        let head = &self.layers[self.layers.len() - 1];
+        head.weights..head.biases + head.outputs
+    }
+
     /// All parameters.
     pub fn parameters(&self) -> usize {
         self.table_entries() * self.features + self.layer_parameters()

@@ -20,9 +20,9 @@ fn trainer() -> Trainer {
     Trainer::new(&settings, &*tracer, 1, false).unwrap()
 }
 
-fn labels() -> SampleRing {
+fn labels() -> ReplayBuffer {
     let points: Vec<[f32; 3]> = (0..64).map(|i| [i as f32 / 64.0, 0.5, 0.5]).collect();
-    SampleRing::holding(&Samples { log_stretch: vec![1.0; points.len()], points, ..Samples::default() })
+    ReplayBuffer::holding(&Samples { log_stretch: vec![1.0; points.len()], points, ..Samples::default() })
 }
 
 impl Offload for Full {
@@ -35,7 +35,7 @@ impl Offload for Full {
 }
 
 impl OffloadedTraining for Full {
-    fn bring(&mut self, ring: &SampleRing, _: Option<&Table>) -> Result<Brought, NotTaken> {
+    fn bring(&mut self, ring: &ReplayBuffer, _: Option<&Table>) -> Result<Brought, NotTaken> {
         Ok(Brought { usable: ring.len(), dropped: 0 })
     }
     fn forget_labels(&mut self) {}
@@ -115,7 +115,7 @@ fn a_slide_keeps_the_memory_of_the_copy_but_nothing_comes_back_from_before_it() 
     let tracer = cpu_tracer(flow, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
     let settings = NetworkSettings { levels: 2, log2_table: 8, width: 16, batch: 256, ..NetworkSettings::default() };
     let mut trainer = Trainer::new(&settings, &*tracer, 1, false).unwrap();
-    let mut ring = SampleRing::new(1000);
+    let mut ring = ReplayBuffer::new(1000);
     let points: Vec<[f32; 3]> = (0..1000).map(|i| [i as f32 / 1000.0, (i % 7) as f32 / 7.0, 0.5]).collect();
     ring.push(&Samples { log_stretch: vec![0.7; points.len()], points, ..Samples::default() });
     let learn = |trainer: &mut Trainer| assert_eq!(trainer.learn(&ring, None, f64::INFINITY, 10).steps, 10);

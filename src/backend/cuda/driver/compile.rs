@@ -3,7 +3,7 @@
 //! Each file in `kernels/` is compiled with macros that fix what a run does not change (dimensions, precision, interpolation, ...):
 //! the kernel then holds one variant only, with the registers that this variant needs.
 
-use super::DeviceError;
+use crate::backend::cuda::DeviceError;
 use cudarc::nvrtc::{result as nvrtc, sys};
 use std::ffi::{CStr, CString};
 use std::fs;
@@ -12,7 +12,7 @@ use std::path::{Path, PathBuf};
 
 macro_rules! kernel {
     ($name:literal) => {
-        ($name, include_str!(concat!("../../../kernels/", $name)))
+        ($name, include_str!(concat!("../../../../kernels/", $name)))
     };
 }
 

@@ -1,11 +1,9 @@
 //! One GPU: asked for before it is touched, its context, streams, memory and compiled kernels.
 
-use super::DeviceError;
-use super::behind::Behind;
-use super::compile::{self, KernelCache};
-use super::memory::{Budget, Buffer};
-use crate::engine::accelerator::Health;
-use crate::engine::device::WhenLost;
+use crate::backend::cuda::DeviceError;
+use crate::backend::cuda::driver::compile::{self, KernelCache};
+use crate::backend::cuda::driver::memory::{Budget, Buffer};
+use crate::backend::cuda::driver::readback::AsyncReadback;
 use cudarc::driver::{CudaContext, CudaEvent, CudaFunction, CudaModule, CudaStream, DeviceRepr, result, sys};
 use cudarc::nvrtc::Ptx;
 use std::collections::HashMap;
@@ -24,8 +22,6 @@ pub struct GpuSettings {
     pub cache: Option<std::path::PathBuf>,
     /// Lowest stream priority, for life beside a solver.
     pub polite: bool,
-    /// What happens when work on the device fails.
-    pub when_lost: WhenLost,
     /// Fills fresh device memory with bytes that make NaN and far indices, so that a kernel that reads what nothing has written shows. For
     /// tests.
     pub poison: bool,
@@ -51,12 +47,11 @@ pub struct Gpu {
     context: Arc<CudaContext>,
     work: Arc<CudaStream>,
     transfer: Arc<CudaStream>,
-    behind: Behind,
+    behind: AsyncReadback,
     budget: Arc<Budget>,
     cache: KernelCache,
     /// Or why one does not compile: no frame tries that anew.
     modules: Mutex<HashMap<String, Result<Arc<CudaModule>, DeviceError>>>,
-    health: Arc<Health>,
 }
 
 impl fmt::Debug for Gpu {
@@ -129,7 +124,7 @@ impl Gpu {
             }
         };
         let (work, transfer) = (stream().map_err(&opening)?, stream().map_err(&opening)?);
-        let behind = Behind::new(stream().map_err(&opening)?);
+        let behind = AsyncReadback::new(stream().map_err(&opening)?);
         let (free, total) = context.mem_get_info().map_err(&opening)?;
         let attribute = |which| context.attribute(which).map_err(&opening);
         let multiprocessors = attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)? as u32;
@@ -147,7 +142,6 @@ impl Gpu {
             budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64).filling(settings.poison.then_some(0xFF))),
             cache: KernelCache::new(settings.cache.clone()),
             modules: Mutex::new(HashMap::new()),
-            health: Arc::new(Health::new(settings.when_lost)),
             context,
         };
         gpu.keep_freed_memory()?;
@@ -205,10 +199,10 @@ impl Gpu {
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
     }
-    pub(super) fn behind(&self) -> &Behind {
+    pub(in crate::backend::cuda) fn behind(&self) -> &AsyncReadback {
         &self.behind
     }
-    pub(super) fn budget(&self) -> &Arc<Budget> {
+    pub(in crate::backend::cuda) fn budget(&self) -> &Arc<Budget> {
         &self.budget
     }
     /// Bytes taken and bytes that may be taken.
@@ -222,7 +216,7 @@ impl Gpu {
 
     /// Things that are best worked on together, at so many bytes each: `most`, or as many as a quarter of the memory that is left holds, but at
     /// least 4096.
-    pub(super) fn batch(&self, most: usize, bytes: u64) -> usize {
+    pub(in crate::backend::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
         const SHARE: u64 = 4;
         const LEAST: usize = 1 << 12;
         usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(LEAST).min(most)
@@ -312,10 +306,5 @@ impl Gpu {
             best = best.min(self.milliseconds(&begin, &self.mark()?)?);
         }
         Ok(2.0 * bytes as f64 / f64::from(best) * 1e3)
-    }
-
-    /// Whether it still works, and what follows when it does not.
-    pub fn health(&self) -> &Arc<Health> {
-        &self.health
     }
 }

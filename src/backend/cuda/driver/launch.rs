@@ -1,6 +1,6 @@
 //! Launching kernels.
 
-use super::{DeviceError, Gpu};
+use crate::backend::cuda::{DeviceError, Gpu};
 use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchArgs, LaunchConfig};
 
@@ -21,17 +21,17 @@ pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Re
 
 /// A kernel whose blocks stay and take one tile after another, with shared memory beyond what every block may have.
 #[derive(Debug)]
-pub(super) struct Resident {
-    pub(super) function: CudaFunction,
+pub(in crate::backend::cuda) struct Resident {
+    pub(in crate::backend::cuda) function: CudaFunction,
     threads: u32,
     shared: u32,
     /// That the device holds at once.
-    pub(super) blocks: u32,
+    pub(in crate::backend::cuda) blocks: u32,
 }
 
 impl Resident {
     /// Blocks of `threads` threads and `shared` bytes, which the device has.
-    pub(super) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("asking for shared memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
         function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
@@ -40,7 +40,7 @@ impl Resident {
     }
 
     /// As many blocks as stay, or as there are tiles.
-    pub(super) fn config(&self, tiles: usize) -> LaunchConfig {
+    pub(in crate::backend::cuda) fn config(&self, tiles: usize) -> LaunchConfig {
         let blocks = tiles.clamp(1, self.blocks as usize) as u32;
         LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (self.threads, 1, 1), shared_mem_bytes: self.shared }
     }

@@ -1,6 +1,6 @@
 //! Device memory under a cap.
 
-use super::DeviceError;
+use crate::backend::cuda::DeviceError;
 use cudarc::driver::{CudaSlice, CudaStream, DevicePtr, DevicePtrMut, DeviceRepr, result, sys};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -68,7 +68,12 @@ pub struct Buffer<T> {
 }
 
 impl<T: DeviceRepr> Buffer<T> {
-    pub(super) fn new(stream: &Arc<CudaStream>, budget: &Arc<Budget>, what: &str, len: usize) -> Result<Self, DeviceError> {
+    pub(in crate::backend::cuda) fn new(
+        stream: &Arc<CudaStream>,
+        budget: &Arc<Budget>,
+        what: &str,
+        len: usize,
+    ) -> Result<Self, DeviceError> {
         // An empty buffer still has an address.
         let len = len.max(1);
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
@@ -91,7 +96,7 @@ impl<T: DeviceRepr> Buffer<T> {
     }
 
     /// The same, read by another stream. Whoever reads waits for an event behind the last write.
-    pub(super) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
+    pub(in crate::backend::cuda) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
         self.reader = Some(reader.clone());
         self
     }
@@ -100,7 +105,7 @@ impl<T: DeviceRepr> Buffer<T> {
     ///
     /// # Safety
     /// `values` is unchanged until the stream has passed this.
-    pub(super) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
         assert!(at + values.len() <= self.len(), "values fit the buffer");
         let doing = DeviceError::driver("copying to the device");
         self.stream.context().bind_to_thread().map_err(&doing)?;

@@ -1,11 +1,11 @@
 //! Page-locked host memory: what the device copies to while the host does other things.
 
-use super::{DeviceError, Gpu};
+use crate::backend::cuda::{DeviceError, Gpu};
 use cudarc::driver::{CudaContext, CudaStream, result};
 use std::sync::Arc;
 
 /// Values that the device may write at any time between a copy and the next synchronisation of the stream that makes it.
-pub(super) struct Pinned<T: Copy> {
+pub(in crate::backend::cuda) struct Pinned<T: Copy> {
     values: *mut T,
     len: usize,
     context: Arc<CudaContext>,
@@ -18,7 +18,7 @@ unsafe impl<T: Copy + Sync> Sync for Pinned<T> {}
 
 impl<T: Copy + Default> Pinned<T> {
     /// `len` values of `T::default()`.
-    pub(super) fn new(gpu: &Gpu, len: usize) -> Result<Self, DeviceError> {
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, len: usize) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("allocating page-locked memory");
         let context = gpu.context().clone();
         context.bind_to_thread().map_err(&doing)?;
@@ -32,7 +32,7 @@ impl<T: Copy + Default> Pinned<T> {
     }
 
     /// Values.
-    pub(super) fn len(&self) -> usize {
+    pub(in crate::backend::cuda) fn len(&self) -> usize {
         self.len
     }
 
@@ -40,7 +40,7 @@ impl<T: Copy + Default> Pinned<T> {
     ///
     /// # Safety
     /// As for [`Self::copy_on`], of the work stream.
-    pub(super) unsafe fn copy_from(&mut self, gpu: &Gpu, from: u64, count: usize) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) unsafe fn copy_from(&mut self, gpu: &Gpu, from: u64, count: usize) -> Result<(), DeviceError> {
         // SAFETY: the caller's.
         unsafe { self.copy_on(gpu.work(), from, count) }
     }
@@ -49,7 +49,7 @@ impl<T: Copy + Default> Pinned<T> {
     ///
     /// # Safety
     /// The device holds as many values there when the stream comes to it, and `count` is at most `len`.
-    pub(super) unsafe fn copy_on(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) unsafe fn copy_on(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
         debug_assert!(count <= self.len);
         // SAFETY: `count` values of `T` lie within the allocation.
         let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };
@@ -58,7 +58,7 @@ impl<T: Copy + Default> Pinned<T> {
     }
 
     /// The values, once the copies have been waited for.
-    pub(super) fn values(&self) -> &[T] {
+    pub(in crate::backend::cuda) fn values(&self) -> &[T] {
         // SAFETY: initialised in `new`; copies in progress are the caller's to wait for, as the type says.
         unsafe { std::slice::from_raw_parts(self.values, self.len) }
     }

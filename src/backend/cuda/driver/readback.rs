@@ -1,7 +1,7 @@
 //! What comes back from the device while kernels run: through page-locked pieces, on a stream of its own.
 
-use super::pinned::Pinned;
-use super::{Buffer, DeviceError, Gpu};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use cudarc::driver::CudaStream;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -9,14 +9,14 @@ use std::sync::{Arc, Mutex, PoisonError};
 const PIECE: usize = 1 << 20;
 
 /// The way back, for one reader at a time.
-pub(super) struct Behind {
+pub(in crate::backend::cuda) struct AsyncReadback {
     stream: Arc<CudaStream>,
     /// Two that take turns; taken when they are first needed.
     pieces: Mutex<Option<[Pinned<f32>; 2]>>,
 }
 
-impl Behind {
-    pub(super) fn new(stream: Arc<CudaStream>) -> Self {
+impl AsyncReadback {
+    pub(in crate::backend::cuda) fn new(stream: Arc<CudaStream>) -> Self {
         Self { stream, pieces: Mutex::new(None) }
     }
 }
@@ -26,7 +26,7 @@ impl Gpu {
     ///
     /// # Errors
     /// What the device says.
-    pub(super) fn read_behind(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
+    pub(in crate::backend::cuda) fn read_behind(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
         assert!(len <= from.len(), "the buffer holds as many");
         let mut pieces = self.behind().pieces.lock().unwrap_or_else(PoisonError::into_inner);
         let pieces = match &mut *pieces {

@@ -1,9 +1,9 @@
 //! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and the gradients of the weights
 //! are products over all samples. See `kernels/network_batched.cu`.
 
-use super::launch::Resident;
-use super::network_layout::{DrawArgument, GridArgument, ReadingArgument};
-use super::{Buffer, DeviceError, Gpu, launch, threads};
+use crate::backend::cuda::driver::Resident;
+use crate::backend::cuda::network::layout::{DrawArgument, GridArgument, ReadingArgument};
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::surrogate::network::{Architecture, Target};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use std::sync::{Arc, Mutex, PoisonError};

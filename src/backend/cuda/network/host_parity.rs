@@ -1,8 +1,8 @@
 //! The network's kernels compiled as host C++, with the very macros and arguments of a launch, against the CPU's prediction. No GPU.
 
 use super::host_parity::{half, library};
-use super::network::{further_places, grid, network_defines, placed_times, reading};
-use super::network_layout::{GridArgument, ReadingArgument};
+use crate::backend::cuda::network::layout::{GridArgument, ReadingArgument};
+use crate::backend::cuda::network::network::{further_places, grid, network_defines, placed_times, reading};
 use crate::surrogate::network::{Architecture, Encoding, Input, Loss, NetworkSettings, Objective, Predictor, Scale, Target, uniform};
 
 type HostPredict = unsafe extern "C" fn(*const GridArgument, *const u16, *const f32, *const ReadingArgument, *const f32, u32, *mut f32);

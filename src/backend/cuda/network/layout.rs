@@ -1,6 +1,6 @@
 //! Structures that the network's kernels read, laid out as in `kernels/network.cuh`, `kernels/network_data.cuh` and `kernels/network.cu`.
 
-use super::layout::TableArgument;
+use crate::backend::cuda::layout::TableArgument;
 use crate::surrogate::network::GRID_INPUTS;
 use cudarc::driver::DeviceRepr;
 

@@ -3,15 +3,14 @@
 //! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads
 //! them (fused) or once a call (batched).
 
-use super::launch::Resident;
-use super::layout::TableArgument;
-use super::network_batched::{Batched, GradientTo, Tiling};
-use super::network_layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
-use super::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
+use crate::backend::cuda::driver::Resident;
+use crate::backend::cuda::layout::TableArgument;
+use crate::backend::cuda::network::batched::{Batched, GradientTo, Tiling};
+use crate::backend::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
+use crate::backend::cuda::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Average, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
+use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
-use half::f16;
 use std::sync::Arc;
 
 /// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
@@ -293,18 +292,6 @@ pub(super) fn grid(shape: &Architecture) -> Result<(GridArgument, usize), Device
     Ok((GridArgument::new(&levels, shape.inputs()), offset * shape.features))
 }
 
-/// burn's tables of padded ones in half precision, of which [`grid`] says where each level lies.
-fn unpadded(shape: &Architecture, halves: &[u16]) -> Vec<f32> {
-    let mut tables = vec![0.0; shape.table_entries() * shape.features];
-    let mut from = 0;
-    for level in &shape.levels {
-        let to = &mut tables[level.offset * shape.features..][..level.entries * shape.features];
-        to.iter_mut().zip(&halves[from..]).for_each(|(to, &half)| *to = f16::from_bits(half).to_f32());
-        from += level.entries.next_multiple_of(PADDING) * shape.features;
-    }
-    tables
-}
-
 /// How outputs become log-stretch, above `base` by `share` of them where there is one, and the times that points have ([`placed_times`]).
 pub(super) fn reading(
     shape: &Architecture,
@@ -394,16 +381,6 @@ impl DeviceNetwork {
         Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone() })
     }
 
-    /// Brings its parameters back, the tables as halves hold them. Takes no memory.
-    pub(super) fn fetch(&self, into: &mut Average) -> Result<(), DeviceError> {
-        let shape = &self.kernels.shape;
-        let mut halves = vec![0; self.kernels.padded];
-        self.halves.read(&mut halves)?;
-        into.tables = unpadded(shape, &halves);
-        into.layers.resize(self.layers.len(), 0.0);
-        self.layers.read(&mut into.layers)
-    }
-
     /// Memory of what prediction reads, in bytes.
     pub fn bytes(&self) -> usize {
         2 * self.kernels.padded + 4 * self.layers.len()
@@ -463,6 +440,19 @@ pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer
 #[cfg(test)]
 mod tests {
     use super::*;
+    use half::f16;
+
+    /// burn's tables of padded ones in half precision; [`grid`] says where each level lies.
+    fn unpadded(shape: &Architecture, halves: &[u16]) -> Vec<f32> {
+        let mut tables = vec![0.0; shape.table_entries() * shape.features];
+        let mut from = 0;
+        for level in &shape.levels {
+            let to = &mut tables[level.offset * shape.features..][..level.entries * shape.features];
+            to.iter_mut().zip(&halves[from..]).for_each(|(to, &half)| *to = f16::from_bits(half).to_f32());
+            from += level.entries.next_multiple_of(PADDING) * shape.features;
+        }
+        tables
+    }
     use crate::surrogate::network::{Encoding, NetworkSettings};
 
     /// Each level lies where [`grid`] says that the kernels look for it.

@@ -1,85 +1,157 @@
-//! Networks that train on the device, for the surrogates that own them: the device's side of [`crate::surrogate::Offload`].
+//! Surrogates whose table and network are on the GPU.
 
-use super::answers::DeviceLearns;
-use super::labels::HELD_BACK;
-use super::layout::Outputs;
-use super::network_samples::{Filled, SampleWriter};
-use super::network_training::NetworkCopy;
-use super::predictor::{TableCopy, predict_from_host};
-use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
+use super::samples::{Filled, SampleWriter};
+use super::training::NetworkCopy as DeviceCopy;
+use super::{DeviceNetwork, DeviceSamples, DeviceTraining};
+use crate::backend::DeviceError;
+use crate::backend::cuda::driver::Gpu;
+use crate::backend::cuda::layout::Outputs;
+use crate::backend::cuda::rendering::{DeviceLearns, DevicePredict, HELD_BACK};
+use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Average, Model, Objective, PlannedStep, Target};
+use crate::surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
 use crate::surrogate::{
-    Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining, RingMark, SampleRing, Table,
+    BufferMark, DeviceTable as TableOnDevice, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice,
+    SyncedSamples, Table, Training, fresh_stamp,
 };
-use std::ops::Range;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Instant;
 
-/// Labels that were traced on the device and stay there: so many times the ring's, but at most one part of the memory that is left.
-const TIMES_THE_RING: usize = 4;
+/// Labels that were traced on the device and stay there, as a multiple of the replay buffer's capacity; at most one part in `MEMORY_SHARE` of the memory
+/// that is left.
+const POOL_PER_BUFFER: usize = 4;
 const MEMORY_SHARE: u64 = 8;
-/// A copy of the network for checkpoints takes at most one part of the memory that is left: frames may still want the rest.
+/// A copy of the network for checkpoints takes at most one part in so many of the memory that is left: frames may still need the rest.
 const COPY_SHARE: u64 = 2;
+/// Most steps between two looks at the clock, and steps before it is known how long one takes.
+const MAX_GROUP: u64 = 64;
+const FIRST_GROUP: u64 = 8;
+/// Points from the host that are predicted at once, at most: bounds the memory of a call.
+const BATCH: usize = 1 << 22;
+/// Bytes of a point and its prediction.
+const POINT_BYTES: u64 = 16;
 
-/// Trains networks on a GPU.
-#[derive(Debug)]
-pub struct CudaOffload(Arc<Gpu>);
+/// A GPU as a surrogate's device.
+pub struct OnGpu;
 
-impl CudaOffload {
-    /// On this device.
-    pub fn new(gpu: &Arc<Gpu>) -> Self {
-        Self(gpu.clone())
+impl SurrogateDevice for OnGpu {
+    type Tracer<'t> = CudaTracer;
+    type Table = CudaTable;
+    type Training = CudaTraining;
+
+    fn trace_table(tracer: &CudaTracer, nodes: [usize; 3], old: Option<CudaTable>) -> Result<CudaTable, DeviceError> {
+        // Old and new must not need memory together.
+        drop(old);
+        Ok(CudaTable::new(DeviceTable::trace(tracer.device(), tracer.host().domain(), nodes)?))
+    }
+
+    fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        match frozen_parts(frozen)? {
+            (Some(table), None) => predict_from_host(table.gpu(), table, points, out),
+            (base, Some(network)) => {
+                let above = network.network.above(base.map(|base| (base, frozen.shrinkage))).at(frozen.times);
+                predict_from_host(&network.gpu, &above, points, out)
+            }
+            (None, None) => {
+                out.fill(0.0);
+                Ok(())
+            }
+        }
     }
 }
 
-impl Offload for CudaOffload {
-    fn takes(&self, shape: &Architecture, objective: &Objective) -> bool {
-        DeviceTraining::takes(&self.0, shape, objective)
+/// The table and the network of a frozen surrogate, on the device.
+///
+/// # Errors
+/// The table has left the device.
+pub(in crate::backend::cuda) fn frozen_parts(
+    frozen: &FrozenHybrid<OnGpu>,
+) -> Result<(Option<&DeviceTable>, Option<&CudaNetwork>), DeviceError> {
+    Ok((frozen.table.as_ref().map(CudaTable::device).transpose()?, frozen.network.as_deref()))
+}
+
+/// Predicts at unit points on the host.
+pub(in crate::backend::cuda) fn predict_from_host(
+    gpu: &Gpu,
+    by: &dyn DevicePredict,
+    points: &[[f32; 3]],
+    out: &mut [f32],
+) -> Result<(), DeviceError> {
+    let batch = gpu.batch(BATCH, POINT_BYTES);
+    for (points, out) in points.chunks(batch).zip(out.chunks_mut(batch)) {
+        let unit = gpu.upload("points to predict at", points)?;
+        let values = gpu.alloc::<f32>("points to predict at", points.len())?;
+        // SAFETY: both buffers hold as many entries as there are points, and reading waits for the stream.
+        unsafe { by.predict(unit.address(), points.len(), values.address()) }?;
+        values.read(out)?;
+    }
+    Ok(())
+}
+
+/// A table on the GPU, and on the host after the first download.
+#[derive(Clone)]
+pub struct CudaTable {
+    /// `None` after it has left the device for a table of another size.
+    device: Option<Arc<DeviceTable>>,
+    host: Arc<OnceLock<Table>>,
+    /// A number that tables in this process share only if they share their values.
+    stamp: u64,
+}
+
+impl CudaTable {
+    fn new(table: DeviceTable) -> Self {
+        Self { device: Some(Arc::new(table)), host: Arc::default(), stamp: fresh_stamp() }
     }
 
-    fn training(
-        &self,
-        model: &Model,
-        objective: &Objective,
-        average: &Average,
-        ring: usize,
-        batch: usize,
-    ) -> Result<Box<dyn OffloadedTraining>, NotTaken> {
-        // Frames need less, and may go on here where training has no memory.
-        let taken = self.0.health().ask_for_room(|| CudaTraining::new(&self.0, model, objective, average, ring, batch))?;
-        Ok(Box::new(taken))
+    /// The values on the device.
+    ///
+    /// # Errors
+    /// They have left it.
+    pub fn device(&self) -> Result<&DeviceTable, DeviceError> {
+        self.device.as_deref().ok_or_else(|| DeviceError::Unsupported { what: "a table that has left the device".into() })
+    }
+
+    /// Downloads the values and frees the device's memory once no frame uses it.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(in crate::backend::cuda) fn leave_device(&mut self) -> Result<(), DeviceError> {
+        self.to_host()?;
+        self.device = None;
+        Ok(())
     }
 }
 
-/// What was brought over of a ring.
-#[derive(Debug)]
-struct Held {
-    samples: DeviceSamples,
-    capacity: usize,
-    /// None before the first.
-    mark: Option<RingMark>,
-    /// The table that targets are relative to.
-    base: Option<u64>,
-    usable: usize,
-    /// And of the labels that were traced on the device.
-    more_usable: usize,
+impl TableOnDevice for CudaTable {
+    fn to_host(&self) -> Result<Table, DeviceError> {
+        if let Some(table) = self.host.get() {
+            return Ok(table.clone());
+        }
+        let device = self.device()?;
+        let table = Table::from_values(device.nodes(), device.values()?, device.not_finite());
+        Ok(self.host.get_or_init(|| table).clone())
+    }
+
+    fn with_values(&self, values: Table) -> Result<Self, DeviceError> {
+        Ok(Self::new(self.device()?.with_values(&values)?))
+    }
 }
 
-/// Labels of the frames that were traced on the device and stay there, since the last slide that made them wrong; frames write, training reads, in turns.
+/// Labels of the frames that were traced on the device and stay there, since the last slide that made them wrong. Frames write and training reads, in turns.
 #[derive(Debug)]
-pub(super) struct LabelPool {
+pub(in crate::backend::cuda) struct LabelPool {
     writer: SampleWriter,
     samples: Mutex<DeviceSamples>,
 }
 
 impl LabelPool {
-    /// What it holds, to [go back](Self::go_back) to.
-    pub(super) fn mark(&self) -> Filled {
+    /// The present filling, to [return](Self::go_back) to.
+    pub(in crate::backend::cuda) fn mark(&self) -> Filled {
         self.samples().filled()
     }
 
-    /// Forgets the labels that were taken in behind a mark: those of a frame that broke off come from elsewhere, and less of them may be learned from.
-    pub(super) fn go_back(&self, to: Filled) {
+    /// Drops the labels that were added after a mark.
+    pub(in crate::backend::cuda) fn go_back(&self, to: Filled) {
         self.samples().go_back(to);
     }
 
@@ -88,8 +160,8 @@ impl LabelPool {
     }
 }
 
-/// What learns from the labels of one frame.
-pub(super) struct LabelSink<'a> {
+/// Adds the labels of one frame to the pool.
+pub(in crate::backend::cuda) struct LabelSink<'a> {
     pool: &'a LabelPool,
     domain: &'a Domain,
     base: Option<&'a DeviceTable>,
@@ -111,254 +183,326 @@ impl DeviceLearns for LabelSink<'_> {
     }
 }
 
-/// A network in training.
-struct CudaTraining {
-    gpu: Arc<Gpu>,
-    training: DeviceTraining,
-    held: Option<Held>,
-    pool: Option<Arc<LabelPool>>,
-    /// The stamp of the table, if any, that the pool's targets are relative to; the outer none: whichever is next.
-    pool_base: Option<Option<u64>>,
-    below: TableCopy,
-    /// Device seconds of steps, not yet asked for.
-    seconds: f64,
-    /// Where the network is copied to: taken at the first copy, and not here while that is read.
-    room: Room,
-}
-
-type Room = Arc<Mutex<Option<NetworkCopy>>>;
-
-/// A copy of a network, which goes back to its room.
-struct CudaCopy {
-    gpu: Arc<Gpu>,
-    copy: Option<NetworkCopy>,
-    room: Room,
-}
-
-impl Drop for CudaCopy {
-    fn drop(&mut self) {
-        *self.room.lock().unwrap_or_else(PoisonError::into_inner) = self.copy.take();
-    }
-}
-
-impl OffloadedCopy for CudaCopy {
-    fn read(self: Box<Self>, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
-        let read = || self.copy.as_ref().map_or(Ok(()), |copy| copy.read_behind(&self.gpu, model, average));
-        self.gpu.health().ask(read).ok_or(DeviceLost)
-    }
-}
-
-impl CudaTraining {
-    /// With all that training needs for good, and room for what predicts of it, so that what does not fit is refused before it begins.
-    fn new(
-        gpu: &Arc<Gpu>,
-        model: &Model,
-        objective: &Objective,
-        average: &Average,
-        ring: usize,
-        batch: usize,
-    ) -> Result<Self, DeviceError> {
-        let mut training = DeviceTraining::new(gpu, model, objective)?;
-        training.set_average(average)?;
-        training.reserve(batch)?;
-        // To come back to; overwritten with the first step.
-        training.keep()?;
-        let samples = training.ring(ring)?;
-        let held = Some(Held { samples, capacity: ring, mark: None, base: None, usable: 0, more_usable: 0 });
-        let (gpu, below) = (gpu.clone(), TableCopy::default());
-        let mut taken = Self { gpu, training, held, pool: None, pool_base: None, below, seconds: 0.0, room: Arc::default() };
-        taken.pool(ring)?;
-        // What a frame is rendered with, and what has learned since.
-        let _tried = [taken.training.frozen()?, taken.training.frozen()?];
-        Ok(taken)
-    }
-
-    /// What the device says; nothing more is asked of it once it has failed.
-    fn ask<T>(&mut self, call: impl FnOnce(&mut Self) -> Result<T, DeviceError>) -> Result<T, DeviceLost> {
-        let gpu = self.gpu.clone();
-        gpu.health().ask(|| call(self)).ok_or(DeviceLost)
-    }
-
-    /// The same for what takes memory.
-    fn ask_for_room<T>(&mut self, call: impl FnOnce(&mut Self) -> Result<T, DeviceError>) -> Result<T, NotTaken> {
-        let gpu = self.gpu.clone();
-        gpu.health().ask_for_room(|| call(self))
-    }
-
-    /// The samples on the device are those of the ring.
-    fn follow(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Result<Brought, NotTaken>, DeviceError> {
-        let pool = self.pool(ring.capacity())?;
-        // In two dimensions tables have one node along z.
-        let domain = match base.map(Table::nodes) {
-            Some([.., 1]) => Domain::slab([0.0; 2], [1.0; 2], (0.0, 1.0)),
-            _ => Domain::cuboid([0.0; 3], [1.0; 3]),
-        };
-        let below = match base.map(|table| self.below.of(&self.gpu, &domain, table)).transpose() {
-            // What the ring has comes over once there is a table to hold it against.
-            Err(error) if error.is_refusal() => return Ok(Err(NotTaken::NoRoomForBase(error.to_string()))),
-            below => below?,
-        };
-        let stamp = base.map(Table::stamp);
-        let held = self.held.take().filter(|held| held.capacity == ring.capacity());
-        // Where samples were moved, those of the window before lie behind what the ring holds now.
-        let known = held.as_ref().filter(|held| held.base == stamp).and_then(|held| held.mark).filter(|&mark| ring.continues(mark));
-        let ranges = ring.written_since(known);
-        let mut samples = match held {
-            Some(held) => held.samples,
-            None => self.training.ring(ring.capacity())?,
-        };
-        if known.is_none() {
-            // All comes over anew; the memory stays.
-            samples.clear();
-        }
-        if self.pool_base.replace(stamp).is_some_and(|of| of != stamp) {
-            pool.samples().clear();
-        }
-        // What lies before what was written comes first.
-        let [newest, wrapped] = ranges;
-        for range in [wrapped, newest].into_iter().filter(|range| !range.is_empty()) {
-            self.training.write(&mut samples, range, ring.samples(), below)?;
-        }
-        let usable = self.training.usable(&samples)?;
-        let more_usable = self.training.usable(&pool.samples())?;
-        self.held = Some(Held { samples, capacity: ring.capacity(), mark: Some(ring.mark()), base: stamp, usable, more_usable });
-        Ok(Ok(Brought { usable: usable + more_usable, dropped: ring.len() - usable }))
-    }
-
-    /// The labels that stay here.
-    fn pool(&mut self, ring: usize) -> Result<Arc<LabelPool>, DeviceError> {
-        if let Some(pool) = &self.pool {
-            return Ok(pool.clone());
-        }
-        let writer = self.training.writer();
-        let most = self.gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
-        // The kernels count samples, those of the ring included, in 32 bits.
-        let capacity = TIMES_THE_RING.saturating_mul(ring).min(most as usize).clamp(1, 1 << 31);
-        let pool = LabelPool { writer, samples: Mutex::new(self.training.ring(capacity)?) };
-        Ok(self.pool.insert(Arc::new(pool)).clone())
-    }
-}
-
-impl OffloadedTraining for CudaTraining {
-    fn bring(&mut self, ring: &SampleRing, base: Option<&Table>) -> Result<Brought, NotTaken> {
-        self.ask_for_room(|training| training.follow(ring, base))?
-    }
-
-    fn forget_labels(&mut self) {
-        if let Some(pool) = &self.pool {
-            pool.samples().clear();
-        }
-        self.pool_base = None;
-    }
-
-    fn let_go_of_base(&mut self) {
-        self.below.let_go();
-    }
-
-    fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
-        self.ask_for_room(|Self { gpu, training, held, pool, seconds, .. }| {
-            let (Some(Held { samples, usable, more_usable, .. }), Some(pool)) = (held, pool) else { return Ok(Vec::new()) };
-            let more = pool.samples();
-            let begin = gpu.mark()?;
-            let mut losses = training.train_steps(samples, Some(&more), steps)?;
-            *seconds += 1e-3 * f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?);
-            // Those without a target are drawn too, and count for nothing in the mean over the batch.
-            let drawn = (samples.len() + more.len()) as f64 / (*usable + *more_usable) as f64;
-            losses.iter_mut().for_each(|loss| *loss *= drawn);
-            Ok(losses)
-        })
-    }
-
-    fn keep(&mut self) -> Result<(), NotTaken> {
-        self.ask_for_room(|this| this.training.keep())
-    }
-
-    fn roll_back(&mut self) -> Result<(), DeviceLost> {
-        self.ask(|this| this.training.roll_back())
-    }
-
-    fn restart_average(&mut self) -> Result<(), DeviceLost> {
-        self.ask(|this| this.training.restart_average())
-    }
-
-    fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceLost> {
-        self.ask(|this| this.training.zero_layers(range))
-    }
-
-    fn frozen(&self) -> Result<Arc<dyn OffloadedNetwork>, NotTaken> {
-        let network = self.gpu.health().ask_for_room(|| self.training.frozen())?;
-        Ok(Arc::new(CudaNetwork { gpu: self.gpu.clone(), network, pool: self.pool.clone() }))
-    }
-
-    fn fetch(&self, model: &mut Model, average: &mut Average) -> Result<(), DeviceLost> {
-        let fetch = || {
-            let fetched = self.training.average()?;
-            self.training.store(model)?;
-            *average = fetched;
-            Ok(())
-        };
-        self.gpu.health().ask(fetch).ok_or(DeviceLost)
-    }
-
-    fn copy(&mut self) -> Result<Copied, DeviceLost> {
-        self.ask(|Self { gpu, training, room, .. }| {
-            let taken = room.lock().unwrap_or_else(PoisonError::into_inner).take();
-            let (needed, left) = (training.copy_bytes(), gpu.memory_left());
-            if taken.is_none() && needed > left / COPY_SHARE {
-                let [needed, left] = [needed, left].map(|bytes| bytes.div_ceil(1 << 20));
-                let why =
-                    format!("a copy of the network takes {needed} MiB of the device, and of {left} MiB that are left frames may want half");
-                return Ok(Copied::NoRoom(why));
-            }
-            match training.copy(taken) {
-                Ok(copy) => Ok(Copied::There(Box::new(CudaCopy { gpu: gpu.clone(), copy: Some(copy), room: room.clone() }))),
-                // Under the cap, but others hold the rest.
-                Err(error) if error.is_out_of_memory() => Ok(Copied::NoRoom(error.to_string())),
-                Err(error) => Err(error),
-            }
-        })
-    }
-
-    fn device_seconds(&mut self) -> f64 {
-        std::mem::take(&mut self.seconds)
-    }
-}
-
-/// A network that was trained here, as it was.
-pub(super) struct CudaNetwork {
+/// A network on the GPU that does not change.
+pub struct CudaNetwork {
     gpu: Arc<Gpu>,
     network: DeviceNetwork,
-    /// Whose training takes labels.
+    /// The labels of the training that it comes from; `None` if the CPU trains it.
     pool: Option<Arc<LabelPool>>,
 }
 
 impl CudaNetwork {
-    /// Where labels that stay here go.
-    pub(super) fn pool(&self) -> Option<&Arc<LabelPool>> {
+    /// The network for prediction.
+    pub fn network(&self) -> &DeviceNetwork {
+        &self.network
+    }
+
+    pub(in crate::backend::cuda) fn pool(&self) -> Option<&Arc<LabelPool>> {
         self.pool.as_ref()
     }
 
-    /// Who learns from what a frame traces at these unit times, beyond `base`.
-    pub(super) fn label_sink<'a>(&'a self, domain: &'a Domain, base: Option<&'a DeviceTable>, times: [f32; 2]) -> Option<LabelSink<'a>> {
+    /// The sink for the labels of a frame at these unit times, as differences from `base`.
+    pub(in crate::backend::cuda) fn label_sink<'a>(
+        &'a self,
+        domain: &'a Domain,
+        base: Option<&'a DeviceTable>,
+        times: [f32; 2],
+    ) -> Option<LabelSink<'a>> {
         self.pool.as_ref().map(|pool| LabelSink { pool, domain, base, times })
-    }
-
-    pub(super) fn network(&self) -> &DeviceNetwork {
-        &self.network
     }
 }
 
-impl OffloadedNetwork for CudaNetwork {
-    fn predict(&self, points: &[[f32; 3]], times: [f32; 2], out: &mut [f32]) -> Result<(), NotTaken> {
-        let network = self.network.above(None).at(times);
-        self.gpu.health().ask_or("the CPU asked a network of the GPU's", || predict_from_host(&self.gpu, &network, points, out))
+/// A network in training: on the GPU once its targets' scale is known, on the CPU until then or if the placement says so.
+pub struct CudaTraining {
+    gpu: Arc<Gpu>,
+    /// The network before it moved, and afterwards its latest host copy.
+    host: HostTraining,
+    resident: Option<Resident>,
+    /// Whether it may move to the GPU.
+    may_move: bool,
+    /// The network of the CPU that was uploaded last, by its parameters.
+    uploaded: Mutex<Option<(Arc<Average>, Arc<CudaNetwork>)>>,
+}
+
+/// The part on the GPU.
+struct Resident {
+    training: DeviceTraining,
+    samples: DeviceSamples,
+    /// Where the replay buffer stood at the latest sync; `None` before the first.
+    mark: Option<BufferMark>,
+    /// Stamp of the table that the samples' targets are relative to, and that of the pool's; `None` in the latter before the first sync.
+    base: Option<u64>,
+    pool_base: Option<Option<u64>>,
+    usable: usize,
+    usable_in_pool: usize,
+    pool: Arc<LabelPool>,
+    /// Device seconds of steps that were not asked for yet.
+    seconds: f64,
+    /// Wall-clock seconds of a step, by the latest steps; 0 before the first.
+    step_seconds: f64,
+    frozen: OnceLock<Arc<CudaNetwork>>,
+    /// Memory for copies; taken at the first one, and not here while a copy is downloaded.
+    copy_memory: CopyMemory,
+}
+
+type CopyMemory = Arc<Mutex<Option<DeviceCopy>>>;
+
+/// A copy in the memory for copies, to which it returns.
+struct HeldCopy {
+    copy: Option<DeviceCopy>,
+    memory: CopyMemory,
+}
+
+impl Drop for HeldCopy {
+    fn drop(&mut self) {
+        *self.memory.lock().unwrap_or_else(PoisonError::into_inner) = self.copy.take();
+    }
+}
+
+impl CudaTraining {
+    /// Takes a network over. It moves to the GPU with the first steps if `may_move`.
+    pub fn new(gpu: &Arc<Gpu>, network: HostNetwork, may_move: bool) -> Self {
+        Self { gpu: gpu.clone(), host: HostTraining::new(network), resident: None, may_move, uploaded: Mutex::default() }
     }
 
-    fn fetch(&self, into: &mut Average) -> Result<(), DeviceLost> {
-        self.gpu.health().ask(|| self.network.fetch(into)).ok_or(DeviceLost)
+    /// Moves training to the CPU for the rest of the run.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub fn move_to_host(&mut self) -> Result<(), DeviceError> {
+        if let Some(resident) = &self.resident {
+            self.host = HostTraining::new(resident.download(&self.host.host_copy().model)?);
+            self.resident = None;
+        }
+        self.may_move = false;
+        Ok(())
     }
 
-    fn as_any(&self) -> &dyn std::any::Any {
-        self
+    /// Labels that the device holds beyond the replay buffer: capacity for a buffer of `capacity` samples.
+    fn pool(gpu: &Gpu, training: &DeviceTraining, capacity: usize) -> Result<Arc<LabelPool>, DeviceError> {
+        let writer = training.writer();
+        let most = gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
+        // The kernels count samples, those of the replay buffer included, in 32 bits.
+        let capacity = POOL_PER_BUFFER.saturating_mul(capacity).min(most as usize).clamp(1, 1 << 31);
+        Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.ring(capacity)?) }))
+    }
+}
+
+impl Resident {
+    fn new(gpu: &Arc<Gpu>, network: &HostNetwork, objective: &Objective, capacity: usize, batch: usize) -> Result<Self, DeviceError> {
+        let mut training = DeviceTraining::new(gpu, &network.model, objective)?;
+        training.set_average(&network.average)?;
+        training.reserve(batch)?;
+        // Takes the memory of the state to roll back to.
+        training.keep()?;
+        let samples = training.ring(capacity)?;
+        let pool = CudaTraining::pool(gpu, &training, capacity)?;
+        Ok(Self {
+            training,
+            samples,
+            mark: None,
+            base: None,
+            pool_base: None,
+            usable: 0,
+            usable_in_pool: 0,
+            pool,
+            seconds: 0.0,
+            step_seconds: 0.0,
+            frozen: OnceLock::new(),
+            copy_memory: Arc::default(),
+        })
+    }
+
+    fn download(&self, shaped: &crate::surrogate::network::Model) -> Result<HostNetwork, DeviceError> {
+        let mut model = shaped.clone();
+        let average = Arc::new(self.training.average()?);
+        self.training.store(&mut model)?;
+        Ok(HostNetwork { model, average })
+    }
+}
+
+impl Training for CudaTraining {
+    type Table = CudaTable;
+    type Network = CudaNetwork;
+
+    fn shape(&self) -> &Architecture {
+        self.host.shape()
+    }
+
+    fn steps_taken(&self) -> usize {
+        self.resident.as_ref().map_or_else(|| self.host.steps_taken(), |resident| resident.training.steps())
+    }
+
+    fn is_on_device(&self) -> bool {
+        self.may_move
+    }
+
+    fn begin(&mut self, objective: &Objective, capacity: usize, batch: usize) -> Result<(), DeviceError> {
+        self.host.begin(objective, capacity, batch)?;
+        if self.may_move && self.resident.is_none() {
+            self.resident = Some(Resident::new(&self.gpu, self.host.host_copy(), objective, capacity, batch)?);
+        }
+        Ok(())
+    }
+
+    fn sync(&mut self, objective: &Objective, labels: Labels<'_, CudaTable>) -> Result<SyncedSamples, DeviceError> {
+        let Some(resident) = &mut self.resident else {
+            return self.host.sync(objective, Labels { buffer: labels.buffer, base: None });
+        };
+        let Labels { buffer, base } = labels;
+        let stamp = base.map(|base| base.stamp);
+        let known = resident.mark.filter(|&mark| resident.base == stamp && buffer.continues(mark));
+        if known.is_none() {
+            resident.samples.clear();
+        }
+        if resident.pool_base.replace(stamp).is_some_and(|of| of != stamp) {
+            resident.pool.samples().clear();
+        }
+        let below = base.map(CudaTable::device).transpose()?;
+        // The older range comes first.
+        let [newest, wrapped] = buffer.written_since(known);
+        for range in [wrapped, newest].into_iter().filter(|range| !range.is_empty()) {
+            resident.training.write(&mut resident.samples, range, buffer.samples(), below)?;
+        }
+        resident.usable = resident.training.usable(&resident.samples)?;
+        resident.usable_in_pool = resident.training.usable(&resident.pool.samples())?;
+        (resident.mark, resident.base) = (Some(buffer.mark()), stamp);
+        Ok(SyncedSamples { usable: resident.usable + resident.usable_in_pool, dropped: buffer.len() - resident.usable })
+    }
+
+    fn train(&mut self, objective: &Objective, labels: Labels<'_, CudaTable>, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceError> {
+        let Some(resident) = &mut self.resident else {
+            let base = labels.base.map(TableOnDevice::to_host).transpose()?;
+            return self.host.train(objective, Labels { buffer: labels.buffer, base: base.as_ref() }, steps);
+        };
+        let begin = Instant::now();
+        resident.frozen = OnceLock::new();
+        let pool = resident.pool.samples();
+        let mark = self.gpu.mark()?;
+        let mut losses = resident.training.train_steps(&resident.samples, Some(&pool), steps)?;
+        resident.seconds += 1e-3 * f64::from(self.gpu.milliseconds(&mark, &self.gpu.mark()?)?);
+        // Samples without a target are drawn too, and count for nothing in the mean over the batch.
+        let drawn = (resident.samples.len() + pool.len()) as f64 / (resident.usable + resident.usable_in_pool) as f64;
+        losses.iter_mut().for_each(|loss| *loss *= drawn);
+        resident.step_seconds = begin.elapsed().as_secs_f64() / steps.len() as f64;
+        Ok(losses)
+    }
+
+    fn group(&self, seconds: f64) -> u64 {
+        match &self.resident {
+            None => self.host.group(seconds),
+            Some(resident) if resident.step_seconds == 0.0 => FIRST_GROUP,
+            Some(resident) => ((seconds / resident.step_seconds) as u64).clamp(1, MAX_GROUP),
+        }
+    }
+
+    fn keep(&mut self) -> Result<(), DeviceError> {
+        self.resident.as_mut().map_or_else(|| self.host.keep(), |resident| resident.training.keep())
+    }
+
+    fn roll_back(&mut self) -> Result<(), DeviceError> {
+        let Some(resident) = &mut self.resident else { return self.host.roll_back() };
+        resident.frozen = OnceLock::new();
+        resident.training.roll_back()
+    }
+
+    fn restart_average(&mut self) -> Result<(), DeviceError> {
+        let Some(resident) = &mut self.resident else { return self.host.restart_average() };
+        resident.frozen = OnceLock::new();
+        resident.training.restart_average()
+    }
+
+    fn settle(&mut self) {
+        if self.resident.is_none() {
+            self.host.settle();
+        }
+    }
+
+    fn zero_output(&mut self) -> Result<(), DeviceError> {
+        let output = self.shape().output_layer();
+        let Some(resident) = &mut self.resident else { return self.host.zero_output() };
+        resident.frozen = OnceLock::new();
+        resident.training.zero_layers(output)
+    }
+
+    fn forget_labels(&mut self) {
+        if let Some(resident) = &mut self.resident {
+            resident.pool.samples().clear();
+            resident.pool_base = None;
+        }
+    }
+
+    fn frozen(&self, objective: &Objective) -> Result<Arc<CudaNetwork>, DeviceError> {
+        let gpu = self.gpu.clone();
+        if let Some(resident) = &self.resident {
+            if let Some(frozen) = resident.frozen.get() {
+                return Ok(frozen.clone());
+            }
+            let network = CudaNetwork { gpu, network: resident.training.frozen()?, pool: Some(resident.pool.clone()) };
+            return Ok(resident.frozen.get_or_init(|| Arc::new(network)).clone());
+        }
+        let average = &self.host.host_copy().average;
+        let mut uploaded = self.uploaded.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, network)) = uploaded.as_ref().filter(|(of, _)| Arc::ptr_eq(of, average)) {
+            return Ok(network.clone());
+        }
+        // Old and new must not need memory together.
+        *uploaded = None;
+        let network = DeviceNetwork::upload(&gpu, self.shape(), objective, &average.tables, &average.layers)?;
+        let network = Arc::new(CudaNetwork { gpu, network, pool: None });
+        *uploaded = Some((average.clone(), network.clone()));
+        Ok(network)
+    }
+
+    fn download(&self) -> Result<HostNetwork, DeviceError> {
+        self.resident.as_ref().map_or_else(|| self.host.download(), |resident| resident.download(&self.host.host_copy().model))
+    }
+
+    fn copy(&mut self) -> Result<NetworkCopy, DeviceError> {
+        let Some(resident) = &self.resident else { return self.host.copy() };
+        let memory = resident.copy_memory.clone();
+        let taken = memory.lock().unwrap_or_else(PoisonError::into_inner).take();
+        let (needed, left) = (resident.training.copy_bytes(), self.gpu.memory_left());
+        let waited = |why: String| Ok(NetworkCopy::Ready(resident.download(&self.host.host_copy().model)?, Some(why)));
+        if taken.is_none() && needed > left / COPY_SHARE {
+            let [needed, left] = [needed, left].map(|bytes| bytes.div_ceil(1 << 20));
+            return waited(format!(
+                "a copy of the network takes {needed} MiB of the GPU's memory; {left} MiB are left, half of them for frames"
+            ));
+        }
+        match resident.training.copy(taken) {
+            Ok(copy) => {
+                let (gpu, mut model) = (self.gpu.clone(), self.host.host_copy().model.clone());
+                let held = HeldCopy { copy: Some(copy), memory };
+                let download: Download = Box::new(move || {
+                    let mut average = Average::default();
+                    if let Some(copy) = &held.copy {
+                        copy.read_behind(&gpu, &mut model, &mut average)?;
+                    }
+                    Ok(HostNetwork { model, average: Arc::new(average) })
+                });
+                Ok(NetworkCopy::Downloadable(download))
+            }
+            // Under the cap, but other programs hold the rest.
+            Err(error) if error.is_out_of_memory() => waited(error.to_string()),
+            Err(error) => Err(error),
+        }
+    }
+
+    fn host_copy(&self) -> &HostNetwork {
+        self.host.host_copy()
+    }
+
+    fn set_host_copy(&mut self, network: HostNetwork) {
+        self.host.set_host_copy(network);
+    }
+
+    fn restore(&mut self, network: HostNetwork) {
+        self.resident = None;
+        self.host.restore(network);
+    }
+
+    fn device_seconds(&mut self) -> Option<f64> {
+        self.resident.as_mut().map(|resident| std::mem::take(&mut resident.seconds))
     }
 }

@@ -1,8 +1,8 @@
 //! Samples on the device: traced points, their times and labels, as one network learns from them.
 
-use super::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_fours, unit_box};
-use super::network_layout::ReadingArgument;
-use super::{Buffer, DeviceError, DeviceTable, launch, threads};
+use crate::backend::cuda::network::layout::ReadingArgument;
+use crate::backend::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_fours, unit_box};
+use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
 use crate::surrogate::network::{Objective, Target};
@@ -141,7 +141,7 @@ pub struct DeviceSamples {
 
 /// How far a ring is filled.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Filled {
+pub(in crate::backend::cuda) struct Filled {
     pub(super) len: usize,
     /// Where the next one goes.
     next: usize,

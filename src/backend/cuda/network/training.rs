@@ -3,11 +3,13 @@
 //! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
 //! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
 
-use super::network::{DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_fours, unit_box};
-use super::network_batched::GradientTo;
-use super::network_layout::{AdamArgument, DrawArgument, ReadingArgument};
-use super::network_samples::{DeviceSamples, Filled, SampleWriter, TracedPoints};
-use super::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
+use crate::backend::cuda::network::batched::GradientTo;
+use crate::backend::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
+use crate::backend::cuda::network::network::{
+    DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_fours, unit_box,
+};
+use crate::backend::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedPoints};
+use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
 use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Model, Objective, PlannedStep};
@@ -202,6 +204,15 @@ impl DeviceTraining {
             self.batch = Some(WholeBatch::new(&self.gpu, &kernels.shape, batch)?);
         }
         kernels.reserve()
+    }
+
+    /// Device memory of a network in training with `capacity` samples, bytes: parameters, moments, mean and gradient, the state to roll back to,
+    /// rounded tables, and two frozen copies.
+    pub(in crate::backend::cuda) fn bytes(shape: &Architecture, capacity: usize) -> u64 {
+        const STATE: u64 = 9 * size_of::<f32>() as u64;
+        const ROUNDED: u64 = 3 * size_of::<u16>() as u64;
+        let samples = size_of::<[f32; 4]>() * sample_fours(shape) * capacity;
+        (STATE + ROUNDED) * shape.parameters() as u64 + samples as u64
     }
 
     /// What is stored where.

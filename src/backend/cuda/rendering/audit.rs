@@ -1,13 +1,12 @@
 //! A frame's audit on the device: points drawn, traced, predicted and added up there, so that only sums come back (and each point's optical
 //! residual, for the quantile; and the samples, where somebody learns from them).
 
-use super::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
-use super::pinned::Pinned;
-use super::{Buffer, CudaTracer, DeviceError, DeviceLand, DevicePredict, Gpu, launch, threads};
-use crate::engine::answers::unit_arrival;
-use crate::engine::audit::{AuditFindings, AuditRequest, draws};
+use crate::backend::audit::{AuditFindings, AuditRequest, draws};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
+use crate::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
+use crate::backend::router::unit_arrival;
 use crate::field::Domain;
-use crate::flow::Tracer;
 use crate::surrogate::Samples;
 use crate::trust::Audited;
 use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
@@ -92,7 +91,7 @@ impl Audits {
         Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// What [`crate::engine::audit()`] does, to the last bit where both trace and predict the same; Jacobians do not come back.
+    /// What [`crate::backend::audit::audit`] does, to the last bit where both trace and predict the same; Jacobians do not come back.
     ///
     /// # Errors
     /// Memory that is not there, or a device fault.
@@ -128,14 +127,14 @@ impl Audits {
         let arrival = memory.arrivals.as_ref().filter(|_| arrivals).map_or(0, Buffer::address);
         let stream = gpu.work();
         let (key, stream_words) = draws(request.seed, request.stream);
-        let domain = tracer.domain();
+        let domain = tracer.host().domain();
         let draw = AuditDrawArgument {
             shape: strata.shape.map(|n| n as i32),
             key,
             stream: stream_words,
             min: domain.min,
             extent: domain.extent(),
-            land: tracer.land().map_or(LandArgument::NONE, DeviceLand::argument),
+            land: tracer.missing_cells().map_or(LandArgument::NONE, DeviceMissingCells::argument),
         };
         let points = AuditPointsArgument {
             unit: memory.unit.address(),
@@ -146,7 +145,7 @@ impl Audits {
             predicted: memory.predicted.address(),
             optical: memory.optical.address(),
         };
-        let (low, per_range, tau) = request.transfer.ramp_parts(tracer.tau());
+        let (low, per_range, tau) = request.transfer.ramp_parts(tracer.host().tau());
         let (mut optical, mut samples) = (Vec::with_capacity(strata.total()), Samples::default());
         for batch in batches {
             let count = in_batch(&batch);

@@ -1,138 +1,160 @@
-//! Films of a run, made on the GPU alone where every query can be answered there.
+//! Frames that are rendered, traced, answered and audited on the GPU alone.
 
 use super::audit::Audits;
-use super::predictor::{self, Predictor, Predictors};
-use super::{CudaTracer, DeviceError, DevicePredict, Division, Gpu, GpuRenderer, Panel, Traced};
-use crate::engine::accelerator::DeviceRenderer;
-use crate::engine::{Answers, AuditFindings, AuditRequest, EngineError, Tally};
-use crate::flow::Tracer;
-use crate::render::{Film, RenderStats, Renderer};
-use crate::surrogate::{Predict, Samples};
+use super::renderer::GpuRenderer;
+use super::router::{DeviceLearns, DevicePredict, FrameQueries, QueryRouter, TraceAll};
+use crate::backend::cuda::device::Cuda;
+use crate::backend::cuda::driver::Gpu;
+use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
+use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::backend::{AuditFindings, AuditRequest, DeviceError, FrameJob, FrameSamples, Rendered, Tally};
+use crate::render::{RenderStats, Renderer};
+use crate::surrogate::{FrozenHybrid, Samples};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
 
-/// Walks, traces, predicts and audits on the GPU.
-pub struct CudaFrames {
+/// Renders and audits frames. Keeps kernels and memory from frame to frame.
+pub struct GpuFrames {
     renderer: GpuRenderer,
-    division: Division,
+    router: QueryRouter,
     audits: Audits,
-    predictors: Predictors,
 }
 
-impl CudaFrames {
+/// The surrogate of one frame on the device.
+pub(in crate::backend::cuda) enum Predictor<'a> {
+    Table(&'a DeviceTable),
+    /// And the sink for labels, if the device trains the network.
+    Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
+}
+
+impl<'a> Predictor<'a> {
+    fn of(frozen: &'a FrozenHybrid<OnGpu>, tracer: &'a CudaTracer) -> Result<Self, DeviceError> {
+        Ok(match frozen_parts(frozen)? {
+            (base, Some(network)) => {
+                let sink = network.label_sink(tracer.host().domain(), base, frozen.times);
+                Self::Network(network.network().above(base.map(|base| (base, frozen.shrinkage))).at(frozen.times), sink)
+            }
+            (Some(table), None) => Self::Table(table),
+            (None, None) => return Err(DeviceError::Unsupported { what: "a surrogate without table and network".into() }),
+        })
+    }
+
+    fn label_sink(&self) -> Option<&dyn DeviceLearns> {
+        match self {
+            Self::Network(_, Some(sink)) => Some(sink),
+            _ => None,
+        }
+    }
+}
+
+impl DevicePredict for Predictor<'_> {
+    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+        // SAFETY: the caller's.
+        unsafe {
+            match self {
+                Self::Table(table) => table.predict(points, count, out),
+                Self::Network(network, _) => network.predict(points, count, out),
+            }
+        }
+    }
+}
+
+/// The labels of a frame: some on the host, and those that stay in the device's pool. Dropped before the commit, the pool forgets them.
+pub struct CudaSamples {
+    host: Samples,
+    uncommitted: Option<(Arc<LabelPool>, Filled)>,
+}
+
+impl CudaSamples {
+    /// Labels on the host alone.
+    pub(in crate::backend::cuda) fn on_host(host: Samples) -> Self {
+        Self { host, uncommitted: None }
+    }
+}
+
+impl FrameSamples for CudaSamples {
+    fn on_host(&self) -> &Samples {
+        &self.host
+    }
+
+    fn commit(mut self) -> Samples {
+        self.uncommitted = None;
+        std::mem::take(&mut self.host)
+    }
+}
+
+impl Drop for CudaSamples {
+    fn drop(&mut self) {
+        if let Some((pool, before)) = self.uncommitted.take() {
+            pool.go_back(before);
+        }
+    }
+}
+
+impl GpuFrames {
     /// Compiles the kernels, or takes them from the cache.
     ///
     /// # Errors
-    /// What the compiler or the device says.
+    /// The compiler or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
-        Ok(Self {
-            renderer: GpuRenderer::new(gpu)?,
-            division: Division::new(gpu)?,
-            audits: Audits::new(gpu)?,
-            predictors: Predictors::new(gpu),
-        })
+        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: QueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
     }
-}
 
-/// The tracer, where it is one of this engine's.
-fn own(tracer: &dyn Tracer) -> Option<&CudaTracer> {
-    tracer.as_any()?.downcast_ref()
-}
-
-/// What the renderer counted of the answers.
-fn tally(stats: &RenderStats) -> Tally {
-    Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, ..Tally::default() }
-}
-
-impl DeviceRenderer for CudaFrames {
-    /// With RK4 alone, with a table, or with a network that the kernels take; the others, and Jacobians as labels, need the CPU.
-    fn render(
+    /// Renders a frame.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn render(
         &mut self,
+        job: &FrameJob<'_, Cuda>,
+        surrogate: Option<&FrozenHybrid<OnGpu>>,
         renderer: &mut Renderer,
-        picture: u64,
-        samples: usize,
-        tracer: &dyn Tracer,
-        answers: &mut Answers<'_>,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<Option<(Film, RenderStats)>, EngineError> {
-        let pool = answers.asked().surrogate.and_then(predictor::pool);
-        let before = pool.as_ref().map(|pool| pool.mark());
-        let rendered = self.rendered(renderer, picture, samples, tracer, answers, progress, stop);
-        // The CPU makes the frame again, and its labels go to the ring, those that are held out among them.
-        if let (Err(_), Some(pool), Some(before)) = (&rendered, pool, before) {
-            pool.go_back(before);
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let (tracer, routing) = (job.tracer, job.routing);
+        let progress = job.progress.map(|report| report as &dyn Fn(f32));
+        let samples = 0..u32::try_from(job.samples).unwrap_or(u32::MAX);
+        let counts =
+            |stats: &RenderStats| Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, ..Tally::default() };
+        if surrogate.is_none() && tracer.missing_cells().is_none() && routing.keep <= 1 {
+            let mut all = TraceAll(tracer.device());
+            let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut all, progress, job.stop)?;
+            let tally = Tally { trace_seconds: stats.evaluate_seconds, ..counts(&stats) };
+            return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()) });
         }
-        rendered
-    }
-
-    fn let_go_of_tables(&mut self) {
-        self.predictors.let_go_of_tables();
-    }
-
-    /// Where the surrogate predicts on the device, unless Jacobians are to come back.
-    fn audit(
-        &mut self,
-        request: &AuditRequest<'_>,
-        tracer: &dyn Tracer,
-        surrogate: &dyn Predict,
-    ) -> Result<Option<AuditFindings>, DeviceError> {
-        let jacobian = request.samples.is_some_and(|extras| extras.jacobian);
-        let Some(tracer) = own(tracer).filter(|_| !jacobian) else { return Ok(None) };
-        let Some(predictor) = self.predictors.of(surrogate, tracer)? else { return Ok(None) };
-        self.audits.audit(request, tracer, &predictor).map(Some)
-    }
-}
-
-impl CudaFrames {
-    fn rendered(
-        &mut self,
-        renderer: &mut Renderer,
-        picture: u64,
-        samples: usize,
-        tracer: &dyn Tracer,
-        answers: &mut Answers<'_>,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<Option<(Film, RenderStats)>, EngineError> {
-        let Some(tracer) = own(tracer) else { return Ok(None) };
-        let asked = answers.asked();
-        if asked.extras.jacobian {
-            return Ok(None);
-        }
-        let predictor = match asked.surrogate {
-            None => None,
-            Some(surrogate) => match self.predictors.of(surrogate, tracer)? {
-                None => return Ok(None),
-                found => found,
-            },
-        };
-        let samples = 0..u32::try_from(samples).unwrap_or(u32::MAX);
-        if asked.surrogate.is_none() && tracer.land().is_none() && asked.keep <= 1 {
-            let mut every = Traced(tracer.device());
-            let (film, stats) = self.renderer.render_samples(renderer, picture, samples, &mut every, progress, stop)?;
-            answers.answered_elsewhere(Tally { trace_seconds: stats.evaluate_seconds, ..tally(&stats) }, Samples::default());
-            return Ok(Some((film, stats)));
-        }
-        let mut divided = self.division.begin(Panel {
+        let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
+        let pool = surrogate.and_then(|frozen| frozen.network.as_ref()?.pool().cloned());
+        let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
+        let mut answers = self.router.begin(FrameQueries {
             tracer: tracer.device(),
-            domain: tracer.domain(),
-            land: tracer.land(),
+            domain: tracer.host().domain(),
+            missing_cells: tracer.missing_cells(),
             surrogate: predictor.as_ref().map(|predictor| predictor as &dyn DevicePredict),
             label_sink: predictor.as_ref().and_then(Predictor::label_sink),
-            gate: asked.gate,
-            trace_budget: asked.trace_budget,
-            keep: asked.keep,
-            arrivals: asked.extras.arrival,
+            gate: routing.gate,
+            trace_budget: routing.trace_budget,
+            keep: routing.keep,
+            arrivals: routing.extras.arrival,
         })?;
-        let (film, stats) = self.renderer.render_samples(renderer, picture, samples, &mut divided, progress, stop)?;
+        let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut answers, progress, job.stop)?;
         let tally = Tally {
             over_budget: self.renderer.over_budget(),
-            trace_seconds: divided.trace_seconds(),
-            predict_seconds: divided.predict_seconds(),
-            ..tally(&stats)
+            trace_seconds: answers.trace_seconds(),
+            predict_seconds: answers.predict_seconds(),
+            ..counts(&stats)
         };
-        answers.answered_elsewhere(tally, divided.labels());
-        Ok(Some((film, stats)))
+        labels.host = answers.labels();
+        Ok(Rendered { film, stats, tally, samples: labels })
+    }
+
+    /// Audits a frame.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        surrogate: &FrozenHybrid<OnGpu>,
+    ) -> Result<AuditFindings, DeviceError> {
+        self.audits.audit(request, tracer, &Predictor::of(surrogate, tracer)?)
     }
 }

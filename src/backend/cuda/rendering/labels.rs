@@ -3,9 +3,9 @@
 //! Which ones are kept is a function of their points alone (`keeps_label` of `answer.cuh`): of every 2^shift points one, where the shift
 //! grows as a frame traces more. So the set does not depend on the order in which the device's threads come, nor does its order here.
 
-use super::layout::LabelsArgument;
-use super::{Buffer, DeviceError, Gpu};
-use crate::engine::answers::unit_arrival;
+use crate::backend::cuda::layout::LabelsArgument;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu};
+use crate::backend::router::unit_arrival;
 use crate::field::Domain;
 use crate::render::rng::philox;
 use crate::surrogate::Samples;
@@ -16,7 +16,7 @@ const MOST: usize = 1 << 22;
 
 /// Where a network learns on the device, one label of 2^3 may come back to the host, and is not learned from there: what is held out of
 /// training must be held out on both sides.
-pub(super) const HELD_BACK: u32 = 3;
+pub(in crate::backend::cuda) const HELD_BACK: u32 = 3;
 
 /// A traced point.
 #[derive(Debug, Clone, Copy)]

@@ -1,7 +1,7 @@
 //! How a frame is cut into bands of pixels and parts of samples, and the device memory that this takes: one block, taken once.
 
-use super::pinned::Pinned;
-use super::{Buffer, DeviceError, Gpu};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use crate::render::PixelValue;
 use cudarc::driver::DeviceRepr;
 
@@ -16,21 +16,21 @@ const SUM_FIELDS: u64 = 11;
 
 /// A frame's shape on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Plan {
+pub(in crate::backend::cuda) struct Plan {
     /// Pixels that are tracked together.
-    pub(super) band: u32,
+    pub(in crate::backend::cuda) band: u32,
     /// Parts of a pixel's samples that run side by side.
-    pub(super) parts: u32,
+    pub(in crate::backend::cuda) parts: u32,
     /// Collisions that fit the queue.
-    pub(super) queue: u32,
+    pub(in crate::backend::cuda) queue: u32,
     /// Majorant cells.
-    pub(super) cells: u32,
+    pub(in crate::backend::cuda) cells: u32,
 }
 
 impl Plan {
     /// The sums, and so the picture's last bits, depend on the parts, therefore these on the picture's size and its samples alone. How
     /// many pixels are tracked together follows `memory` (bytes that may be used) and changes nothing but the speed.
-    pub(super) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
+    pub(in crate::backend::cuda) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
         let pixels = pixels.max(1) as u64;
         let parts = (WANTED_SLOTS / pixels).clamp(1, u64::from(samples));
         let mut band = pixels.min(MOST_SLOTS / parts).max(1);
@@ -47,7 +47,7 @@ impl Plan {
         plan(band, queue)
     }
 
-    pub(super) fn slots(&self) -> u64 {
+    pub(in crate::backend::cuda) fn slots(&self) -> u64 {
         u64::from(self.band) * u64::from(self.parts)
     }
 
@@ -56,32 +56,32 @@ impl Plan {
     }
 
     /// Whether memory that was taken for `self` does for `other`.
-    pub(super) fn covers(&self, other: &Self) -> bool {
+    pub(in crate::backend::cuda) fn covers(&self, other: &Self) -> bool {
         self.slots() >= other.slots() && self.band >= other.band && self.queue >= other.queue && self.cells == other.cells
     }
 }
 
 /// Where each array begins, in bytes.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Layout {
-    pub(super) place: u64,
-    pub(super) way: u64,
-    pub(super) colour: u64,
-    pub(super) progress: u64,
-    pub(super) seen: u64,
-    pub(super) first: u64,
-    pub(super) sums: u64,
-    pub(super) live: [u64; 2],
-    pub(super) points: u64,
-    pub(super) hits: [u64; 2],
-    pub(super) log_stretch: u64,
-    pub(super) by: u64,
-    pub(super) film: u64,
-    pub(super) majorants: u64,
-    pub(super) may_miss: u64,
+pub(in crate::backend::cuda) struct Layout {
+    pub(in crate::backend::cuda) place: u64,
+    pub(in crate::backend::cuda) way: u64,
+    pub(in crate::backend::cuda) colour: u64,
+    pub(in crate::backend::cuda) progress: u64,
+    pub(in crate::backend::cuda) seen: u64,
+    pub(in crate::backend::cuda) first: u64,
+    pub(in crate::backend::cuda) sums: u64,
+    pub(in crate::backend::cuda) live: [u64; 2],
+    pub(in crate::backend::cuda) points: u64,
+    pub(in crate::backend::cuda) hits: [u64; 2],
+    pub(in crate::backend::cuda) log_stretch: u64,
+    pub(in crate::backend::cuda) by: u64,
+    pub(in crate::backend::cuda) film: u64,
+    pub(in crate::backend::cuda) majorants: u64,
+    pub(in crate::backend::cuda) may_miss: u64,
     /// Counts, highest, missing: what is set to 0 at the start of a frame, together with `control`.
-    pub(super) watch: u64,
-    pub(super) control: u64,
+    pub(in crate::backend::cuda) watch: u64,
+    pub(in crate::backend::cuda) control: u64,
     end: u64,
 }
 
@@ -122,28 +122,28 @@ impl Layout {
 /// What the kernels count (`Control` of `kernels/render.cu`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(super) struct Control {
-    pub(super) live: u32,
-    pub(super) length: u32,
+pub(in crate::backend::cuda) struct Control {
+    pub(in crate::backend::cuda) live: u32,
+    pub(in crate::backend::cuda) length: u32,
     /// Queries, traced, missing, exceeded, paths, over budget.
-    pub(super) totals: [u64; 6],
+    pub(in crate::backend::cuda) totals: [u64; 6],
 }
 
 // SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/render.cu`.
 unsafe impl DeviceRepr for Control {}
 
 /// The memory of a plan.
-pub(super) struct Memory {
-    pub(super) plan: Plan,
-    pub(super) layout: Layout,
-    pub(super) block: Buffer<u8>,
-    pub(super) control: Pinned<Control>,
-    pub(super) watch: Pinned<u32>,
-    pub(super) film: Pinned<PixelValue>,
+pub(in crate::backend::cuda) struct Memory {
+    pub(in crate::backend::cuda) plan: Plan,
+    pub(in crate::backend::cuda) layout: Layout,
+    pub(in crate::backend::cuda) block: Buffer<u8>,
+    pub(in crate::backend::cuda) control: Pinned<Control>,
+    pub(in crate::backend::cuda) watch: Pinned<u32>,
+    pub(in crate::backend::cuda) film: Pinned<PixelValue>,
 }
 
 impl Memory {
-    pub(super) fn new(gpu: &Gpu, plan: Plan) -> Result<Self, DeviceError> {
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, plan: Plan) -> Result<Self, DeviceError> {
         let layout = Layout::new(&plan);
         Ok(Self {
             plan,
@@ -156,7 +156,7 @@ impl Memory {
     }
 
     /// Copies values to an offset of the layout that has room for them.
-    pub(super) fn write<T: Copy>(&mut self, offset: u64, values: &[T]) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) fn write<T: Copy>(&mut self, offset: u64, values: &[T]) -> Result<(), DeviceError> {
         let bytes = size_of_val(values);
         // SAFETY: numbers and bools, whose bytes are all initialised.
         let bytes = unsafe { std::slice::from_raw_parts(values.as_ptr().cast::<u8>(), bytes) };
@@ -164,12 +164,12 @@ impl Memory {
     }
 
     /// Sets bytes to 0.
-    pub(super) fn zero(&self, offset: u64, bytes: u64) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) fn zero(&self, offset: u64, bytes: u64) -> Result<(), DeviceError> {
         self.block.zero_at(offset as usize, bytes as usize)
     }
 
     /// Device address of an offset of the layout.
-    pub(super) fn at(&self, offset: u64) -> u64 {
+    pub(in crate::backend::cuda) fn at(&self, offset: u64) -> u64 {
         self.block.address() + offset
     }
 }

@@ -3,10 +3,9 @@
 //! The picture is that of [`Renderer::render`] with the same answers, up to rounding: same random numbers, same states, same sums in
 //! an order that depends on the picture's size alone. The host derives majorants between frames, from what the device saw.
 
-use super::render_memory::{Control, Memory, Plan};
-use super::{DeviceAnswers, DeviceError, Gpu, launch, threads};
-use crate::engine::EngineError;
-use crate::render::{Film, FrameParameters, RenderStats, Renderer, SeenInCells};
+use crate::backend::cuda::rendering::memory::{Control, Memory, Plan};
+use crate::backend::cuda::{DeviceAnswers, DeviceError, Gpu, launch, threads};
+use crate::render::{Film, FrameParameters, RenderError, RenderStats, Renderer, SeenInCells};
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
 use std::ops::Range;
 use std::sync::Arc;
@@ -192,11 +191,12 @@ impl GpuRenderer {
         answers: &mut dyn DeviceAnswers,
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), EngineError> {
+    ) -> Result<(Film, RenderStats), DeviceError> {
         let settings = &renderer.scene().settings;
         let (width, height) = (settings.width, settings.height);
         let pixels = width * height;
-        let setup = renderer.set_up(frame, samples.clone())?;
+        let refused = |refused: RenderError| DeviceError::Unsupported { what: refused.to_string() };
+        let setup = renderer.set_up(frame, samples.clone()).map_err(refused)?;
         let count = samples.end - samples.start;
         self.timeline = Timeline::default();
         let own = self.memory.as_ref().map_or(0, |memory| memory.block.len() as u64);

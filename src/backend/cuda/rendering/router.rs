@@ -1,12 +1,9 @@
-//! Who answers a wave's collisions on the device: RK4 alone, or a surrogate where the gate trusts it and RK4 elsewhere.
-//!
-//! What [`crate::engine::Answers`] is to the renderer on the CPU. A surrogate takes part once it predicts on the device
-//! ([`DevicePredict`]); land, the gate, the tracing budget and the labels that come back are the same for all of them.
+//! Routes a frame's log-stretch queries on the device, by the rule of [`crate::backend::QueryRouter`], and keeps labels of the traced ones.
 
-use super::labels::{HELD_BACK, Labels};
-use super::layout::{ChoiceArgument, LandArgument, ListsArgument, Outputs};
-use super::pinned::Pinned;
-use super::{Buffer, DeviceError, DeviceLand, DeviceTracer, Gpu, launch, threads};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::layout::{ChoiceArgument, LandArgument, ListsArgument, Outputs};
+use crate::backend::cuda::rendering::labels::{HELD_BACK, Labels};
+use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
 use crate::trust::Gate;
@@ -53,9 +50,9 @@ pub trait DeviceLearns {
 }
 
 /// Every query traced.
-pub struct Traced<'a>(pub &'a DeviceTracer);
+pub struct TraceAll<'a>(pub &'a DeviceTracer);
 
-impl DeviceAnswers for Traced<'_> {
+impl DeviceAnswers for TraceAll<'_> {
     fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         let gpu = self.0.gpu();
         let doing = DeviceError::driver("filling device memory");
@@ -68,14 +65,14 @@ impl DeviceAnswers for Traced<'_> {
     }
 }
 
-/// Whom to ask in one frame.
-pub struct Panel<'a> {
+/// What answers the queries of one frame.
+pub struct FrameQueries<'a> {
     /// RK4.
     pub tracer: &'a DeviceTracer,
     /// Seeds' domain.
     pub domain: &'a Domain,
     /// Where there is no value; none: nowhere.
-    pub land: Option<&'a DeviceLand>,
+    pub missing_cells: Option<&'a DeviceMissingCells>,
     /// Who answers where the gate trusts it; none: RK4 answers everywhere.
     pub surrogate: Option<&'a dyn DevicePredict>,
     /// Who learns from what is traced, on the device; none: nobody does.
@@ -96,7 +93,7 @@ const CHUNK: usize = 1 << 23;
 const POINT: u64 = 20;
 
 /// Divides waves between surrogate and RK4. Keeps its memory from frame to frame.
-pub struct Division {
+pub struct QueryRouter {
     gpu: Arc<Gpu>,
     split: CudaFunction,
     join: CudaFunction,
@@ -141,7 +138,7 @@ impl Memory {
     }
 }
 
-impl Division {
+impl QueryRouter {
     /// Compiles the kernels, or takes them from the cache.
     ///
     /// # Errors
@@ -166,7 +163,7 @@ impl Division {
     ///
     /// # Errors
     /// Memory that is not there, or a device fault.
-    pub fn begin<'a>(&'a mut self, panel: Panel<'a>) -> Result<Divided<'a>, DeviceError> {
+    pub fn begin<'a>(&'a mut self, queries: FrameQueries<'a>) -> Result<RoutedQueries<'a>, DeviceError> {
         let gpu = self.gpu.clone();
         let memory = match self.memory.take() {
             Some(memory) => memory,
@@ -174,28 +171,28 @@ impl Division {
         };
         let memory = self.memory.insert(memory);
         memory.lengths.fill_bytes(0)?;
-        if panel.arrivals && memory.arrivals.is_none() {
+        if queries.arrivals && memory.arrivals.is_none() {
             memory.arrivals = Some(gpu.alloc("the lists of a gated frame", memory.capacity)?);
         }
-        let trusted: Vec<u8> = panel.gate.cells().iter().map(|&trusted| u8::from(trusted)).collect();
-        let trusted = panel.surrogate.map(|_| gpu.upload("a gate", &trusted)).transpose()?;
+        let trusted: Vec<u8> = queries.gate.cells().iter().map(|&trusted| u8::from(trusted)).collect();
+        let trusted = queries.surrogate.map(|_| gpu.upload("a gate", &trusted)).transpose()?;
         let choice = ChoiceArgument {
-            min: panel.domain.min,
-            extent: panel.domain.extent(),
-            gate_shape: panel.gate.shape().map(|n| n as i32),
+            min: queries.domain.min,
+            extent: queries.domain.extent(),
+            gate_shape: queries.gate.shape().map(|n| n as i32),
             gate_pad: 0,
             trusted: trusted.as_ref().map_or(0, Buffer::address),
-            land: panel.land.map_or(LandArgument::NONE, DeviceLand::argument),
+            land: queries.missing_cells.map_or(LandArgument::NONE, DeviceMissingCells::argument),
             budget_spent: 0,
             pad: 0,
         };
-        Ok(Divided {
-            labels: Labels::new(&gpu, panel.keep, if panel.label_sink.is_some() { HELD_BACK } else { 0 }, panel.arrivals)?,
+        Ok(RoutedQueries {
+            labels: Labels::new(&gpu, queries.keep, if queries.label_sink.is_some() { HELD_BACK } else { 0 }, queries.arrivals)?,
             split: &self.split,
             join: &self.join,
             memory,
             gpu,
-            panel,
+            queries,
             choice,
             _trusted: trusted,
             marks: None,
@@ -206,12 +203,12 @@ impl Division {
 }
 
 /// The answers of one frame, and what was found out on the way.
-pub struct Divided<'a> {
+pub struct RoutedQueries<'a> {
     gpu: Arc<Gpu>,
     split: &'a CudaFunction,
     join: &'a CudaFunction,
     memory: &'a mut Memory,
-    panel: Panel<'a>,
+    queries: FrameQueries<'a>,
     choice: ChoiceArgument,
     _trusted: Option<Buffer<u8>>,
     labels: Labels,
@@ -221,7 +218,7 @@ pub struct Divided<'a> {
     predict_seconds: f64,
 }
 
-impl Divided<'_> {
+impl RoutedQueries<'_> {
     /// Device seconds of sorting and tracing so far.
     pub fn trace_seconds(&self) -> f64 {
         self.trace_seconds
@@ -234,7 +231,7 @@ impl Divided<'_> {
 
     /// The labels that were kept, in unit coordinates: of queries, and of points traced ahead of flights that ended before them.
     pub fn labels(&mut self) -> Samples {
-        self.labels.finish(self.panel.domain)
+        self.labels.finish(self.queries.domain)
     }
 
     /// Adds the latest chunk's times up, whose work is waited for.
@@ -253,14 +250,14 @@ impl Divided<'_> {
         self.add_up()?;
         let gpu = self.gpu.clone();
         let stream = gpu.work();
-        let spent = self.panel.surrogate.is_some() && self.panel.trace_budget.is_some_and(|budget| self.trace_seconds >= budget);
+        let spent = self.queries.surrogate.is_some() && self.queries.trace_budget.is_some_and(|budget| self.trace_seconds >= budget);
         let choice = ChoiceArgument { budget_spent: i32::from(spent), ..self.choice };
         let (capacity, n) = (self.memory.capacity, count as u32);
         let lists = ListsArgument {
             points: self.memory.points.address(),
             places: self.memory.places.address(),
             values: self.memory.values.address(),
-            arrivals: self.memory.arrivals.as_ref().filter(|_| self.panel.arrivals).map_or(0, Buffer::address),
+            arrivals: self.memory.arrivals.as_ref().filter(|_| self.queries.arrivals).map_or(0, Buffer::address),
             lengths: self.memory.lengths.address(),
             capacity: capacity as u32,
             pad: 0,
@@ -274,7 +271,7 @@ impl Divided<'_> {
         let divided = gpu.mark()?;
         let [predicted, traced, stored] = self.memory.lengths(&gpu)?;
         let asked = gpu.mark()?;
-        if let Some(surrogate) = self.panel.surrogate {
+        if let Some(surrogate) = self.queries.surrogate {
             // SAFETY: the lists hold as many entries at their front; what uses their memory next is behind this on the stream.
             unsafe { surrogate.predict(lists.points, predicted, lists.values) }?;
         }
@@ -283,9 +280,9 @@ impl Divided<'_> {
         let arrival = if lists.arrivals == 0 { 0 } else { lists.arrivals + 12 * back };
         let out = Outputs { log_stretch: lists.values + 4 * back, arrival, ..Outputs::default() };
         // SAFETY: as above, at their back.
-        unsafe { self.panel.tracer.trace(lists.points + 12 * back, traced, &out) }?;
+        unsafe { self.queries.tracer.trace(lists.points + 12 * back, traced, &out) }?;
         let tracing = gpu.mark()?;
-        if let Some(label_sink) = self.panel.label_sink {
+        if let Some(label_sink) = self.queries.label_sink {
             // SAFETY: as above.
             unsafe { label_sink.learn_from(lists.points + 12 * back, &out, traced) }?;
         }
@@ -303,7 +300,7 @@ impl Divided<'_> {
     }
 }
 
-impl DeviceAnswers for Divided<'_> {
+impl DeviceAnswers for RoutedQueries<'_> {
     fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         for first in (0..count).step_by(self.memory.capacity) {
             let (part, at) = ((count - first).min(self.memory.capacity), first as u64);

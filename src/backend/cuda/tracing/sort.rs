@@ -1,7 +1,7 @@
 //! Points in the order of their cells.
 
-use super::layout::SortFrame;
-use super::{Buffer, DeviceError, Gpu, launch, threads};
+use crate::backend::cuda::layout::SortFrame;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::field::{Domain, Grid};
 use cudarc::driver::{CudaFunction, PushKernelArg};
 use std::sync::Arc;

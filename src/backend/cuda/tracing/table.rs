@@ -1,11 +1,9 @@
 //! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
 
-use super::layout::{Outputs, TableArgument, TableFrame};
-use super::predictor::predict_from_host;
-use super::sort::Sorter;
-use super::trace::DeviceTracer;
-use super::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
-use crate::engine::accelerator::DeviceNodes;
+use crate::backend::cuda::layout::{Outputs, TableArgument, TableFrame};
+use crate::backend::cuda::tracing::sort::Sorter;
+use crate::backend::cuda::tracing::trace::DeviceTracer;
+use crate::backend::cuda::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Table;
 use cudarc::driver::{CudaFunction, PushKernelArg};
@@ -50,9 +48,23 @@ impl DeviceTable {
         Ok(copy)
     }
 
-    /// The device's own values of a table that was traced here; none where they are elsewhere.
-    pub fn of(table: &Table) -> Option<&Self> {
-        table.on_device()?.as_any().downcast_ref()
+    /// A table of the same nodes with these values.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub(in crate::backend::cuda) fn with_values(&self, table: &Table) -> Result<Self, DeviceError> {
+        let domain =
+            crate::field::Domain { dimensions: self.frame.dimensions as usize, ..crate::field::Domain::cuboid([0.0; 3], [1.0; 3]) };
+        let mut copy = Self::empty(&self.gpu, &domain, self.nodes())?;
+        copy.frame = self.frame;
+        copy.values.write(table.values())?;
+        copy.not_finite = table.not_finite();
+        Ok(copy)
+    }
+
+    /// The GPU that holds the table.
+    pub fn gpu(&self) -> &Arc<Gpu> {
+        &self.gpu
     }
 
     /// Its values unset.
@@ -140,23 +152,5 @@ impl DevicePredict for DeviceTable {
         call.arg(&table).arg(&points).arg(&n).arg(&out);
         // SAFETY: the caller's, and the arguments are as declared in table.cu.
         unsafe { launch(&mut call, threads(count, 256)) }
-    }
-}
-
-impl DeviceNodes for DeviceTable {
-    fn not_finite(&self) -> usize {
-        self.not_finite
-    }
-
-    fn values(&self) -> Result<Vec<f32>, DeviceError> {
-        Self::values(self)
-    }
-
-    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
-        predict_from_host(&self.gpu, self, points, out)
-    }
-
-    fn as_any(&self) -> &dyn std::any::Any {
-        self
     }
 }

@@ -1,10 +1,10 @@
 //! Tracing on the device: from addresses of seeds to addresses of results, sorted by cell where velocities are read from memory.
 
-use super::grid::GridArguments;
-use super::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
-use super::sort::{MOST, SortCells, Sorter};
-use super::window::DeviceWindow;
-use super::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
+use crate::backend::cuda::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
+use crate::backend::cuda::tracing::sort::{MOST, SortCells, Sorter};
+use crate::backend::cuda::window::DeviceWindow;
+use crate::backend::cuda::window::grid::GridArguments;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
 use crate::field::analytic::{Analytic, ClosedForm, Constants, Form};
 use crate::field::{Domain, Geometry};
 use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};

@@ -1,37 +1,24 @@
-//! The tracer that the engine uses: seeds on the host in, results on the host out.
+//! A slide's flow map on the GPU, for seeds on the host and on the device.
 
-use super::layout::Outputs;
-use super::trace::{DeviceTracer, Tuning};
-use super::{Buffer, DeviceError, DeviceLand, DeviceTable, Gpu, SnapshotStore};
-use crate::engine::accelerator::{Backed, DeviceNodes, DeviceTrace};
-use crate::field::Domain;
-use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, Voids, cpu_tracer};
+use crate::backend::BackendError;
+use crate::backend::cuda::layout::Outputs;
+use crate::backend::cuda::tracing::trace::{DeviceTracer, Tuning};
+use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, Gpu, SnapshotStore};
+use crate::flow::{Extras, FlowMap, Precision, Traced, Tracer, VelocitySource, Voids, cpu_tracer};
+use crate::surrogate::Trace;
 use std::sync::{Arc, Mutex, PoisonError};
-use thiserror::Error;
 
 /// Seeds that go over at once, at most: bounds the memory of a call.
 const BATCH: usize = 1 << 22;
 /// Bytes of one, with all that comes back of it.
 const SEED: u64 = 76;
 
-/// Why no tracer was made.
-#[derive(Debug, Error)]
-pub enum CudaTracerError {
-    /// The flow map is refused, on any device.
-    #[error(transparent)]
-    Flow(#[from] FlowError),
-    /// The device.
-    #[error(transparent)]
-    Device(#[from] DeviceError),
-}
-
-/// A flow map on the GPU, with the CPU's tracer behind it.
-pub type CudaTracer = Backed<CudaTrace>;
-
-/// A flow map on the GPU, for seeds on the host.
-pub struct CudaTrace {
+/// A flow map on the GPU.
+pub struct CudaTracer {
     device: DeviceTracer,
-    land: Option<DeviceLand>,
+    /// The same flow map on the CPU, which checks the settings and chooses the number of steps.
+    host: Box<dyn Tracer>,
+    missing_cells: Option<DeviceMissingCells>,
     double: bool,
     /// One call at a time.
     room: Mutex<Option<Room>>,
@@ -50,10 +37,10 @@ struct Room {
 }
 
 impl CudaTracer {
-    /// For seeds at `t0`.
+    /// A tracer of `map` for seeds at `t0`.
     ///
     /// # Errors
-    /// What the CPU's tracer refuses, and what the device cannot do.
+    /// A flow map that the CPU's tracer refuses too; a device that fails or lacks memory.
     pub fn new(
         store: &SnapshotStore,
         gpu: &Arc<Gpu>,
@@ -61,38 +48,44 @@ impl CudaTracer {
         map: &FlowMap,
         t0: f64,
         tuning: Tuning,
-    ) -> Result<Self, CudaTracerError> {
+    ) -> Result<Self, BackendError> {
         let host = cpu_tracer(source.clone(), map, t0)?;
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
-        let land = match &source {
+        let missing_cells = match &source {
             VelocitySource::Analytic(..) => None,
-            VelocitySource::Window(window) => DeviceLand::new(gpu, &Voids::at(window, t0, map.interpolation))?,
+            VelocitySource::Window(window) => DeviceMissingCells::new(gpu, &Voids::at(window, t0, map.interpolation))?,
         };
-        let trace = CudaTrace { device, land, double: map.precision == Precision::F64, room: Mutex::new(None) };
-        Ok(Self::with(trace, host, gpu.health().clone()))
+        Ok(Self { device, host, missing_cells, double: map.precision == Precision::F64, room: Mutex::new(None) })
     }
 
-    /// The device's side, for callers whose seeds are there.
+    /// The tracer for seeds on the device.
     pub fn device(&self) -> &DeviceTracer {
-        &self.on_device().device
+        &self.device
     }
 
-    /// Where no particle can start, on the device; none where every one can.
-    pub fn land(&self) -> Option<&DeviceLand> {
-        self.on_device().land.as_ref()
+    /// The same flow map on the CPU.
+    pub fn host(&self) -> &dyn Tracer {
+        &*self.host
+    }
+
+    /// The flow map on the CPU alone.
+    pub fn into_host(self) -> Box<dyn Tracer> {
+        self.host
+    }
+
+    /// The cells in which no particle can start, on the device; `None` if there are none.
+    pub fn missing_cells(&self) -> Option<&DeviceMissingCells> {
+        self.missing_cells.as_ref()
     }
 }
 
-impl DeviceTrace for CudaTrace {
-    fn double(&self) -> bool {
-        self.double
-    }
-
-    fn trace_nodes(&self, domain: &Domain, nodes: [usize; 3]) -> Result<Option<Box<dyn DeviceNodes>>, DeviceError> {
-        Ok(Some(Box::new(DeviceTable::trace(&self.device, domain, nodes)?)))
+impl Trace for CudaTracer {
+    fn flow(&self) -> &dyn Tracer {
+        &*self.host
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
+        out.set_len(seeds.len(), extras, self.double);
         let gpu = self.device.gpu();
         let mut room = self.room.lock().unwrap_or_else(PoisonError::into_inner);
         let batch = gpu.batch(BATCH, SEED);

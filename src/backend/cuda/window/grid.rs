@@ -1,7 +1,7 @@
 //! A window and a flow map as kernels see them.
 
-use super::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
-use super::{DeviceError, Storage};
+use crate::backend::cuda::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
+use crate::backend::cuda::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
 use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
 
@@ -144,7 +144,7 @@ impl GridArguments {
 }
 
 /// `RW_STORAGE`, as `Storage` in `grid.cuh`.
-pub(super) fn storage_define(storage: Storage) -> String {
+pub(in crate::backend::cuda) fn storage_define(storage: Storage) -> String {
     format!("RW_STORAGE={}", storage as u8)
 }
 

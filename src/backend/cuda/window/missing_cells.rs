@@ -1,21 +1,21 @@
 //! The cells in which no particle can start, on the device.
 
-use super::layout::{LandArgument, LandAxis};
-use super::{Buffer, DeviceError, Gpu};
+use crate::backend::cuda::layout::{LandArgument, LandAxis};
+use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use crate::flow::Voids;
 
 /// Land under the seeds of one window.
 #[derive(Debug)]
-pub struct DeviceLand {
+pub struct DeviceMissingCells {
     argument: LandArgument,
     // Memory that the argument points to.
     _nodes: Vec<Buffer<f64>>,
     _empty: Buffer<u8>,
 }
 
-impl DeviceLand {
+impl DeviceMissingCells {
     /// None where particles can start everywhere.
-    pub(super) fn new(gpu: &Gpu, voids: &Voids) -> Result<Option<Self>, DeviceError> {
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, voids: &Voids) -> Result<Option<Self>, DeviceError> {
         let Some((grid, empty)) = voids.cells() else { return Ok(None) };
         let mut argument = LandArgument { dimensions: grid.axes.len() as i32, ..LandArgument::NONE };
         let mut nodes = Vec::new();
@@ -32,7 +32,7 @@ impl DeviceLand {
     }
 
     /// `Land` of `land.cuh`.
-    pub(super) fn argument(&self) -> LandArgument {
+    pub(in crate::backend::cuda) fn argument(&self) -> LandArgument {
         self.argument
     }
 }

@@ -6,7 +6,7 @@ use std::sync::{Arc, Weak};
 
 /// Snapshots that are expected, and what `T` holds of those that came over.
 #[derive(Debug)]
-pub(super) struct Ahead<T> {
+pub(in crate::backend::cuda) struct PrefetchQueue<T> {
     entries: VecDeque<Entry<T>>,
 }
 
@@ -24,21 +24,21 @@ enum Stage<T> {
     There(Arc<T>),
 }
 
-impl<T> Default for Ahead<T> {
+impl<T> Default for PrefetchQueue<T> {
     fn default() -> Self {
         Self { entries: VecDeque::new() }
     }
 }
 
-impl<T> Ahead<T> {
+impl<T> PrefetchQueue<T> {
     /// One that will be wanted after all that were expected before.
-    pub(super) fn expect(&mut self, snapshot: &Arc<Snapshot>) {
+    pub(in crate::backend::cuda) fn expect(&mut self, snapshot: &Arc<Snapshot>) {
         self.entries.retain(|e| !matches!(e.stage, Stage::Waiting) || e.host.strong_count() > 0);
         self.entries.push_back(Entry { host: Arc::downgrade(snapshot), stage: Stage::Waiting });
     }
 
     /// The next one to bring, when fewer than `most` are there or on the way and it fits; it then is on its way.
-    pub(super) fn next(&mut self, most: usize, fits: impl Fn(&Snapshot) -> bool) -> Option<Arc<Snapshot>> {
+    pub(in crate::backend::cuda) fn next(&mut self, most: usize, fits: impl Fn(&Snapshot) -> bool) -> Option<Arc<Snapshot>> {
         if self.entries.iter().filter(|e| !matches!(e.stage, Stage::Waiting)).count() >= most {
             return None;
         }
@@ -52,7 +52,7 @@ impl<T> Ahead<T> {
     }
 
     /// What became of one that was on its way; none: whoever wants it brings it himself.
-    pub(super) fn arrived(&mut self, snapshot: &Arc<Snapshot>, there: Option<Arc<T>>) {
+    pub(in crate::backend::cuda) fn arrived(&mut self, snapshot: &Arc<Snapshot>, there: Option<Arc<T>>) {
         let Some(at) = self.find(snapshot) else { return };
         match there {
             Some(there) => self.entries[at].stage = Stage::There(there),
@@ -61,13 +61,13 @@ impl<T> Ahead<T> {
     }
 
     /// Whether it is worth waiting for.
-    pub(super) fn is_on_the_way(&self, snapshot: &Arc<Snapshot>) -> bool {
+    pub(in crate::backend::cuda) fn is_on_the_way(&self, snapshot: &Arc<Snapshot>) -> bool {
         self.find(snapshot).is_some_and(|at| matches!(self.entries[at].stage, Stage::OnTheWay))
     }
 
     /// What is there of a window's snapshots. Everything that was expected before the newest of them is forgotten: what the window has
     /// not taken by then, it never will.
-    pub(super) fn take(&mut self, window: &[&Arc<Snapshot>]) -> Vec<Arc<T>> {
+    pub(in crate::backend::cuda) fn take(&mut self, window: &[&Arc<Snapshot>]) -> Vec<Arc<T>> {
         let wanted = |e: &Entry<T>| window.iter().any(|s| std::ptr::eq(e.host.as_ptr(), Arc::as_ptr(s)));
         let count = self.entries.iter().rposition(wanted).map_or(0, |last| last + 1);
         let taken = self.entries.drain(..count).filter(wanted);
@@ -75,7 +75,7 @@ impl<T> Ahead<T> {
     }
 
     /// Lets go of what is there; it comes over again in its turn.
-    pub(super) fn let_go(&mut self) {
+    pub(in crate::backend::cuda) fn let_go(&mut self) {
         self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::There(_))).for_each(|e| e.stage = Stage::Waiting);
     }
 
@@ -95,7 +95,7 @@ mod tests {
         (0..count).map(|t| Arc::new(Snapshot::new(t as f64, grid.clone(), vec![[0.0; 4]; 4]))).collect()
     }
 
-    fn bring(ahead: &mut Ahead<f64>) -> Option<f64> {
+    fn bring(ahead: &mut PrefetchQueue<f64>) -> Option<f64> {
         let next = ahead.next(2, |_| true)?;
         ahead.arrived(&next, Some(Arc::new(next.time)));
         Some(next.time)
@@ -104,7 +104,7 @@ mod tests {
     #[test]
     fn the_next_two_come_over_in_order_and_a_slide_takes_the_first() {
         let s = snapshots(5);
-        let mut ahead = Ahead::default();
+        let mut ahead = PrefetchQueue::default();
         s.iter().for_each(|s| ahead.expect(s));
         assert!(ahead.next(2, |_| false).is_none(), "what does not fit stays");
         assert_eq!((bring(&mut ahead), bring(&mut ahead), bring(&mut ahead)), (Some(0.0), Some(1.0), None));
@@ -121,7 +121,7 @@ mod tests {
     #[test]
     fn one_on_its_way_is_waited_for_and_one_that_fails_is_not() {
         let s = snapshots(2);
-        let mut ahead = Ahead::<f64>::default();
+        let mut ahead = PrefetchQueue::<f64>::default();
         s.iter().for_each(|s| ahead.expect(s));
         let first = ahead.next(2, |_| true).unwrap();
         assert!(ahead.is_on_the_way(&s[0]) && !ahead.is_on_the_way(&s[1]));
@@ -132,7 +132,7 @@ mod tests {
         assert_eq!(bring(&mut ahead), Some(1.0), "let go, it comes again");
         // Passed by while on its way: what arrives is not kept.
         let s = snapshots(2);
-        let mut ahead = Ahead::<f64>::default();
+        let mut ahead = PrefetchQueue::<f64>::default();
         s.iter().for_each(|s| ahead.expect(s));
         let first = ahead.next(1, |_| true).unwrap();
         assert!(ahead.take(&[&s[1]]).is_empty());
@@ -143,7 +143,7 @@ mod tests {
     #[test]
     fn what_nobody_holds_any_more_is_forgotten() {
         let mut s = snapshots(3);
-        let mut ahead = Ahead::<f64>::default();
+        let mut ahead = PrefetchQueue::<f64>::default();
         s.iter().for_each(|s| ahead.expect(s));
         let kept = s.pop().unwrap();
         s.clear();

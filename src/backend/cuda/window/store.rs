@@ -1,10 +1,10 @@
 //! Snapshots on the device: each comes over once, those that are expected by a thread of their own, while frames of the slide before are
 //! made. A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
 
-use super::ahead::Ahead;
-use super::grid::{Nodes, storage_define};
-use super::transfer::Carrier;
-use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
+use crate::backend::cuda::window::grid::{Nodes, storage_define};
+use crate::backend::cuda::window::prefetch::PrefetchQueue;
+use crate::backend::cuda::window::uploader::SnapshotUploader;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::{Snapshot, Window};
 use cudarc::driver::{CudaEvent, PushKernelArg};
 use rayon::prelude::*;
@@ -31,17 +31,17 @@ const COPIERS: usize = 4;
 #[derive(Debug)]
 pub struct DeviceSnapshot {
     /// Holding it keeps its address from being given to another one.
-    pub(super) host: Arc<Snapshot>,
+    pub(in crate::backend::cuda) host: Arc<Snapshot>,
     /// [`Storage::bytes`] a node.
-    pub(super) nodes: Buffer<u32>,
-    pub(super) storage: Storage,
-    pub(super) scale: f32,
+    pub(in crate::backend::cuda) nodes: Buffer<u32>,
+    pub(in crate::backend::cuda) storage: Storage,
+    pub(in crate::backend::cuda) scale: f32,
     /// Whether some node is missing.
-    pub(super) missing: bool,
+    pub(in crate::backend::cuda) missing: bool,
     /// When it is there.
-    pub(super) ready: CudaEvent,
+    pub(in crate::backend::cuda) ready: CudaEvent,
     /// The one that its pairs lead to, once: earlier windows go on reading them.
-    pub(super) next: OnceLock<Weak<Snapshot>>,
+    pub(in crate::backend::cuda) next: OnceLock<Weak<Snapshot>>,
 }
 
 /// The snapshots of one window, oldest first.
@@ -52,7 +52,7 @@ pub struct DeviceWindow {
 
 impl DeviceWindow {
     /// What kernels need to know of it.
-    pub(super) fn nodes(&self) -> Nodes {
+    pub(in crate::backend::cuda) fn nodes(&self) -> Nodes {
         let first = self.snapshots.first();
         Nodes {
             addresses: self.snapshots.iter().map(|s| s.nodes.address()).collect(),
@@ -82,14 +82,14 @@ struct Shared {
     /// Told of every change that somebody may wait for.
     changed: Condvar,
     /// Locked behind `state`, never before it.
-    carrier: Mutex<Carrier>,
+    carrier: Mutex<SnapshotUploader>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     /// Those of the latest window.
     held: Vec<Arc<DeviceSnapshot>>,
-    ahead: Ahead<DeviceSnapshot>,
+    ahead: PrefetchQueue<DeviceSnapshot>,
     /// How the latest window is held: storage and scale. None before the first.
     form: Option<(Storage, f32)>,
     /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's as soon as nobody else holds it.
@@ -104,7 +104,8 @@ struct State {
 impl SnapshotStore {
     /// Nothing there yet.
     pub fn new(gpu: &Arc<Gpu>) -> Self {
-        let shared = Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), carrier: Mutex::new(Carrier::new(gpu)) };
+        let shared =
+            Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), carrier: Mutex::new(SnapshotUploader::new(gpu)) };
         Self { shared: Arc::new(shared), thread: Mutex::new(None) }
     }
 
@@ -319,15 +320,8 @@ impl Shared {
         if storage != Storage::F32 && peak(snapshot) / scale > HALF_MOST {
             return None;
         }
-        match self.carry(snapshot, storage, scale) {
-            Ok(there) => Some(there),
-            Err(error) => {
-                if error.is_fault() {
-                    self.gpu.health().fail(error);
-                }
-                None
-            }
-        }
+        // A failure shows again when the window brings the snapshot itself.
+        self.carry(snapshot, storage, scale).ok()
     }
 }
 

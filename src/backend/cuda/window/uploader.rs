@@ -1,8 +1,8 @@
 //! One snapshot from host to device: through page-locked pieces on the transfer stream, while kernels run on the work stream.
 
-use super::grid::storage_define;
-use super::window::DeviceSnapshot;
-use super::{Buffer, DeviceError, Gpu, Storage, launch, threads};
+use crate::backend::cuda::window::grid::storage_define;
+use crate::backend::cuda::window::store::DeviceSnapshot;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::Snapshot;
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
 use rayon::prelude::*;
@@ -13,7 +13,7 @@ const PIECE: usize = 1 << 19;
 
 /// Brings snapshots over, one after the other.
 #[derive(Debug)]
-pub(super) struct Carrier {
+pub(in crate::backend::cuda) struct SnapshotUploader {
     gpu: Arc<Gpu>,
     pieces: Option<Pieces>,
     encode: Option<(Storage, CudaFunction)>,
@@ -28,14 +28,19 @@ struct Pieces {
     images: Option<[Buffer<u32>; 2]>,
 }
 
-impl Carrier {
+impl SnapshotUploader {
     /// Memory is taken when it is first needed.
-    pub(super) fn new(gpu: &Arc<Gpu>) -> Self {
+    pub(in crate::backend::cuda) fn new(gpu: &Arc<Gpu>) -> Self {
         Self { gpu: gpu.clone(), pieces: None, encode: None }
     }
 
     /// Enqueues the whole snapshot; [`DeviceSnapshot::ready`] tells when it is there. Velocities are divided by `scale`.
-    pub(super) fn carry(&mut self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<DeviceSnapshot, DeviceError> {
+    pub(in crate::backend::cuda) fn carry(
+        &mut self,
+        snapshot: &Arc<Snapshot>,
+        storage: Storage,
+        scale: f32,
+    ) -> Result<DeviceSnapshot, DeviceError> {
         let gpu = self.gpu.clone();
         let doing = DeviceError::driver("bringing a snapshot over");
         let words = (storage.bytes() / 4) as usize;

@@ -11,14 +11,14 @@ pub const KEEP_STALE: f64 = 0.95;
 
 /// Where a ring stood when somebody took a copy of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RingMark {
+pub struct BufferMark {
     epoch: u64,
     pushed: u64,
 }
 
 /// Newest samples, at most `capacity`, those set aside included.
 #[derive(Debug)]
-pub struct SampleRing {
+pub struct ReplayBuffer {
     capacity: usize,
     /// Labels of the present window. Circular once full.
     fresh: Samples,
@@ -33,7 +33,7 @@ pub struct SampleRing {
     now: Option<[f32; 2]>,
 }
 
-impl SampleRing {
+impl ReplayBuffer {
     /// An empty ring of at least one sample.
     pub fn new(capacity: usize) -> Self {
         let empty = Samples::default();
@@ -53,17 +53,17 @@ impl SampleRing {
     }
 
     /// Where the ring stands now.
-    pub fn mark(&self) -> RingMark {
-        RingMark { epoch: self.epoch, pushed: self.pushed }
+    pub fn mark(&self) -> BufferMark {
+        BufferMark { epoch: self.epoch, pushed: self.pushed }
     }
 
     /// Whether samples still lie where they lay at `mark`.
-    pub fn continues(&self, mark: RingMark) -> bool {
+    pub fn continues(&self, mark: BufferMark) -> bool {
         mark.epoch == self.epoch
     }
 
-    /// Places in [`SampleRing::samples`] that have been written since `mark`: all of them where samples have been moved since, or without a mark.
-    pub fn written_since(&self, mark: Option<RingMark>) -> [Range<usize>; 2] {
+    /// Places in [`ReplayBuffer::samples`] that have been written since `mark`: all of them where samples have been moved since, or without a mark.
+    pub fn written_since(&self, mark: Option<BufferMark>) -> [Range<usize>; 2] {
         let len = self.len();
         let fresh = match mark {
             Some(mark) if self.continues(mark) => usize::try_from(self.pushed - mark.pushed).map_or(len, |fresh| fresh.min(len)),
@@ -140,12 +140,10 @@ impl SampleRing {
         self.epoch = fresh_stamp();
     }
 
-    /// Numbers of up to `count` stale samples to trace anew, drawn with repetition by seed and counter.
+    /// Numbers of up to `count` samples to trace anew before they are marked stale, drawn with repetition by seed and counter.
     pub fn probe(&self, count: usize, seed: u64, counter: u64) -> Vec<usize> {
-        if self.stale.is_empty() {
-            return Vec::new();
-        }
-        (0..count.min(self.stale.len())).map(|i| draw(seed, counter + i as u64, self.stale.len())).collect()
+        let len = self.len();
+        (0..count.min(len)).map(|i| draw(seed, counter + i as u64, len)).collect()
     }
 
     /// Tells which share of the probed labels still holds: from [`KEEP_STALE`] on the stale samples may be trained on again (as many as fit),
@@ -212,7 +210,7 @@ mod tests {
 
     #[test]
     fn the_newest_stay() {
-        let mut ring = SampleRing::new(10);
+        let mut ring = ReplayBuffer::new(10);
         ring.push(&numbered(0..7));
         ring.push(&numbered(7..13));
         assert_eq!(labels(ring.samples()), (3..13).collect::<Vec<_>>());
@@ -225,7 +223,7 @@ mod tests {
     #[test]
     fn stale_labels_are_not_drawn_until_they_are_shown_to_hold() {
         let half_stale = || {
-            let mut ring = SampleRing::new(10);
+            let mut ring = ReplayBuffer::new(10);
             ring.push(&numbered(0..8));
             ring.mark_stale();
             assert!(ring.is_empty() && ring.stale().len() == 8);
@@ -245,7 +243,7 @@ mod tests {
 
     #[test]
     fn a_copy_that_takes_what_was_written_stays_a_copy() {
-        let mut ring = SampleRing::new(10);
+        let mut ring = ReplayBuffer::new(10);
         let (mut copy, mut mark, mut next) = (Vec::new(), None, 0);
         for count in [0, 3, 4, 5, 10, 1, 9, 25, 7] {
             ring.push(&numbered(next..next + count));
@@ -263,12 +261,12 @@ mod tests {
         ring.push(&numbered(90..92));
         ring.revalidate(1.0);
         assert_eq!((ring.len(), ring.written_since(mark)), (10, [0..10, 0..0]), "all were moved");
-        assert_ne!(SampleRing::new(10).mark(), SampleRing::new(10).mark(), "two rings are never the same");
+        assert_ne!(ReplayBuffer::new(10).mark(), ReplayBuffer::new(10).mark(), "two rings are never the same");
     }
 
     #[test]
     fn flow_map_labels_travel_along() {
-        let mut ring = SampleRing::new(4);
+        let mut ring = ReplayBuffer::new(4);
         let mut samples = numbered(0..6);
         samples.arrival = (0..6).map(|i| [i as f32; 3]).collect();
         samples.jacobian = (0..6).map(|i| [i as f32; 9]).collect();

@@ -1,0 +1,136 @@
+//! A step of a run as a transaction on one backend.
+//!
+//! A step computes first and takes effect only when nothing can fail any more. If the device lacks memory, the slide is planned anew and the step is
+//! repeated there; if the device is lost, or nothing is left to plan, the step is repeated once by the CPU, from the latest host copy of the weights.
+
+use super::stop::RunEnd;
+use super::{EngineError, Slide};
+use crate::backend::{Backend, Cpu, Surrogate, WhenLost};
+use crate::backend::{DeviceError, Interruptible};
+use crate::flow::FlowMap;
+use crate::surrogate::NetworkFrom;
+use std::sync::atomic::AtomicBool;
+
+/// A backend with the flow map and the surrogate of the present slide.
+pub(super) struct On<B: Backend> {
+    pub(super) backend: B,
+    /// `None` between two slides: it holds the window, here and on the device.
+    pub(super) tracer: Option<B::Tracer>,
+    /// `None` for the method `reference`.
+    pub(super) surrogate: Option<B::Surrogate>,
+}
+
+/// The flow map of the slide in progress.
+pub(super) fn present<T>(tracer: &Option<T>) -> &T {
+    tracer.as_ref().unwrap_or_else(|| unreachable!("steps run while a slide is in progress"))
+}
+
+impl<B: Backend> On<B> {
+    /// The flow map of the slide in progress.
+    pub(super) fn tracer(&self) -> &B::Tracer {
+        present(&self.tracer)
+    }
+}
+
+/// Where a run computes.
+pub(super) enum Session<B: Backend> {
+    /// On the backend that it began with.
+    Device(On<B>),
+    /// On the CPU, after the device.
+    Cpu(On<Cpu>),
+}
+
+/// Runs `$work` with `$on` bound to the session's backend, whichever it is.
+macro_rules! with {
+    ($session:expr, $on:ident => $work:expr) => {
+        match $session {
+            $crate::run::transaction::Session::Device($on) => $work,
+            $crate::run::transaction::Session::Cpu($on) => $work,
+        }
+    };
+}
+
+/// Runs `$work` as a transaction: repeats it after a device failed.
+macro_rules! transaction {
+    ($cycle:expr, $slide:expr, $run:ident, $on:ident => $work:expr) => {
+        loop {
+            let $run = &mut $cycle.run;
+            let result: Result<_, RunEnd> = with!(&mut $cycle.session, $on => $work);
+            match result {
+                Err(RunEnd::Device(error)) => $cycle.session.recover(error, $slide, &$cycle.map, $run)?,
+                result => break result?,
+            }
+        }
+    };
+}
+
+pub(super) use {transaction, with};
+
+/// The part of a run that a recovery needs.
+pub(super) trait Recovering: Sync {
+    /// What happens when the device is lost.
+    fn when_lost(&self) -> WhenLost;
+    /// Adds a warning to the next record.
+    fn warn(&mut self, warning: String);
+    /// The threads that trace.
+    fn pool(&self) -> &rayon::ThreadPool;
+    /// The request to stop.
+    fn stop(&self) -> &AtomicBool;
+}
+
+impl<B: Backend> Session<B> {
+    /// Makes it possible to repeat a step after `error`.
+    ///
+    /// # Errors
+    /// The run is to end with the device.
+    pub(super) fn recover(&mut self, error: DeviceError, slide: &Slide, map: &FlowMap, run: &mut impl Recovering) -> Result<(), RunEnd> {
+        let Session::Device(on) = self else { return Err(EngineError::Device(Box::new(error)).into()) };
+        let mut error = error;
+        // Without a flow map there is nothing to plan with: the window itself does not fit.
+        if let (true, Some(tracer)) = (error.is_refusal(), &on.tracer) {
+            match run.pool().install(|| on.backend.replan(&error, tracer, &mut on.surrogate)) {
+                Ok(Some(warning)) => {
+                    run.warn(warning);
+                    return Ok(());
+                }
+                Ok(None) => {}
+                Err(worse) => error = worse,
+            }
+        }
+        self.move_to_cpu(error, slide, map, run)
+    }
+
+    /// Goes on with the CPU for the rest of the run.
+    ///
+    /// # Errors
+    /// The run is to end with the device; a flow map that the CPU refuses.
+    pub(super) fn move_to_cpu(
+        &mut self,
+        error: DeviceError,
+        slide: &Slide,
+        map: &FlowMap,
+        run: &mut impl Recovering,
+    ) -> Result<(), RunEnd> {
+        if run.when_lost() == WhenLost::Stop && !error.is_refusal() {
+            return Err(EngineError::Device(Box::new(error)).into());
+        }
+        let Session::Device(on) = self else { return Ok(()) };
+        let mut backend = Cpu;
+        let tracer = run.pool().install(|| backend.tracer(&slide.velocity, map, slide.time))?;
+        let surrogate = match &mut on.surrogate {
+            None => None,
+            Some(surrogate) => {
+                let alive = error.is_refusal().then(|| surrogate.to_host(NetworkFrom::Device).ok()).flatten();
+                let mut host = match alive {
+                    Some(host) => host,
+                    None => surrogate.to_host(NetworkFrom::HostCopy)?,
+                };
+                run.pool().install(|| host.trace_table(&Interruptible::new(&tracer, run.stop())))?;
+                Some(host)
+            }
+        };
+        *self = Session::Cpu(On { backend, tracer: Some(tracer), surrogate });
+        run.warn(format!("work on the GPU has ended, the CPU goes on: {error}"));
+        Ok(())
+    }
+}
