@@ -159,7 +159,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let seeds = seeds(&plan.domain, grid);
     let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
     let TracedOnce { flow: tracer, traced, seconds, note } =
-        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(EngineError::from)?;
+        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(EngineError::of)?;
     note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
     let ftle: Vec<f64> =

@@ -54,17 +54,16 @@ pub enum EngineError {
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
 
-impl From<BackendError> for EngineError {
-    fn from(error: BackendError) -> Self {
+impl EngineError {
+    /// The error of a backend that cannot prepare a slide.
+    pub fn of(error: BackendError) -> Self {
         match error {
             BackendError::Flow(error) => error.into(),
             BackendError::Surrogate(error) => error.into(),
             BackendError::Device(error) => Self::Device(Box::new(error)),
         }
     }
-}
 
-impl EngineError {
     /// The setting at fault, where it is one.
     pub fn refused(&self) -> Option<Refused> {
         match self {
