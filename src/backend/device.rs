@@ -206,24 +206,6 @@ impl Device {
         !matches!(self, Self::Cpu { .. })
     }
 
-    /// Whether the CPU computes if the first slide does not fit the device.
-    pub fn may_fall_back(&self) -> bool {
-        match self {
-            Self::Cpu { .. } => true,
-            #[cfg(feature = "cuda")]
-            Self::Cuda(device) => device.may_fall_back,
-        }
-    }
-
-    /// What happens when the device is lost.
-    pub fn when_lost(&self) -> WhenLost {
-        match self {
-            Self::Cpu { .. } => WhenLost::Cpu,
-            #[cfg(feature = "cuda")]
-            Self::Cuda(device) => device.when_lost,
-        }
-    }
-
     /// Traces seeds at `t0` once. If the device cannot and the settings allow it, the CPU does, and a note says why.
     ///
     /// # Errors

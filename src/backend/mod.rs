@@ -14,7 +14,7 @@ mod placement;
 mod router;
 
 pub use audit::{Audit, AuditFindings, AuditRequest, residuals, stratified_points, trusted_error};
-pub use cpu::{Cpu, render_on_cpu};
+pub use cpu::{Cpu, HostFrame, render_on_cpu};
 #[cfg(feature = "cuda")]
 pub use device::CudaDevice;
 pub use device::{Device, DeviceChoice, DeviceSettings, Storage, TracedOnce, UnknownDevice, WhenLost};
@@ -90,6 +90,16 @@ pub trait Backend: Send + Sync + Sized {
         tracer: &Self::Tracer,
         surrogate: &mut Option<Self::Surrogate>,
     ) -> Result<Option<String>, DeviceError>;
+
+    /// What happens when the device is lost.
+    fn when_lost(&self) -> WhenLost {
+        WhenLost::Cpu
+    }
+
+    /// Whether the CPU computes if the first slide does not fit the device.
+    fn may_fall_back(&self) -> bool {
+        true
+    }
 
     /// Warnings about the placement since the last call.
     fn warnings(&mut self) -> Vec<String> {

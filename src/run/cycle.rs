@@ -167,9 +167,6 @@ pub(super) struct RunProgress {
 }
 
 impl Recovering for Run<'_> {
-    fn when_lost(&self) -> WhenLost {
-        self.options.device.when_lost()
-    }
     fn warn(&mut self, warning: String) {
         self.progress.warnings.push(warning);
     }
@@ -206,11 +203,11 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &Atomi
     match &options.device {
         Device::Cpu { .. } => run_on(Cpu, setup, options, sink, stop),
         #[cfg(feature = "cuda")]
-        Device::Cuda(device) => run_on(Cuda::new(&device.gpu, device.storage), setup, options, sink, stop),
+        Device::Cuda(device) => run_on(Cuda::new(device), setup, options, sink, stop),
     }
 }
 
-/// The same on any backend. The options' device says what happens if it is lost.
+/// The same on any backend; the options' device is not used.
 ///
 /// # Errors
 /// As for [`run`].
@@ -252,7 +249,7 @@ fn drive<B: Backend>(
     check_stop(stop)?;
     let mut slide = first.ok_or(EngineError::EndedEarly)?;
     let begun = Instant::now();
-    let mut beginning = Beginning { options, threads: &threads, stop, warnings: Vec::new() };
+    let mut beginning = Beginning { threads: &threads, stop, warnings: Vec::new() };
     let mut session = begin(backend, &plan, &slide, &mut beginning)?;
     check_stop(stop)?;
     let map = match with!(&session, on => fixed_steps(on.tracer().flow())) {
@@ -283,16 +280,12 @@ fn drive<B: Backend>(
 
 /// What a recovery needs before there is a run.
 struct Beginning<'a> {
-    options: &'a RunOptions,
     threads: &'a Threads,
     stop: &'a AtomicBool,
     warnings: Vec<String>,
 }
 
 impl Recovering for Beginning<'_> {
-    fn when_lost(&self) -> WhenLost {
-        self.options.device.when_lost()
-    }
     fn warn(&mut self, warning: String) {
         self.warnings.push(warning);
     }
@@ -312,8 +305,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
         Err(BackendError::Device(error)) => error,
         Err(error) => return Err(error.into()),
     };
-    let device = &beginning.options.device;
-    let goes_on = if error.is_fault() { device.when_lost() == WhenLost::Cpu } else { device.may_fall_back() };
+    let goes_on = if error.is_fault() { backend.when_lost() == WhenLost::Cpu } else { backend.may_fall_back() };
     if !goes_on {
         return Err(EngineError::Device(Box::new(error)).into());
     }

@@ -210,13 +210,14 @@ impl Run<'_> {
             (Some(surrogate), Some([beside, all])) => std::thread::scope(|scope| {
                 let (rendered, learned) = (&rendered, &mut learned);
                 let training = scope.spawn(move || {
-                    beside.install(|| train(surrogate, buffer, settings, Until::Rendered(rendered), stop, learned))?;
+                    let mut learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+                    beside.install(|| train(&mut learn, settings, Until::Rendered(rendered), stop, learned))?;
                     let left = settings.seconds() - learned.seconds;
                     if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
                         return Ok(());
                     }
                     // The picture is done: its threads are free.
-                    all.install(|| train(surrogate, buffer, settings, Until::Seconds(left), stop, learned))
+                    all.install(|| train(&mut learn, settings, Until::Seconds(left), stop, learned))
                 });
                 let work = threads.render().install(&mut render);
                 rendered.store(true, Ordering::Release);
@@ -227,7 +228,8 @@ impl Run<'_> {
                 let mut trained = Ok(());
                 if let (true, Ok(work)) = (waits, &work) {
                     let seconds = if threads.device_trains { settings.turn(work.device_share()) } else { settings.seconds() };
-                    trained = threads.render().install(|| train(surrogate, buffer, settings, Until::Seconds(seconds), stop, &mut learned));
+                    let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+                    trained = threads.render().install(|| train(learn, settings, Until::Seconds(seconds), stop, &mut learned));
                 }
                 (work, trained)
             }
@@ -266,7 +268,8 @@ impl Run<'_> {
                 break;
             }
             let (mut learned, buffer, stop) = (Learned::default(), &self.learning.buffer, self.stop);
-            let result = self.threads.all().install(|| train(surrogate, buffer, settings, Until::Seconds(slice), stop, &mut learned));
+            let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+            let result = self.threads.all().install(|| train(learn, settings, Until::Seconds(slice), stop, &mut learned));
             trained += learned.seconds;
             self.learning.budget.took(learned.device_seconds.unwrap_or(learned.seconds));
             let is_idle = learned.steps == 0;

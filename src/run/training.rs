@@ -1,9 +1,9 @@
 //! Which threads train while the others render, and for how long; where a device trains, for how long after the picture.
 
 use super::{EngineError, Settings, TrainingSettings};
-use crate::backend::{DeviceError, Surrogate};
+use crate::backend::DeviceError;
 use crate::render::Method;
-use crate::surrogate::{Kind, Learned, ReplayBuffer};
+use crate::surrogate::{Kind, Learned};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
@@ -94,13 +94,12 @@ pub(super) enum Until<'a> {
     Seconds(f64),
 }
 
-/// Trains in slices until the end is reached or the run is to stop. Adds to `learned` what the slices did.
+/// Trains in slices (`learn` takes seconds and steps, at most) until the end is reached or the run is to stop. Adds to `learned` what the slices did.
 ///
 /// # Errors
 /// The device fails; `learned` has the slices before.
-pub(super) fn train<S: Surrogate>(
-    live: &mut S,
-    buffer: &ReplayBuffer,
+pub(super) fn train(
+    mut learn: impl FnMut(f64, u64) -> Result<Learned, DeviceError>,
     settings: &TrainingSettings,
     until: Until<'_>,
     stop: &AtomicBool,
@@ -127,7 +126,7 @@ pub(super) fn train<S: Surrogate>(
                 (left.min(SLICE), u64::MAX)
             }
         };
-        let slice = match live.learn(buffer, seconds, steps) {
+        let slice = match learn(seconds, steps) {
             Ok(slice) => slice,
             Err(error) => {
                 result = Err(error);
@@ -147,41 +146,6 @@ pub(super) fn train<S: Surrogate>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::flow::Tracer;
-    use crate::surrogate::{CheckpointError, Draft, Predict};
-
-    /// Learns what it is told to have learned, slice after slice, and then nothing.
-    struct Told(std::vec::IntoIter<Learned>);
-
-    impl Predict for Told {
-        fn name(&self) -> &'static str {
-            "network"
-        }
-        fn predict(&self, _: &[[f32; 3]], _: &mut [f32]) {}
-        fn bytes(&self) -> usize {
-            0
-        }
-    }
-
-    impl Surrogate for Told {
-        fn freeze(&self) -> std::sync::Arc<dyn Predict> {
-            unreachable!("nothing is rendered")
-        }
-        fn learns(&self) -> bool {
-            true
-        }
-        fn learn(&mut self, _: &SampleRing, _: f64, _: u64) -> Learned {
-            self.0.next().unwrap_or_default()
-        }
-        fn window_slid(&mut self, _: &dyn Tracer) {}
-        fn draft(&self) -> Draft {
-            unreachable!("nothing is written")
-        }
-        fn load(&mut self, _: &std::path::Path) -> Result<(), CheckpointError> {
-            Ok(())
-        }
-    }
-
     /// Samples that are left out stay where they are, and every slice finds them; a slice that was rolled back has a loss all the same.
     #[test]
     fn slices_add_up() {
@@ -189,12 +153,21 @@ mod tests {
         let rolled_back = Learned { lost_steps: 90, rollbacks: 1, ..slice(0, 200, Some(6.0), 3) };
         let slices = vec![slice(32, 300, Some(1.0), 3), slice(8, 500, Some(2.0), 2), rolled_back];
         let settings = TrainingSettings { steps_per_frame: Some(1000), ..TrainingSettings::default() };
-        let (ring, stop) = (SampleRing::new(1), AtomicBool::new(false));
-        let sum = train(&mut Told(slices.into_iter()), &ring, &settings, Until::Seconds(1.0), &stop);
+        let (mut slices, mut sum) = (slices.into_iter(), Learned::default());
+        let learn = |_, _| Ok(slices.next().unwrap_or_default());
+        train(learn, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum).unwrap();
         assert_eq!((sum.steps, sum.lost_steps, sum.samples, sum.rollbacks, sum.dropped), (40, 90, 1000, 1, 3));
         // (300 * 1 + 500 * 2 + 200 * 6) / 1000.
         assert_eq!(sum.loss, Some(2.5));
         assert!(sum.seconds > 0.0);
+        // A device that fails keeps what it did before.
+        let (mut calls, mut sum) = (0, Learned::default());
+        let fails = |_, _| {
+            calls += 1;
+            if calls < 3 { Ok(slice(5, 10, None, 0)) } else { Err(DeviceError::Driver { doing: "training", reason: "by the test".into() }) }
+        };
+        train(fails, &settings, Until::Seconds(1.0), &AtomicBool::new(false), &mut sum).unwrap_err();
+        assert_eq!((sum.steps, sum.samples), (10, 20));
     }
 
     /// However long frames take and however late a turn ends, training gets its share of the time.

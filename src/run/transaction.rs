@@ -68,8 +68,6 @@ pub(super) use {transaction, with};
 
 /// The part of a run that a recovery needs.
 pub(super) trait Recovering: Sync {
-    /// What happens when the device is lost.
-    fn when_lost(&self) -> WhenLost;
     /// Adds a warning to the next record.
     fn warn(&mut self, warning: String);
     /// The threads that trace.
@@ -111,10 +109,10 @@ impl<B: Backend> Session<B> {
         map: &FlowMap,
         run: &mut impl Recovering,
     ) -> Result<(), RunEnd> {
-        if run.when_lost() == WhenLost::Stop && !error.is_refusal() {
+        let Session::Device(on) = self else { return Ok(()) };
+        if on.backend.when_lost() == WhenLost::Stop && !error.is_refusal() {
             return Err(EngineError::Device(Box::new(error)).into());
         }
-        let Session::Device(on) = self else { return Ok(()) };
         let mut backend = Cpu;
         let tracer = run.pool().install(|| backend.tracer(&slide.velocity, map, slide.time))?;
         let surrogate = match &mut on.surrogate {

@@ -109,7 +109,7 @@ pub struct HostTraining {
     /// Numbers of the samples that can be trained on; `None` if all can.
     among: Option<Vec<u32>>,
     /// What [`Training::keep`] saved: parameters with moments, mean, steps.
-    kept: Option<([[Vec<f32>; 3]; 2], Average, usize)>,
+    pub(super) kept: Option<([[Vec<f32>; 3]; 2], Average, usize)>,
 }
 
 impl HostTraining {

@@ -96,6 +96,9 @@ impl<D: SurrogateDevice> Hybrid<D> {
             Kind::Table => None,
             _ => Some(Trainer::new(network, tracer.flow(), seed, kind == Kind::Residual, training)?),
         };
+        // As tables have them.
+        let dimensions = tracer.flow().domain().dimensions.clamp(2, 3);
+        let nodes = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
         let mut surrogate = Self { kind, nodes, table: None, trainer, shrinkage: 0.0, slid: false };
         Ok(surrogate.trace_table(tracer).map(|()| surrogate))
     }

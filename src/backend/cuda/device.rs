@@ -7,8 +7,8 @@ use super::tracing::{CudaTracer, Tuning};
 use super::window::SnapshotStore;
 use crate::backend::cpu::{HostFrame, render_on_cpu};
 use crate::backend::{
-    AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, Interruptible, Needs, Place, Placement, Rendered, Storage,
-    Surrogate, SurrogateRequest, audit,
+    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
+    Rendered, Surrogate, SurrogateRequest, WhenLost, audit,
 };
 use crate::flow::{FlowMap, VelocitySource};
 use crate::render::Renderer;
@@ -24,9 +24,9 @@ use std::sync::atomic::AtomicBool;
 
 /// A GPU as a backend, with the snapshots that it holds.
 pub struct Cuda {
+    device: CudaDevice,
     gpu: Arc<Gpu>,
     snapshots: Arc<SnapshotStore>,
-    storage: Storage,
     placement: Placement,
     /// Made when the first frame needs it.
     frames: Option<GpuFrames>,
@@ -34,10 +34,11 @@ pub struct Cuda {
 }
 
 impl Cuda {
-    /// A backend that holds windows in `storage`.
-    pub fn new(gpu: &Arc<Gpu>, storage: Storage) -> Self {
-        let snapshots = Arc::new(SnapshotStore::new(gpu));
-        Self { gpu: gpu.clone(), snapshots, storage, placement: Placement::DEVICE, frames: None, warnings: Vec::new() }
+    /// A backend on an opened device.
+    pub fn new(device: &CudaDevice) -> Self {
+        let (gpu, device) = (device.gpu.clone(), device.clone());
+        let snapshots = Arc::new(SnapshotStore::new(&gpu));
+        Self { device, gpu, snapshots, placement: Placement::DEVICE, frames: None, warnings: Vec::new() }
     }
 
     /// The snapshots on the device.
@@ -110,7 +111,7 @@ impl Backend for Cuda {
     }
 
     fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<CudaTracer, BackendError> {
-        let tuning = Tuning { storage: self.storage, ..Tuning::default() };
+        let tuning = Tuning { storage: self.device.storage, ..Tuning::default() };
         CudaTracer::new(&self.snapshots, &self.gpu, velocity.clone(), map, t0, tuning)
     }
 
@@ -176,6 +177,14 @@ impl Backend for Cuda {
             *present = CudaSurrogate::OnHost(moved);
         }
         Ok(Some(format!("the CPU renders the frames from now on and the GPU traces for them: {shortage}")))
+    }
+
+    fn when_lost(&self) -> WhenLost {
+        self.device.when_lost
+    }
+
+    fn may_fall_back(&self) -> bool {
+        self.device.may_fall_back
     }
 
     fn warnings(&mut self) -> Vec<String> {

@@ -1,9 +1,9 @@
 //! The kernels' numerics, compiled as host C++ with the very macros and arguments of a launch, against the Rust reference in f64. No GPU.
 
-use super::grid::{GridArguments, Nodes};
-use super::layout::{DeviceReal, Outputs, Verdict};
-use super::trace::{ClosedArguments, verdict};
-use super::{DeviceError, Storage};
+use crate::backend::cuda::layout::{DeviceReal, Outputs, Verdict};
+use crate::backend::cuda::tracing::trace::{ClosedArguments, verdict};
+use crate::backend::cuda::window::grid::{GridArguments, Nodes};
+use crate::backend::cuda::{DeviceError, Storage};
 use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};

@@ -1,6 +1,6 @@
 //! The network's kernels compiled as host C++, with the very macros and arguments of a launch, against the CPU's prediction. No GPU.
 
-use super::host_parity::{half, library};
+use crate::backend::cuda::host_parity::{half, library};
 use crate::backend::cuda::network::layout::{GridArgument, ReadingArgument};
 use crate::backend::cuda::network::network::{further_places, grid, network_defines, placed_times, reading};
 use crate::surrogate::network::{Architecture, Encoding, Input, Loss, NetworkSettings, Objective, Predictor, Scale, Target, uniform};

@@ -2,7 +2,7 @@
 
 mod sort;
 mod table;
-mod trace;
+pub(super) mod trace;
 mod tracer;
 
 pub use sort::{SortCells, Sorter};

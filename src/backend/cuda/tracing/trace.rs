@@ -218,7 +218,7 @@ impl DeviceTracer {
     ///
     /// # Safety
     /// As for [`Self::trace`], with room for every index.
-    pub(super) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         // SAFETY: the caller's.
         unsafe { self.launch(&self.sorted, self.seeds_a_warp, sorted, count, out) }
     }
@@ -272,16 +272,22 @@ fn step_word<R: DeviceReal>(map: &FlowMap, steps: usize) -> [u64; 1] {
 }
 
 /// What `trace_closed.cu` is compiled with and launched with.
-pub(super) struct ClosedArguments {
-    pub(super) data: Words,
+pub(in crate::backend::cuda) struct ClosedArguments {
+    pub(in crate::backend::cuda) data: Words,
     /// Constants of every stage, as bytes.
-    pub(super) stages: Vec<u8>,
-    pub(super) defines: Vec<String>,
+    pub(in crate::backend::cuda) stages: Vec<u8>,
+    pub(in crate::backend::cuda) defines: Vec<String>,
 }
 
 impl ClosedArguments {
     /// `t0`: none where every seed of a double gyre has its own.
-    pub(super) fn new<R: DeviceReal>(flow: &Analytic, domain: &Domain, map: &FlowMap, t0: Option<f64>, steps: usize) -> Self {
+    pub(in crate::backend::cuda) fn new<R: DeviceReal>(
+        flow: &Analytic,
+        domain: &Domain,
+        map: &FlowMap,
+        t0: Option<f64>,
+        steps: usize,
+    ) -> Self {
         let from = t0.unwrap_or(0.0);
         let to = from + map.direction.sign() * map.tau;
         let (stages, form, rate) = match (flow.form(), t0) {
@@ -307,7 +313,7 @@ fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<S
 }
 
 /// What `give` does with a path.
-pub(super) fn verdict(map: &FlowMap, steps: usize) -> Verdict {
+pub(in crate::backend::cuda) fn verdict(map: &FlowMap, steps: usize) -> Verdict {
     Verdict {
         zero_where_left: i32::from(map.boundary == Boundary::Zero),
         by_lived: i32::from(map.normalisation == Normalisation::Lived),

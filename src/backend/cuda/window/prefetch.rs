@@ -1,27 +1,29 @@
-//! Which snapshots come over before a window asks for them: the bookkeeping, in the order of reading.
+//! The queue of snapshots on their way to the device: those that a window needs now come first, then those that later windows will need, in the order in
+//! which they are read.
 
 use crate::field::Snapshot;
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 
-/// Snapshots that are expected, and what `T` holds of those that came over.
+/// Snapshots to upload, and what `T` holds of those that are uploaded and not yet taken.
 #[derive(Debug)]
-pub(in crate::backend::cuda) struct PrefetchQueue<T> {
+pub(super) struct PrefetchQueue<T> {
     entries: VecDeque<Entry<T>>,
 }
 
 #[derive(Debug)]
 struct Entry<T> {
-    /// Weak, so that what nobody wants after all is not kept for it.
+    /// Weak, so that a snapshot that no window wants after all is not kept for it.
     host: Weak<Snapshot>,
+    is_needed: bool,
     stage: Stage<T>,
 }
 
 #[derive(Debug)]
 enum Stage<T> {
     Waiting,
-    OnTheWay,
-    There(Arc<T>),
+    Uploading,
+    Uploaded(Arc<T>),
 }
 
 impl<T> Default for PrefetchQueue<T> {
@@ -31,52 +33,70 @@ impl<T> Default for PrefetchQueue<T> {
 }
 
 impl<T> PrefetchQueue<T> {
-    /// One that will be wanted after all that were expected before.
-    pub(in crate::backend::cuda) fn expect(&mut self, snapshot: &Arc<Snapshot>) {
+    /// Adds a snapshot that will be needed after all that were added before.
+    pub(super) fn expect(&mut self, snapshot: &Arc<Snapshot>) {
         self.entries.retain(|e| !matches!(e.stage, Stage::Waiting) || e.host.strong_count() > 0);
-        self.entries.push_back(Entry { host: Arc::downgrade(snapshot), stage: Stage::Waiting });
+        self.entries.push_back(Entry { host: Arc::downgrade(snapshot), is_needed: false, stage: Stage::Waiting });
     }
 
-    /// The next one to bring, when fewer than `most` are there or on the way and it fits; it then is on its way.
-    pub(in crate::backend::cuda) fn next(&mut self, most: usize, fits: impl Fn(&Snapshot) -> bool) -> Option<Arc<Snapshot>> {
-        if self.entries.iter().filter(|e| !matches!(e.stage, Stage::Waiting)).count() >= most {
+    /// Moves a snapshot that a window needs now before all others.
+    pub(super) fn need(&mut self, snapshot: &Arc<Snapshot>) {
+        match self.find(snapshot) {
+            Some(at) => self.entries[at].is_needed = true,
+            None => {
+                let at = self.entries.iter().position(|e| !e.is_needed).unwrap_or(self.entries.len());
+                self.entries.insert(at, Entry { host: Arc::downgrade(snapshot), is_needed: true, stage: Stage::Waiting });
+            }
+        }
+    }
+
+    /// The next needed snapshot to upload; it counts as uploading from then on.
+    pub(super) fn next_needed(&mut self) -> Option<Arc<Snapshot>> {
+        self.begin(|e| e.is_needed)
+    }
+
+    /// The next snapshot to upload early, if fewer than `most` are uploaded or uploading and it fits.
+    pub(super) fn next_early(&mut self, most: usize, fits: impl Fn(&Snapshot) -> bool) -> Option<Arc<Snapshot>> {
+        if self.entries.iter().filter(|e| !e.is_needed && !matches!(e.stage, Stage::Waiting)).count() >= most {
             return None;
         }
-        let waiting = self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::Waiting));
+        let mut waiting = self.entries.iter().filter(|e| !e.is_needed && matches!(e.stage, Stage::Waiting));
+        let first = waiting.find_map(|e| e.host.upgrade())?;
+        if fits(&first) { self.begin(|e| std::ptr::eq(e.host.as_ptr(), Arc::as_ptr(&first))) } else { None }
+    }
+
+    fn begin(&mut self, which: impl Fn(&Entry<T>) -> bool) -> Option<Arc<Snapshot>> {
+        let waiting = self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::Waiting) && which(e));
         let (entry, snapshot) = waiting.filter_map(|e| e.host.upgrade().map(|s| (e, s))).next()?;
-        if !fits(&snapshot) {
-            return None;
-        }
-        entry.stage = Stage::OnTheWay;
+        entry.stage = Stage::Uploading;
         Some(snapshot)
     }
 
-    /// What became of one that was on its way; none: whoever wants it brings it himself.
-    pub(in crate::backend::cuda) fn arrived(&mut self, snapshot: &Arc<Snapshot>, there: Option<Arc<T>>) {
+    /// Ends the upload of a snapshot. `None`: it failed, and the snapshot leaves the queue.
+    pub(super) fn end(&mut self, snapshot: &Arc<Snapshot>, uploaded: Option<Arc<T>>) {
         let Some(at) = self.find(snapshot) else { return };
-        match there {
-            Some(there) => self.entries[at].stage = Stage::There(there),
+        match uploaded {
+            Some(uploaded) => self.entries[at].stage = Stage::Uploaded(uploaded),
             None => drop(self.entries.remove(at)),
         }
     }
 
-    /// Whether it is worth waiting for.
-    pub(in crate::backend::cuda) fn is_on_the_way(&self, snapshot: &Arc<Snapshot>) -> bool {
-        self.find(snapshot).is_some_and(|at| matches!(self.entries[at].stage, Stage::OnTheWay))
+    /// Whether a snapshot is being uploaded.
+    pub(super) fn is_uploading(&self, snapshot: &Arc<Snapshot>) -> bool {
+        self.find(snapshot).is_some_and(|at| matches!(self.entries[at].stage, Stage::Uploading))
     }
 
-    /// What is there of a window's snapshots. Everything that was expected before the newest of them is forgotten: what the window has
-    /// not taken by then, it never will.
-    pub(in crate::backend::cuda) fn take(&mut self, window: &[&Arc<Snapshot>]) -> Vec<Arc<T>> {
+    /// Takes the uploaded snapshots of a window. Everything that was added before the newest of them is forgotten: the window has passed it.
+    pub(super) fn take(&mut self, window: &[&Arc<Snapshot>]) -> Vec<Arc<T>> {
         let wanted = |e: &Entry<T>| window.iter().any(|s| std::ptr::eq(e.host.as_ptr(), Arc::as_ptr(s)));
         let count = self.entries.iter().rposition(wanted).map_or(0, |last| last + 1);
         let taken = self.entries.drain(..count).filter(wanted);
-        taken.filter_map(|e| if let Stage::There(there) = e.stage { Some(there) } else { None }).collect()
+        taken.filter_map(|e| if let Stage::Uploaded(uploaded) = e.stage { Some(uploaded) } else { None }).collect()
     }
 
-    /// Lets go of what is there; it comes over again in its turn.
-    pub(in crate::backend::cuda) fn let_go(&mut self) {
-        self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::There(_))).for_each(|e| e.stage = Stage::Waiting);
+    /// Drops what is uploaded; it is uploaded again in its turn.
+    pub(super) fn release(&mut self) {
+        self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::Uploaded(_))).for_each(|e| e.stage = Stage::Waiting);
     }
 
     fn find(&self, snapshot: &Arc<Snapshot>) -> Option<usize> {
@@ -95,60 +115,74 @@ mod tests {
         (0..count).map(|t| Arc::new(Snapshot::new(t as f64, grid.clone(), vec![[0.0; 4]; 4]))).collect()
     }
 
-    fn bring(ahead: &mut PrefetchQueue<f64>) -> Option<f64> {
-        let next = ahead.next(2, |_| true)?;
-        ahead.arrived(&next, Some(Arc::new(next.time)));
+    fn upload(queue: &mut PrefetchQueue<f64>) -> Option<f64> {
+        let next = queue.next_early(2, |_| true)?;
+        queue.end(&next, Some(Arc::new(next.time)));
         Some(next.time)
     }
 
     #[test]
     fn the_next_two_come_over_in_order_and_a_slide_takes_the_first() {
         let s = snapshots(5);
-        let mut ahead = PrefetchQueue::default();
-        s.iter().for_each(|s| ahead.expect(s));
-        assert!(ahead.next(2, |_| false).is_none(), "what does not fit stays");
-        assert_eq!((bring(&mut ahead), bring(&mut ahead), bring(&mut ahead)), (Some(0.0), Some(1.0), None));
-        let taken = ahead.take(&[&s[0]]);
+        let mut queue = PrefetchQueue::default();
+        s.iter().for_each(|s| queue.expect(s));
+        assert!(queue.next_early(2, |_| false).is_none(), "what does not fit stays");
+        assert_eq!((upload(&mut queue), upload(&mut queue), upload(&mut queue)), (Some(0.0), Some(1.0), None));
+        let taken = queue.take(&[&s[0]]);
         assert_eq!(taken.len(), 1);
         assert_eq!(*taken[0], 0.0);
-        assert_eq!(bring(&mut ahead), Some(2.0), "there is room again");
+        assert_eq!(upload(&mut queue), Some(2.0), "there is room again");
         // A window that wants the fourth has passed the second and the third by, and brings the fourth itself.
-        assert!(ahead.take(&[&s[0], &s[3]]).is_empty());
-        assert_eq!(bring(&mut ahead), Some(4.0));
-        assert_eq!(ahead.take(&[&s[3], &s[4]]).len(), 1);
+        assert!(queue.take(&[&s[0], &s[3]]).is_empty());
+        assert_eq!(upload(&mut queue), Some(4.0));
+        assert_eq!(queue.take(&[&s[3], &s[4]]).len(), 1);
     }
 
     #[test]
     fn one_on_its_way_is_waited_for_and_one_that_fails_is_not() {
         let s = snapshots(2);
-        let mut ahead = PrefetchQueue::<f64>::default();
-        s.iter().for_each(|s| ahead.expect(s));
-        let first = ahead.next(2, |_| true).unwrap();
-        assert!(ahead.is_on_the_way(&s[0]) && !ahead.is_on_the_way(&s[1]));
-        ahead.arrived(&first, None);
-        assert!(!ahead.is_on_the_way(&s[0]));
-        assert_eq!(bring(&mut ahead), Some(1.0));
-        ahead.let_go();
-        assert_eq!(bring(&mut ahead), Some(1.0), "let go, it comes again");
+        let mut queue = PrefetchQueue::<f64>::default();
+        s.iter().for_each(|s| queue.expect(s));
+        let first = queue.next_early(2, |_| true).unwrap();
+        assert!(queue.is_uploading(&s[0]) && !queue.is_uploading(&s[1]));
+        queue.end(&first, None);
+        assert!(!queue.is_uploading(&s[0]));
+        assert_eq!(upload(&mut queue), Some(1.0));
+        queue.release();
+        assert_eq!(upload(&mut queue), Some(1.0), "let go, it comes again");
         // Passed by while on its way: what arrives is not kept.
         let s = snapshots(2);
-        let mut ahead = PrefetchQueue::<f64>::default();
-        s.iter().for_each(|s| ahead.expect(s));
-        let first = ahead.next(1, |_| true).unwrap();
-        assert!(ahead.take(&[&s[1]]).is_empty());
-        ahead.arrived(&first, Some(Arc::new(0.0)));
-        assert!(ahead.entries.is_empty());
+        let mut queue = PrefetchQueue::<f64>::default();
+        s.iter().for_each(|s| queue.expect(s));
+        let first = queue.next_early(1, |_| true).unwrap();
+        assert!(queue.take(&[&s[1]]).is_empty());
+        queue.end(&first, Some(Arc::new(0.0)));
+        assert!(queue.entries.is_empty());
     }
 
     #[test]
     fn what_nobody_holds_any_more_is_forgotten() {
         let mut s = snapshots(3);
-        let mut ahead = PrefetchQueue::<f64>::default();
-        s.iter().for_each(|s| ahead.expect(s));
+        let mut queue = PrefetchQueue::<f64>::default();
+        s.iter().for_each(|s| queue.expect(s));
         let kept = s.pop().unwrap();
         s.clear();
-        assert_eq!(bring(&mut ahead), Some(2.0));
-        ahead.expect(&kept);
-        assert_eq!(ahead.entries.len(), 2, "the dead ones are gone");
+        assert_eq!(upload(&mut queue), Some(2.0));
+        queue.expect(&kept);
+        assert_eq!(queue.entries.len(), 2, "the dead ones are gone");
+    }
+
+    #[test]
+    fn what_a_window_needs_comes_before_what_is_expected() {
+        let s = snapshots(4);
+        let mut queue = PrefetchQueue::<f64>::default();
+        s[..3].iter().for_each(|s| queue.expect(s));
+        queue.need(&s[2]);
+        queue.need(&s[3]);
+        let needed: Vec<f64> = std::iter::from_fn(|| queue.next_needed()).map(|s| s.time).collect();
+        assert_eq!(needed, [3.0, 2.0], "one that was not expected is needed all the same");
+        queue.end(&s[2], Some(Arc::new(2.0)));
+        queue.end(&s[3], None);
+        assert_eq!(queue.take(&[&s[2], &s[3]]).len(), 1, "one that failed is not there");
     }
 }

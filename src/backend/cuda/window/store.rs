@@ -1,5 +1,6 @@
-//! Snapshots on the device: each comes over once, those that are expected by a thread of their own, while frames of the slide before are
-//! made. A window that slides keeps what it still needs; a snapshot's memory is free again once no tracer uses it.
+//! Snapshots on the device. Every snapshot is uploaded once, through one queue: a thread uploads what later windows will need, while the frames of the
+//! present slide are made, and a window uploads what is still missing. A window that slides keeps what it still needs; a snapshot's memory is free again
+//! once no tracer uses it.
 
 use crate::backend::cuda::window::grid::{Nodes, storage_define};
 use crate::backend::cuda::window::prefetch::PrefetchQueue;
@@ -16,16 +17,16 @@ use std::time::{Duration, Instant};
 /// Half-precision velocities of the first window are scaled to below this, which leaves later ones room to grow sevenfold.
 const HALF_PEAK: f32 = 4096.0;
 /// Largest half-precision velocity that is used, so that changes fit too; beyond it the window is encoded anew.
-const HALF_MOST: f32 = 30_000.0;
+const HALF_MAX: f32 = 30_000.0;
 /// Snapshots that come over before a window wants them, at most.
-const AHEAD: usize = 2;
+const MAX_PREFETCHED: usize = 2;
 /// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
-const AHEAD_SHARE: u64 = 4;
+const PREFETCH_SHARE: u64 = 4;
 /// How often memory that others still hold is asked for again, and how long at most: beyond it they give it back, or use it again.
-const SOON: Duration = Duration::from_millis(20);
-const AT_MOST: Duration = Duration::from_millis(100);
+const RETRY: Duration = Duration::from_millis(20);
+const RETRY_LIMIT: Duration = Duration::from_millis(100);
 /// Threads that copy expected snapshots to page-locked memory, at most: as many as keep the bus busy.
-const COPIERS: usize = 4;
+const MAX_COPY_THREADS: usize = 4;
 
 /// One snapshot on the device.
 #[derive(Debug)]
@@ -82,20 +83,20 @@ struct Shared {
     /// Told of every change that somebody may wait for.
     changed: Condvar,
     /// Locked behind `state`, never before it.
-    carrier: Mutex<SnapshotUploader>,
+    uploader: Mutex<SnapshotUploader>,
 }
 
 #[derive(Debug, Default)]
 struct State {
     /// Those of the latest window.
     held: Vec<Arc<DeviceSnapshot>>,
-    ahead: PrefetchQueue<DeviceSnapshot>,
+    queue: PrefetchQueue<DeviceSnapshot>,
     /// How the latest window is held: storage and scale. None before the first.
     form: Option<(Storage, f32)>,
     /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's as soon as nobody else holds it.
     gone: Vec<(Arc<Snapshot>, Instant)>,
-    brought: u64,
-    brought_ahead: u64,
+    uploaded: u64,
+    prefetched: u64,
     /// Whether the thread is there.
     helped: bool,
     ended: bool,
@@ -105,18 +106,18 @@ impl SnapshotStore {
     /// Nothing there yet.
     pub fn new(gpu: &Arc<Gpu>) -> Self {
         let shared =
-            Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), carrier: Mutex::new(SnapshotUploader::new(gpu)) };
+            Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), uploader: Mutex::new(SnapshotUploader::new(gpu)) };
         Self { shared: Arc::new(shared), thread: Mutex::new(None) }
     }
 
-    /// Snapshots brought over so far.
-    pub fn brought(&self) -> u64 {
-        self.shared.state().brought
+    /// Snapshots uploaded over so far.
+    pub fn uploaded(&self) -> u64 {
+        self.shared.state().uploaded
     }
 
     /// Of them, those that were there before a window wanted them.
-    pub fn brought_ahead(&self) -> u64 {
-        self.shared.state().brought_ahead
+    pub fn prefetched(&self) -> u64 {
+        self.shared.state().prefetched
     }
 
     /// A snapshot that windows will want, after those expected before: it comes over beside other work, once there is a window and where
@@ -125,14 +126,14 @@ impl SnapshotStore {
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if thread.is_none() {
             let shared = self.shared.clone();
-            let started = std::thread::Builder::new().name("ridgewatch-upload".into()).spawn(move || shared.bring_expected());
+            let started = std::thread::Builder::new().name("ridgewatch-upload".into()).spawn(move || shared.upload_expected());
             // Without the thread, windows bring their snapshots themselves.
             let Ok(started) = started else { return };
             *thread = Some(started);
         }
         let mut state = self.shared.state();
         state.helped = true;
-        state.ahead.expect(snapshot);
+        state.queue.expect(snapshot);
         self.shared.changed.notify_all();
     }
 
@@ -171,24 +172,24 @@ impl Shared {
         self.changed.wait_timeout(state, time).unwrap_or_else(PoisonError::into_inner).0
     }
 
-    fn carry(&self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<Arc<DeviceSnapshot>, DeviceError> {
-        let mut carrier = self.carrier.lock().unwrap_or_else(PoisonError::into_inner);
-        carrier.carry(snapshot, storage, scale).map(Arc::new)
+    fn upload(&self, snapshot: &Arc<Snapshot>, storage: Storage, scale: f32) -> Result<Arc<DeviceSnapshot>, DeviceError> {
+        let mut uploader = self.uploader.lock().unwrap_or_else(PoisonError::into_inner);
+        uploader.upload(snapshot, storage, scale).map(Arc::new)
     }
 
     fn window(&self, window: &Window, storage: Storage) -> Result<DeviceWindow, DeviceError> {
         let wanted: Vec<&Arc<Snapshot>> = window.snapshots().collect();
         let mut state = self.state();
-        while wanted.iter().any(|s| state.ahead.is_on_the_way(s)) {
+        while wanted.iter().any(|s| state.queue.is_uploading(s)) {
             state = self.wait(state);
         }
         if state.form.is_some_and(|(held, _)| held != storage) {
             state.held.clear();
-            state.ahead.let_go();
+            state.queue.release();
             state.form = None;
         }
-        let taken = state.ahead.take(&wanted);
-        state.brought_ahead += taken.len() as u64;
+        let taken = state.queue.take(&wanted);
+        state.prefetched += taken.len() as u64;
         state.held.extend(taken);
         let (held, gone) = std::mem::take(&mut state.held).into_iter().partition(|s| wanted.iter().any(|w| Arc::ptr_eq(w, &s.host)));
         state.held = held;
@@ -214,10 +215,10 @@ impl Shared {
         let mut scale = state.held.first().map_or(1.0, |s| s.scale);
         if storage != Storage::F32 {
             let peak = missing.iter().map(|s| peak(s)).fold(0.0, f32::max);
-            if state.held.is_empty() || peak / scale > HALF_MOST {
+            if state.held.is_empty() || peak / scale > HALF_MAX {
                 // A power of two, so that nothing but range is changed.
                 state.held.clear();
-                state.ahead.let_go();
+                state.queue.release();
                 missing = fresh(&state);
                 let peak = missing.iter().map(|s| self::peak(s)).fold(f32::MIN_POSITIVE, f32::max);
                 scale = (peak / HALF_PEAK).log2().ceil().clamp(-100.0, 100.0).exp2();
@@ -226,7 +227,7 @@ impl Shared {
         let needed = |bytes: u64| missing.iter().map(|s| s.nodes.len() as u64 * bytes).sum::<u64>();
         if needed(storage.bytes()) > self.gpu.memory_left() {
             // What is here early makes room for what is wanted now.
-            state.ahead.let_go();
+            state.queue.release();
         }
         let left = self.gpu.memory_left();
         if needed(storage.bytes()) > left {
@@ -240,12 +241,14 @@ impl Shared {
                 left,
             });
         }
-        // What comes over from here on is held so, also when not all of it can.
+        // What is uploaded from here on has this form, even if the window fails.
         state.form = Some((storage, scale));
-        for snapshot in &missing {
-            let there = self.carry(snapshot, storage, scale)?;
-            state.held.push(there);
-            state.brought += 1;
+        missing.iter().for_each(|snapshot| state.queue.need(snapshot));
+        while let Some(snapshot) = state.queue.next_needed() {
+            let uploaded = self.upload(&snapshot, storage, scale);
+            state.queue.end(&snapshot, None);
+            state.uploaded += 1;
+            state.held.push(uploaded?);
         }
         let doing = DeviceError::driver("ordering the transfer of snapshots");
         let mut snapshots = Vec::with_capacity(wanted.len());
@@ -279,8 +282,8 @@ impl Shared {
     }
 
     /// The thread: brings what is expected, and gives back the memory of what is gone.
-    fn bring_expected(&self) {
-        let copiers = (rayon::current_num_threads() / 4).clamp(1, COPIERS);
+    fn upload_expected(&self) {
+        let copiers = (rayon::current_num_threads() / 4).clamp(1, MAX_COPY_THREADS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(copiers).thread_name(|i| format!("ridgewatch-copy-{i}")).build();
         let mut state = self.state();
         let Ok(pool) = pool else {
@@ -288,40 +291,40 @@ impl Shared {
             return;
         };
         while !state.ended {
-            let over = |(snapshot, since): &(Arc<Snapshot>, Instant)| Arc::strong_count(snapshot) == 1 || since.elapsed() >= AT_MOST;
+            let over = |(snapshot, since): &(Arc<Snapshot>, Instant)| Arc::strong_count(snapshot) == 1 || since.elapsed() >= RETRY_LIMIT;
             let (gone, held): (Vec<_>, Vec<_>) = std::mem::take(&mut state.gone).into_iter().partition(over);
             state.gone = held;
             let next = state.form.and_then(|form| {
-                let fits = |s: &Snapshot| s.nodes.len() as u64 * form.0.bytes() <= self.gpu.memory_left() / AHEAD_SHARE;
-                state.ahead.next(AHEAD, fits).map(|snapshot| (snapshot, form))
+                let fits = |s: &Snapshot| s.nodes.len() as u64 * form.0.bytes() <= self.gpu.memory_left() / PREFETCH_SHARE;
+                state.queue.next_early(MAX_PREFETCHED, fits).map(|snapshot| (snapshot, form))
             });
             if gone.is_empty() && next.is_none() {
-                state = if state.gone.is_empty() { self.wait(state) } else { self.wait_at_most(state, SOON) };
+                state = if state.gone.is_empty() { self.wait(state) } else { self.wait_at_most(state, RETRY) };
                 continue;
             }
             drop(state);
             gone.into_iter().filter_map(|(snapshot, _)| Arc::into_inner(snapshot)).for_each(give_back);
-            let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.bring_one(snapshot, *form));
+            let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.upload_early(snapshot, *form));
             // A panic must not leave a window waiting for what will never come.
             let there = next.as_ref().and_then(|next| catch_unwind(AssertUnwindSafe(|| bring(next))).ok().flatten());
             state = self.state();
             if let Some((snapshot, form)) = next {
                 // A window may have been encoded anew meanwhile.
                 let there = there.filter(|_| state.form == Some(form));
-                state.brought += u64::from(there.is_some());
-                state.ahead.arrived(&snapshot, there);
+                state.uploaded += u64::from(there.is_some());
+                state.queue.end(&snapshot, there);
                 self.changed.notify_all();
             }
         }
     }
 
-    /// One expected snapshot; none where it cannot come over now. The window that wants it then brings it, and says what is wrong.
-    fn bring_one(&self, snapshot: &Arc<Snapshot>, (storage, scale): (Storage, f32)) -> Option<Arc<DeviceSnapshot>> {
-        if storage != Storage::F32 && peak(snapshot) / scale > HALF_MOST {
+    /// Uploads one expected snapshot; `None` if it cannot be uploaded now. The window that needs it then uploads it, and reports the error.
+    fn upload_early(&self, snapshot: &Arc<Snapshot>, (storage, scale): (Storage, f32)) -> Option<Arc<DeviceSnapshot>> {
+        if storage != Storage::F32 && peak(snapshot) / scale > HALF_MAX {
             return None;
         }
         // A failure shows again when the window brings the snapshot itself.
-        self.carry(snapshot, storage, scale).ok()
+        self.upload(snapshot, storage, scale).ok()
     }
 }
 

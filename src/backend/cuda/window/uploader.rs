@@ -35,7 +35,7 @@ impl SnapshotUploader {
     }
 
     /// Enqueues the whole snapshot; [`DeviceSnapshot::ready`] tells when it is there. Velocities are divided by `scale`.
-    pub(in crate::backend::cuda) fn carry(
+    pub(in crate::backend::cuda) fn upload(
         &mut self,
         snapshot: &Arc<Snapshot>,
         storage: Storage,
