@@ -13,7 +13,7 @@ use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
     Architecture, Average, Encoding, Input, Loss, Model, NetworkSettings, Objective, PlannedStep, Row, Target, row, stock_step,
 };
-use ridgewatch::surrogate::{Brought, Offload, Predict, SampleRing, Samples, Table};
+use ridgewatch::surrogate::{Brought, Offload, Predict, ReplayBuffer, Samples, Table};
 
 /// Whether all inputs have their places in a point, and there is one output; the others are tested in `network_flow_map`.
 pub(super) fn is_plain(case: &Case) -> bool {
@@ -478,8 +478,8 @@ fn a_ring_is_followed_wherever_it_writes() {
     let offload = CudaOffload::new(&gpu());
     assert!(offload.takes(&model.shape, &objective));
     let mut device = offload.training(&model, &objective, &average, 1 << 16, 1 << 10).unwrap();
-    let mut ring = SampleRing::new(1000);
-    let mut follow = |ring: &SampleRing, broken: usize| {
+    let mut ring = ReplayBuffer::new(1000);
+    let mut follow = |ring: &ReplayBuffer, broken: usize| {
         assert_eq!(device.bring(ring, None).unwrap(), Brought { usable: ring.len() - broken, dropped: broken });
         let found = device.steps(&[step(ring.len(), 1e-12)]).unwrap()[0];
         let finite: Vec<usize> = (0..ring.len()).filter(|&i| ring.samples().log_stretch[i].is_finite()).collect();
@@ -506,7 +506,7 @@ fn a_ring_is_followed_wherever_it_writes() {
     follow(&ring, 1);
     ring.revalidate(1.0);
     follow(&ring, 1);
-    follow(&SampleRing::holding(&labels(700, 10)), 0);
+    follow(&ReplayBuffer::holding(&labels(700, 10)), 0);
     assert!(device.device_seconds() > 0.0 && device.device_seconds() == 0.0, "asked for once");
 }
 

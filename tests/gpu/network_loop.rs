@@ -8,7 +8,7 @@ use ridgewatch::backend::{Device, WhenLost};
 use ridgewatch::flow::Tracer;
 use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
-use ridgewatch::surrogate::{Kind, Offload, SampleRing, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, Offload, ReplayBuffer, SurrogateSettings, build};
 use std::sync::Arc;
 
 /// A small run that trains a fixed number of steps a frame.
@@ -325,7 +325,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     let (log2_table, batch) = if small() { (12, 1 << 10) } else { (18, 1 << 16) };
     let network = NetworkSettings { levels: 8, log2_table, batch, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: batch / 4, ..NetworkSettings::default() };
-    let ring = SampleRing::holding(&traced(&tracer, uniform_points(1, 20_000), false));
+    let ring = ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 20_000), false));
     let (rounds, steps) = if small() { (1, 10) } else { (3, 1000) };
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);

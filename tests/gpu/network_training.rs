@@ -14,7 +14,7 @@ use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{
     Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, row,
 };
-use ridgewatch::surrogate::{Kind, Offload, SampleRing, Samples, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, Offload, ReplayBuffer, Samples, SurrogateSettings, build};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -231,7 +231,7 @@ fn a_loss_that_is_no_number_is_rolled_back() {
     let mut network = build(&kind, &settings, tracer.domain(), 5, &tracer).unwrap();
     network.offload(&(Arc::new(CudaOffload::new(&gpu())) as Arc<dyn Offload>));
     let points = uniform_points(2, 2_000);
-    let mut predictions = |learned: &SampleRing, seconds, steps| {
+    let mut predictions = |learned: &ReplayBuffer, seconds, steps| {
         let learned = network.learn(learned, seconds, steps);
         assert!(network.is_offloaded() && learned.device_seconds.is_some_and(|seconds| seconds > 0.0), "{learned:?}");
         let mut values = vec![f32::NAN; points.len()];
@@ -240,10 +240,10 @@ fn a_loss_that_is_no_number_is_rolled_back() {
     };
     // As many at least as lie between two copies of what is good.
     let steps = if small() { 64 } else { 100 };
-    let (learned, before) = predictions(&SampleRing::holding(&samples), 600.0, steps);
+    let (learned, before) = predictions(&ReplayBuffer::holding(&samples), 600.0, steps);
     assert_eq!((learned.steps, learned.rollbacks, learned.lost_steps), (steps, 0, 0));
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples };
-    let (learned, after) = predictions(&SampleRing::holding(&poison), 2.0, 20);
+    let (learned, after) = predictions(&ReplayBuffer::holding(&poison), 2.0, 20);
     assert!(learned.rollbacks > 0 && learned.steps == 0 && learned.lost_steps > 0, "{learned:?}");
     assert!(before.iter().all(|value| value.is_finite()) && after == before, "what predicts is what it was");
 }
