@@ -64,7 +64,8 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
         let network = NetworkSettings { target: Target::FlowMap, jacobian_weight, ..small() };
         let mut surrogate = surrogate(Kind::Network, &network, &tracer);
         let first = surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap().loss.unwrap();
-        let last = (0..14).map(|_| surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap().loss.unwrap()).last().unwrap();
+        let last =
+            (0..14).map(|_| surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap().loss.unwrap()).last().unwrap();
         assert!(last < 0.5 * first, "weight {jacobian_weight}: loss {first}, then {last}");
         // A network that has learned nothing maps every point nearly onto itself: hardly any stretch. Derivatives lag behind values, so in
         // 300 steps only a third of the way is asked for.
@@ -73,7 +74,10 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
     }
     // Labels that lack what the target asks for are dropped, not trained on.
     let network = NetworkSettings { target: Target::FlowMap, ..small() };
-    assert_eq!(surrogate(Kind::Network, &network, &tracer).learn(&ReplayBuffer::holding(&held_out), f64::INFINITY, 20).unwrap().dropped, 2_000);
+    assert_eq!(
+        surrogate(Kind::Network, &network, &tracer).learn(&ReplayBuffer::holding(&held_out), f64::INFINITY, 20).unwrap().dropped,
+        2_000
+    );
 }
 
 #[test]
