@@ -42,7 +42,7 @@ pub fn device_when_lost(settings: GpuSettings, when_lost: WhenLost) -> Device {
 /// A surrogate whose table and network are on the device.
 pub fn resident(gpu: &Arc<Gpu>, kind: Kind, nodes: [usize; 3], network: &NetworkSettings, tracer: &CudaTracer) -> Hybrid<OnGpu> {
     let training = |model| CudaTraining::new(gpu, HostNetwork::fresh(model), true);
-    Hybrid::new(kind, nodes, network, 5, tracer, training).unwrap().unwrap()
+    Hybrid::<OnGpu>::new(kind, nodes, network, 5, tracer, training).unwrap().unwrap()
 }
 
 /// All frames of a scene with further `keys`.
