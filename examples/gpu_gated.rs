@@ -7,18 +7,16 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::backend::cuda::{CudaAccelerator, Gpu, GpuSettings};
-use ridgewatch::backend::{Device, Storage, stratified_points};
+use ridgewatch::backend::cuda::{Gpu, GpuSettings};
+use ridgewatch::backend::{CudaDevice, Device, Storage, TracedOnce, WhenLost, stratified_points};
 use ridgewatch::config::SceneFile;
-use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
-use ridgewatch::run::{CheckpointRecord, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, run, trace};
+use ridgewatch::run::{CheckpointRecord, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, run};
 use ridgewatch::surrogate::Kind;
 use ridgewatch::surrogate::network::Encoding;
 use ridgewatch::trust::Strata;
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
@@ -69,11 +67,11 @@ fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
 /// One transfer function for all pictures, scaled to this field as a bare file's would be.
 fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let mut setup = Setup::new(settings.clone()).unwrap();
-    let slide = setup.feed.next_slide().unwrap().unwrap();
-    let (tracer, _) = device.tracer(slide.velocity, &setup.plan.map, slide.time).unwrap();
+    let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
     let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
-    let labels = trace(&*tracer, &points, Extras::default()).samples.log_stretch;
-    let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).collect();
+    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
+    let TracedOnce { flow, traced, .. } = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).unwrap();
+    let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
     TransferSettings::default().scaled_to(&ftle)
 }
 
@@ -164,7 +162,8 @@ fn main() {
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
     let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
-    let device = Device::Gpu { gpu: Arc::new(CudaAccelerator::new(gpu.clone(), Storage::F32)), may_fall_back: false };
+    let device = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
+    let device = Device::Cuda(device);
     let text = include_str!("../configs/turbulence_easy.toml");
     let mut keys = vec!["flow.steps=22".to_owned()];
     keys.extend(NETWORK.map(str::to_owned));

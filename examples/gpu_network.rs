@@ -51,9 +51,7 @@ mod bench {
     use ridgewatch::field::Domain;
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
-    use ridgewatch::flow::{
-        Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
-    };
+    use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
     use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale, Target};
     use std::error::Error;
     use std::sync::Arc;
@@ -269,7 +267,7 @@ mod bench {
             };
             let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
             let exact = CudaTracer::new(&store, &gpu, source.clone(), &map(220, Precision::F64), 0.0, Tuning::default())?;
-            let domain = tracer.domain().clone();
+            let domain = tracer.host().domain().clone();
             let points = KnownPoints::new(&gpu, &domain, tracer.device(), exact.device())?;
             Ok(Self { gpu, source, store, tracer, domain, steps, points })
         }

@@ -3,47 +3,80 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::backend::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
-use ridgewatch::backend::{Device, Storage};
+use ridgewatch::backend::cuda::{Cuda, CudaSamples, CudaSurrogate, CudaTracer, DeviceError, Gpu, GpuSettings};
+use ridgewatch::backend::{
+    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, Device, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest,
+    WhenLost,
+};
 use ridgewatch::config::SceneFile;
 use ridgewatch::field::Snapshot;
 use ridgewatch::field::turbulence::Turbulence;
-use ridgewatch::flow::{FlowMap, Tracer, VelocitySource};
-use ridgewatch::run::{Accelerator, DeviceRenderer, Event, FrameRecord, Health, RunOptions, Setup, run};
-use ridgewatch::source::MemorySource;
+use ridgewatch::flow::{FlowMap, VelocitySource};
+use ridgewatch::render::Renderer;
+use ridgewatch::run::{Event, FrameRecord, RunOptions, Setup, run_on};
+use ridgewatch::source::{Listener, MemorySource};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-/// The GPU, with a clock on what a slide asks of it; told of snapshots ahead or not.
-#[derive(Debug)]
-struct Timed {
-    inner: CudaAccelerator,
-    ahead: bool,
-    tracer_seconds: Mutex<Vec<f64>>,
+/// Clock on what slides ask of a GPU.
+#[derive(Default)]
+struct Clock {
+    tracer_seconds: Vec<f64>,
+    /// Snapshots uploaded as of the latest slide, and those of them that were uploaded before a window needed them.
+    uploaded: u64,
+    ahead: u64,
 }
 
-impl Accelerator for Timed {
+/// The GPU with a clock; uploads snapshots ahead or not.
+struct Timed {
+    inner: Cuda,
+    ahead: bool,
+    clock: Arc<Mutex<Clock>>,
+}
+
+impl Backend for Timed {
+    type Tracer = CudaTracer;
+    type Surrogate = CudaSurrogate;
+    type Samples = CudaSamples;
+
     fn name(&self) -> String {
         self.inner.name()
     }
-    fn health(&self) -> &Arc<Health> {
-        self.inner.health()
+    fn prefetch(&self) -> Option<Listener> {
+        self.inner.prefetch().filter(|_| self.ahead)
     }
-    fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, CudaTracerError> {
+    fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<CudaTracer, BackendError> {
         let began = Instant::now();
-        let tracer = self.inner.tracer(source, map, t0);
-        self.tracer_seconds.lock().unwrap().push(began.elapsed().as_secs_f64());
+        let tracer = self.inner.tracer(velocity, map, t0);
+        let mut clock = self.clock.lock().unwrap();
+        clock.tracer_seconds.push(began.elapsed().as_secs_f64());
+        (clock.uploaded, clock.ahead) = (self.inner.snapshots().brought(), self.inner.snapshots().brought_ahead());
         tracer
     }
-    fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError> {
-        self.inner.renderer()
+    fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &CudaTracer) -> Result<CudaSurrogate, BackendError> {
+        self.inner.surrogate(request, tracer)
     }
-    fn expect(&self, snapshot: &Arc<Snapshot>) {
-        if self.ahead {
-            self.inner.expect(snapshot);
-        }
+    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let &FrameJob { tracer, surrogate, routing, picture, samples, progress, stop } = job;
+        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, progress, stop }, renderer)
+    }
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        surrogate: Option<&FrozenOf<Self>>,
+    ) -> Result<AuditFindings, DeviceError> {
+        self.inner.audit(request, tracer, surrogate)
+    }
+    fn replan(
+        &mut self,
+        shortage: &DeviceError,
+        tracer: &CudaTracer,
+        surrogate: &mut Option<CudaSurrogate>,
+    ) -> Result<Option<String>, DeviceError> {
+        self.inner.replan(shortage, tracer, surrogate)
     }
 }
 
@@ -83,16 +116,16 @@ fn main() {
     for (what, ahead, slides, frames_per_slide) in
         [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)]
     {
-        let device = Timed { inner: CudaAccelerator::new(gpu.clone(), Storage::F32), ahead, tracer_seconds: Mutex::default() };
-        let device = Arc::new(device);
-        let seen = stream(&gpu, &device, [width, height], shape, slides, frames_per_slide);
+        let clock = Arc::<Mutex<Clock>>::default();
+        let device = Timed { inner: Cuda::new(&gpu, Storage::F32), ahead, clock: clock.clone() };
+        let seen = stream(&gpu, device, [width, height], shape, slides, frames_per_slide);
+        let clock = clock.lock().unwrap();
         let of = |with_slide: bool| seen.iter().filter(move |s| s.record.slide > 0 && (s.record.seconds.slide > 0.0) == with_slide);
-        let tracers = device.tracer_seconds.lock().unwrap();
         let from_frame_to_frame = |with_slide: bool| spread(of(with_slide).map(|s| s.interval - s.record.seconds.waiting));
         println!(
             "| {what} | {slides} | {frames_per_slide} | {} | {} | {} | {} | {} | {} | {} | {} |",
             spread(of(true).map(|s| s.record.seconds.slide)),
-            spread(tracers.iter().skip(1).copied()),
+            spread(clock.tracer_seconds.iter().skip(1).copied()),
             spread(of(true).map(|s| s.record.seconds.waiting)),
             spread(of(true).map(|s| s.record.seconds.total)),
             spread(of(false).map(|s| s.record.seconds.total)),
@@ -107,8 +140,8 @@ fn main() {
         memory.push(format!(
             "{} frames, {} of {} snapshots ahead: {} to {} MiB taken from the third slide on; free at its begin {} MiB, at the end {} MiB.",
             seen.len(),
-            device.inner.snapshots().brought_ahead(),
-            device.inner.snapshots().brought(),
+            clock.ahead,
+            clock.uploaded,
             least >> 20,
             most >> 20,
             begin >> 20,
@@ -119,7 +152,7 @@ fn main() {
 }
 
 /// Runs the cycle over snapshots that are ready in memory, so that reading costs nothing.
-fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 3], slides: usize, frames_per_slide: usize) -> Vec<Seen> {
+fn stream(gpu: &Arc<Gpu>, device: Timed, size: [usize; 2], shape: [usize; 3], slides: usize, frames_per_slide: usize) -> Vec<Seen> {
     let text = format!(
         "[source]\nkind = \"turbulence\"\nnodes = {shape:?}\n[time]\ntau = 11\nframes_per_slide = {frames_per_slide}\n[flow]\nsteps = 22\n\
          [render]\nmethod = \"reference\"\nwidth = {}\nheight = {}\nsamples = 1\n",
@@ -132,7 +165,8 @@ fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 
     let times = (0..ready.len()).map(|t| t as f64).collect();
     let source = MemorySource::new("streamed turbulence", grid, times, move |index, _| ready[index].take().unwrap()).unwrap();
     let setup = Setup::over(scene.settings(), Some(Box::new(source))).unwrap();
-    let options = RunOptions { device: Device::Gpu { gpu: device.clone(), may_fall_back: false }, ..RunOptions::default() };
+    let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
+    let options = RunOptions { device: Device::Cuda(chosen), ..RunOptions::default() };
     let (mut seen, mut last) = (Vec::new(), Instant::now());
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
@@ -146,7 +180,6 @@ fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 
             });
         }
     };
-    run(setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
-    assert_eq!(device.health().failure(), None);
+    run_on(device, setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
     seen
 }

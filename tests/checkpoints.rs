@@ -9,7 +9,7 @@ use ridgewatch::config::SceneFile;
 use ridgewatch::flow::Tracer;
 use ridgewatch::run::{Event, FrameRecord, RunOptions, RunReport, Setup, run};
 use ridgewatch::surrogate::network::NetworkSettings;
-use ridgewatch::surrogate::{Kind, SampleRing, Surrogate, SurrogateSettings, build};
+use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, SurrogateSettings, build};
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::Command;
@@ -121,13 +121,13 @@ fn a_checkpoint_holds_the_weights_after_its_frame() {
 /// What the process that is killed is told by.
 const TARGET: &str = "RIDGEWATCH_TEST_CHECKPOINT";
 
-fn network() -> Box<dyn Surrogate> {
+fn network() -> HostSurrogate {
     let tracer = DoubleGyre::new(0.0, 5.0, 10);
     // 24 MB a checkpoint, so that it takes a while.
     let network = NetworkSettings { levels: 6, log2_table: 17, ..NetworkSettings::default() };
     let settings = SurrogateSettings { kind: Kind::Network, table_nodes: None };
     let mut surrogate = build(&settings, &network, tracer.domain(), 5, &tracer).unwrap();
-    surrogate.learn(&SampleRing::holding(&traced(&tracer, uniform_points(1, 500), false)), f64::INFINITY, 2);
+    surrogate.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 500), false)), f64::INFINITY, 2).unwrap();
     surrogate
 }
 

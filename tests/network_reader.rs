@@ -7,7 +7,7 @@ mod network_support;
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target, Times};
-use ridgewatch::surrogate::{Kind, SampleRing, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, ReplayBuffer, SurrogateSettings, build};
 use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -59,21 +59,21 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     ] {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        let mut ring = SampleRing::new(2 * samples.len());
+        let mut ring = ReplayBuffer::new(2 * samples.len());
         for (window, samples) in [(&tracer, &samples), (&later, &other)] {
             ring.set_now(Times::new(network, tracer.tau).unit(window.start, window.tau));
             ring.push(samples);
         }
-        surrogate.learn(&ring, f64::INFINITY, 200);
+        surrogate.learn(&ring, f64::INFINITY, 200).unwrap();
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]]);
         if !times.is_empty() {
-            surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30));
+            surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30)).unwrap();
         }
         let mut expected = vec![0.0; points.len()];
-        surrogate.predict(&points, &mut expected);
+        surrogate.predict(&points, &mut expected).unwrap();
         let found = evaluated(&path, &points, times).unwrap();
         assert_eq!(found.len(), expected.len());
         for ((point, found), expected) in points.iter().zip(&found).zip(&expected) {

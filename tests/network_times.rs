@@ -11,7 +11,7 @@ use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::run::{Event, FrameRecord, RunOptions, Setup, run};
 use ridgewatch::surrogate::network::{Input, NetworkSettings, Times};
-use ridgewatch::surrogate::{Kind, Predict, SampleRing, Samples, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, build};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
@@ -19,7 +19,7 @@ const SETTINGS: SurrogateSettings = SurrogateSettings { kind: Kind::Network, tab
 
 fn rms(surrogate: &dyn Predict, samples: &Samples) -> f64 {
     let mut predicted = vec![0.0; samples.len()];
-    surrogate.predict(&samples.points, &mut predicted);
+    surrogate.predict(&samples.points, &mut predicted).unwrap();
     let sum: f64 = predicted.iter().zip(&samples.log_stretch).map(|(p, t)| f64::from(p - t).powi(2)).sum();
     (sum / samples.len() as f64).sqrt()
 }
@@ -32,23 +32,23 @@ fn one_network_knows_two_windows() {
     let held_out = windows.each_ref().map(|window| traced(window, uniform_points(2, 2_000), false));
     let errors = |network: &NetworkSettings| {
         let mut surrogate = build(&SETTINGS, network, windows[0].domain(), 5, &windows[0]).unwrap();
-        let mut ring = SampleRing::new(1 << 16);
+        let mut ring = ReplayBuffer::new(1 << 16);
         for (seed, window) in (7..).zip(&windows) {
             ring.set_now(Times::new(network, 10.0).unit(window.start, 10.0));
             ring.push(&traced(window, uniform_points(seed, 20_000), false));
         }
-        let learned = surrogate.learn(&ring, f64::INFINITY, 300);
+        let learned = surrogate.learn(&ring, f64::INFINITY, 300).unwrap();
         assert_eq!((learned.steps, learned.dropped), (300, 0));
-        let frozen = surrogate.freeze();
+        let frozen = surrogate.freeze().unwrap();
         let errors: Vec<f64> = windows
             .iter()
             .zip(&held_out)
             .map(|(window, held_out)| {
-                surrogate.window_slid(window);
-                rms(&*surrogate, held_out)
+                surrogate.window_slid(window).unwrap();
+                rms(&surrogate.freeze().unwrap(), held_out)
             })
             .collect();
-        assert!((rms(&*frozen, &held_out[0]) - errors[0]).abs() < 1e-6, "what is frozen is asked for the window of its time");
+        assert!((rms(&frozen, &held_out[0]) - errors[0]).abs() < 1e-6, "what is frozen is asked for the window of its time");
         errors
     };
     let blind = NetworkSettings { log2_table: 14, width: 32, batch: 2048, ..NetworkSettings::default() };
@@ -105,14 +105,14 @@ fn durations_below_tau_are_learned() {
         assert_eq!(made.len(), 4);
         let flow = VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, Domain::slab([-1.0; 2], [1.0; 2], (0.0, 0.2)));
         let tracer = |tau| cpu_tracer(flow.clone(), &FlowMap::tangent(tau, 40), 0.0).unwrap();
-        let mut surrogate = build(&SETTINGS, network, tracer(4.0).domain(), 5, &*tracer(4.0)).unwrap();
+        let mut surrogate = build(&SETTINGS, network, tracer(4.0).domain(), 5, &tracer(4.0)).unwrap();
         surrogate.load(&checkpoint).unwrap();
         let points = uniform_points(3, 500);
         let mut worst = 0.0_f32;
         for duration in [0.8, 1.5, 2.9, 4.0] {
-            surrogate.window_slid(&*tracer(duration));
+            surrogate.window_slid(&tracer(duration)).unwrap();
             let mut found = vec![0.0; points.len()];
-            surrogate.predict(&points, &mut found);
+            surrogate.predict(&points, &mut found).unwrap();
             worst = found.iter().fold(worst, |worst, s| worst.max((s - 0.7 * duration as f32).abs()));
         }
         worst
@@ -197,7 +197,7 @@ fn what_inputs_cannot_be_is_said() {
     let cube = NetworkSettings { inputs: vec![Input::Start, Input::Duration], ..NetworkSettings::default() };
     let abc = VelocitySource::Analytic(Analytic::Abc { a: 1.0, b: 1.0, c: 1.0, growth: 0.0 }, Domain::cuboid([0.0; 3], [1.0; 3]));
     let tracer = cpu_tracer(abc, &FlowMap::tangent(1.0, 4), 0.0).unwrap();
-    let fault = build(&SETTINGS, &cube, tracer.domain(), 0, &*tracer).err().unwrap().to_string();
+    let fault = build(&SETTINGS, &cube, tracer.domain(), 0, &tracer).err().unwrap().to_string();
     assert!(fault.contains("network.inputs") && fault.contains("4 inputs in all"), "{fault}");
     // One start time needs no input.
     let scene = SceneFile::parse(Path::new("a test"), &format!("{GYRE}{COMMON}"), &[start.to_owned(), "time.slides=1".to_owned()]).unwrap();

@@ -9,7 +9,7 @@ use ridgewatch::flow::Tracer;
 use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings};
-use ridgewatch::surrogate::{Kind, Learned, SampleRing, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, Learned, ReplayBuffer, SurrogateSettings, build};
 use ridgewatch::trust::TrustedError;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -54,7 +54,7 @@ fn the_page_names_all_that_a_checkpoint_holds_and_nothing_else() {
     for (kind, network) in [(Kind::Table, &hash), (Kind::Residual, &hash), (Kind::Network, &start), (Kind::Network, &frequency)] {
         let settings = SurrogateSettings { kind, table_nodes: Some([5, 4, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        surrogate.learn(&SampleRing::holding(&traced(&tracer, uniform_points(3, 100), false)), f64::INFINITY, 1);
+        surrogate.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(3, 100), false)), f64::INFINITY, 1).unwrap();
         let path = folder.path().join("checkpoint");
         surrogate.save(&path).unwrap();
         let file = std::fs::read(path).unwrap();

@@ -2,7 +2,7 @@
 //! GPU, held to the reference on machines without one. Needs a C++ compiler (`c++`, or what CXX names).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
-use ridgewatch::backend::{residuals, stratified_points};
+use ridgewatch::backend::{DeviceError, residuals, stratified_points};
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
@@ -294,12 +294,12 @@ fn table_bytes(table: &Table, dimensions: i32) -> Vec<u8> {
 #[test]
 fn tables_are_looked_up_alike() {
     for (domain, dimensions) in [(domain(), 3), (Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), 2)] {
-        let table = Table::trace(&Plane(domain), [9, 5, 6]);
+        let table = Table::trace(&Plane(domain), [9, 5, 6]).unwrap();
         let mut random = uniform(5);
         let mut points: Vec<[f32; 3]> = (0..10_000).map(|_| std::array::from_fn(|_| 1.2 * random() - 0.1)).collect();
         points.extend([[0.0; 3], [1.0; 3]]);
         let mut expected = vec![0.0; points.len()];
-        table.predict(&points, &mut expected);
+        table.interpolate(&points, &mut expected);
         let mut input = table_bytes(&table, dimensions);
         input.extend(bytes(&[points.len() as u32]));
         input.extend(bytes(&points));
@@ -402,7 +402,7 @@ fn some_gate() -> Gate {
 #[test]
 fn the_same_one_answers_at_every_point() {
     let (gate, domain) = (some_gate(), domain());
-    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]).unwrap();
     for (periodic, spent) in [(false, false), (true, true)] {
         let tracer = holed(periodic);
         let mut random = uniform(8);
@@ -432,7 +432,7 @@ fn the_same_one_answers_at_every_point() {
             seen[expected as usize] += 1;
             if expected > 0 {
                 let mut predicted = [0.0];
-                table.predict(&[unit], &mut predicted);
+                table.interpolate(&[unit], &mut predicted);
                 assert_eq!(values[..3], unit, "{point:?}");
                 assert!((values[3] - predicted[0]).abs() <= 1e-6, "{point:?}");
             }
@@ -449,8 +449,9 @@ impl Predict for Told {
     fn name(&self) -> &'static str {
         "told"
     }
-    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) {
+    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
         out.copy_from_slice(&self.0);
+        Ok(())
     }
     fn bytes(&self) -> usize {
         0
@@ -490,7 +491,7 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
     }
     let output = ask("audit", &input);
     let mut output = &output[..];
-    let expected = Audited::of(&residuals(&Told(predicted), &samples, &transfer, tau), strata.clone());
+    let expected = Audited::of(&residuals(&Told(predicted), &samples, &transfer, tau).unwrap(), strata.clone());
     let (mut number, mut points, mut peak) = (0, 0.0, f64::NEG_INFINITY);
     for (cell, &drawn) in strata.drawn.iter().enumerate() {
         for _ in 0..drawn {
@@ -541,7 +542,7 @@ impl LogStretch for Gated<'_> {
                 log_stretch[i] = f32::NAN;
             } else if self.gate.is_some_and(|gate| self.spent || gate.trusts(unit)) {
                 self.over_budget += u64::from(self.gate.is_some_and(|gate| !gate.trusts(unit)));
-                self.table.predict(&[unit], &mut log_stretch[i..=i]);
+                self.table.interpolate(&[unit], &mut log_stretch[i..=i]);
             } else {
                 (log_stretch[i], traced[i]) = ((7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos(), true);
             }
@@ -552,7 +553,7 @@ impl LogStretch for Gated<'_> {
 #[test]
 fn gated_frames_are_the_cpu_s() {
     let (gate, domain) = (some_gate(), domain());
-    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]).unwrap();
     let tracer = holed(false);
     let land = land_bytes(&*tracer, false);
     for (gate, spent) in [(Some(&gate), false), (Some(&gate), true), (None, false)] {

@@ -34,7 +34,7 @@ fn snapshots_that_have_left_the_window_are_let_go() {
     let setup = Setup::new(scene.settings()).unwrap();
     let read: Arc<Mutex<Vec<Weak<Snapshot>>>> = Arc::default();
     let told = read.clone();
-    setup.feed.tell(Box::new(move |snapshot| told.lock().unwrap().push(Arc::downgrade(snapshot))));
+    setup.slides.listen(Box::new(move |snapshot| told.lock().unwrap().push(Arc::downgrade(snapshot))));
     let mut held = Vec::new();
     let mut sink = |event: Event| {
         if let Event::Frame(_) = event {

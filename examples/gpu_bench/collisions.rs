@@ -1,9 +1,10 @@
 //! The points that a frame's waves ask about.
 
 use cudarc::driver::result;
-use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, Traced};
-use ridgewatch::flow::{Extras, Tracer};
+use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, TraceAll};
+use ridgewatch::flow::Extras;
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
+use ridgewatch::surrogate::Trace;
 use std::error::Error;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -24,21 +25,22 @@ pub struct Collisions {
 impl Collisions {
     /// At most `most` points of the scene that a bare file of this field would get, its majorants settled.
     pub fn new(gpu: &Arc<Gpu>, tracer: &CudaTracer, most: usize) -> Result<Self, Box<dyn Error>> {
+        let (domain, tau) = (tracer.host().domain(), tracer.host().tau());
         let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
         let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
-        let seeds: Vec<[f32; 3]> = unit.map(|u| tracer.domain().from_unit(u)).collect();
+        let seeds: Vec<[f32; 3]> = unit.map(|u| domain.from_unit(u)).collect();
         let mut probes = ridgewatch::flow::Traced::default();
-        tracer.trace(&seeds, Extras::default(), &mut probes);
-        let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / tracer.tau() as f32).collect();
+        tracer.trace(&seeds, Extras::default(), &mut probes)?;
+        let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / tau as f32).collect();
         let settings = RenderSettings { width: PICTURE[0], height: PICTURE[1], ..RenderSettings::default() };
         let transfer = TransferSettings::default().scaled_to(&ftle);
-        let scene = Scene::assemble(tracer.domain(), None, None, Some(transfer), settings, 0);
-        let mut renderer = Renderer::new(scene, tracer.domain(), tracer.tau())?;
+        let scene = Scene::assemble(domain, None, None, Some(transfer), settings, 0);
+        let mut renderer = Renderer::new(scene, domain, tau)?;
         let mut device = GpuRenderer::new(gpu)?;
         for frame in 0..4 {
-            device.render_samples(&mut renderer, frame, 0..1, &mut Traced(tracer.device()), None, &NEVER)?;
+            device.render_samples(&mut renderer, frame, 0..1, &mut TraceAll(tracer.device()), None, &NEVER)?;
         }
-        let mut heard = Listening { inner: Traced(tracer.device()), points: gpu.alloc("points", most)?, waves: Vec::new() };
+        let mut heard = Listening { inner: TraceAll(tracer.device()), points: gpu.alloc("points", most)?, waves: Vec::new() };
         device.render_samples(&mut renderer, 4, 0..1, &mut heard, None, &NEVER)?;
         let mut points = heard.points;
         let found: usize = heard.waves.iter().sum();
@@ -55,7 +57,7 @@ impl Collisions {
 
 /// Traces every query and copies what is asked, until there is no more room.
 struct Listening<'a> {
-    inner: Traced<'a>,
+    inner: TraceAll<'a>,
     points: Buffer<[f32; 3]>,
     /// Points copied of each wave.
     waves: Vec<usize>,

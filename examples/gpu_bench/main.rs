@@ -35,8 +35,9 @@ mod bench {
     use ridgewatch::field::turbulence::Turbulence;
     use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
     use ridgewatch::flow::{
-        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
+        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource,
     };
+    use ridgewatch::surrogate::Trace;
     use std::error::Error;
     use std::f64::consts::TAU;
     use std::sync::Arc;
@@ -195,7 +196,7 @@ mod bench {
             let fine = CudaTracer::new(&self.store, &self.gpu, source.clone(), &fine, 0.0, Tuning::default())?;
             let points = scattered(domain, 1 << 18, 77);
             let mut truth = Traced::default();
-            fine.trace(&points, Extras::default(), &mut truth);
+            fine.trace(&points, Extras::default(), &mut truth)?;
             let peak = truth.log_stretch_f64.iter().copied().fold(0.0, f64::max);
             Ok(Truth { batch: Batch::new(&self.gpu, &points)?, points, log_stretch: truth.log_stretch_f64, peak })
         }

@@ -296,17 +296,17 @@ impl SurrogateSettings {
         Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
     }
 
-    /// Nodes of the table: those set, else 256 along the longest edge (128 below a network) and in proportion along the others.
+    /// Nodes of the table: those set, else 256 along the longest edge (128 below a network) and in proportion along the others. In two dimensions there is
+    /// one node along z.
     pub(crate) fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
         let dimensions = domain.dimensions.clamp(1, 3);
         self.check_nodes(dimensions)?;
-        if let Some(nodes) = self.table_nodes {
-            return Ok(nodes);
-        }
         let longest = DEFAULT_NODES[usize::from(self.kind == Kind::Residual)];
         let lengths = domain.lengths();
         let most = lengths[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
-        Ok(std::array::from_fn(|axis| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
+        let in_proportion = |axis: usize| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest);
+        let nodes = self.table_nodes.unwrap_or_else(|| std::array::from_fn(in_proportion));
+        Ok(std::array::from_fn(|axis| if axis < dimensions.max(2) { nodes[axis].max(2) } else { 1 }))
     }
 }
 

@@ -2,18 +2,19 @@
 
 use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
 use ridgewatch::backend::cuda::{
-    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs, Panel,
-    SnapshotStore, Tuning, keeps_label,
+    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, FrameQueries, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs,
+    QueryRouter, SnapshotStore, Tuning, keeps_label,
 };
-use ridgewatch::backend::{Device, Tally, residuals, stratified_points};
+use ridgewatch::backend::{Device, QueryRouter as HostRouter, Routing, Tally, audit, residuals, stratified_points};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
-use ridgewatch::run::{Answers, RunOptions, trace};
-use ridgewatch::surrogate::{Predict, Samples, Table};
+use ridgewatch::run::RunOptions;
+use ridgewatch::surrogate::network::NetworkSettings;
+use ridgewatch::surrogate::{HostSurrogate, Kind, Predict, Samples, SurrogateSettings, Trace, build};
 use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -41,9 +42,14 @@ struct Stage {
     host: Box<dyn Tracer>,
     cuda: CudaTracer,
     scene: Scene,
-    table: Table,
+    table: HostSurrogate,
     on_device: DeviceTable,
     gate: Gate,
+}
+
+fn table_of(host: &dyn Trace, nodes: [usize; 3]) -> HostSurrogate {
+    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+    build(&settings, &NetworkSettings::default(), host.flow().domain(), 5, host).unwrap()
 }
 
 impl Stage {
@@ -59,14 +65,14 @@ impl Stage {
         let cuda = CudaTracer::new(store, &gpu, source, map, 0.0, Tuning::default()).unwrap();
         let settings = RenderSettings { width: 160, height: 80, ..RenderSettings::default() };
         let scene = Scene::assemble(host.domain(), None, None, Some(transfer), settings, 3);
-        let table = Table::trace(&*host, nodes);
-        let on_device = DeviceTable::upload(&gpu, host.domain(), &table).unwrap();
+        let table = table_of(&host, nodes);
+        let on_device = DeviceTable::upload(&gpu, host.domain(), table.table().unwrap()).unwrap();
         // A gate as runs earn it, probes held against the table, at the first tolerance that trusts a third of the cells.
         let trust = |tolerance: f64| TrustMap::new(&TrustSettings { tolerance, ..TrustSettings::default() }, host.domain());
         let strata = Strata::even(trust(0.03).shape(), 32);
-        let probes = trace(&*host, &stratified_points(&strata, 5, 0), Extras::default());
+        let probes = audit::trace(&host, &stratified_points(&strata, 5, 0), Extras::default()).unwrap();
         let renderer = Renderer::new(scene.clone(), host.domain(), map.tau).unwrap();
-        let measured = residuals(&table, &probes.samples, renderer.transfer(), map.tau);
+        let measured = residuals(&table.freeze().unwrap(), &probes.samples, renderer.transfer(), map.tau).unwrap();
         let gate = |i: i32| {
             let mut trust = trust(0.03 * 1.1_f64.powi(i));
             trust.observe(Some(&Audited::of(&measured, strata.clone())), &[]);
@@ -85,10 +91,13 @@ impl Stage {
     }
 
     fn on_cpu(&self, renderer: &mut Renderer, frame: u64, samples: u32, how: &How<'_>) -> (Film, RenderStats, Tally) {
-        let surrogate = how.surrogate.then_some(&self.table as &dyn Predict);
-        let mut answers = Answers::new(&*self.host, surrogate, &self.gate, how.budget, 0);
-        let (film, stats) = renderer.render_samples(frame, 0..samples, &mut answers, None, &NEVER).unwrap();
-        (film, stats, answers.tally)
+        let frozen = self.table.freeze().unwrap();
+        let surrogate = how.surrogate.then_some(&frozen as &dyn Predict);
+        let routing = Routing { gate: &self.gate, trace_budget: how.budget, keep: 0, extras: Extras::default() };
+        let mut router = HostRouter::new(&self.host, surrogate, routing);
+        let (film, stats) = renderer.render_samples(frame, 0..samples, &mut router, None, &NEVER).unwrap();
+        let (tally, _) = router.finish().unwrap();
+        (film, stats, tally)
     }
 
     fn on_gpu(
@@ -101,13 +110,13 @@ impl Stage {
     ) -> (Film, RenderStats, Tally, Samples) {
         // What a kernel reads before it has written it would show.
         side.renderer.poison().unwrap();
-        side.division.poison().unwrap();
-        let mut divided = side
-            .division
-            .begin(Panel {
+        side.router.poison().unwrap();
+        let mut routed = side
+            .router
+            .begin(FrameQueries {
                 tracer: self.cuda.device(),
                 domain: self.domain(),
-                land: self.cuda.land(),
+                missing_cells: self.cuda.missing_cells(),
                 surrogate: how.surrogate.then_some(&self.on_device as &dyn DevicePredict),
                 label_sink: how.label_sink,
                 gate: &self.gate,
@@ -116,16 +125,16 @@ impl Stage {
                 arrivals: how.label_sink.is_some(),
             })
             .unwrap();
-        let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut divided, None, &NEVER).unwrap();
-        let labels = divided.labels();
-        assert!(divided.trace_seconds() >= 0.0 && divided.predict_seconds() > 0.0);
+        let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut routed, None, &NEVER).unwrap();
+        let labels = routed.labels();
+        assert!(routed.trace_seconds() >= 0.0 && routed.predict_seconds() > 0.0);
         let tally = Tally {
             queries: stats.queries,
             traced: stats.traced,
             missing: stats.missing,
             over_budget: side.renderer.over_budget(),
-            trace_seconds: divided.trace_seconds(),
-            predict_seconds: divided.predict_seconds(),
+            trace_seconds: routed.trace_seconds(),
+            predict_seconds: routed.predict_seconds(),
         };
         (film, stats, tally, labels)
     }
@@ -134,12 +143,12 @@ impl Stage {
 /// What the GPU keeps from frame to frame.
 struct Side {
     renderer: GpuRenderer,
-    division: Division,
+    router: QueryRouter,
 }
 
 impl Side {
     fn new(gpu: &Arc<Gpu>) -> Self {
-        Self { renderer: GpuRenderer::new(gpu).unwrap(), division: Division::new(gpu).unwrap() }
+        Self { renderer: GpuRenderer::new(gpu).unwrap(), router: QueryRouter::new(gpu).unwrap() }
     }
 }
 
@@ -229,11 +238,11 @@ fn pictures_with_land_are_the_cpu_s() {
     let gpu = gpu();
     let host = cpu_tracer(source.clone(), &backward, 3.5).unwrap();
     let cuda = CudaTracer::new(store(), &gpu, source, &backward, 3.5, Tuning::default()).unwrap();
-    assert!(cuda.land().is_some());
+    assert!(cuda.missing_cells().is_some());
     let settings = RenderSettings { width: 160, height: 80, ..RenderSettings::default() };
     let scene = Scene::assemble(host.domain(), None, None, Some(transfer), settings, 3);
-    let table = Table::trace(&*host, [40, 30, 20]);
-    let on_device = DeviceTable::upload(&gpu, host.domain(), &table).unwrap();
+    let table = table_of(&host, [40, 30, 20]);
+    let on_device = DeviceTable::upload(&gpu, host.domain(), table.table().unwrap()).unwrap();
     let mut stage = Stage { gpu, host, cuda, scene, table, on_device, gate: Gate::uniform(false) };
     let tally = pictures_agree(&stage, &How { surrogate: false, ..GATED }, "reference with land");
     assert!(tally.missing > tally.queries / 100 && tally.traced + tally.missing == tally.queries, "{tally:?}");
@@ -263,7 +272,7 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
         assert!(first.points.iter().all(|&p| !stage.gate.trusts(p)));
         let points: Vec<[f32; 3]> = first.points.iter().map(|&p| stage.domain().from_unit(p)).collect();
         let mut exact = ridgewatch::flow::Traced::default();
-        stage.host.trace(&points, Extras::default(), &mut exact);
+        stage.host.trace(&points, Extras::default(), &mut exact).unwrap();
         let mut errors: Vec<f32> = exact.log_stretch.iter().zip(&first.log_stretch).map(|(a, b)| (a - b).abs()).collect();
         errors.sort_by(f32::total_cmp);
         // Unit coordinates round the seed, by 1e-7 of a domain of 96 cells: 1e-5 of a cell, stretched by up to e^4.

@@ -1,26 +1,27 @@
 //! Audits on the device against those on the host: the same points, and sums of the same bits from the same traces and predictions.
 
 use super::scenes::*;
-use ridgewatch::backend::cuda::{Audits, CudaTracer, DeviceTable, Tuning};
+use ridgewatch::backend::audit::audit;
+use ridgewatch::backend::cuda::{Audits, CudaTracer, Tuning};
 use ridgewatch::backend::{AuditRequest, stratified_points};
-use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Precision, Tracer, VelocitySource};
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Precision, VelocitySource};
 use ridgewatch::render::{Transfer, TransferSettings};
-use ridgewatch::run::audit;
-use ridgewatch::surrogate::{Predict, Table};
+use ridgewatch::surrogate::Kind;
+use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::trust::{CellErrors, Strata};
 
 fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], strata: &Strata, land: bool) {
     let gpu = gpu();
     let tracer = CudaTracer::new(store(), &gpu, source.clone(), map, t0, Tuning::default()).unwrap();
-    assert_eq!(tracer.land().is_some(), land);
-    let table = Table::trace(&tracer, nodes);
-    let on_device = DeviceTable::of(&table).unwrap();
+    assert_eq!(tracer.missing_cells().is_some(), land);
+    let surrogate = resident(&gpu, Kind::Table, nodes, &NetworkSettings::default(), &tracer);
+    let (frozen, on_device) = (surrogate.freeze().unwrap(), surrogate.table().unwrap().device().unwrap());
     let settings = TransferSettings { low: Some(0.1), high: Some(0.3), ..TransferSettings::default() };
     let transfer = Transfer::new(&settings, 1.0).unwrap();
     let mut audits = Audits::new(&gpu).unwrap();
     for (stream, samples) in [(0, None), (1, Some(Extras { arrival: true, jacobian: false })), (1 << 40, Some(Extras::default()))] {
         let request = AuditRequest { strata: strata.clone(), seed: 77, stream, transfer: &transfer, samples };
-        let expected = audit(request.clone(), &tracer, Some(&table));
+        let expected = audit(&request, &tracer, Some(&frozen)).unwrap();
         let found = audits.audit(&request, &tracer, on_device).unwrap();
         assert_eq!((found.drawn, found.points), (expected.drawn, expected.points));
         assert_eq!(land, found.points < found.drawn);
@@ -41,7 +42,6 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
         let total: f64 = found.cells().iter().map(|cell| cell.square).sum();
         assert!(total > 0.0, "the table is not exact");
     }
-    assert_eq!(gpu.health().failure(), None);
 }
 
 #[test]
@@ -72,7 +72,8 @@ fn memory_is_kept_from_audit_to_audit() {
     let store = ridgewatch::backend::cuda::SnapshotStore::new(&gpu);
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let tracer = CudaTracer::new(&store, &gpu, turbulence([40, 24, 24], 4), &map, 0.0, Tuning::default()).unwrap();
-    let table = Table::trace(&tracer, [30, 20, 20]);
+    let surrogate = resident(&gpu, Kind::Table, [30, 20, 20], &NetworkSettings::default(), &tracer);
+    let table = surrogate.table().unwrap().device().unwrap();
     let transfer = Transfer::new(&TransferSettings { low: Some(0.1), high: Some(0.3), ..TransferSettings::default() }, 1.0).unwrap();
     let mut audits = Audits::new(&gpu).unwrap();
     let mut taken = None;
@@ -80,10 +81,10 @@ fn memory_is_kept_from_audit_to_audit() {
         let strata = Strata::even([16, 8, 8], 20 + (stream % 7) as u32);
         let points = stratified_points(&strata, 77, stream).len();
         let request = AuditRequest { strata, seed: 77, stream, transfer: &transfer, samples: None };
-        assert_eq!(audits.audit(&request, &tracer, DeviceTable::of(&table).unwrap()).unwrap().drawn, points);
+        assert_eq!(audits.audit(&request, &tracer, table).unwrap().drawn, points);
         if stream >= 7 {
             assert_eq!(*taken.get_or_insert(gpu.memory().0), gpu.memory().0);
         }
     }
-    assert!(table.bytes() > 0 && tracer.steps() == 9);
+    assert!(surrogate.bytes() > 0 && tracer.host().steps() == 9);
 }
