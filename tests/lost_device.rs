@@ -466,35 +466,14 @@ samples = 2
 ";
 
 fn sliding(kind: Kind, frames_per_slide: usize) -> SceneFile {
+    let table = if kind == Kind::Network { "" } else { "table_nodes = [16, 8, 8]\n" };
+    let network = format!("[network]\nlevels = 4\nlog2_table = 8\nwidth = 16\nbatch = 256\n[training]\nsteps_per_frame = {STEPS}\n");
     scene(&format!(
-        "
-[source]
-kind = \"turbulence\"
-nodes = [16, 8, 8]
-snapshots = 8
-[time]
-tau = 4
-frames_per_slide = {frames_per_slide}
-[flow]
-steps = 8
-[surrogate]
-kind = \"{}\"
-table_nodes = [16, 8, 8]
-[network]
-levels = 4
-log2_table = 8
-width = 16
-batch = 256
-[training]
-steps_per_frame = {STEPS}
-[trust]
-cells = [2, 2, 2]
-[render]
-width = 16
-height = 8
-samples = 2
-",
-        kind.name()
+        "[source]\nkind = \"turbulence\"\nnodes = [16, 8, 8]\nsnapshots = 8\n[time]\ntau = 4\nframes_per_slide = {frames_per_slide}\n\
+         [flow]\nsteps = 8\n[surrogate]\nkind = \"{}\"\n{table}{}[trust]\ncells = [2, 2, 2]\n\
+         [render]\nwidth = 16\nheight = 8\nsamples = 2\n",
+        kind.name(),
+        if kind == Kind::Table { "" } else { &network }
     ))
 }
 
