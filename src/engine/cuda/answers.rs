@@ -4,7 +4,7 @@
 //! ([`DevicePredict`]); land, the gate, the tracing budget and the labels that come back are the same for all of them.
 
 use super::labels::{HELD_BACK, Labels};
-use super::layout::{ChoiceArgument, LandArgument, ListsArgument, Outputs};
+use super::layout::{ChoiceArgument, ListsArgument, Outputs};
 use super::pinned::Pinned;
 use super::{Buffer, DeviceError, DeviceLand, DeviceTracer, Gpu, launch, threads};
 use crate::field::Domain;
@@ -185,7 +185,7 @@ impl Division {
             gate_shape: panel.gate.shape().map(|n| n as i32),
             gate_pad: 0,
             trusted: trusted.as_ref().map_or(0, Buffer::address),
-            land: panel.land.map_or(LandArgument::NONE, DeviceLand::argument),
+            missing_cells: panel.land.map_or_else(bytemuck::Zeroable::zeroed, DeviceLand::argument),
             budget_spent: 0,
             pad: 0,
         };

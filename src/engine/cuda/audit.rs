@@ -1,7 +1,7 @@
 //! A frame's audit on the device: points drawn, traced, predicted and added up there, so that only sums come back (and each point's optical
 //! residual, for the quantile; and the samples, where somebody learns from them).
 
-use super::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
+use super::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
 use super::pinned::Pinned;
 use super::{Buffer, CudaTracer, DeviceError, DeviceLand, DevicePredict, Gpu, launch, threads};
 use crate::engine::answers::unit_arrival;
@@ -135,12 +135,12 @@ impl Audits {
             stream: stream_words,
             min: domain.min,
             extent: domain.extent(),
-            land: tracer.land().map_or(LandArgument::NONE, DeviceLand::argument),
+            missing_cells: tracer.land().map_or_else(bytemuck::Zeroable::zeroed, DeviceLand::argument),
         };
         let points = AuditPointsArgument {
             unit: memory.unit.address(),
             points: memory.points.address(),
-            land: memory.land.address(),
+            is_missing: memory.land.address(),
             traced: memory.traced.address(),
             lived: memory.lived.address(),
             predicted: memory.predicted.address(),

@@ -3,7 +3,7 @@
 use super::answers::DeviceLearns;
 use super::labels::HELD_BACK;
 use super::layout::Outputs;
-use super::network_samples::{Filled, SampleWriter};
+use super::network_samples::{Filled, SampleWriter, TracedBatch};
 use super::network_training::NetworkCopy;
 use super::predictor::{TableCopy, predict_from_host};
 use super::{DeviceError, DeviceNetwork, DeviceSamples, DeviceTable, DeviceTraining, Gpu};
@@ -106,8 +106,10 @@ impl DeviceLearns for LabelSink<'_> {
         if labels == 0 {
             return Ok(());
         }
+        let (base, times) = (self.base, Some(self.times));
+        let batch = TracedBatch { domain: self.domain, points, labels, count, base, times, held_back: HELD_BACK };
         // SAFETY: the caller's.
-        unsafe { writer.append(&mut samples, self.domain, points, labels, count, self.base, Some(self.times), HELD_BACK) }
+        unsafe { writer.append(&mut samples, batch) }
     }
 }
 
