@@ -17,6 +17,11 @@ RW_FN float bits_float(uint32_t bits) { return __uint_as_float(bits); }
 RW_FN void atomic_add(uint32_t* at, uint32_t value) { atomicAdd(at, value); }
 RW_FN void atomic_max(uint32_t* at, uint32_t value) { atomicMax(at, value); }
 RW_FN uint32_t relaxed_load(const uint32_t* at) { return *(const volatile uint32_t*)at; }
+// Sum over the lanes of a warp, in every lane. All of them must call it.
+template <class T> RW_FN T warp_sum(T value) {
+    for (int apart = 16; apart > 0; apart /= 2) value += __shfl_xor_sync(0xffffffffu, value, apart);
+    return value;
+}
 // Appends to a queue and returns the new entry's index. One atomic serves all active threads of a warp (warp-aggregated atomics).
 RW_FN uint32_t reserve(uint32_t* length) {
     const uint32_t together = __activemask();

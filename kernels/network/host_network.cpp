@@ -37,15 +37,13 @@ extern "C" void host_predict(const Grid* grid, const uint16_t* tables, const flo
                     next[row][neuron] = layer < HIDDEN && (row == 0 ? sum : next[0][neuron]) <= 0.0f ? 0.0f : sum;
                 }
             }
-            for (int row = 0; row < ROWS; ++row) {
+            for (int row = 0; row < ROWS; ++row)
                 for (int neuron = 0; neuron < many; ++neuron) rows[row][neuron] = next[row][neuron];
-            }
         }
 #if RW_FLOW_MAP
         float tangents[OUTPUTS][SPACE];
-        for (int output = 0; output < OUTPUTS; ++output) {
+        for (int output = 0; output < OUTPUTS; ++output)
             for (int along = 0; along < SPACE; ++along) tangents[output][along] = rows[1 + along][output];
-        }
         out[i] = read_tangents(*reading, tangents);
 #else
         out[i] = read_output(*reading, rows[0][0], unit);

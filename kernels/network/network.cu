@@ -150,7 +150,7 @@ network_means(const __grid_constant__ Draw draw, const float* __restrict__ predi
         difference = usable ? double(predicted[i]) - double(label) : 0.0;
     }
     const uint32_t all = __ballot_sync(0xffffffffu, usable);
-    for (int apart = 16; apart > 0; apart /= 2) difference += __shfl_xor_sync(0xffffffffu, difference, apart);
+    difference = warp_sum(difference);
     if ((threadIdx.x & 31u) == 0u && all) {
         atomicAdd(&means->difference, difference);
         atomicAdd(&means->usable, double(__popc(all)));

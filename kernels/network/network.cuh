@@ -179,9 +179,7 @@ RW_FN void encode_tangents(float2 (&sums)[GROUPS], [[maybe_unused]] const Level*
     sincospif(half_turns(point, column), &sums[0].x, &sums[0].y);
     const int axis = column / (2 * OCTAVES), octave = column / 2 % OCTAVES;
     const float rate = 3.14159265f * step * float(1u << octave);
-    RW_UNROLL for (int along = 0; along < SPACE; ++along) {
-        if (along == axis) sums[1 + along] = make_float2(rate * sums[0].y, -rate * sums[0].x);
-    }
+    RW_UNROLL for (int along = 0; along < SPACE; ++along) if (along == axis) sums[1 + along] = make_float2(rate * sums[0].y, -rate * sums[0].x);
 #else
     auto add_level = [&](int number, auto add_corner) {
         const Level& level = levels[number];
@@ -383,16 +381,14 @@ template <int IN> RW_FN void add_product(Sums<2 * WIDTH_BLOCKS>& sums, const Row
 // sums = rows * matrix + biases.
 template <int IN>
 RW_FN void forward(Sums<2 * WIDTH_BLOCKS>& sums, const Rows<IN>& rows, const uint16_t (*matrix)[STRIDE], const float* biases) {
-    RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n) {
+    RW_UNROLL for (int n = 0; n < 2 * WIDTH_BLOCKS; ++n)
         RW_UNROLL for (int k = 0; k < 2; ++k) sums.block[n][k] = sums.block[n][k + 2] = biases[8 * n + 2 * (lane() & 3u) + k];
-    }
     add_product(sums, rows, matrix);
 }
 
 template <int BLOCKS> RW_FN void clear(Sums<BLOCKS>& sums) {
-    RW_UNROLL for (int n = 0; n < BLOCKS; ++n) {
+    RW_UNROLL for (int n = 0; n < BLOCKS; ++n)
         RW_UNROLL for (int k = 0; k < 4; ++k) sums.block[n][k] = 0.0f;
-    }
 }
 
 // sums = rows * transposed matrix, where matrix has 8 * OUT rows.

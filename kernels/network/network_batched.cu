@@ -113,9 +113,8 @@ RW_FN int right_column() { return warp_column() + (lane() >> 4) * 8u; }
 
 template <int BLOCKS> RW_FN void clear(float (&sums)[BLOCKS][N][4]) {
     RW_UNROLL for (int m = 0; m < BLOCKS; ++m) {
-        RW_UNROLL for (int n = 0; n < N; ++n) {
+        RW_UNROLL for (int n = 0; n < N; ++n)
             RW_UNROLL for (int k = 0; k < 4; ++k) sums[m][n][k] = 0.0f;
-        }
     }
 }
 
@@ -343,7 +342,7 @@ RW_FN void outputs_of(float (&outputs)[OWN][OUTPUTS], const Tile& tile, const fl
             }
         }
         RW_UNROLL for (int row = 0; row < OWN; ++row) {
-            for (int apart = 16; apart > 0; apart /= 2) outputs[row][output] += __shfl_xor_sync(0xffffffffu, outputs[row][output], apart);
+            outputs[row][output] = warp_sum(outputs[row][output]);
             if (biased) outputs[row][output] += head[WIDTH * OUTPUTS + output];
         }
     }
@@ -454,10 +453,8 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
                 squares = fma_(0.25f * tile.slopes[row][output], tile.slopes[row][output], squares);
                 sum += tile.slopes[row][output];
             }
-            for (int apart = 16; apart > 0; apart /= 2) {
-                squares += __shfl_xor_sync(0xffffffffu, squares, apart);
-                sum += __shfl_xor_sync(0xffffffffu, sum, apart);
-            }
+            squares = warp_sum(squares);
+            sum = warp_sum(sum);
             if (lane() == 0u) {
                 atomicAdd(loss, double(squares) / OUTPUTS / draw.batch);
                 atomicAdd(head_gradient + WIDTH * OUTPUTS + output, sum);
@@ -468,7 +465,7 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
     // The loss is complete, so the slopes can take the penalty in.
     __syncthreads();
     if (int(lane()) < OWN) tile.slopes[own_row() + lane()][0] += penalties;
-    for (int apart = 16; apart > 0; apart /= 2) penalties += __shfl_xor_sync(0xffffffffu, penalties, apart);
+    penalties = warp_sum(penalties);
     if (lane() == 0u) atomicAdd(head_gradient + WIDTH, penalties);
     __syncthreads();
 #endif
@@ -560,9 +557,8 @@ batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
         auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
         multiply_tile<ENCODED_PASSES>(tile, stream, PADDED, begin, [&](const float (&sums)[M][N][4], int, uint32_t (&pairs)[M][N][2]) {
             RW_UNROLL for (int m = 0; m < M; ++m) {
-                RW_UNROLL for (int n = 0; n < N; ++n) {
+                RW_UNROLL for (int n = 0; n < N; ++n)
                     RW_UNROLL for (int half = 0; half < 2; ++half) pairs[m][n][half] = pack(sums[m][n][2 * half], sums[m][n][2 * half + 1]);
-                }
             }
         });
         for (int i = threadIdx.x; i < ROWS * ENCODED_PADDED / 2; i += THREADS) {

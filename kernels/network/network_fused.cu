@@ -66,9 +66,8 @@ template <int IN, int OUT> struct Products {
     float tile[OWN][4];
 
     RW_FN void clear() {
-        RW_UNROLL for (int i = 0; i < OWN; ++i) {
+        RW_UNROLL for (int i = 0; i < OWN; ++i)
             RW_UNROLL for (int k = 0; k < 4; ++k) tile[i][k] = 0.0f;
-        }
     }
 
     // Adds the samples of the whole block.
@@ -223,7 +222,7 @@ network_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__
     first.flush(layer_gradient, ENCODED, WIDTH);
     RW_UNROLL for (int layer = 1; layer < HIDDEN; ++layer) middle[layer - 1].flush(layer_gradient + layer_start(layer), WIDTH, WIDTH);
     last.flush(layer_gradient + layer_start(HIDDEN), WIDTH, OUTPUTS);
-    for (int apart = 16; apart > 0; apart /= 2) squares += __shfl_xor_sync(0xffffffffu, squares, apart);
+    squares = warp_sum(squares);
     if (lane() == 0u) losses[threadIdx.x / 32u] = squares;
     __syncthreads();
     if (threadIdx.x == 0) {

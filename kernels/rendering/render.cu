@@ -23,8 +23,7 @@ __device__ __forceinline__ void add_counts(const Counts& counts, Control* contro
     const uint32_t each[COUNTS] = {counts.queries, counts.traced, counts.missing, counts.exceeded, counts.paths, counts.over_budget};
     RW_UNROLL
     for (int k = 0; k < COUNTS; ++k) {
-        uint32_t sum = each[k];
-        for (int d = 16; d > 0; d >>= 1) sum += __shfl_xor_sync(0xFFFFFFFFu, sum, d);
+        const uint32_t sum = warp_sum(each[k]);
         if ((threadIdx.x & 31u) == 0u && sum != 0u) atomicAdd(&control->totals[k], (unsigned long long)sum);
     }
 }

@@ -32,9 +32,7 @@ __device__ __forceinline__ uint32_t bucket_of(const SortFrame& f, float x, float
     int at = 0;
     for (int bit = 0; bit < 16; bit++) {
 #pragma unroll
-        for (int k = 0; k < 3; k++) {
-            if (bit < f.bits[k]) key |= (cell[k] >> bit & 1u) << at++;
-        }
+        for (int k = 0; k < 3; k++) if (bit < f.bits[k]) key |= (cell[k] >> bit & 1u) << at++;
     }
     return key >> f.shift;
 }

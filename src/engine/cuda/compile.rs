@@ -10,62 +10,56 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-macro_rules! kernel {
-    ($folder:literal, $name:literal) => {
-        ($name, include_str!(concat!("../../../kernels/", $folder, "/", $name)))
+macro_rules! kernel_files {
+    ($($path:literal),* $(,)?) => {
+        &[$(($path, include_str!(concat!("../../../kernels/", $path)))),*]
     };
 }
 
-macro_rules! header {
-    ($path:literal) => {
-        ($path, include_str!(concat!("../../../kernels/", $path)))
-    };
-}
-
-/// The `.cu` files: file name and text.
-pub const SOURCES: &[(&str, &str)] = &[
-    kernel!("network", "network.cu"),
-    kernel!("network", "network_batched.cu"),
-    kernel!("network", "network_fused.cu"),
-    kernel!("rendering", "answer.cu"),
-    kernel!("rendering", "audit.cu"),
-    kernel!("rendering", "render.cu"),
-    kernel!("tracing", "sort.cu"),
-    kernel!("tracing", "table.cu"),
-    kernel!("tracing", "trace_closed.cu"),
-    kernel!("tracing", "trace_grid.cu"),
-    kernel!("tracing", "window.cu"),
+/// The `.cu` files: path in `kernels/` and text.
+pub const SOURCES: &[(&str, &str)] = kernel_files![
+    "network/network.cu",
+    "network/network_batched.cu",
+    "network/network_fused.cu",
+    "rendering/answer.cu",
+    "rendering/audit.cu",
+    "rendering/render.cu",
+    "tracing/sort.cu",
+    "tracing/table.cu",
+    "tracing/trace_closed.cu",
+    "tracing/trace_grid.cu",
+    "tracing/window.cu",
 ];
 
 /// The headers: path as in `#include` and text.
-const HEADERS: &[(&str, &str)] = &[
-    header!("common/atomics.cuh"),
-    header!("common/base.cuh"),
-    header!("common/domain.cuh"),
-    header!("common/rng.cuh"),
-    header!("common/stretch.cuh"),
-    header!("network/network.cuh"),
-    header!("network/network_data.cuh"),
-    header!("rendering/answer.cuh"),
-    header!("rendering/audit.cuh"),
-    header!("rendering/camera.cuh"),
-    header!("rendering/film.cuh"),
-    header!("rendering/gate.cuh"),
-    header!("rendering/light.cuh"),
-    header!("rendering/majorant.cuh"),
-    header!("rendering/space.cuh"),
-    header!("rendering/tracking.cuh"),
-    header!("rendering/transfer.cuh"),
-    header!("rendering/wavefront.cuh"),
-    header!("tracing/closed.cuh"),
-    header!("tracing/closed_variant.cuh"),
-    header!("tracing/grid.cuh"),
-    header!("tracing/grid_variant.cuh"),
-    header!("tracing/integrate.cuh"),
-    header!("tracing/missing_cells.cuh"),
-    header!("tracing/sphere.cuh"),
-    header!("tracing/table.cuh"),
-    header!("tracing/variant.cuh"),
+const HEADERS: &[(&str, &str)] = kernel_files![
+    "common/atomics.cuh",
+    "common/base.cuh",
+    "common/domain.cuh",
+    "common/rng.cuh",
+    "common/stretch.cuh",
+    "network/network.cuh",
+    "network/network_data.cuh",
+    "rendering/answer.cuh",
+    "rendering/audit.cuh",
+    "rendering/camera.cuh",
+    "rendering/film.cuh",
+    "rendering/gate.cuh",
+    "rendering/light.cuh",
+    "rendering/majorant.cuh",
+    "rendering/space.cuh",
+    "rendering/tracking.cuh",
+    "rendering/transfer.cuh",
+    "rendering/wavefront.cuh",
+    "tracing/closed.cuh",
+    "tracing/closed_variant.cuh",
+    "tracing/grid.cuh",
+    "tracing/grid_variant.cuh",
+    "tracing/integrate.cuh",
+    "tracing/missing_cells.cuh",
+    "tracing/sphere.cuh",
+    "tracing/table.cuh",
+    "tracing/variant.cuh",
 ];
 
 /// NVRTC options of every kernel: only those that speed and parity with the CPU need.
@@ -81,12 +75,12 @@ pub struct Request {
 }
 
 impl Request {
-    /// `source`: a file name in [`SOURCES`]; `defines`: macros, `NAME=VALUE`.
+    /// `source`: name of a file of [`SOURCES`], without its folder; `defines`: macros, `NAME=VALUE`.
     ///
     /// # Errors
     /// [`DeviceError::Unsupported`] if no source has this name.
     pub fn new(source: &str, capability: (i32, i32), defines: &[String]) -> Result<Self, DeviceError> {
-        let Some(&(name, text)) = SOURCES.iter().find(|(name, _)| *name == source) else {
+        let Some(&(name, text)) = SOURCES.iter().find(|(path, _)| path.rsplit('/').next() == Some(source)) else {
             return Err(DeviceError::Unsupported { what: format!("no kernel source `{source}`") });
         };
         Ok(Self { name, text, arch: format!("sm_{}{}", capability.0, capability.1), defines: defines.to_vec() })

@@ -196,7 +196,7 @@ mod tests {
             for steps in [1, 3, 6, 12] {
                 let stages = stages(&times, from, to, steps);
                 assert!(stages.windows(2).all(|pair| pair[0][2] == pair[1][0]), "{from} {to} {steps}: {stages:?}");
-                // One change an interval, and none at the end, where there is nothing to come.
+                // One change per interval, and none at the end.
                 let changes = stages.iter().filter(|step| step[0].0 != step[2].0).count();
                 assert!(steps < 3 || changes == 2, "{from} {to} {steps}: {changes}");
             }

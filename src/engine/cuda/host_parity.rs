@@ -318,6 +318,24 @@ fn cartesian(axes: Vec<Axis>) -> Arc<Grid> {
     Arc::new(Grid { axes, geometry: Geometry::Cartesian, slab: (0.0, 1.0) })
 }
 
+fn sphere(axes: Vec<Axis>) -> Arc<Grid> {
+    Arc::new(Grid { axes, geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) })
+}
+
+fn globe_axes() -> Vec<Axis> {
+    let lon = Axis::uniform("lon", "", -180.0, 170.0, 36).unwrap().with_period(360.0);
+    vec![lon, Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap()]
+}
+
+fn region_axes() -> Vec<Axis> {
+    vec![Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap(), Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap()]
+}
+
+/// Even axes of a cube.
+fn even_axes(dimensions: usize) -> Vec<Axis> {
+    ["x", "y", "z"][..dimensions].iter().map(|name| Axis::uniform(*name, "", 0.0, 5.0, 11).unwrap()).collect()
+}
+
 #[test]
 fn windows_in_the_plane() {
     let even = || vec![Axis::uniform("x", "", 0.0, 9.0, 19).unwrap(), Axis::uniform("y", "", 1.0, 5.0, 13).unwrap()];
@@ -344,7 +362,7 @@ fn windows_in_the_plane() {
 #[test]
 fn windows_in_space() {
     let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
-    let even = || ["x", "y", "z"].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
+    let even = || even_axes(3);
     check("linear", &smooth(&cartesian(even()), 0.5, false), &stop, 0.1);
     check("linear, holes", &smooth(&cartesian(even()), 0.5, true), &stop, 0.1);
     check("linear, uneven", &smooth(&cartesian(uneven(&[11, 9, 8])), 0.5, false), &stop, 0.1);
@@ -369,15 +387,10 @@ fn windows_in_space() {
 
 #[test]
 fn windows_on_the_sphere() {
-    let lon = Axis::uniform("lon", "", -180.0, 170.0, 36).unwrap().with_period(360.0);
-    let lat = Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap();
-    let globe = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
-    // A particle at a pole, where the grid's cells meet, would be decided by rounding: Clamp lets all live.
+    let (globe, region) = (sphere(globe_axes()), sphere(region_axes()));
+    // Rounding would decide the end of a particle at a pole, where the grid's cells meet. With Clamp none ends.
     let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
     check("globe, cubic", &smooth(&globe, 1.0, false), &around, 0.1);
-    let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
-    let lat = Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap();
-    let region = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
     let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
     check("region, linear, holes", &smooth(&region, 0.8, true), &stop, 3.4);
     check("region, differences", &smooth(&region, 0.8, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);
@@ -385,22 +398,15 @@ fn windows_on_the_sphere() {
 
 #[test]
 fn levels_on_the_sphere() {
-    let grid = |lon: Axis, lat: Axis, heights: &[f64]| {
-        let levels = Axis::new("z", "", heights.to_vec()).unwrap();
-        Arc::new(Grid { axes: vec![lon, lat, levels], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) })
-    };
     let even = [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0];
     let uneven = [0.0, 0.3, 0.7, 1.2, 1.8, 2.5, 3.4];
-    let globe = |heights: &[f64]| {
-        let lon = Axis::uniform("lon", "", -180.0, 170.0, 36).unwrap().with_period(360.0);
-        grid(lon, Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap(), heights)
+    let levels = |mut axes: Vec<Axis>, heights: &[f64]| {
+        axes.push(Axis::new("z", "", heights.to_vec()).unwrap());
+        sphere(axes)
     };
-    let region = |heights: &[f64]| {
-        let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
-        grid(lon, Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap(), heights)
-    };
+    let region = |heights: &[f64]| levels(region_axes(), heights);
     let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
-    check("globe", &smooth(&globe(&even), 0.8, false), &around, 0.1);
+    check("globe", &smooth(&levels(globe_axes(), &even), 0.8, false), &around, 0.1);
     let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
     check("region, uneven levels, holes", &smooth(&region(&uneven), 0.5, true), &stop, 3.4);
     let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
@@ -421,15 +427,13 @@ fn levels_on_the_sphere() {
 
 #[test]
 fn windows_in_half_precision_and_in_pairs() {
-    let even = |n: usize| ["x", "y", "z"][..n].iter().map(|n| Axis::uniform(*n, "", 0.0, 5.0, 11).unwrap()).collect::<Vec<_>>();
+    let even = even_axes;
     let stop = FlowMap { boundary: Boundary::Stop, ..map(3.2, 16) };
     let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
     check_storage("linear, holes", &smooth(&cartesian(even(3)), 0.5, true), &stop, 0.1);
     check_storage("cubic in the plane, holes", &smooth(&cartesian(even(2)), 0.5, true), &cubic, 0.1);
     check_storage("cubic in space", &smooth(&cartesian(even(3)), 0.5, false), &cubic, 0.1);
-    let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
-    let lat = Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap();
-    let region = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
+    let region = sphere(region_axes());
     check_storage("sphere", &smooth(&region, 0.8, true), &stop, 0.1);
     check_storage("sphere, cubic", &smooth(&region, 0.8, false), &cubic, 0.1);
 }

@@ -18,7 +18,7 @@ pub fn threads(count: usize, block: u32) -> LaunchConfig {
 /// The arguments are those of the kernel, in number, order and type. The memory that they point to is as large as the kernel expects and lives until the
 /// work stream has passed the launch.
 pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Result<(), DeviceError> {
-    // SAFETY: the caller's.
+    // SAFETY: as required of the caller.
     unsafe { arguments.launch(config) }.map(|_| ()).map_err(DeviceError::driver("launching a kernel"))
 }
 

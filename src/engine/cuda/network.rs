@@ -211,13 +211,13 @@ impl NetworkKernels {
         out: u64,
     ) -> Result<(), DeviceError> {
         match &self.path {
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             Path::Batched(batched) => unsafe { batched.predict(halves, layers, reading, points, count, out) },
             Path::Fused { predict, .. } => {
                 let n = count as u32;
                 let mut call = self.gpu.work().launch_builder(&predict.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(reading).arg(&points).arg(&n).arg(&out);
-                // SAFETY: the caller's, and the arguments are those of `network_predict`.
+                // SAFETY: as required of the caller; the arguments are those of `network_predict`.
                 unsafe { launch(&mut call, predict.config(count.div_ceil(TILE))) }
             }
         }
@@ -229,12 +229,12 @@ impl NetworkKernels {
     /// Device addresses as for [`Self::predict`]; the samples of `draw` are there, and room for the gradients.
     pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
         match &self.path {
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             Path::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, to) },
             Path::Fused { gradient, .. } => {
                 let mut call = self.gpu.work().launch_builder(&gradient.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&to.tables).arg(&to.layers).arg(&to.loss);
-                // SAFETY: the caller's, and the arguments are those of `network_gradient`.
+                // SAFETY: as required of the caller; the arguments are those of `network_gradient`.
                 unsafe { launch(&mut call, gradient.config((draw.batch as usize).div_ceil(TILE))) }
             }
         }
@@ -427,7 +427,7 @@ impl NetworkAbove<'_> {
 
 impl DevicePredict for DeviceNetwork {
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
-        // SAFETY: the caller's.
+        // SAFETY: as required of the caller.
         unsafe { self.above(None).predict(points, count, out) }
     }
 }
@@ -441,7 +441,7 @@ impl DevicePredict for NetworkAbove<'_> {
         let times = placed_times(&kernels.shape, self.times);
         let (base, share) = self.base.map_or((None, 1.0), |(table, share)| (Some(table), share));
         let reading = reading(&kernels.shape, objective, times, base, share);
-        // SAFETY: the caller's; the parameters are of these kernels' architecture.
+        // SAFETY: as required of the caller; the parameters are of these kernels' architecture.
         unsafe { kernels.predict(halves.address(), layers.address(), &reading, points, count, out) }
     }
 }

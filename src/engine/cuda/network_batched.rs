@@ -250,7 +250,7 @@ impl Batched {
         let mut call = self.gpu.work().launch_builder(&self.predict.function);
         call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(reading).arg(&points).arg(&n);
         call.arg(&passed).arg(&out);
-        // SAFETY: the caller's, and the arguments are those of `batched_predict`.
+        // SAFETY: as required of the caller; the arguments are those of `batched_predict`.
         unsafe { launch(&mut call, self.predict.config(count.div_ceil(self.tiling.rows))) }
     }
 
@@ -272,7 +272,7 @@ impl Batched {
             let mut call = self.gpu.work().launch_builder(&self.gradient.function);
             call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(draw).arg(&first).arg(&n).arg(&held);
             call.arg(&encoded).arg(&values).arg(&deltas).arg(&passed).arg(&to.tables).arg(&to.layers).arg(&to.loss);
-            // SAFETY: the arguments of `batched_gradient`; memory holds as many rows.
+            // SAFETY: the arguments of `batched_gradient`; the memory holds `rows` rows.
             unsafe { launch(&mut call, self.gradient.config(rows / self.tiling.rows)) }?;
 
             let panels = |inputs: usize| inputs.div_ceil(PANEL) * self.tiling.passes;

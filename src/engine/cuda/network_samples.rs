@@ -112,7 +112,7 @@ impl SampleWriter {
             let part = TracedBatch { points: batch.points + 12 * from, labels: batch.labels + label_bytes * from, count, ..batch };
             // Counted before the write: even if it fails, the old samples there are lost.
             to.filled.append(count, capacity);
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             unsafe { self.write(to, first, part, 0) }?;
         }
         Ok(())

@@ -368,7 +368,7 @@ impl DeviceTraining {
         let (samples, n, to) = (ring.samples.address(), ring.len() as u32, count.address());
         let mut call = self.gpu.work().launch_builder(&self.writer.kernels.usable);
         call.arg(&samples).arg(&n).arg(&to);
-        // SAFETY: the arguments of `network_usable`; the ring holds as many samples.
+        // SAFETY: the arguments of `network_usable`; the buffer holds `n` samples.
         unsafe { launch(&mut call, threads(ring.len(), 256)) }?;
         let mut found = [0];
         count.read(&mut found)?;
@@ -397,7 +397,7 @@ impl DeviceTraining {
     ) -> Result<(), DeviceError> {
         let capacity = ring.capacity();
         assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
-        // SAFETY: the caller's.
+        // SAFETY: as required of the caller.
         unsafe { self.writer.append(ring, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
     }
 

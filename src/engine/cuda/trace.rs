@@ -199,7 +199,7 @@ impl DeviceTracer {
     /// The memory at these addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
     pub unsafe fn trace(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         let Some(cells) = self.cells.as_ref().filter(|_| count >= SORT_FROM) else {
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             return unsafe { self.in_given_order(seeds, count, out) };
         };
         let mut sorter = self.sorter.lock().unwrap_or_else(PoisonError::into_inner);
@@ -210,7 +210,7 @@ impl DeviceTracer {
         let most = sorter.at_once();
         for first in (0..count).step_by(most) {
             let part = (count - first).min(most);
-            // SAFETY: the caller's; the launch that reads the sorted points is next on the same stream.
+            // SAFETY: as required of the caller; the launch that reads the sorted points is next on the same stream.
             unsafe {
                 let sorted = sorter.sort(seeds + 12 * first as u64, part, cells)?;
                 self.launch(&self.sorted, self.seeds_a_warp, sorted, part, &shifted(out, first))?;
@@ -225,7 +225,7 @@ impl DeviceTracer {
     /// # Safety
     /// As for [`Self::trace`], with room for every index.
     pub(super) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
-        // SAFETY: the caller's.
+        // SAFETY: as required of the caller.
         unsafe { self.launch(&self.sorted, self.seeds_a_warp, sorted, count, out) }
     }
 
@@ -233,14 +233,14 @@ impl DeviceTracer {
     /// As for [`Self::trace`].
     unsafe fn in_given_order(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         for first in (0..count).step_by(MAX_POINTS) {
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             unsafe { self.launch(&self.plain, 32, seeds + 12 * first as u64, (count - first).min(MAX_POINTS), &shifted(out, first))? };
         }
         Ok(())
     }
 
     /// # Safety
-    /// `seeds` is what the kernel reads, for `count` seeds; `out` has room.
+    /// `seeds` holds `count` seeds in the kernel's format, and `out` has room for their results.
     unsafe fn launch(
         &self,
         kernel: &CudaFunction,
@@ -255,7 +255,7 @@ impl DeviceTracer {
         let n = count as u32;
         let mut call = self.gpu.work().launch_builder(kernel);
         call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.result_policy).arg(&seeds).arg(&n).arg(out);
-        // SAFETY: the caller's; all that the data points to is held by `self`.
+        // SAFETY: as required of the caller; `self` owns all memory that the data points to.
         unsafe { launch(&mut call, threads(32 * count.div_ceil(seeds_a_warp), self.block)) }
     }
 }
