@@ -19,7 +19,7 @@ constexpr int M = ROWS / 32, N = COLUMNS / 32, PANEL = 128;
 
 RW_FN int warp_row(int blocks) { return threadIdx.x / 128 * 16 * blocks; }
 RW_FN int warp_column() { return threadIdx.x / 32 % 4 * 8 * N; }
-// First of this lane's rows (the other is 8 below) and columns (the other is beside it) in block (m, n) of `blocks` times N.
+// First row and column of this lane in block (m, n) of `blocks` times N. Its second row is 8 further, its second column the next one.
 RW_FN int lane_row(int blocks, int m) { return warp_row(blocks) + 16 * m + int(lane() >> 2); }
 RW_FN int lane_column(int n) { return warp_column() + 8 * n + 2 * int(lane() & 3u); }
 
@@ -453,8 +453,10 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
                 squares = fma_(0.25f * tile.slopes[row][output], tile.slopes[row][output], squares);
                 sum += tile.slopes[row][output];
             }
-            squares = warp_sum(squares);
-            sum = warp_sum(sum);
+            for (int apart = 16; apart > 0; apart /= 2) {
+                squares += __shfl_xor_sync(0xffffffffu, squares, apart);
+                sum += __shfl_xor_sync(0xffffffffu, sum, apart);
+            }
             if (lane() == 0u) {
                 atomicAdd(loss, double(squares) / OUTPUTS / draw.batch);
                 atomicAdd(head_gradient + WIDTH * OUTPUTS + output, sum);

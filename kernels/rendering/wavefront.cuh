@@ -26,10 +26,10 @@ RW_FN uint32_t part_start(const Band& band, uint32_t part) {
 
 // State of the slots: one array per group of fields that are accessed together.
 struct Slots {
-    Float4* place;       // origin, t
-    Float4* way;         // direction, end
-    Float4* colour;      // radiance, weight
-    Uint4* progress;  // sample, dimension and (in the upper two bits) stage, queries, traced
+    Float4* place;     // origin, t
+    Float4* way;       // direction, end
+    Float4* colour;    // radiance, weight
+    Uint4* progress;   // sample, dimension and (in the upper two bits) stage, queries, traced
     Float2* seen;      // weight and weighted FTLE of the scattering event
     uint32_t* first;   // first pending collision in the queue
     double* sums;      // PIXEL_SUM_FIELDS arrays of `count` sums
@@ -41,7 +41,7 @@ struct Slots {
 // whose records are read while new ones are written.
 struct Queue {
     float* points;                // domain coordinates, three per collision
-    Float4* hits;                   // t, majorant, cell, next
+    Float4* hits;                 // t, majorant, cell, next
     uint32_t* length;
     const Float4* answered;       // records of the answered collisions
     const float* log_stretch;     // NaN: no value exists
