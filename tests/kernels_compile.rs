@@ -123,13 +123,3 @@ fn what_does_not_compile_is_told_with_the_log() {
     let error = request.compile().unwrap_err().to_string();
     assert!(error.contains("trace_closed.cu") && error.contains("nonsense"), "{error}");
 }
-#[test]
-fn dump_variants() {
-    use std::io::Write;
-    let mut f = std::fs::File::create("/tmp/k_variants.txt").unwrap();
-    for source in SOURCES.iter().filter_map(|(path, _)| path.rsplit('/').next()) {
-        for defines in variants(source) {
-            writeln!(f, "{source}\t{}", defines.join(" ")).unwrap();
-        }
-    }
-}
