@@ -199,7 +199,8 @@ RW_FN void encode_tangents(float2 (&sums)[GROUPS], [[maybe_unused]] const Level*
         });
     };
     add_single(column, &float2::x);
-    if (column + 1 < ENCODED) add_single(column + 1, &float2::y);
+    if (column + 1 >= ENCODED) return;
+    add_single(column + 1, &float2::y);
 #else
     add_level(column / FEATURES, [&](uint32_t entry, const float (&factors)[GROUPS]) {
         const float2 pair = features.pair(entry, column % FEATURES);
