@@ -1,5 +1,5 @@
-//! Compiles every kernel for two architectures, in representative variants. Needs NVRTC but no GPU: `make test` fetches NVRTC and runs these tests;
-//! a plain `cargo test` reports them as ignored.
+//! Compiles every kernel for two architectures, in representative variants. Needs NVRTC but no GPU: `make test` fetches NVRTC and runs these
+//! tests; a plain `cargo test` reports them as ignored.
 
 #![cfg(feature = "cuda")]
 #![allow(clippy::unwrap_used)]

@@ -1,5 +1,5 @@
-//! Compares the rendering kernels' numerics, compiled as host C++, with the Rust code on random inputs. The source is the one that runs on the GPU; the
-//! test needs no GPU but a C++ compiler (`c++`, or the one in CXX).
+//! Compares the rendering kernels' numerics, compiled as host C++, with the Rust code on random inputs. The source is the one that runs on the
+//! GPU; the test needs no GPU but a C++ compiler (`c++`, or the one in CXX).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
 use ridgewatch::engine::{residuals, stratified_points};

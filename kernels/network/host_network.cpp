@@ -1,5 +1,5 @@
-// A network as host C++, for the test that compares it with the Rust reference. Places, encodings, tangents and the map from outputs to log-stretch
-// are the device's; layers are multiplied in single precision. Compiled with the macros of network.cuh.
+// A network as host C++, for the test that compares it with the Rust reference. Places, encodings, tangents and the map from outputs to
+// log-stretch are the device's; layers are multiplied in single precision. Compiled with the macros of network.cuh.
 #include "network/network_data.cuh"
 
 using namespace rw;

@@ -29,7 +29,8 @@ RW_FN bool table_index(const Grid& grid, size_t i, size_t* at) {
     return inside < grid.levels[level].entries;
 }
 
-// One thread per value of the padded tables, `n` in all. With `lazy`, groups of 16 values without a gradient are skipped (see lazy_step in adam.rs).
+// One thread per value of the padded tables, `n` in all. With `lazy`, groups of 16 values without a gradient are skipped (see lazy_step in
+// adam.rs).
 extern "C" __global__ void __launch_bounds__(256)
 network_adam_tables(const __grid_constant__ Grid grid, const Adam adam, uint64_t n, uint32_t lazy, float* __restrict__ gradient,
                     float* __restrict__ parameters, float* __restrict__ first, float* __restrict__ second, uint16_t* __restrict__ halves) {
@@ -77,9 +78,9 @@ network_points(const __grid_constant__ UnitBox domain, uint64_t seed, uint64_t f
     }
 }
 
-// Turns traced points (domain coordinates) and their labels into samples. From a log-stretch the target is its difference to `base`, scaled; from an
-// arrival (domain coordinates, 3 floats each) it is the scaled displacement (see Objective::targets). One point in 2^held_back gets no target,
-// since the host may keep it for validation; with 0 all points get one.
+// Turns traced points (domain coordinates) and their labels into samples. From a log-stretch the target is its difference to `base`, scaled;
+// from an arrival (domain coordinates, 3 floats each) it is the scaled displacement (see Objective::targets). One point in 2^held_back gets no
+// target, since the host may keep it for validation; with 0 all points get one.
 extern "C" __global__ void __launch_bounds__(256)
 network_samples(const __grid_constant__ UnitBox domain, const __grid_constant__ Reading reading, const float* __restrict__ points,
                 const float* __restrict__ labels, uint32_t n, uint32_t held_back, Float4* __restrict__ samples) {
@@ -125,8 +126,8 @@ network_usable(const Float4* __restrict__ samples, uint32_t n, uint32_t* __restr
     if ((threadIdx.x & 31u) == 0u && usable) atomicAdd(count, uint32_t(__popc(usable)));
 }
 
-// The penalty on the difference of a batch's means needs all outputs before any gradient. `network_drawn` writes the batch's points (`points` and
-// `further`, see Reading); after a prediction at them, `network_means` compares predictions with labels, both in linear scale.
+// The penalty on the difference of a batch's means needs all outputs before any gradient. `network_drawn` writes the batch's points (`points`
+// and `further`, see Reading); after a prediction at them, `network_means` compares predictions with labels, both in linear scale.
 extern "C" __global__ void __launch_bounds__(256)
 network_drawn(const __grid_constant__ Draw draw, float* __restrict__ points, float* __restrict__ further) {
     const uint32_t i = blockIdx.x * 256u + threadIdx.x;

@@ -2,14 +2,15 @@
 // multilayer perceptron (Mueller et al. 2021). Mirrors src/surrogate/network/.
 //
 // A warp carries 16 samples through the network in registers. Between layers the values have the layout of the matrix instruction's left operand
-// (rows are samples, columns neurons): lane 4g + q holds, of samples g and g + 8, columns 2q and 2q + 1 of every 8. The lane that gathers a pair of
-// features is therefore the one that needs them, and the one that receives their gradient. Values are in half precision, sums in single precision.
+// (rows are samples, columns neurons): lane 4g + q holds, of samples g and g + 8, columns 2q and 2q + 1 of every 8. The lane that gathers a pair
+// of features is therefore the one that needs them, and the one that receives their gradient. Values are in half precision, sums in single
+// precision.
 //
-// Macros: RW_DIMS, number of inputs; RW_AXES, their places in a sample (axes have their own, times take those of unused axes, then further ones);
-// RW_SPACE, number of inputs that are axes, which come first; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH, neurons of a hidden
-// layer; RW_HIDDEN, number of hidden layers; RW_FLOW_MAP (1: one output per axis, whose derivatives along the axes are the gradient of the flow map;
-// 0: one output); RW_PENALTY (1: the loss has a penalty on batch means); RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, shared memory of prediction and of
-// training.
+// Macros: RW_DIMS, number of inputs; RW_AXES, their places in a sample (axes have their own, times take those of unused axes, then further
+// ones); RW_SPACE, number of inputs that are axes, which come first; RW_LEVELS (0: frequencies), RW_FEATURES, RW_OCTAVES; RW_WIDTH, neurons of a
+// hidden layer; RW_HIDDEN, number of hidden layers; RW_FLOW_MAP (1: one output per axis, whose derivatives along the axes are the gradient of
+// the flow map; 0: one output); RW_PENALTY (1: the loss has a penalty on batch means); RW_WEIGHTS_BYTES and RW_WORKSPACE_BYTES, shared memory of
+// prediction and of training.
 #pragma once
 #include "common/base.cuh"
 
@@ -237,7 +238,8 @@ RW_FN void multiply(float (&d)[4], const uint32_t (&a)[4], uint32_t b0, uint32_t
         : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
 }
 
-// Loads four 8x8 blocks from shared memory. Lane i passes the address of row i % 8 of block i / 8; lane 4g + q gets columns 2q, 2q + 1 of row g of each.
+// Loads four 8x8 blocks from shared memory. Lane i passes the address of row i % 8 of block i / 8; lane 4g + q gets columns 2q, 2q + 1 of row g
+// of each.
 RW_FN void load_blocks(uint32_t (&to)[4], const uint16_t* row) {
     asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
                  : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])

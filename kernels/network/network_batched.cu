@@ -1,7 +1,7 @@
 // Prediction and gradient of a batch for networks too wide or too deep for a warp's registers: tiled matrix products with asynchronous copies
-// (software pipelining, as in CUTLASS). A block takes a tile of samples through all layers; their values stay in shared memory while slices of the
-// layers stream in from the L2 cache. Training stores each layer's values and gradients, whose products over all samples are the weight gradients.
-// Values and weights are in half precision, sums in single precision, as in network_fused.cu.
+// (software pipelining, as in CUTLASS). A block takes a tile of samples through all layers; their values stay in shared memory while slices of
+// the layers stream in from the L2 cache. Training stores each layer's values and gradients, whose products over all samples are the weight
+// gradients. Values and weights are in half precision, sums in single precision, as in network_fused.cu.
 //
 // Macros besides those of network.cuh: RW_ROWS, samples of a tile; RW_STAGES, slices in shared memory or in flight; RW_TILE_BYTES and
 // RW_PRODUCT_BYTES, the shared memory of a tile and of a product. Slices are padded with zeros, which contribute nothing.
@@ -55,8 +55,8 @@ struct Operands {
     const uint16_t *left, *right;
 };
 
-// A product's sums, and blocks of its operands in registers. The next blocks are read into registers of blocks already multiplied. The four quarters
-// of the sums alternate, so that loads are one or two quarters ahead of their use.
+// A product's sums, and blocks of its operands in registers. The next blocks are read into registers of blocks already multiplied. The four
+// quarters of the sums alternate, so that loads are one or two quarters ahead of their use.
 template <class Left, int BLOCKS> struct Product {
     static constexpr int HALF_BLOCKS = (BLOCKS + 1) / 2, PAIRS = N / 2, HALF_PAIRS = (PAIRS + 1) / 2;
     float (&sums)[BLOCKS][N][4];
@@ -186,8 +186,8 @@ struct TileRows {
     static RW_FN void read(uint32_t (&to)[4], const uint16_t* from, int m) { load_blocks(to, from + 16 * m * ROW); }
 };
 
-// Replaces the tile's values by their product with the next slices (`depth` rows, PARTS * COLUMNS columns). `begin(sums, part)` initialises a part's
-// sums, and `end(sums, part, pairs)` turns them into pairs of halves. The whole block must call it.
+// Replaces the tile's values by their product with the next slices (`depth` rows, PARTS * COLUMNS columns). `begin(sums, part)` initialises a
+// part's sums, and `end(sums, part, pairs)` turns them into pairs of halves. The whole block must call it.
 template <int PARTS, class Begin, class End> RW_FN void multiply_tile(Tile& tile, Stream& stream, int depth, Begin begin, End end) {
     const uint32_t l = lane();
     const uint16_t* left = &tile.values[warp_row(M) + (l >> 3 & 1u) * 8u + (l & 7u)][(l >> 4) * 8u];
@@ -222,8 +222,8 @@ constexpr int PASSED = PASSES * M * THREADS;
 // Bit of a block's word that is set if the lower value of a pair is not 0; the upper value's bit is 16 higher.
 RW_FN constexpr int passed_bit(int n, int half) { return 16 - 2 * N + 2 * n + half; }
 
-// Computes a layer's values from the previous layer's. If `passed` is not null, it gets the bits of values that are not 0: one word for each of a
-// thread's M blocks, with adjacent threads in adjacent words.
+// Computes a layer's values from the previous layer's. If `passed` is not null, it gets the bits of values that are not 0: one word for each of
+// a thread's M blocks, with adjacent threads in adjacent words.
 RW_FN void forward_tile(Tile& tile, Stream& stream, int depth, const float* __restrict__ biases, uint32_t* passed) {
     auto begin = [&](float (&sums)[M][N][4], int pass) {
         RW_UNROLL for (int n = 0; n < N; ++n) {
@@ -260,7 +260,8 @@ RW_FN void add_pair(float* row, int column, float x, float y) {
     }
 }
 
-// Products with the next slices, masked by the ReLU's bits. `also(column, sum)` gets the sums over this lane's rows for its column and the next one.
+// Products with the next slices, masked by the ReLU's bits. `also(column, sum)` gets the sums over this lane's rows for its column and the next
+// one.
 template <class Also> RW_FN void masked_tile(Tile& tile, Stream& stream, int depth, const uint32_t* passed, Also also) {
     auto begin = [](float (&sums)[M][N][4], int) { clear(sums); };
     multiply_tile<PASSES>(tile, stream, depth, begin, [&](const float (&sums)[M][N][4], int pass, uint32_t (&pairs)[M][N][2]) {
@@ -390,8 +391,8 @@ RW_FN void predict_tile(Tile& tile, Stream& stream, const uint16_t* tables, cons
 #endif
 }
 
-// Log-stretch at `n` points (3 floats each, unit coordinates). `slices` and `biases` are the results of `batched_slices`. `passed`: for a flow map
-// HIDDEN times PASSED words per block.
+// Log-stretch at `n` points (3 floats each, unit coordinates). `slices` and `biases` are the results of `batched_slices`. `passed`: for a flow
+// map HIDDEN times PASSED words per block.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_predict(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
                 const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Reading reading,
@@ -426,8 +427,8 @@ RW_FN Sample sample_at(const Draw& draw, uint32_t position) {
     return position < draw.batch ? drawn_sample(draw, position) : no_sample();
 }
 
-// Adds the gradients of the head and of the last hidden layer's biases, and adds the squared errors over outputs and batch to the loss. Replaces the
-// values of the last hidden layer by the gradient with respect to its sums. A sample without targets contributes nothing.
+// Adds the gradients of the head and of the last hidden layer's biases, and adds the squared errors over outputs and batch to the loss. Replaces
+// the values of the last hidden layer by the gradient with respect to its sums. A sample without targets contributes nothing.
 RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& draw, float* head_gradient, float* bias_gradient, double* loss) {
     float outputs[OWN][OUTPUTS];
     outputs_of(outputs, tile, head);
@@ -515,9 +516,9 @@ RW_FN void head_tile(Tile& tile, const float* __restrict__ head, const Draw& dra
 // First bias of a hidden layer of the flat vector.
 RW_FN constexpr int bias_start(int layer) { return layer_start(layer) + (layer == 0 ? ENCODED : WIDTH) * WIDTH; }
 
-// Handles `rows` samples (whole tiles) of a batch from number `first` on. Adds the gradients of the tables (`table_gradient`, padded), of the biases and
-// the head (`layer_gradient`, flat) and the loss. Stores encoded points (rows of ENCODED_PADDED), and values of and gradients with respect to the sums
-// of each hidden layer (rows of PADDED, `held` rows per layer). `passed`: HIDDEN - 1 times PASSED words per block.
+// Handles `rows` samples (whole tiles) of a batch from number `first` on. Adds the gradients of the tables (`table_gradient`, padded), of the
+// biases and the head (`layer_gradient`, flat) and the loss. Stores encoded points (rows of ENCODED_PADDED), and values of and gradients with
+// respect to the sums of each hidden layer (rows of PADDED, `held` rows per layer). `passed`: HIDDEN - 1 times PASSED words per block.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_gradient(const __grid_constant__ Grid grid, const uint16_t* __restrict__ tables, const uint16_t* __restrict__ slices,
                  const float* __restrict__ biases, const float* __restrict__ head, const __grid_constant__ Draw draw, uint32_t first, uint32_t rows,
@@ -588,8 +589,8 @@ struct PanelColumns {
     static RW_FN void read(uint32_t (&to)[4], const uint16_t* from, int m) { load_transposed(to, from + 16 * m); }
 };
 
-// Adds the weight gradients over `rows` samples: the transposed inputs of a layer times its gradients, as `batched_gradient` stored them. Each block of
-// the grid's y takes `share` samples; each block of its x takes PANEL times COLUMNS weights, layer by layer.
+// Adds the weight gradients over `rows` samples: the transposed inputs of a layer times its gradients, as `batched_gradient` stored them. Each
+// block of the grid's y takes `share` samples; each block of its x takes PANEL times COLUMNS weights, layer by layer.
 extern "C" __global__ void __launch_bounds__(THREADS, 1)
 batched_products(const uint16_t* __restrict__ encoded, const uint16_t* __restrict__ values, const uint16_t* __restrict__ deltas, uint32_t rows,
                  uint32_t held, uint32_t share, float* __restrict__ layer_gradient) {

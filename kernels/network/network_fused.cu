@@ -1,5 +1,5 @@
-// Prediction and gradient of a batch by a fully fused multilayer perceptron (Mueller et al. 2021): a warp keeps its samples in registers through all
-// layers, whose weights are in shared memory. network_batched.cu has the networks that are too large for this.
+// Prediction and gradient of a batch by a fully fused multilayer perceptron (Mueller et al. 2021): a warp keeps its samples in registers through
+// all layers, whose weights are in shared memory. network_batched.cu has the networks that are too large for this.
 #include "network/network_data.cuh"
 
 using namespace rw;

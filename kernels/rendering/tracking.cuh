@@ -1,7 +1,7 @@
 // One path, by single scattering: the free flight from the camera by delta tracking (Woodcock et al. 1965), then the transmittance toward the
 // light by ratio tracking (Novak et al. 2014). States and random numbers equal those of `render::tracking`. Both walk the majorant grid and stop
-// at tentative collisions, at which the extinction is queried. If an extinction exceeds its majorant, the null-collision rate is negative; events
-// are then drawn in proportion to absolute rates and weighted (Galtier et al. 2013), which keeps the estimator unbiased.
+// at tentative collisions, at which the extinction is queried. If an extinction exceeds its majorant, the null-collision rate is negative;
+// events are then drawn in proportion to absolute rates and weighted (Galtier et al. 2013), which keeps the estimator unbiased.
 //
 // Positions of a flight's tentative collisions do not depend on the answers there; answers only decide how many of them the flight reaches. A
 // flight may therefore query several at once (`look_ahead`). Answers beyond its end are ignored.

@@ -16,8 +16,8 @@ RW_FN void sin_cos_pi(double x, double& sine, double& cosine) {
     cosine = (quarter + 1) & 2 ? -b : b;
 #endif
 }
-// sin and cos of pi x without their common sign, which is minus if the lowest bit of the result is set. Reduction to half a turn, unlike a quarter,
-// never exchanges the two, which saves instructions. Minimax polynomials with errors of 4e-9 and 5e-8.
+// sin and cos of pi x without their common sign, which is minus if the lowest bit of the result is set. Reduction to half a turn, unlike a
+// quarter, never exchanges the two, which saves instructions. Minimax polynomials with errors of 4e-9 and 5e-8.
 RW_FN uint32_t half_turn(float x, float& sine, float& cosine) {
     float shifted = x + 12582912.0f, r = x - (shifted - 12582912.0f), u = r * r;
     sine = fma_(fma_(fma_(fma_(0.077222246f, u, -0.59804645f), u, 2.5500316f), u, -5.1677069f), u, 3.1415926f) * r;
@@ -144,8 +144,8 @@ template <> struct FormOf<LINEAR> {
 // Edge policies of flow::Boundary.
 enum Boundary { STOP = 0, CLAMP = 1, PERIODIC = 2, UNBOUNDED = 3, ZERO = 4 };
 
-// The flow's bounds: particles stop outside [low, high]; `box` is the domain. `rate`: radians of phase per unit of time, used if every seed has its
-// own start.
+// The flow's bounds: particles stop outside [low, high]; `box` is the domain. `rate`: radians of phase per unit of time, used if every seed has
+// its own start.
 template <class Real> struct ClosedData {
     Real low[3], high[3], box_low[3], box_high[3];
     double rate;

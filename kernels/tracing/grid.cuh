@@ -1,15 +1,15 @@
 // Velocity between nodes and snapshots: linear in time, linear or cubic (Catmull and Rom 1974) in space, with the exact derivative of the
 // interpolant. Mirrors src/flow/axis_map.rs, sampler.rs and grid_flow.rs.
 //
-// Neighbouring threads have neighbouring seeds, and a particle stays in its cell for several stages. Each thread therefore caches the corners of its
-// cell, at both snapshots, in registers and reads them again only if the cell or the snapshots change (Config::KEEP).
+// Neighbouring threads have neighbouring seeds, and a particle stays in its cell for several stages. Each thread therefore caches the corners of
+// its cell, at both snapshots, in registers and reads them again only if the cell or the snapshots change (Config::KEEP).
 #pragma once
 #include "common/base.cuh"
 
 namespace rw {
 
-// Storage of nodes. F16_PAIRS stores each node in half precision, followed by its change to the next snapshot, so that one request reads both and
-// the second snapshot is never accessed.
+// Storage of nodes. F16_PAIRS stores each node in half precision, followed by its change to the next snapshot, so that one request reads both
+// and the second snapshot is never accessed.
 enum Storage { F32 = 0, F16 = 1, F16_PAIRS = 2 };
 
 // One axis. A state coordinate is the distance from the first node in mean spacings.
@@ -45,8 +45,8 @@ template <class R> struct GridData {
     double radius, level;
 };
 
-// Start, middle and end of one step: the two adjacent snapshots around each time, and the weight of the later one. Addresses instead of indices into
-// a table of snapshots save a dependent load before each cell is read.
+// Start, middle and end of one step: the two adjacent snapshots around each time, and the weight of the later one. Addresses instead of indices
+// into a table of snapshots save a dependent load before each cell is read.
 template <class R> struct GridStep {
     const void* first[3];
     const void* second[3];
@@ -86,8 +86,8 @@ template <bool EVEN, bool WRAP, class R> RW_FN Place<R> locate(const AxisData<R>
     return place;
 }
 
-// One node: velocity components, and false in `known` if it is missing. NaN in the fourth place marks a missing node; without a fourth component the
-// place holds the mark alone.
+// One node: velocity components, and false in `known` if it is missing. NaN in the fourth place marks a missing node; without a fourth component
+// the place holds the mark alone.
 template <class Config> struct Node {
     float v[4];
     bool known;
@@ -188,7 +188,8 @@ template <class Config, class Real> struct Sampler {
     static constexpr bool SCALE_LATE = Config::SCALED && DOUBLE;
     using Step = GridStep<R>;
 
-    // The cell read last. `second` is the change since the first snapshot in single precision, the second snapshot's velocity in double precision.
+    // The cell read last. `second` is the change since the first snapshot in single precision, the second snapshot's velocity in double
+    // precision.
     struct CellCache {
         const void* snapshot = nullptr;
         uint32_t cell = 0;

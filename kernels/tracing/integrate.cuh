@@ -153,8 +153,9 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
 }
 
 #if RW_DEVICE
-// As `trace_differences` with one particle per lane, each with its own cached cell. The particles of a seed are in the lanes of the mask `group`,
-// from lane `first` on. All lanes of the warp must call it; a lane without a seed has an empty `group`. The result is valid in lane `first`.
+// As `trace_differences` with one particle per lane, each with its own cached cell. The particles of a seed are in the lanes of the mask
+// `group`, from lane `first` on. All lanes of the warp must call it; a lane without a seed has an empty `group`. The result is valid in lane
+// `first`.
 template <class Flow>
 RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flow& flow, int steps, typename Flow::R h, double gap,
                                                                       const double (&seed)[3], int particle, int first, uint32_t group) {

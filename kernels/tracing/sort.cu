@@ -3,8 +3,8 @@
 // 1. sort_count: each point's bucket and, from the counter's previous value, its rank within the bucket.
 // 2. scan_*: bucket starts from bucket counts.
 // 3. sort_place: writes {x, y, z, index} at start + rank.
-// Buckets are ranges of the Morton curve that hold a few points each, so that a warp reads the same cells as after a full sort. Atomics decide the
-// order within a bucket, which differs from run to run. Results are written by index and do not depend on it.
+// Buckets are ranges of the Morton curve that hold a few points each, so that a warp reads the same cells as after a full sort. Atomics decide
+// the order within a bucket, which differs from run to run. Results are written by index and do not depend on it.
 #include "common/base.cuh"
 
 using namespace rw;

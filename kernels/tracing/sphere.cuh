@@ -1,5 +1,5 @@
-// Gridded flow on the sphere. The state is a unit vector in R^3 that moves with velocity / radius and is normalised after each step, so that poles are
-// regular points. Its gradient is taken in the tangent plane. Mirrors src/flow/sphere.rs and src/flow/sphere_levels.rs.
+// Gridded flow on the sphere. The state is a unit vector in R^3 that moves with velocity / radius and is normalised after each step, so that
+// poles are regular points. Its gradient is taken in the tangent plane. Mirrors src/flow/sphere.rs and src/flow/sphere_levels.rs.
 #pragma once
 #include "tracing/grid.cuh"
 
@@ -69,8 +69,9 @@ template <class R> RW_FN void tangential_velocity(const SpherePoint<R>& h, const
     RW_UNROLL for (int i = 0; i < 3; i++) v[i] = fma_(-radial, h.p[i], all[i]);
 }
 
-// Particles on the sphere. The state is a direction and, with levels (Config::N == 3), a height in mean distances between levels. A horizontal metre is a
-// metre on the sphere's radius at every height, and the fourth stored component is the vertical velocity. Config as for Sampler, with COMPONENTS = N + 1.
+// Particles on the sphere. The state is a direction and, with levels (Config::N == 3), a height in mean distances between levels. A horizontal
+// metre is a metre on the sphere's radius at every height, and the fourth stored component is the vertical velocity. Config as for Sampler, with
+// COMPONENTS = N + 1.
 template <class Config, class Real> struct SphereFlow {
     using R = Real;
     static constexpr bool LEVELS = Config::N == 3, SETTLES = true;

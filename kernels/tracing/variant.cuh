@@ -1,5 +1,5 @@
-// Kernels that trace seeds, for the flow that the including file selects by macros. It defines `Config`, `Flow` (constructed from a `FlowData`, an
-// array of `FlowTimes` and a seed) and BLOCK, the threads of a block. RW_DIFFERENCES selects central differences instead of the tangent.
+// Kernels that trace seeds, for the flow that the including file selects by macros. It defines `Config`, `Flow` (constructed from a `FlowData`,
+// an array of `FlowTimes` and a seed) and BLOCK, the threads of a block. RW_DIFFERENCES selects central differences instead of the tangent.
 #pragma once
 #include "tracing/integrate.cuh"
 

@@ -182,8 +182,8 @@ impl Drop for Program {
     }
 }
 
-/// Cache of compiled kernels on disk. It never fails: an entry that cannot be read is compiled, one that cannot be written is compiled again in the next
-/// run.
+/// Cache of compiled kernels on disk. It never fails: an entry that cannot be read is compiled, one that cannot be written is compiled again in
+/// the next run.
 #[derive(Debug)]
 pub struct KernelCache {
     folder: Option<PathBuf>,

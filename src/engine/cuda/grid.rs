@@ -165,8 +165,8 @@ pub(super) fn storage_define(storage: Storage) -> String {
     format!("RW_STORAGE={}", storage as u8)
 }
 
-/// Interval between snapshots and weight of its later snapshot, at start, middle and end of every step. A snapshot's own time belongs to the interval
-/// that the particle enters next, so that the end of a step reads the same cell as the start of the next one.
+/// Interval between snapshots and weight of its later snapshot, at start, middle and end of every step. A snapshot's own time belongs to the
+/// interval that the particle enters next, so that the end of a step reads the same cell as the start of the next one.
 pub fn stages(times: &[f64], from: f64, to: f64, steps: usize) -> Vec<[(usize, f64); 3]> {
     let last = times.len() - 1;
     let forward = to > from;

@@ -1,4 +1,5 @@
-//! Compares the tracing kernels' numerics, compiled as host C++ with the macros and arguments of a launch, with the Rust reference in f64. Needs no GPU.
+//! Compares the tracing kernels' numerics, compiled as host C++ with the macros and arguments of a launch, with the Rust reference in f64. Needs
+//! no GPU.
 
 use super::grid::{GridArguments, Nodes, WindowFlowMap};
 use super::layout::{DeviceReal, Outputs, ResultPolicy};

@@ -15,8 +15,8 @@ pub fn threads(count: usize, block: u32) -> LaunchConfig {
 /// Error of the driver.
 ///
 /// # Safety
-/// The arguments are those of the kernel, in number, order and type. The memory that they point to is as large as the kernel expects and lives until the
-/// work stream has passed the launch.
+/// The arguments are those of the kernel, in number, order and type. The memory that they point to is as large as the kernel expects and lives
+/// until the work stream has passed the launch.
 pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Result<(), DeviceError> {
     // SAFETY: as required of the caller.
     unsafe { arguments.launch(config) }.map(|_| ()).map_err(DeviceError::driver("launching a kernel"))

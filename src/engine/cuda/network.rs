@@ -1,7 +1,7 @@
 //! The network on the device: its kernels, compiled for one architecture, and prediction.
 //!
-//! Tables are in half precision, each level padded to a multiple of 64 entries. Layers are in burn's layout; a block rounds them when it reads them
-//! (fused), or a kernel does once per call (batched).
+//! Tables are in half precision, each level padded to a multiple of 64 entries. Layers are in burn's layout; a block rounds them when it reads
+//! them (fused), or a kernel does once per call (batched).
 
 use super::launch::Resident;
 use super::layout::TableArgument;
@@ -38,8 +38,8 @@ pub(super) fn has_penalty(objective: &Objective) -> bool {
     objective.target == Target::Ftle && objective.loss == Loss::Published && objective.mean_penalty != 0.0
 }
 
-/// Macros of `network*.cu` for an architecture and a loss with or without a penalty on means. `None` if the architecture has no hidden layer or is
-/// the flow map of a single axis.
+/// Macros of `network*.cu` for an architecture and a loss with or without a penalty on means. `None` if the architecture has no hidden layer or
+/// is the flow map of a single axis.
 pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
     let flow_map = shape.target == Target::FlowMap;
@@ -411,8 +411,8 @@ impl DeviceNetwork {
         2 * self.kernels.padded + 4 * self.layers.len()
     }
 
-    /// Adds a share of the network to a table. If times are inputs, points carry them at the places of unused axes; times without such a place are those
-    /// of samples without times.
+    /// Adds a share of the network to a table. If times are inputs, points carry them at the places of unused axes; times without such a place
+    /// are those of samples without times.
     pub fn above<'a>(&'a self, base: Option<(&'a DeviceTable, f32)>) -> NetworkAbove<'a> {
         NetworkAbove { network: self, base, times: None }
     }

@@ -1,5 +1,5 @@
-//! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and weight gradients are products over
-//! all samples. See `kernels/network/network_batched.cu`.
+//! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and weight gradients are products
+//! over all samples. See `kernels/network/network_batched.cu`.
 
 use super::launch::Resident;
 use super::network_layout::{DrawArgument, GridArgument, ReadingArgument};
@@ -219,7 +219,8 @@ impl Batched {
         Ok(Rounded { slices, biases })
     }
 
-    /// Rounds the layers (device address of the flat vector) into `count` values of the slices, and pads the biases. Returns the addresses of both.
+    /// Rounds the layers (device address of the flat vector) into `count` values of the slices, and pads the biases. Returns the addresses of
+    /// both.
     fn round(&self, rounded: &Rounded, layers: u64, count: usize) -> Result<(u64, u64), DeviceError> {
         let (n, slices, biases) = (count as u32, rounded.slices.address(), rounded.biases.address());
         let mut call = self.gpu.work().launch_builder(&self.round);

@@ -74,8 +74,8 @@ impl SampleWriter {
         size_of::<[f32; 4]>() * sample_float4s(&self.kernels.shape)
     }
 
-    /// Writes samples of traced points from number `first` on. `further`: device address of the times without a place in a point, 0 if the batch's unit
-    /// times apply instead.
+    /// Writes samples of traced points from number `first` on. `further`: device address of the times without a place in a point, 0 if the
+    /// batch's unit times apply instead.
     ///
     /// # Safety
     /// As for [`super::DeviceTraining::append`].

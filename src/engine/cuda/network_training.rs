@@ -1,7 +1,7 @@
 //! Training on the device: [`DeviceTraining::train_steps`] takes optimizer steps (batch, gradient, Adam, running mean) with one wait at the end.
 //!
-//! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use half-precision
-//! values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.
+//! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use
+//! half-precision values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.
 
 use super::network::{DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_float4s, unit_box};
 use super::network_batched::GradientTo;
@@ -375,8 +375,9 @@ impl DeviceTraining {
         Ok(found[0] as usize)
     }
 
-    /// Appends traced points on the device: `count` points (three f32 each, coordinates of `domain`, with times at the places of unused axes) and their
-    /// labels: log-stretch (f32 each), or for a flow map arrivals (three f32 each, coordinates of `domain`). Training skips samples that are not finite.
+    /// Appends traced points on the device: `count` points (three f32 each, coordinates of `domain`, with times at the places of unused axes)
+    /// and their labels: log-stretch (f32 each), or for a flow map arrivals (three f32 each, coordinates of `domain`). Training skips samples
+    /// that are not finite.
     ///
     /// # Errors
     /// Error of the driver.
@@ -418,7 +419,8 @@ impl DeviceTraining {
         self.writer.clone()
     }
 
-    /// Takes the steps in order and waits for the last one. Returns the loss before each step. Random steps draw from `samples` and `more` together.
+    /// Takes the steps in order and waits for the last one. Returns the loss before each step. Random steps draw from `samples` and `more`
+    /// together.
     ///
     /// # Errors
     /// Error of the driver; the parameters are then lost.

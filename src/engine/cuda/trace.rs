@@ -219,8 +219,8 @@ impl DeviceTracer {
         Ok(())
     }
 
-    /// Traces `count` seeds that are in an order of good locality already: `{x, y, z, index as bits}`. Results go to their index; index 0xffffffff
-    /// marks an entry without a seed.
+    /// Traces `count` seeds that are in an order of good locality already: `{x, y, z, index as bits}`. Results go to their index; index
+    /// 0xffffffff marks an entry without a seed.
     ///
     /// # Safety
     /// As for [`Self::trace`], with room for every index.
