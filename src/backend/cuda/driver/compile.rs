@@ -1,7 +1,7 @@
-//! From kernel sources to machine code: NVRTC for the device found, kept on disk.
+//! Compiles kernel sources to machine code (CUBIN) by NVRTC, with a cache on disk.
 //!
-//! Each file in `kernels/` is compiled with macros that fix what a run does not change (dimensions, precision, interpolation, ...):
-//! the kernel then holds one variant only, with the registers that this variant needs.
+//! Each source in `kernels/` is compiled with macros for everything that is constant during a run (dimensions, precision, interpolation, ...). A
+//! kernel then contains one variant only and uses no more registers than this variant needs.
 
 use crate::backend::cuda::DeviceError;
 use cudarc::nvrtc::{result as nvrtc, sys};
@@ -10,60 +10,62 @@ use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-macro_rules! kernel {
-    ($name:literal) => {
-        ($name, include_str!(concat!("../../../../kernels/", $name)))
+macro_rules! kernel_files {
+    ($($path:literal),* $(,)?) => {
+        &[$(($path, include_str!(concat!("../../../../kernels/", $path)))),*]
     };
 }
 
-/// The `.cu` files, by name.
-pub const SOURCES: &[(&str, &str)] = &[
-    kernel!("answer.cu"),
-    kernel!("audit.cu"),
-    kernel!("network.cu"),
-    kernel!("network_batched.cu"),
-    kernel!("network_fused.cu"),
-    kernel!("render.cu"),
-    kernel!("sort.cu"),
-    kernel!("table.cu"),
-    kernel!("trace_closed.cu"),
-    kernel!("trace_grid.cu"),
-    kernel!("window.cu"),
+/// The `.cu` files: path in `kernels/` and text.
+pub const SOURCES: &[(&str, &str)] = kernel_files![
+    "network/network.cu",
+    "network/network_batched.cu",
+    "network/network_fused.cu",
+    "rendering/answer.cu",
+    "rendering/audit.cu",
+    "rendering/render.cu",
+    "tracing/sort.cu",
+    "tracing/table.cu",
+    "tracing/trace_closed.cu",
+    "tracing/trace_grid.cu",
+    "tracing/window.cu",
 ];
 
-/// The headers that they include.
-pub const HEADERS: &[(&str, &str)] = &[
-    kernel!("answer.cuh"),
-    kernel!("atomics.cuh"),
-    kernel!("audit.cuh"),
-    kernel!("base.cuh"),
-    kernel!("camera.cuh"),
-    kernel!("closed.cuh"),
-    kernel!("closed_variant.cuh"),
-    kernel!("film.cuh"),
-    kernel!("gate.cuh"),
-    kernel!("grid.cuh"),
-    kernel!("grid_variant.cuh"),
-    kernel!("integrate.cuh"),
-    kernel!("land.cuh"),
-    kernel!("light.cuh"),
-    kernel!("majorant.cuh"),
-    kernel!("network.cuh"),
-    kernel!("network_data.cuh"),
-    kernel!("rng.cuh"),
-    kernel!("space.cuh"),
-    kernel!("sphere.cuh"),
-    kernel!("stretch.cuh"),
-    kernel!("table.cuh"),
-    kernel!("tracking.cuh"),
-    kernel!("transfer.cuh"),
-    kernel!("wavefront.cuh"),
+/// The headers: path as in `#include` and text.
+const HEADERS: &[(&str, &str)] = kernel_files![
+    "common/atomics.cuh",
+    "common/base.cuh",
+    "common/domain.cuh",
+    "common/rng.cuh",
+    "common/stretch.cuh",
+    "network/network.cuh",
+    "network/network_data.cuh",
+    "rendering/answer.cuh",
+    "rendering/audit.cuh",
+    "rendering/camera.cuh",
+    "rendering/film.cuh",
+    "rendering/gate.cuh",
+    "rendering/light.cuh",
+    "rendering/majorant.cuh",
+    "rendering/space.cuh",
+    "rendering/tracking.cuh",
+    "rendering/transfer.cuh",
+    "rendering/wavefront.cuh",
+    "tracing/closed.cuh",
+    "tracing/closed_variant.cuh",
+    "tracing/grid.cuh",
+    "tracing/grid_variant.cuh",
+    "tracing/integrate.cuh",
+    "tracing/missing_cells.cuh",
+    "tracing/sphere.cuh",
+    "tracing/table.cuh",
+    "tracing/variant.cuh",
 ];
 
-/// Macros that every kernel is compiled without and with: nothing but what speed and parity need.
+/// NVRTC options of every kernel: only those that speed and parity with the CPU need.
 const OPTIONS: &[&str] = &["--std=c++17", "--device-as-default-execution-space", "--extra-device-vectorization", "-lineinfo"];
 
-/// What is to be compiled.
+/// One source with the macros and the architecture that it is compiled for.
 #[derive(Debug, Clone)]
 pub struct Request {
     name: &'static str,
@@ -73,9 +75,12 @@ pub struct Request {
 }
 
 impl Request {
-    /// `source` as in [`SOURCES`]; `defines` as `NAME=VALUE`.
+    /// `source`: name of a file of [`SOURCES`], without its folder; `defines`: macros, `NAME=VALUE`.
+    ///
+    /// # Errors
+    /// [`DeviceError::Unsupported`] if no source has this name.
     pub fn new(source: &str, capability: (i32, i32), defines: &[String]) -> Result<Self, DeviceError> {
-        let Some(&(name, text)) = SOURCES.iter().find(|(name, _)| *name == source) else {
+        let Some(&(name, text)) = SOURCES.iter().find(|(path, _)| path.rsplit('/').next() == Some(source)) else {
             return Err(DeviceError::Unsupported { what: format!("no kernel source `{source}`") });
         };
         Ok(Self { name, text, arch: format!("sm_{}{}", capability.0, capability.1), defines: defines.to_vec() })
@@ -88,10 +93,13 @@ impl Request {
         options
     }
 
-    /// Compiles to a CUBIN. (PTX of a compiler newer than the driver would not load.)
+    /// Compiles to a CUBIN. (A driver older than the compiler would not load PTX.)
+    ///
+    /// # Errors
+    /// [`DeviceError::NoNvrtc`], or [`DeviceError::Compile`] with the compiler's log.
     pub fn compile(&self) -> Result<Vec<u8>, DeviceError> {
         let fault = |log: String| DeviceError::Compile { source_name: self.name.into(), arch: self.arch.clone(), log };
-        // SAFETY: only looks the library up.
+        // SAFETY: the call only looks up the library.
         if !unsafe { sys::is_culib_present() } {
             return Err(DeviceError::NoNvrtc);
         }
@@ -104,19 +112,18 @@ impl Request {
         program.cubin().map_err(|error| fault(error.to_string()))
     }
 
-    /// Everything that the machine code depends on.
+    /// Everything that determines the machine code.
     fn key(&self) -> String {
-        let mut hash = Fnv::new();
-        for (name, text) in HEADERS.iter().chain([&(self.name, self.text)]) {
-            hash.add(name.as_bytes());
-            hash.add(text.as_bytes());
+        let mut hash = blake3::Hasher::new();
+        for part in HEADERS.iter().chain([&(self.name, self.text)]).flat_map(|&(name, text)| [name, text]) {
+            hash.update(&(part.len() as u64).to_le_bytes()).update(part.as_bytes());
         }
         let (major, minor) = nvrtc_version();
-        format!("ridgewatch kernel {} nvrtc {major}.{minor} sources {:032x} {}\n", self.name, hash.0, self.options().join(" "))
+        format!("ridgewatch kernel {} nvrtc {major}.{minor} sources {} {}\n", self.name, hash.finalize(), self.options().join(" "))
     }
 }
 
-/// (0, 0) where there is none.
+/// Version of the NVRTC library, (major, minor); (0, 0) if there is none.
 pub fn nvrtc_version() -> (i32, i32) {
     let (mut major, mut minor) = (0, 0);
     // SAFETY: the library is looked up before it is called; the numbers outlive the call.
@@ -158,7 +165,7 @@ impl Program {
 
     fn cubin(&self) -> Result<Vec<u8>, nvrtc::NvrtcError> {
         let mut size = 0;
-        // SAFETY: the program is live and compiled; the array has the size that NVRTC says.
+        // SAFETY: the program is live and compiled; the array has the size that NVRTC reports.
         unsafe {
             sys::nvrtcGetCUBINSize(self.0, &mut size).result()?;
             let mut cubin = vec![0u8; size];
@@ -175,39 +182,22 @@ impl Drop for Program {
     }
 }
 
-/// FNV-1a with 128 bits: names files and finds flipped bits; entries are compared by their whole key besides.
-struct Fnv(u128);
-
-impl Fnv {
-    fn new() -> Self {
-        Self(0x6c62_272e_07bb_0142_62b8_2175_6295_c58d)
-    }
-    fn add(&mut self, bytes: &[u8]) {
-        for &byte in bytes {
-            self.0 = (self.0 ^ u128::from(byte)).wrapping_mul(0x0000_0000_0100_0000_0000_0000_0000_013b);
-        }
-        self.0 = (self.0 ^ 0xff).wrapping_mul(0x0000_0000_0100_0000_0000_0000_0000_013b);
-    }
-    fn of(bytes: &[u8]) -> u128 {
-        let mut hash = Self::new();
-        hash.add(bytes);
-        hash.0
-    }
-}
-
-/// Compiled kernels on disk. Never fails: what cannot be read is compiled, what cannot be written is compiled again next time.
+/// Cache of compiled kernels on disk. It never fails: an entry that cannot be read is compiled, one that cannot be written is compiled again in
+/// the next run.
 #[derive(Debug)]
 pub struct KernelCache {
     folder: Option<PathBuf>,
 }
 
-/// Entries kept; the oldest go first.
-const MOST_ENTRIES: usize = 512;
-/// Largest entry that is read.
-const MOST_BYTES: u64 = 64 << 20;
+/// Number of entries; the oldest are removed first.
+const MAX_ENTRIES: usize = 512;
+/// Length of a hexadecimal checksum and a newline.
+const CHECKSUM_LINE: usize = 2 * blake3::OUT_LEN + 1;
+/// Size of the largest entry that is read.
+const MAX_BYTES: u64 = 64 << 20;
 
 impl KernelCache {
-    /// In `folder`, else in the user's cache folder.
+    /// Uses `folder`, or the user's cache folder if it is `None`.
     pub fn new(folder: Option<PathBuf>) -> Self {
         let set = |name: &str| std::env::var_os(name).filter(|v| !v.is_empty()).map(PathBuf::from);
         let home = || set("XDG_CACHE_HOME").or_else(|| set("HOME").map(|home| home.join(".cache"))).map(|c| c.join("ridgewatch/kernels"));
@@ -215,23 +205,23 @@ impl KernelCache {
     }
 
     fn path(&self, request: &Request) -> Option<PathBuf> {
-        let name = format!("{:032x}.cubin", Fnv::of(request.key().as_bytes()));
+        let name = format!("{}.cubin", blake3::hash(request.key().as_bytes()));
         self.folder.as_ref().map(|folder| folder.join(name))
     }
 
-    /// The machine code of an earlier run: key, a line with the checksum, code.
+    /// Machine code of an earlier run. A file holds the key, a line with the checksum of the code, and the code.
     pub fn find(&self, request: &Request) -> Option<Vec<u8>> {
         let path = self.path(request)?;
-        if fs::metadata(&path).ok()?.len() > MOST_BYTES {
+        if fs::metadata(&path).ok()?.len() > MAX_BYTES {
             return None;
         }
         let bytes = fs::read(&path).ok()?;
         let rest = bytes.strip_prefix(request.key().as_bytes())?;
-        let (sum, cubin) = rest.split_at_checked(33)?;
-        (sum == format!("{:032x}\n", Fnv::of(cubin)).as_bytes()).then(|| cubin.to_vec())
+        let (sum, cubin) = rest.split_at_checked(CHECKSUM_LINE)?;
+        (sum == format!("{}\n", blake3::hash(cubin)).as_bytes()).then(|| cubin.to_vec())
     }
 
-    /// Keeps machine code for later runs: written aside with mode 0600 and renamed, so that a reader sees all or nothing.
+    /// Stores machine code for later runs: in a temporary file of mode 0600 that is then renamed, so that readers see a whole entry or none.
     pub fn keep(&self, request: &Request, cubin: &[u8]) {
         let Some(path) = self.path(request) else { return };
         if let Err(error) = write_aside(&path, request.key().as_bytes(), cubin) {
@@ -247,12 +237,12 @@ fn write_aside(path: &Path, key: &[u8], cubin: &[u8]) -> std::io::Result<()> {
     // `tempfile` creates files with mode 0600.
     let mut file = tempfile::NamedTempFile::new_in(folder)?;
     file.write_all(key)?;
-    writeln!(file, "{:032x}", Fnv::of(cubin))?;
+    writeln!(file, "{}", blake3::hash(cubin))?;
     file.write_all(cubin)?;
     file.persist(path).map(|_| ()).map_err(|error| error.error)
 }
 
-/// Makes room for one more entry.
+/// Removes the oldest entries so that there is room for one more.
 fn prune(folder: &Path) -> std::io::Result<()> {
     let mut entries: Vec<_> = fs::read_dir(folder)?
         .filter_map(|entry| {
@@ -261,9 +251,9 @@ fn prune(folder: &Path) -> std::io::Result<()> {
             path.extension().is_some_and(|e| e == "cubin").then_some((modified, path))
         })
         .collect();
-    if entries.len() >= MOST_ENTRIES {
+    if entries.len() >= MAX_ENTRIES {
         entries.sort();
-        for (_, path) in &entries[..entries.len() + 1 - MOST_ENTRIES] {
+        for (_, path) in &entries[..entries.len() + 1 - MAX_ENTRIES] {
             fs::remove_file(path)?;
         }
     }

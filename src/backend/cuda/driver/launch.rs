@@ -1,36 +1,42 @@
-//! Launching kernels.
+//! Launches kernels.
 
 use crate::backend::cuda::{DeviceError, Gpu};
 use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchArgs, LaunchConfig};
 
-/// Enough blocks of `block` threads for `count` threads.
+/// Launch configuration with enough blocks of `block` threads for `count` threads.
 pub fn threads(count: usize, block: u32) -> LaunchConfig {
     LaunchConfig { grid_dim: ((count.div_ceil(block as usize)).max(1) as u32, 1, 1), block_dim: (block, 1, 1), shared_mem_bytes: 0 }
 }
 
-/// Launches what was put together with `stream.launch_builder(&kernel)` and its `.arg(..)`.
+/// Launches a kernel whose arguments were collected by `stream.launch_builder(&kernel)` and `.arg(..)`.
+///
+/// # Errors
+/// Error of the driver.
 ///
 /// # Safety
-/// The arguments are those of the kernel, in number, order and type; the memory that they point to is as large as the kernel
-/// presumes and lives until the work stream has passed the launch.
+/// The arguments are those of the kernel, in number, order and type. The memory that they point to is as large as the kernel expects and lives
+/// until the work stream has passed the launch.
 pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Result<(), DeviceError> {
-    // SAFETY: the caller's.
+    // SAFETY: as required of the caller.
     unsafe { arguments.launch(config) }.map(|_| ()).map_err(DeviceError::driver("launching a kernel"))
 }
 
-/// A kernel whose blocks stay and take one tile after another, with shared memory beyond what every block may have.
+/// A persistent kernel: its blocks stay on the device and take one tile after another. It uses more shared memory than the default limit.
 #[derive(Debug)]
 pub(in crate::backend::cuda) struct Resident {
     pub(in crate::backend::cuda) function: CudaFunction,
     threads: u32,
     shared: u32,
-    /// That the device holds at once.
+    /// Number of blocks that are resident at once.
     pub(in crate::backend::cuda) blocks: u32,
 }
 
 impl Resident {
-    /// Blocks of `threads` threads and `shared` bytes, which the device has.
+    /// Blocks of `threads` threads and `shared` bytes, which the device must have.
+    ///
+    /// # Errors
+    /// Error of the driver.
     pub(in crate::backend::cuda) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("asking for shared memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
@@ -39,7 +45,7 @@ impl Resident {
         Ok(Self { function, threads, shared: shared as u32, blocks: together.max(1) * gpu.multiprocessors() })
     }
 
-    /// As many blocks as stay, or as there are tiles.
+    /// As many blocks as are resident at once, at most one per tile.
     pub(in crate::backend::cuda) fn config(&self, tiles: usize) -> LaunchConfig {
         let blocks = tiles.clamp(1, self.blocks as usize) as u32;
         LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (self.threads, 1, 1), shared_mem_bytes: self.shared }

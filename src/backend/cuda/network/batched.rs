@@ -1,5 +1,5 @@
-//! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and the gradients of the weights
-//! are products over all samples. See `kernels/network_batched.cu`.
+//! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and weight gradients are products
+//! over all samples. See `kernels/network/network_batched.cu`.
 
 use crate::backend::cuda::driver::Resident;
 use crate::backend::cuda::network::layout::{DrawArgument, GridArgument, ReadingArgument};
@@ -13,17 +13,17 @@ const DEPTH: usize = 32;
 const THREADS: u32 = 256;
 const PANEL: usize = 128;
 const SKEW: usize = 8;
-/// Neurons that a pass takes at most.
-const WIDEST_PASS: usize = 256;
-/// Samples of a tile, and slices of the layers in shared memory or on the way; the first that fits is taken.
+/// Maximum number of neurons of a pass.
+const MAX_PASS_WIDTH: usize = 256;
+/// Samples of a tile, and slices of the layers in shared memory or in flight. The first pair that fits is used.
 const TILINGS: [(usize, usize); 3] = [(128, 4), (64, 4), (32, 3)];
-/// Values of a tile whose sums a block's registers hold.
-const TILE_VALUES: usize = 1 << 16;
-/// Samples, and values and gradients of all layers, that training holds at once.
-const TRAINED_ROWS: usize = 1 << 16;
-const TRAINED: usize = 1 << 30;
+/// Maximum number of values of a tile whose sums a block's registers hold.
+const MAX_TILE_VALUES: usize = 1 << 16;
+/// Maximum number of samples in memory during training, and of values and of gradients of all their layers.
+const MAX_TRAINING_ROWS: usize = 1 << 16;
+const MAX_TRAINING_VALUES: usize = 1 << 30;
 
-/// How `network_batched.cu` divides samples and layers of an architecture, for so much shared memory.
+/// Division of samples and layers into tiles and slices by `network_batched.cu`, for one architecture and size of shared memory.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tiling {
     rows: usize,
@@ -31,7 +31,7 @@ pub struct Tiling {
     /// Passes over a layer, and neurons of each.
     passes: usize,
     columns: usize,
-    /// Values of an encoded point in whole slices, and passes over them on the way back.
+    /// Values of an encoded point in whole slices, and passes over them in backpropagation.
     encoded: usize,
     encoded_passes: usize,
     /// Shared memory of a tile, and of a product.
@@ -40,10 +40,10 @@ pub struct Tiling {
 }
 
 impl Tiling {
-    /// None where not even the smallest tile fits into `shared_memory` bytes.
+    /// `None` if the smallest tile does not fit into `shared_memory` bytes.
     pub fn of(shape: &Architecture, shared_memory: usize) -> Option<Self> {
         let width = shape.layers[0].outputs;
-        let passes = width.div_ceil(WIDEST_PASS);
+        let passes = width.div_ceil(MAX_PASS_WIDTH);
         let columns = width.next_multiple_of(64 * passes) / passes;
         let encoded_passes = shape.encoded().div_ceil(columns);
         let row = passes.max(encoded_passes) * columns;
@@ -61,10 +61,10 @@ impl Tiling {
             tile_bytes: (2 * rows * (row + SKEW) + stages * slice + sample * rows + levels).next_multiple_of(16),
             product_bytes: stages * (2 * DEPTH * (PANEL + SKEW) + slice),
         });
-        all.into_iter().find(|t| t.rows * row <= TILE_VALUES && t.tile_bytes.max(t.product_bytes) <= shared_memory)
+        all.into_iter().find(|t| t.rows * row <= MAX_TILE_VALUES && t.tile_bytes.max(t.product_bytes) <= shared_memory)
     }
 
-    /// Macros of `network_batched.cu` beside those of all networks.
+    /// Macros of `network_batched.cu` in addition to those of all networks.
     pub fn defines(&self) -> [String; 4] {
         let Self { rows, stages, tile_bytes, product_bytes, .. } = self;
         [
@@ -80,7 +80,7 @@ impl Tiling {
         self.passes * self.columns
     }
 
-    /// Values of the slices that prediction takes, and that training takes.
+    /// Number of values of the slices for prediction, and for training.
     fn slices(&self, hidden: usize, tables: bool) -> [usize; 2] {
         let others = (hidden - 1) * self.width();
         let forward = (self.encoded + others) * self.width();
@@ -88,13 +88,13 @@ impl Tiling {
         [forward, forward + (others + back) * self.width()]
     }
 
-    /// Words that say which of a tile's values the activation passed, of so many layers.
+    /// Words of the ReLU's bits of a tile in `layers` layers.
     fn passed(&self, layers: usize) -> usize {
         layers * self.passes * (self.rows / 32) * THREADS as usize
     }
 }
 
-/// The kernels, and memory between them.
+/// The kernels and the memory between them.
 #[derive(Debug)]
 pub(super) struct Batched {
     gpu: Arc<Gpu>,
@@ -115,31 +115,31 @@ pub(super) struct Batched {
     memory: Mutex<Memory>,
 }
 
-/// Taken when first needed. Kernels of one stream use it in turn.
+/// Allocated when first needed. Kernels of one stream use it in turn.
 #[derive(Debug, Default)]
 struct Memory {
     rounded: Option<Rounded>,
-    /// Which values passed, where a flow map is predicted.
+    /// ReLU bits, for the prediction of a flow map.
     passed: Option<Buffer<u32>>,
     training: Option<Training>,
 }
 
-/// The layers but for the head: slices of weights, and padded biases.
+/// The layers without the head: slices of weights, and padded biases.
 #[derive(Debug)]
 struct Rounded {
     slices: Buffer<u16>,
     biases: Buffer<f32>,
 }
 
-/// What is there, taken first where it is not.
-fn taken<T>(held: &mut Option<T>, take: impl FnOnce() -> Result<T, DeviceError>) -> Result<&T, DeviceError> {
+/// Returns the value, after creating it if there is none.
+fn get_or_try_insert<T>(held: &mut Option<T>, create: impl FnOnce() -> Result<T, DeviceError>) -> Result<&T, DeviceError> {
     Ok(match held {
         Some(held) => held,
-        None => held.insert(take()?),
+        None => held.insert(create()?),
     })
 }
 
-/// What the gradient kernel leaves behind of `rows` samples.
+/// Results of the gradient kernel for `rows` samples.
 #[derive(Debug)]
 struct Training {
     rows: usize,
@@ -150,7 +150,7 @@ struct Training {
     passed: Buffer<u32>,
 }
 
-/// Where a gradient is added to, as device addresses: tables (padded), layers (flat), and the loss.
+/// Device addresses to which a gradient is added: tables (padded), layers (flat), and the loss.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct GradientTo {
     pub(super) tables: u64,
@@ -159,7 +159,7 @@ pub(super) struct GradientTo {
 }
 
 impl Batched {
-    /// `defines` as for every network.
+    /// Compiles the kernels. `defines`: macros of all networks.
     pub(super) fn new(
         gpu: &Arc<Gpu>,
         shape: &Architecture,
@@ -189,7 +189,7 @@ impl Batched {
         })
     }
 
-    /// Takes the memory for predictions and for gradients, where it is not taken yet.
+    /// Allocates the memory for predictions and for gradients.
     pub(super) fn reserve(&self) -> Result<(), DeviceError> {
         let mut memory = self.memory.lock().unwrap_or_else(PoisonError::into_inner);
         self.for_predictions(&mut memory)?;
@@ -197,29 +197,30 @@ impl Batched {
         Ok(())
     }
 
-    /// The memory for predictions, the last where a flow map is predicted.
+    /// Memory for predictions; ReLU bits for a flow map only.
     fn for_predictions<'a>(&self, memory: &'a mut Memory) -> Result<(&'a Rounded, Option<&'a Buffer<u32>>), DeviceError> {
         let Memory { rounded, passed, .. } = memory;
         if self.flow_map && passed.is_none() {
-            *passed = Some(self.passed(&self.predict, self.hidden)?);
+            *passed = Some(self.relu_bits(&self.predict, self.hidden)?);
         }
-        Ok((taken(rounded, || self.take_rounded())?, passed.as_ref()))
+        Ok((get_or_try_insert(rounded, || self.alloc_rounded())?, passed.as_ref()))
     }
 
-    /// The memory for gradients.
+    /// Memory for gradients.
     fn for_gradients<'a>(&self, memory: &'a mut Memory) -> Result<(&'a Rounded, &'a Training), DeviceError> {
         let Memory { rounded, training, .. } = memory;
-        Ok((taken(rounded, || self.take_rounded())?, taken(training, || self.take_training())?))
+        Ok((get_or_try_insert(rounded, || self.alloc_rounded())?, get_or_try_insert(training, || self.alloc_training())?))
     }
 
-    fn take_rounded(&self) -> Result<Rounded, DeviceError> {
+    fn alloc_rounded(&self) -> Result<Rounded, DeviceError> {
         let [_, all] = self.tiling.slices(self.hidden, self.tables);
         let slices = self.gpu.alloc("a network's rounded layers", all)?;
         let biases = self.gpu.alloc("a network's padded biases", self.hidden * self.tiling.width())?;
         Ok(Rounded { slices, biases })
     }
 
-    /// Rounds the layers (device address of the flat vector): `count` values of the slices, and the biases. Addresses of both.
+    /// Rounds the layers (device address of the flat vector) into `count` values of the slices, and pads the biases. Returns the addresses of
+    /// both.
     fn round(&self, rounded: &Rounded, layers: u64, count: usize) -> Result<(u64, u64), DeviceError> {
         let (n, slices, biases) = (count as u32, rounded.slices.address(), rounded.biases.address());
         let mut call = self.gpu.work().launch_builder(&self.round);
@@ -250,7 +251,7 @@ impl Batched {
         let mut call = self.gpu.work().launch_builder(&self.predict.function);
         call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(reading).arg(&points).arg(&n);
         call.arg(&passed).arg(&out);
-        // SAFETY: the caller's, and the arguments are those of `batched_predict`.
+        // SAFETY: as required of the caller; the arguments are those of `batched_predict`.
         unsafe { launch(&mut call, self.predict.config(count.div_ceil(self.tiling.rows))) }
     }
 
@@ -263,46 +264,46 @@ impl Batched {
         let [_, all] = self.tiling.slices(self.hidden, self.tables);
         let (rounded, training) = self.for_gradients(&mut memory)?;
         let (slices, biases) = self.round(rounded, layers, all)?;
-        let Training { rows: most, encoded, values, deltas, passed } = training;
+        let Training { rows: capacity, encoded, values, deltas, passed } = training;
         let (encoded, values, deltas, passed) = (encoded.address(), values.address(), deltas.address(), passed.address());
-        let (head, held) = (layers + 4 * self.head as u64, *most as u32);
-        for first in (0..draw.batch as usize).step_by(*most) {
-            let rows = (draw.batch as usize - first).min(*most).next_multiple_of(self.tiling.rows);
+        let (head, held) = (layers + 4 * self.head as u64, *capacity as u32);
+        for first in (0..draw.batch as usize).step_by(*capacity) {
+            let rows = (draw.batch as usize - first).min(*capacity).next_multiple_of(self.tiling.rows);
             let (n, first) = (rows as u32, first as u32);
             let mut call = self.gpu.work().launch_builder(&self.gradient.function);
             call.arg(&self.grid).arg(&halves).arg(&slices).arg(&biases).arg(&head).arg(draw).arg(&first).arg(&n).arg(&held);
             call.arg(&encoded).arg(&values).arg(&deltas).arg(&passed).arg(&to.tables).arg(&to.layers).arg(&to.loss);
-            // SAFETY: the arguments of `batched_gradient`; memory holds as many rows.
+            // SAFETY: the arguments of `batched_gradient`; the memory holds `rows` rows.
             unsafe { launch(&mut call, self.gradient.config(rows / self.tiling.rows)) }?;
 
             let panels = |inputs: usize| inputs.div_ceil(PANEL) * self.tiling.passes;
             let tiles = panels(self.inputs) + (self.hidden - 1) * panels(self.neurons);
-            // Four rounds of blocks, so that few are idle in the last; each block of at least eight steps.
+            // Four rounds of blocks keep most multiprocessors busy in the last one; each block has at least eight steps.
             let shares = (4 * self.products.blocks as usize / tiles).clamp(1, (rows / (8 * DEPTH)).max(1));
             let share = rows.div_ceil(shares).next_multiple_of(DEPTH) as u32;
             let config = LaunchConfig { grid_dim: (tiles as u32, shares as u32, 1), ..self.products.config(1) };
             let mut call = self.gpu.work().launch_builder(&self.products.function);
             call.arg(&encoded).arg(&values).arg(&deltas).arg(&n).arg(&held).arg(&share).arg(&to.layers);
-            // SAFETY: the arguments of `batched_products`, a block a share of a panel.
+            // SAFETY: the arguments of `batched_products`, with one block per share of a panel.
             unsafe { launch(&mut call, config) }?;
         }
         Ok(())
     }
 
-    fn take_training(&self) -> Result<Training, DeviceError> {
+    fn alloc_training(&self) -> Result<Training, DeviceError> {
         let (width, tile) = (self.tiling.width(), self.tiling.rows);
-        let rows = (TRAINED / (2 * width * self.hidden)).clamp(tile, TRAINED_ROWS) / tile * tile;
+        let rows = (MAX_TRAINING_VALUES / (2 * width * self.hidden)).clamp(tile, MAX_TRAINING_ROWS) / tile * tile;
         Ok(Training {
             rows,
             encoded: self.gpu.alloc("encoded samples", rows * self.tiling.encoded)?,
             values: self.gpu.alloc("the layers' values", self.hidden * rows * width)?,
             deltas: self.gpu.alloc("gradients of the layers' values", self.hidden * rows * width)?,
-            passed: self.passed(&self.gradient, self.hidden - 1)?,
+            passed: self.relu_bits(&self.gradient, self.hidden - 1)?,
         })
     }
 
-    /// Room for which values of so many layers passed, in all blocks of a kernel.
-    fn passed(&self, kernel: &Resident, layers: usize) -> Result<Buffer<u32>, DeviceError> {
-        self.gpu.alloc("which values passed", kernel.blocks as usize * self.tiling.passed(layers))
+    /// Memory for the ReLU's bits of `layers` layers in all blocks of a kernel.
+    fn relu_bits(&self, kernel: &Resident, layers: usize) -> Result<Buffer<u32>, DeviceError> {
+        self.gpu.alloc("ReLU bits", kernel.blocks as usize * self.tiling.passed(layers))
     }
 }

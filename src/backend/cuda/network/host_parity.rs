@@ -1,4 +1,4 @@
-//! The network's kernels compiled as host C++, with the very macros and arguments of a launch, against the CPU's prediction. No GPU.
+//! Compares the network's kernels, compiled as host C++ with the macros and arguments of a launch, with the CPU's prediction. Needs no GPU.
 
 use crate::backend::cuda::host_parity::{half, library};
 use crate::backend::cuda::network::layout::{GridArgument, ReadingArgument};
@@ -19,7 +19,7 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
     let shape = Architecture::new(settings, axes, extent).unwrap();
     let scale = Scale { mean: [0.3, -0.1, 0.2], deviation: [0.7, 1.3, 0.4] };
     let objective = Objective { scale, ..Objective::new(settings, &shape, extent, 2.5) };
-    // Halves hold these tables as they are.
+    // Half precision represents these tables exactly.
     let tables: Vec<f32> = values(1, shape.table_entries() * shape.features).iter().map(|x| (512.0 * x).round() / 1024.0).collect();
     let mut layers = values(2, shape.layer_parameters());
     for layer in &shape.layers {
@@ -41,7 +41,7 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
     }
     assert_eq!(halves.len(), padded);
     let folder = tempfile::tempdir().unwrap();
-    let library = library(folder.path(), "host_network.cpp", &network_defines(&shape, false).unwrap());
+    let library = library(folder.path(), "network/host_network.cpp", &network_defines(&shape, false).unwrap());
     // SAFETY: the function has this signature.
     let predict: libloading::Symbol<HostPredict> = unsafe { library.get(b"host_predict") }.unwrap();
     let found = |points: &[[f32; 3]], reading: &ReadingArgument| {
@@ -52,21 +52,21 @@ fn check(name: &str, settings: &NetworkSettings, axes: &[usize]) {
         };
         out
     };
-    let asked = reading(&shape, &objective, placed_times(&shape, Some(times)), None, 1.0);
+    let given = reading(&shape, &objective, placed_times(&shape, Some(times)), None, 1.0);
     let compare = |found: &[f32], how: &str| {
         for ((found, expected), point) in found.iter().zip(&expected).zip(&points) {
-            // Sums in single precision in another order; slopes are a hundred times what they are slopes of.
+            // Sums in single precision in another order; slopes are about a hundred times the values.
             assert!((found - expected).abs() <= 2e-4 * expected.abs().max(1.0), "{name}, {how}, {point:?}: {found}, not {expected}");
         }
     };
-    compare(&found(&points, &asked), "asked for times");
-    // The same times brought along, each where it has its place.
+    compare(&found(&points, &given), "given times");
+    // The same times in the points, each at its place.
     let placed = placed_times(&shape, Some(times));
-    let brought: Vec<[f32; 3]> =
+    let with_times: Vec<[f32; 3]> =
         points.iter().map(|p| std::array::from_fn(|k| if placed[k].is_nan() { p[k] } else { placed[k] })).collect();
     let further: Vec<f32> = points.iter().flat_map(|_| placed[3..][..further_places(&shape)].to_vec()).collect();
     let further = if further.is_empty() { 0 } else { further.as_ptr() as u64 };
-    compare(&found(&brought, &ReadingArgument { times: [f32::NAN; 5], further, ..asked }), "times brought along");
+    compare(&found(&with_times, &ReadingArgument { times: [f32::NAN; 5], further, ..given }), "times of points");
 }
 
 #[test]

@@ -1,13 +1,12 @@
-//! Structures that the network's kernels read, laid out as in `kernels/network.cuh`, `kernels/network_data.cuh` and `kernels/network.cu`.
+//! Structures that the network's kernels read, laid out as in the files of `kernels/network/`.
 
-use crate::backend::cuda::layout::TableArgument;
+use crate::backend::cuda::layout::{TableArgument, device_repr};
 use crate::surrogate::network::GRID_INPUTS;
-use cudarc::driver::DeviceRepr;
 
-/// Most levels of a hash grid.
-const MOST_LEVELS: usize = 32;
+/// Maximum number of levels of a hash grid.
+const MAX_LEVELS: usize = 32;
 
-/// What `Level` says.
+/// `Level`, with room for all inputs.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct LevelArgument {
     pub cells: [f32; GRID_INPUTS],
@@ -20,23 +19,23 @@ pub struct LevelArgument {
     pub start: u32,
 }
 
-/// `Grid`, of which a kernel takes as many levels as it is compiled for.
+/// `Grid`. A kernel reads as many levels as it is compiled for.
 #[repr(C, align(8))]
 #[derive(Debug, Clone, Copy)]
 pub struct GridArgument {
-    words: [u32; 18 * MOST_LEVELS],
+    words: [u32; 18 * MAX_LEVELS],
 }
 
 impl GridArgument {
-    /// Bytes of a `Level`, which has room for three inputs, or four.
+    /// Bytes of a `Level`, which has room for three or four inputs.
     pub const fn level_bytes(inputs: usize) -> usize {
         if inputs > 3 { 72 } else { 56 }
     }
 
-    /// At most as many levels as there is room for.
+    /// Packs the levels, at most [`MAX_LEVELS`].
     pub fn new(levels: &[LevelArgument], inputs: usize) -> Self {
         let (room, held) = (Self::level_bytes(inputs) / 4, inputs.clamp(3, GRID_INPUTS));
-        let mut grid = Self { words: [0; 18 * MOST_LEVELS] };
+        let mut grid = Self { words: [0; 18 * MAX_LEVELS] };
         for (level, to) in levels.iter().zip(grid.words.chunks_exact_mut(room)) {
             let cells = level.cells.map(f32::to_bits);
             let lists = [&cells[..held], &level.last_cell[..held], &level.factor[..held]];
@@ -49,7 +48,7 @@ impl GridArgument {
     }
 }
 
-/// Unit times at the places of samples that hold them; NaN at the others.
+/// Unit times at their places in a sample; NaN at the other places.
 pub type PlacedTimes = [f32; 5];
 
 /// `Reading`.
@@ -103,16 +102,7 @@ pub struct UnitBoxArgument {
     pub extent: [f64; 3],
 }
 
-// SAFETY: plain numbers in C layout; addresses are used by kernels alone.
-unsafe impl DeviceRepr for GridArgument {}
-// SAFETY: as above.
-unsafe impl DeviceRepr for ReadingArgument {}
-// SAFETY: as above.
-unsafe impl DeviceRepr for DrawArgument {}
-// SAFETY: as above.
-unsafe impl DeviceRepr for AdamArgument {}
-// SAFETY: as above.
-unsafe impl DeviceRepr for UnitBoxArgument {}
+device_repr!(GridArgument, ReadingArgument, DrawArgument, AdamArgument, UnitBoxArgument);
 
 #[cfg(test)]
 mod tests {
@@ -120,7 +110,7 @@ mod tests {
 
     #[test]
     fn sizes_are_those_of_cpp() {
-        // static_asserts in the kernels' sources hold the other side.
+        // static_asserts in the kernels' sources have the same numbers.
         assert_eq!(size_of::<ReadingArgument>(), 128);
         assert_eq!((size_of::<DrawArgument>(), size_of::<AdamArgument>(), size_of::<UnitBoxArgument>()), (64, 16, 48));
     }

@@ -1,7 +1,7 @@
 //! The network on the device: its kernels, compiled for one architecture, and prediction.
 //!
-//! Tables lie there in half precision, each level's at a multiple of 64 entries; layers as burn keeps them, rounded when a block reads
-//! them (fused) or once a call (batched).
+//! Tables are in half precision, each level padded to a multiple of 64 entries. Layers are in burn's layout; a block rounds them when it reads
+//! them (fused), or a kernel does once per call (batched).
 
 use crate::backend::cuda::driver::Resident;
 use crate::backend::cuda::layout::TableArgument;
@@ -16,29 +16,29 @@ use std::sync::Arc;
 /// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
 const THREADS: u32 = 256;
 const TILE: usize = 128;
-/// Entries that each level's place in the padded tables is a multiple of.
+/// The padded tables start each level at a multiple of this many entries.
 const PADDING: usize = 64;
-/// Widest encoding and widest layer, and most hidden layers, that a warp's registers hold.
-const WIDEST: usize = 128;
-const DEEPEST: usize = 4;
-/// Oldest device with the matrix instruction.
-const OLDEST: (i32, i32) = (8, 0);
+/// Largest encoding and layer, and largest number of hidden layers, that a warp's registers hold.
+const MAX_WIDTH: usize = 128;
+const MAX_DEPTH: usize = 4;
+/// Lowest compute capability with the matrix instruction.
+const MIN_CAPABILITY: (i32, i32) = (8, 0);
 
-/// Whether a warp's registers hold samples of this architecture, and so many bytes of shared memory its layers (`network_fused.cu`); batches
-/// go through others (`network_batched.cu`).
+/// Returns true if a warp's registers hold samples of this architecture and `shared_memory` bytes hold its layers (`network_fused.cu`). Other
+/// architectures use `network_batched.cu`.
 pub fn is_fused(shape: &Architecture, shared_memory: usize) -> bool {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
     let (_, workspace) = shared_bytes(shape);
-    hidden <= DEEPEST && width <= WIDEST && shape.encoded() <= WIDEST && workspace <= shared_memory
+    hidden <= MAX_DEPTH && width <= MAX_WIDTH && shape.encoded() <= MAX_WIDTH && workspace <= shared_memory
 }
 
-/// Whether a loss has a penalty on the difference of the batch means.
+/// Returns true if the loss has a penalty on the difference of the batch means.
 pub(super) fn has_penalty(objective: &Objective) -> bool {
     objective.target == Target::Ftle && objective.loss == Loss::Published && objective.mean_penalty != 0.0
 }
 
-/// The macros that `network*.cu` are compiled with for an architecture, and a loss with or without a penalty on means; none where it has no
-/// hidden layer, or the flow map of a single axis.
+/// Macros of `network*.cu` for an architecture and a loss with or without a penalty on means. `None` if the architecture has no hidden layer or
+/// is the flow map of a single axis.
 pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String>> {
     let (width, hidden) = (shape.layers[0].outputs, shape.layers.len() - 1);
     let flow_map = shape.target == Target::FlowMap;
@@ -66,30 +66,29 @@ pub fn network_defines(shape: &Architecture, penalty: bool) -> Option<Vec<String
 /// Numbers of a unit point.
 pub(super) const POINT: usize = 3;
 
-/// Which place of a sample holds each input: axes have their own among the three of its point, times take those of axes that the network is
-/// not shown, and what places they need behind these.
+/// Place of each input in a sample. Axes have their own among the three of the point; times take the places of unused axes, then further ones.
 fn places(shape: &Architecture) -> Vec<usize> {
     let free = (0..).filter(|place| !shape.space().contains(place));
     shape.space().iter().copied().chain(free.take(shape.times().len())).collect()
 }
 
-/// `PLACES` of `network.cuh`, and floats of a sample, in whole `Four`s.
+/// `PLACES` of `network.cuh`, and floats of a sample, in whole `Float4`s.
 fn sample_room(shape: &Architecture) -> [usize; 2] {
     let places = shape.inputs().max(POINT);
     [places, (places + shape.outputs()).next_multiple_of(4)]
 }
 
-/// Places of a sample behind its point.
+/// Places of a sample beyond its point.
 pub(super) fn further_places(shape: &Architecture) -> usize {
     sample_room(shape)[0] - POINT
 }
 
-/// `Four`s of a sample.
-pub(super) fn sample_fours(shape: &Architecture) -> usize {
+/// `Float4`s of a sample.
+pub(super) fn sample_float4s(shape: &Architecture) -> usize {
     sample_room(shape)[1] / 4
 }
 
-/// Unit times at those places; NaN at the others. Where none are asked for, a point brings along what it has places for.
+/// Unit times at their places; NaN at the other places. Without `times` a point supplies its own values at its three places.
 pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> PlacedTimes {
     let mut placed = [f32::NAN; 5];
     let row: Row = row([f32::NAN; 3], times.unwrap_or(UNTIMED));
@@ -101,7 +100,7 @@ pub(super) fn placed_times(shape: &Architecture, times: Option<[f32; 2]>) -> Pla
     placed
 }
 
-/// Length of tangents: between that of the finest and of the coarsest slope of the encoding, so that halves hold both.
+/// Length of tangents: the geometric mean of the encoding's finest and coarsest length, so that half precision holds both slopes.
 fn tangent_step(shape: &Architecture) -> f32 {
     let step = match shape.encoding {
         Encoding::HashGrid => {
@@ -110,11 +109,11 @@ fn tangent_step(shape: &Architecture) -> f32 {
         }
         Encoding::Frequency => 1.0 / (std::f32::consts::PI * (0.5 * (shape.octaves as f32 - 1.0)).exp2()),
     };
-    // A power of two changes no digit.
+    // A power of two does not round.
     step.log2().round().exp2()
 }
 
-/// Sizes of `Weights` in `network.cuh` and `Workspace` in `network_fused.cu`, which asserts them.
+/// Sizes of `Weights` of `network.cuh` and `Workspace` of `network_fused.cu`, which asserts them.
 fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     let hidden = shape.layers.len() - 1;
     let [encoded, width] = [shape.encoded(), shape.layers[0].outputs].map(|n| n.next_multiple_of(16));
@@ -124,14 +123,14 @@ fn shared_bytes(shape: &Architecture) -> (usize, usize) {
     (weights, weights + 2 * TILE * (encoded.max(width) + 8 + row))
 }
 
-/// How samples go through the network.
+/// Kernels of prediction and gradient.
 #[derive(Debug)]
-enum Way {
+enum Path {
     Fused { predict: Resident, gradient: Resident },
     Batched(Box<Batched>),
 }
 
-/// Everything that depends on an architecture alone.
+/// Kernels and layouts that depend on the architecture only.
 #[derive(Debug)]
 pub(super) struct NetworkKernels {
     pub(super) gpu: Arc<Gpu>,
@@ -139,7 +138,7 @@ pub(super) struct NetworkKernels {
     pub(super) grid: GridArgument,
     /// Values of the padded tables.
     pub(super) padded: usize,
-    way: Way,
+    path: Path,
     pub(super) adam_tables: CudaFunction,
     pub(super) adam_layers: CudaFunction,
     pub(super) average: CudaFunction,
@@ -152,16 +151,16 @@ pub(super) struct NetworkKernels {
 }
 
 impl NetworkKernels {
-    /// Compiles them, or takes them from the cache.
+    /// Compiles the kernels, or takes them from the cache.
     pub(super) fn new(gpu: &Arc<Gpu>, shape: &Architecture, objective: &Objective) -> Result<Arc<Self>, DeviceError> {
         let refuse = |what: String| Err(DeviceError::Unsupported { what });
-        if gpu.capability() < OLDEST {
+        if gpu.capability() < MIN_CAPABILITY {
             let (major, minor) = gpu.capability();
-            return refuse(format!("a network on compute capability {major}.{minor}; it needs 8.0 or later"));
+            return refuse(format!("a network on compute capability {major}.{minor}; networks need 8.0 or later"));
         }
         let Some(defines) = network_defines(shape, has_penalty(objective)) else {
             return refuse(format!(
-                "a network of {} hidden layers and the inputs {} for the target {:?}; the device takes at least one layer, and a flow map of two axes or three",
+                "a network of {} hidden layers with inputs {} and target {:?}; the GPU needs at least one hidden layer, and two or three axes for a flow map",
                 shape.layers.len() - 1,
                 shape.input_names().join(", "),
                 shape.target
@@ -171,16 +170,16 @@ impl NetworkKernels {
         let kernel = |name| gpu.kernel("network.cu", &defines, name);
         let (weights, workspace) = shared_bytes(shape);
         let fused = |name, shared| Resident::new(gpu, gpu.kernel("network_fused.cu", &defines, name)?, THREADS, shared);
-        let way = if is_fused(shape, gpu.shared_memory()) {
-            Way::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? }
+        let path = if is_fused(shape, gpu.shared_memory()) {
+            Path::Fused { predict: fused("network_predict", weights)?, gradient: fused("network_gradient", workspace)? }
         } else if let Some(tiling) = Tiling::of(shape, gpu.shared_memory()) {
-            Way::Batched(Box::new(Batched::new(gpu, shape, grid, &defines, tiling)?))
+            Path::Batched(Box::new(Batched::new(gpu, shape, grid, &defines, tiling)?))
         } else {
             let (width, most) = (shape.layers[0].outputs, gpu.shared_memory());
-            return refuse(format!("a network of layers of {width}, whose values {most} bytes of shared memory do not hold"));
+            return refuse(format!("a network of width {width}: a tile of its values exceeds {most} bytes of shared memory"));
         };
         Ok(Arc::new(Self {
-            way,
+            path,
             adam_tables: kernel("network_adam_tables")?,
             adam_layers: kernel("network_adam_layers")?,
             average: kernel("network_average")?,
@@ -197,7 +196,7 @@ impl NetworkKernels {
         }))
     }
 
-    /// Log-stretch at unit points, as device addresses.
+    /// Log-stretch at unit points. `points` and `out` are device addresses.
     ///
     /// # Safety
     /// As for [`DevicePredict::predict`]; `halves` are the padded tables and `layers` the flat vector of this architecture.
@@ -210,14 +209,14 @@ impl NetworkKernels {
         count: usize,
         out: u64,
     ) -> Result<(), DeviceError> {
-        match &self.way {
-            // SAFETY: the caller's.
-            Way::Batched(batched) => unsafe { batched.predict(halves, layers, reading, points, count, out) },
-            Way::Fused { predict, .. } => {
+        match &self.path {
+            // SAFETY: as required of the caller.
+            Path::Batched(batched) => unsafe { batched.predict(halves, layers, reading, points, count, out) },
+            Path::Fused { predict, .. } => {
                 let n = count as u32;
                 let mut call = self.gpu.work().launch_builder(&predict.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(reading).arg(&points).arg(&n).arg(&out);
-                // SAFETY: the caller's, and the arguments are those of `network_predict`.
+                // SAFETY: as required of the caller; the arguments are those of `network_predict`.
                 unsafe { launch(&mut call, predict.config(count.div_ceil(TILE))) }
             }
         }
@@ -228,42 +227,44 @@ impl NetworkKernels {
     /// # Safety
     /// Device addresses as for [`Self::predict`]; the samples of `draw` are there, and room for the gradients.
     pub(super) unsafe fn gradient(&self, halves: u64, layers: u64, draw: &DrawArgument, to: GradientTo) -> Result<(), DeviceError> {
-        match &self.way {
-            // SAFETY: the caller's.
-            Way::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, to) },
-            Way::Fused { gradient, .. } => {
+        match &self.path {
+            // SAFETY: as required of the caller.
+            Path::Batched(batched) => unsafe { batched.gradient(halves, layers, draw, to) },
+            Path::Fused { gradient, .. } => {
                 let mut call = self.gpu.work().launch_builder(&gradient.function);
                 call.arg(&self.grid).arg(&halves).arg(&layers).arg(draw).arg(&to.tables).arg(&to.layers).arg(&to.loss);
-                // SAFETY: the caller's, and the arguments are those of `network_gradient`.
+                // SAFETY: as required of the caller; the arguments are those of `network_gradient`.
                 unsafe { launch(&mut call, gradient.config((draw.batch as usize).div_ceil(TILE))) }
             }
         }
     }
 
-    /// Takes the memory that prediction and gradients need between their kernels, for good.
+    /// Allocates the memory that prediction and gradients need between their kernels. It is kept.
     pub(super) fn reserve(&self) -> Result<(), DeviceError> {
-        match &self.way {
-            Way::Batched(batched) => batched.reserve(),
-            // All of it is in registers and shared memory.
-            Way::Fused { .. } => Ok(()),
+        match &self.path {
+            Path::Batched(batched) => batched.reserve(),
+            // Fused kernels use registers and shared memory only.
+            Path::Fused { .. } => Ok(()),
         }
     }
 
-    /// Rounds burn's tables into padded ones.
+    /// Rounds burn's tables to half precision and pads them.
     pub(super) fn round(&self, tables: &Buffer<f32>, halves: &Buffer<u16>) -> Result<(), DeviceError> {
         if self.padded == 0 {
             return Ok(());
         }
+        let mut call = self.gpu.work().launch_builder(&self.halves);
         let (n, from, to) = (self.padded as u64, tables.address(), halves.address());
-        let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.halves);
         call.arg(&self.grid).arg(&n).arg(&from).arg(&to);
         // SAFETY: the arguments of `network_halves`; `halves` holds `padded` values and `tables` all of burn's.
         unsafe { launch(&mut call, threads(self.padded, 256)) }
     }
 }
 
-/// Levels as the kernels read them, and the values of the padded tables.
+/// Levels as kernel argument, and number of values of the padded tables.
+///
+/// # Errors
+/// The tables have more entries than 32 bits can count.
 pub(super) fn grid(shape: &Architecture) -> Result<(GridArgument, usize), DeviceError> {
     let mut levels = Vec::new();
     let mut offset = 0;
@@ -292,7 +293,8 @@ pub(super) fn grid(shape: &Architecture) -> Result<(GridArgument, usize), Device
     Ok((GridArgument::new(&levels, shape.inputs()), offset * shape.features))
 }
 
-/// How outputs become log-stretch, above `base` by `share` of them where there is one, and the times that points have ([`placed_times`]).
+/// Kernel argument for the map from outputs to log-stretch: `base`, if any, plus `share` times the network, at points with these times
+/// ([`placed_times`]).
 pub(super) fn reading(
     shape: &Architecture,
     objective: &Objective,
@@ -344,18 +346,18 @@ pub struct NetworkAbove<'a> {
 }
 
 impl DeviceNetwork {
-    /// Whether the kernels take networks of this architecture on this device.
+    /// Returns true if this device supports networks of this architecture.
     pub fn takes(gpu: &Gpu, shape: &Architecture) -> bool {
         let most = gpu.shared_memory();
-        gpu.capability() >= OLDEST
+        gpu.capability() >= MIN_CAPABILITY
             && network_defines(shape, false).is_some()
             && (is_fused(shape, most) || Tiling::of(shape, most).is_some())
     }
 
-    /// Brings parameters over, as burn's tensors hold them.
+    /// Uploads parameters in the layout of burn's tensors.
     ///
     /// # Errors
-    /// An architecture that the kernels do not take, or memory that is not there.
+    /// The architecture is not supported, or out of memory.
     pub fn upload(
         gpu: &Arc<Gpu>,
         shape: &Architecture,
@@ -369,7 +371,7 @@ impl DeviceNetwork {
         Self::of(&kernels, objective, &tables, layers)
     }
 
-    /// Of parameters on the device.
+    /// Network with parameters on the device.
     pub(super) fn of(
         kernels: &Arc<NetworkKernels>,
         objective: &Objective,
@@ -381,20 +383,20 @@ impl DeviceNetwork {
         Ok(Self { kernels: kernels.clone(), halves, layers, objective: objective.clone() })
     }
 
-    /// Memory of what prediction reads, in bytes.
+    /// Size of the memory that prediction reads, in bytes.
     pub fn bytes(&self) -> usize {
         2 * self.kernels.padded + 4 * self.layers.len()
     }
 
-    /// Above a table, by a share of the network. Where times are inputs, points bring them along at the places of axes that are none; those
-    /// that find no place there are those of samples that say nothing of time.
+    /// Adds a share of the network to a table. If times are inputs, points carry them at the places of unused axes; times without such a place
+    /// are those of samples without times.
     pub fn above<'a>(&'a self, base: Option<(&'a DeviceTable, f32)>) -> NetworkAbove<'a> {
         NetworkAbove { network: self, base, times: None }
     }
 }
 
 impl NetworkAbove<'_> {
-    /// For these unit times, whatever points bring along.
+    /// Predicts at these unit times and ignores the times that points carry.
     pub fn at(self, times: [f32; 2]) -> Self {
         Self { times: Some(times), ..self }
     }
@@ -402,7 +404,7 @@ impl NetworkAbove<'_> {
 
 impl DevicePredict for DeviceNetwork {
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
-        // SAFETY: the caller's.
+        // SAFETY: as required of the caller.
         unsafe { self.above(None).predict(points, count, out) }
     }
 }
@@ -416,21 +418,21 @@ impl DevicePredict for NetworkAbove<'_> {
         let times = placed_times(&kernels.shape, self.times);
         let (base, share) = self.base.map_or((None, 1.0), |(table, share)| (Some(table), share));
         let reading = reading(&kernels.shape, objective, times, base, share);
-        // SAFETY: the caller's; the parameters are of these kernels' architecture.
+        // SAFETY: as required of the caller; the parameters are of these kernels' architecture.
         unsafe { kernels.predict(halves.address(), layers.address(), &reading, points, count, out) }
     }
 }
 
-/// Copies all of `from` to the front of `to`, in the order of the work stream.
+/// Copies `from` to the front of `to` in the order of the work stream.
 pub(super) fn copy(gpu: &Gpu, from: &Buffer<f32>, to: &Buffer<f32>) -> Result<(), DeviceError> {
     assert!(from.len() <= to.len(), "room for a copy");
     let doing = DeviceError::driver("copying on the device");
     gpu.context().bind_to_thread().map_err(&doing)?;
-    // SAFETY: both buffers hold as many values, and neither is freed before the work stream has passed this.
+    // SAFETY: both buffers hold as many values, and neither is freed before the work stream has passed this call.
     unsafe { result::memcpy_dtod_async(to.address(), from.address(), 4 * from.len(), gpu.work().cu_stream()) }.map_err(doing)
 }
 
-/// A copy on the device, in the order of the work stream.
+/// Copies a buffer on the device in the order of the work stream.
 pub(super) fn copied(gpu: &Gpu, what: &str, from: &Buffer<f32>) -> Result<Buffer<f32>, DeviceError> {
     let to = gpu.alloc(what, from.len())?;
     copy(gpu, from, &to)?;
@@ -455,14 +457,14 @@ mod tests {
     }
     use crate::surrogate::network::{Encoding, NetworkSettings};
 
-    /// Each level lies where [`grid`] says that the kernels look for it.
+    /// Each level is at the position that [`grid`] passes to the kernels.
     #[test]
     fn padded_tables_come_back_in_burn_s_order() {
         let settings = NetworkSettings { levels: 4, log2_table: 9, base_resolution: 3, features: 2, ..NetworkSettings::default() };
         let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap();
         assert!(shape.levels.iter().any(|level| level.entries % PADDING != 0) && shape.levels.iter().any(|level| level.hashed));
         let (_, padded) = grid(&shape).unwrap();
-        // Whole numbers that halves hold.
+        // Integers that half precision represents exactly.
         let tables: Vec<f32> = (0..shape.table_entries() * shape.features).map(|i| (i % 2048) as f32).collect();
         let mut halves = vec![f16::NAN.to_bits(); padded];
         let mut entry = 0;
@@ -477,7 +479,7 @@ mod tests {
 
     #[test]
     fn what_does_not_fit_into_shared_memory_goes_in_batches() {
-        // Of H200, A100 and the RTX cards since Ampere.
+        // Shared memory of H200, A100 and the RTX cards since Ampere.
         let [h200, a100, rtx] = [227, 163, 99].map(|kibibytes| kibibytes << 10);
         let fused = |settings: NetworkSettings, on: usize| is_fused(&Architecture::new(&settings, &[0, 1, 2], [1.0; 3]).unwrap(), on);
         let small = NetworkSettings::default();

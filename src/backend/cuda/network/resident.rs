@@ -1,6 +1,6 @@
 //! Surrogates whose table and network are on the GPU.
 
-use super::samples::{Filled, SampleWriter};
+use super::samples::{Filled, SampleWriter, TracedBatch};
 use super::training::NetworkCopy as DeviceCopy;
 use super::{DeviceNetwork, DeviceSamples, DeviceTraining};
 use crate::backend::DeviceError;
@@ -178,8 +178,10 @@ impl DeviceLearns for LabelSink<'_> {
         if labels == 0 {
             return Ok(());
         }
+        let (base, times) = (self.base, Some(self.times));
+        let batch = TracedBatch { domain: self.domain, points, labels, count, base, times, held_back: HELD_BACK };
         // SAFETY: the caller's.
-        unsafe { writer.append(&mut samples, self.domain, points, labels, count, self.base, Some(self.times), HELD_BACK) }
+        unsafe { writer.append(&mut samples, batch) }
     }
 }
 

@@ -1,7 +1,7 @@
-//! Samples on the device: traced points, their times and labels, as one network learns from them.
+//! Samples of one network on the device: traced points, their times and targets, in a replay buffer.
 
 use crate::backend::cuda::network::layout::ReadingArgument;
-use crate::backend::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_fours, unit_box};
+use crate::backend::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s, unit_box};
 use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
@@ -18,19 +18,27 @@ pub(super) struct SampleWriter {
     pub(super) objective: Objective,
 }
 
-/// Traced points, as device addresses.
+/// Traced points on the device that become samples. Addresses are device addresses.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct TracedPoints {
-    /// Three f32 each, with the times at the places of axes that are no inputs, unless those of all are the same.
+pub(super) struct TracedBatch<'a> {
+    /// Domain of the points.
+    pub(super) domain: &'a Domain,
+    /// Three f32 per point, with its times at the places of unused axes unless `times` are given.
     pub(super) points: u64,
-    /// Log-stretch (f32 each), or for the flow map arrivals (three f32 each, as points).
+    /// Log-stretch (one f32 per point), or for a flow map arrivals (three f32 per point, in domain coordinates).
     pub(super) labels: u64,
-    /// Times that points have no place for, as many f32 each as the network has such; 0: they are of the unit times instead.
-    pub(super) further: u64,
+    /// Number of points.
+    pub(super) count: usize,
+    /// Table to which the network adds.
+    pub(super) base: Option<&'a DeviceTable>,
+    /// Unit times of all points; `None` if points carry theirs.
+    pub(super) times: Option<[f32; 2]>,
+    /// One point in 2^held_back gets no target ([`super::keeps_label`]), since the host may keep it for validation; with 0 all get one.
+    pub(super) held_back: u32,
 }
 
 impl SampleWriter {
-    /// Points of samples on the host, with their times where the network is shown them; and those times that find no place in a point.
+    /// Points of samples on the host, with times at their places if these are inputs, and the times without a place in a point.
     pub(super) fn placed<'a>(&self, samples: &'a Samples, range: Range<usize>) -> (Cow<'a, [[f32; 3]]>, Vec<f32>) {
         let shape = &self.kernels.shape;
         if shape.times().is_empty() {
@@ -45,7 +53,7 @@ impl SampleWriter {
         (range.map(with_times).collect(), further)
     }
 
-    /// Labels of samples on the host; none is NaN.
+    /// Labels of samples on the host; NaN stands for a label that does not exist.
     pub(super) fn labels<'a>(&self, samples: &'a Samples, range: Range<usize>) -> Cow<'a, [f32]> {
         match self.target() {
             Target::Ftle => Cow::Borrowed(&samples.log_stretch[range]),
@@ -56,108 +64,89 @@ impl SampleWriter {
         }
     }
 
-    /// What the network is trained on.
+    /// Target of the network.
     pub(super) fn target(&self) -> Target {
         self.kernels.shape.target
     }
 
     /// Bytes of a sample.
     pub(super) fn sample_bytes(&self) -> usize {
-        size_of::<[f32; 4]>() * sample_fours(&self.kernels.shape)
+        size_of::<[f32; 4]>() * sample_float4s(&self.kernels.shape)
     }
 
-    /// Traced points on the device go to the places of `to`. Of every 2^held_back of them one cannot be learned from
-    /// ([`super::keeps_label`]), since the host may keep it; with 0 all can. They are of the unit times, or bring theirs along.
+    /// Writes samples of traced points from number `first` on. `further`: device address of the times without a place in a point, 0 if the
+    /// batch's unit times apply instead.
     ///
     /// # Safety
     /// As for [`super::DeviceTraining::append`].
-    pub(super) unsafe fn place(
-        &self,
-        ring: &DeviceSamples,
-        to: Range<usize>,
-        domain: &Domain,
-        traced: TracedPoints,
-        base: Option<&DeviceTable>,
-        times: Option<[f32; 2]>,
-        held_back: u32,
-    ) -> Result<(), DeviceError> {
-        if to.is_empty() {
+    pub(super) unsafe fn write(&self, to: &DeviceSamples, first: usize, batch: TracedBatch<'_>, further: u64) -> Result<(), DeviceError> {
+        let TracedBatch { domain, points, labels, count, base, times, held_back } = batch;
+        if count == 0 {
             return Ok(());
         }
-        assert!(to.end <= ring.capacity(), "a ring of {} for samples {to:?}", ring.capacity());
-        let (domain, shape, TracedPoints { points, labels, further }) = (unit_box(domain), &self.kernels.shape, traced);
+        assert!(first + count <= to.capacity(), "a buffer of {} for {count} samples from number {first} on", to.capacity());
+        let (domain, shape) = (unit_box(domain), &self.kernels.shape);
         let mut times = placed_times(shape, times);
         if further != 0 {
             times[POINT..].fill(f32::NAN);
         }
         let reading = ReadingArgument { further, ..reading(shape, &self.objective, times, base, 1.0) };
-        let (n, at) = (to.len() as u32, ring.samples.address_of(ring.fours * to.start));
-        let stream = self.kernels.gpu.work();
-        let mut call = stream.launch_builder(&self.kernels.samples);
+        let (n, at) = (count as u32, to.samples.address_of(to.float4s * first));
+        let mut call = self.kernels.gpu.work().launch_builder(&self.kernels.samples);
         call.arg(&domain).arg(&reading).arg(&points).arg(&labels).arg(&n).arg(&held_back).arg(&at);
-        // SAFETY: the arguments of `network_samples`; the caller's addresses, and as many samples fit behind `at`.
-        unsafe { launch(&mut call, threads(to.len(), 256)) }
+        // SAFETY: the arguments of `network_samples`; the caller's addresses, and `count` samples fit behind `at`.
+        unsafe { launch(&mut call, threads(count, 256)) }
     }
 
-    /// Takes traced points in; of more than the ring holds the last ones.
+    /// Appends traced points to a replay buffer. If there are more than it holds, the last ones remain.
     ///
     /// # Safety
     /// As for [`super::DeviceTraining::append`].
-    pub(super) unsafe fn append(
-        &self,
-        ring: &mut DeviceSamples,
-        domain: &Domain,
-        points: u64,
-        labels: u64,
-        count: usize,
-        base: Option<&DeviceTable>,
-        times: Option<[f32; 2]>,
-        held_back: u32,
-    ) -> Result<(), DeviceError> {
-        let capacity = ring.capacity();
+    pub(super) unsafe fn append(&self, to: &mut DeviceSamples, batch: TracedBatch<'_>) -> Result<(), DeviceError> {
+        let (capacity, count) = (to.capacity(), batch.count);
         let label_bytes = if self.target() == Target::FlowMap { 12 } else { 4 };
         let skipped = count.saturating_sub(capacity);
-        let before_the_end = (count - skipped).min(capacity - ring.filled.next);
-        for (from, part) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
-            let (at, from) = (ring.filled.next, from as u64);
-            let traced = TracedPoints { points: points + 12 * from, labels: labels + label_bytes * from, further: 0 };
-            // Before it is known whether they arrive: what lay there is gone.
-            ring.filled.append(part, capacity);
-            // SAFETY: the caller's.
-            unsafe { self.place(ring, at..at + part, domain, traced, base, times, held_back) }?;
+        let before_the_end = (count - skipped).min(capacity - to.filled.next);
+        for (from, count) in [(skipped, before_the_end), (skipped + before_the_end, count - skipped - before_the_end)] {
+            let (first, from) = (to.filled.next, from as u64);
+            let part = TracedBatch { points: batch.points + 12 * from, labels: batch.labels + label_bytes * from, count, ..batch };
+            // Counted before the write: even if it fails, the old samples there are lost.
+            to.filled.append(count, capacity);
+            // SAFETY: as required of the caller.
+            unsafe { self.write(to, first, part, 0) }?;
         }
         Ok(())
     }
 }
 
-/// Samples to learn from: unit point, further times, targets. A ring: the newest take the place of the oldest.
+/// Replay buffer of samples (unit point, further times, targets): a ring in which the newest samples replace the oldest.
 #[derive(Debug)]
 pub struct DeviceSamples {
     pub(super) samples: Buffer<[f32; 4]>,
-    /// Of a sample.
-    pub(super) fours: usize,
+    /// Buffer elements per sample.
+    pub(super) float4s: usize,
     pub(super) filled: Filled,
 }
 
-/// How far a ring is filled.
+/// Fill state of a replay buffer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(in crate::backend::cuda) struct Filled {
     pub(super) len: usize,
-    /// Where the next one goes.
+    /// Index of the next sample.
     next: usize,
-    /// Samples that were appended since it was empty.
+    /// Number of samples appended since the buffer was empty.
     appended: u64,
 }
 
 impl Filled {
-    /// As many were appended, no more than fit.
+    /// Counts appended samples, at most `capacity`.
     fn append(&mut self, count: usize, capacity: usize) {
         self.next = (self.next + count) % capacity;
         self.len = (self.len + count).min(capacity);
         self.appended += count as u64;
     }
 
-    /// Back to what it was, where all of that is still there; otherwise empty.
+    /// Returns to an earlier state if all of its samples are still present, otherwise to the empty state.
     fn go_back(&mut self, to: Self, capacity: usize) {
         let behind = self.appended.checked_sub(to.appended);
         let is_there = behind.is_some_and(|behind| behind <= (capacity - to.len) as u64);
@@ -171,23 +160,23 @@ impl DeviceSamples {
         self.filled.len
     }
 
-    /// Whether there are none.
+    /// Returns true if there are no samples.
     pub fn is_empty(&self) -> bool {
         self.filled.len == 0
     }
 
-    /// How far it is filled.
+    /// Fill state, for [`Self::go_back`].
     pub(super) fn filled(&self) -> Filled {
         self.filled
     }
 
-    /// Forgets what was appended since; where that took the place of older ones, all.
+    /// Forgets the samples appended since `to`; forgets all if they replaced older ones.
     pub(super) fn go_back(&mut self, to: Filled) {
         self.filled.go_back(to, self.capacity());
     }
 
     pub(super) fn capacity(&self) -> usize {
-        self.samples.len() / self.fours
+        self.samples.len() / self.float4s
     }
 
     /// Forgets all samples.
@@ -195,12 +184,12 @@ impl DeviceSamples {
         self.filled = Filled::default();
     }
 
-    /// Unit point, further times and targets of each, in one or two times four numbers.
+    /// Downloads unit point, further times and targets of each sample, in one or two groups of four numbers.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn values(&self) -> Result<Vec<[f32; 4]>, DeviceError> {
-        let mut values = vec![[0.0; 4]; self.fours * self.len()];
+        let mut values = vec![[0.0; 4]; self.float4s * self.len()];
         self.samples.read(&mut values)?;
         Ok(values)
     }

@@ -1,14 +1,14 @@
-//! Training on the device: `train_steps(k)` takes k optimizer steps (batch, gradient, Adam, running mean) with one wait at their end.
+//! Training on the device: [`DeviceTraining::train_steps`] takes optimizer steps (batch, gradient, Adam, running mean) with one wait at the end.
 //!
-//! Parameters, moments and their mean stay on the device, in single precision and in burn's layout; the gradients are those of
-//! half-precision values and single-precision sums. Threads add gradients up in any order, so runs agree up to rounding.
+//! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use
+//! half-precision values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.
 
 use crate::backend::cuda::network::batched::GradientTo;
 use crate::backend::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
 use crate::backend::cuda::network::network::{
-    DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_fours, unit_box,
+    DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_float4s, unit_box,
 };
-use crate::backend::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedPoints};
+use crate::backend::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedBatch};
 use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use crate::field::Domain;
 use crate::surrogate::Samples;
@@ -17,12 +17,12 @@ use cudarc::driver::PushKernelArg;
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Steps whose losses are waited for together.
+/// Steps per wait for their losses.
 const STEPS: usize = 256;
-/// Samples that come over at once: bounds the memory beside the ring.
-const WRITTEN: usize = 1 << 20;
+/// Samples per upload. It bounds the memory besides the replay buffer.
+const UPLOAD: usize = 1 << 20;
 
-/// Parameters and Adam's moments, as burn lays them out.
+/// Parameters and Adam's moments, in burn's layout.
 #[derive(Debug)]
 struct Moments {
     parameters: Buffer<f32>,
@@ -33,7 +33,7 @@ struct Moments {
     len: usize,
 }
 
-/// What steps change of [`Moments`].
+/// Copies of the buffers of [`Moments`] that steps change.
 type Kept = [Buffer<f32>; 4];
 
 impl Moments {
@@ -54,14 +54,12 @@ impl Moments {
         [&self.parameters, &self.first, &self.second, &self.average]
     }
 
-    /// Copies everything that steps change to what was kept before, or to new memory.
+    /// Copies all buffers that steps change to an earlier copy's memory, or to new memory.
     fn keep(&self, gpu: &Gpu, kept: Option<Kept>) -> Result<Kept, DeviceError> {
+        let room = || gpu.alloc("a copy of a network", self.len);
         let kept = match kept {
             Some(kept) => kept,
-            None => {
-                let room = || gpu.alloc("a copy of a network", self.len);
-                [room()?, room()?, room()?, room()?]
-            }
+            None => [room()?, room()?, room()?, room()?],
         };
         self.all().into_iter().zip(&kept).try_for_each(|(from, to)| copy(gpu, from, to))?;
         Ok(kept)
@@ -88,19 +86,19 @@ pub struct DeviceTraining {
     gpu: Arc<Gpu>,
     writer: SampleWriter,
     epsilon: f32,
-    /// Steps taken.
+    /// Number of steps taken.
     time: usize,
     tables: Moments,
     layers: Moments,
     /// The tables, rounded and padded.
     halves: Buffer<u16>,
     losses: Buffer<f64>,
-    /// None until a penalty on means needs it.
+    /// `None` until a penalty on means needs it.
     batch: Option<WholeBatch>,
     kept: Option<NetworkCopy>,
 }
 
-/// Everything that steps change of tables and layers, as it was after so many steps.
+/// Copy of everything that steps change in tables and layers, after `steps` steps.
 #[derive(Debug)]
 pub(super) struct NetworkCopy {
     steps: usize,
@@ -109,7 +107,7 @@ pub(super) struct NetworkCopy {
 }
 
 impl NetworkCopy {
-    /// Brings it back behind the work stream, into a model of its shape and the running mean.
+    /// Downloads the copy, asynchronously to the work stream, into a model of its shape and the running mean.
     pub(super) fn read_behind(&self, gpu: &Gpu, model: &mut Model, average: &mut Average) -> Result<(), DeviceError> {
         let read = |part: usize, of: usize| gpu.read_behind(&self.parts[part][of], self.lens[part]);
         let moments = |part: usize| Ok([read(part, 0)?, read(part, 1)?, read(part, 2)?]);
@@ -119,11 +117,11 @@ impl NetworkCopy {
     }
 }
 
-/// What the penalty on means needs of a whole batch before any gradient.
+/// Outputs of a whole batch, which the penalty on means needs before any gradient.
 #[derive(Debug)]
 struct WholeBatch {
     points: Buffer<[f32; 3]>,
-    /// Times that points have no place for; most networks have none.
+    /// Times without a place in a point; most networks have none.
     further: Buffer<f32>,
     predicted: Buffer<f32>,
     /// `Means`.
@@ -141,17 +139,17 @@ impl WholeBatch {
         })
     }
 
-    /// Predicts at the samples of `draw`, and leaves how far their mean is off; `layers` and `halves` as for [`NetworkKernels::predict`].
+    /// Predicts at the samples of `draw` and stores the error of their mean. `layers` and `halves` as for [`NetworkKernels::predict`].
     fn measure(&mut self, writer: &SampleWriter, halves: u64, layers: u64, draw: &DrawArgument) -> Result<(), DeviceError> {
         let SampleWriter { kernels, objective } = writer;
         let stream = kernels.gpu.work();
-        let (points, predicted, means) = (self.points.address(), self.predicted.address(), self.means.address());
-        let further = self.further.address();
+        let (points, further) = (self.points.address(), self.further.address());
+        let (predicted, means) = (self.predicted.address(), self.means.address());
         self.means.zero_front(2)?;
         let count = draw.batch as usize;
         // SAFETY: the arguments of `network_drawn`; there is room for the batch.
         unsafe { launch(stream.launch_builder(&kernels.drawn).arg(draw).arg(&points).arg(&further), threads(count, 256)) }?;
-        // Points bring their times along, and a duration of 1 leaves the FTLE.
+        // Points carry their times, and with a duration of 1 the log-stretch is the FTLE.
         let times = [f32::NAN; 5];
         let reading = ReadingArgument { further, tau: 1.0, ..reading(&kernels.shape, objective, times, None, 1.0) };
         // SAFETY: parameters are of this architecture, and there is room for the batch.
@@ -162,15 +160,15 @@ impl WholeBatch {
 }
 
 impl DeviceTraining {
-    /// Whether the kernels train networks of this architecture on this device.
+    /// Returns true if this device can train networks of this architecture.
     pub fn takes(gpu: &Gpu, shape: &Architecture, objective: &Objective) -> bool {
         DeviceNetwork::takes(gpu, shape) && !objective.derivatives()
     }
 
-    /// Brings a model over; the mean of the parameters starts at them.
+    /// Uploads a model. The running mean of the parameters starts at their values.
     ///
     /// # Errors
-    /// What the kernels do not take: derivatives of the flow map. Memory that is not there.
+    /// Training on derivatives of the flow map is not supported, a kernel does not compile, or out of memory.
     pub fn new(gpu: &Arc<Gpu>, model: &Model, objective: &Objective) -> Result<Self, DeviceError> {
         if objective.derivatives() {
             let what = "training on the derivatives of the flow map (network.jacobian_weight)".into();
@@ -194,10 +192,10 @@ impl DeviceTraining {
         Ok(training)
     }
 
-    /// Takes all the memory that steps of at most `batch` samples need beside the samples, so that none of them lacks it.
+    /// Allocates all memory that steps of at most `batch` samples need besides the samples, so that no step runs out of memory.
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     pub fn reserve(&mut self, batch: usize) -> Result<(), DeviceError> {
         let SampleWriter { kernels, objective } = &self.writer;
         if has_penalty(objective) {
@@ -211,99 +209,99 @@ impl DeviceTraining {
     pub(in crate::backend::cuda) fn bytes(shape: &Architecture, capacity: usize) -> u64 {
         const STATE: u64 = 9 * size_of::<f32>() as u64;
         const ROUNDED: u64 = 3 * size_of::<u16>() as u64;
-        let samples = size_of::<[f32; 4]>() * sample_fours(shape) * capacity;
+        let samples = size_of::<[f32; 4]>() * sample_float4s(shape) * capacity;
         (STATE + ROUNDED) * shape.parameters() as u64 + samples as u64
     }
 
-    /// What is stored where.
+    /// Architecture of the network.
     pub fn shape(&self) -> &Architecture {
         &self.writer.kernels.shape
     }
 
-    /// Optimizer steps taken so far.
+    /// Number of optimizer steps taken.
     pub fn steps(&self) -> usize {
         self.time
     }
 
-    /// Brings parameters and moments back into burn's module.
+    /// Downloads parameters and moments into burn's module.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     ///
     /// # Panics
-    /// When `model` has another shape.
+    /// If `model` has another shape.
     pub fn store(&self, model: &mut Model) -> Result<(), DeviceError> {
-        assert!(model.shape == self.writer.kernels.shape, "a model of the shape that was brought over");
+        assert!(model.shape == self.writer.kernels.shape, "a model of the uploaded shape");
         model.set_state([self.tables.read()?, self.layers.read()?], self.time);
         Ok(())
     }
 
-    /// The running mean of the parameters.
+    /// Downloads the running mean of the parameters.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn average(&self) -> Result<Average, DeviceError> {
         Ok(Average { tables: read(&self.tables.average, self.tables.len)?, layers: read(&self.layers.average, self.layers.len)? })
     }
 
-    /// Brings a running mean over.
+    /// Uploads a running mean.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     ///
     /// # Panics
-    /// When it is that of another shape.
+    /// If it has another shape.
     pub fn set_average(&mut self, average: &Average) -> Result<(), DeviceError> {
         assert!((average.tables.len(), average.layers.len()) == (self.tables.len, self.layers.len), "a mean of this shape");
         self.tables.average.write(&average.tables)?;
         self.layers.average.write(&average.layers)
     }
 
-    /// Sets the running mean to the present parameters.
+    /// Sets the running mean to the current parameters.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn restart_average(&mut self) -> Result<(), DeviceError> {
         [&self.tables, &self.layers].into_iter().try_for_each(|moments| copy(&self.gpu, &moments.parameters, &moments.average))
     }
 
-    /// Sets a range of the layers' parameters to 0, and their moments and mean.
+    /// Sets a range of the layers' parameters, their moments and their mean to 0.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     ///
     /// # Panics
-    /// When the range goes beyond the layers.
+    /// If the range exceeds the layers.
     pub fn zero_layers(&mut self, range: Range<usize>) -> Result<(), DeviceError> {
         self.layers.all().into_iter().try_for_each(|values| values.zero_at(range.start, range.len()))
     }
 
-    /// Remembers everything that steps change as what to come back to.
+    /// Copies everything that steps change, for [`Self::roll_back`].
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     pub fn keep(&mut self) -> Result<(), DeviceError> {
         let room = self.kept.take();
         self.kept = Some(self.copy(room)?);
         Ok(())
     }
 
-    /// Copies everything that steps change to `room`, or to new memory, in the order of the work stream.
+    /// Copies everything that steps change to `room` or to new memory, in the order of the work stream.
     pub(super) fn copy(&self, room: Option<NetworkCopy>) -> Result<NetworkCopy, DeviceError> {
         let [tables, layers] = room.map_or([None, None], |room| room.parts.map(Some));
         let parts = [self.tables.keep(&self.gpu, tables)?, self.layers.keep(&self.gpu, layers)?];
         Ok(NetworkCopy { steps: self.time, parts, lens: [self.tables.len, self.layers.len] })
     }
 
-    /// Memory of such a copy, in bytes.
+    /// Size of such a copy, in bytes.
     pub(super) fn copy_bytes(&self) -> u64 {
         4 * size_of::<f32>() as u64 * (self.tables.len + self.layers.len) as u64
     }
 
-    /// Comes back to what was kept last; nothing changes where nothing was.
+    /// Restores the state of the last [`Self::keep`]. Does nothing if there is none.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn roll_back(&mut self) -> Result<(), DeviceError> {
         let Some(NetworkCopy { steps, parts: [tables, layers], .. }) = &self.kept else { return Ok(()) };
         self.tables.roll_back(&self.gpu, tables)?;
@@ -312,41 +310,41 @@ impl DeviceTraining {
         self.writer.kernels.round(&self.tables.parameters, &self.halves)
     }
 
-    /// What predicts now, for good: the running mean.
+    /// Network that predicts with the current running mean, unaffected by later steps.
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     pub fn frozen(&self) -> Result<DeviceNetwork, DeviceError> {
         let layers = copied(&self.gpu, "a network's layers", &self.layers.average)?;
         DeviceNetwork::of(&self.writer.kernels, &self.writer.objective, &self.tables.average, layers)
     }
 
-    /// Room for `capacity` samples.
+    /// Empty replay buffer of `capacity` samples.
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     pub fn ring(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
-        let fours = sample_fours(self.shape());
-        Ok(DeviceSamples { samples: self.gpu.alloc("samples", fours * capacity)?, fours, filled: Filled::default() })
+        let float4s = sample_float4s(self.shape());
+        Ok(DeviceSamples { samples: self.gpu.alloc("samples", float4s * capacity)?, float4s, filled: Filled::default() })
     }
 
-    /// Brings samples over. The network learns what they have beyond `base`.
+    /// Uploads samples to a new buffer. The network learns their difference to `base`.
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     pub fn upload(&self, samples: &Samples, base: Option<&DeviceTable>) -> Result<DeviceSamples, DeviceError> {
         let mut ring = self.ring(samples.len())?;
         self.write(&mut ring, 0..samples.len(), samples, base)?;
         Ok(ring)
     }
 
-    /// Brings a range of samples over, each to the place that it has among `samples`. Those before must be there already.
+    /// Uploads a range of samples, each to its index in `samples`. Samples before the range must be present already.
     ///
     /// # Errors
-    /// Memory that is not there.
+    /// Out of memory.
     ///
     /// # Panics
-    /// When the range goes beyond the ring or the samples.
+    /// If the range exceeds the buffer or the samples.
     pub fn write(
         &self,
         ring: &mut DeviceSamples,
@@ -355,51 +353,51 @@ impl DeviceTraining {
         base: Option<&DeviceTable>,
     ) -> Result<(), DeviceError> {
         let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
-        for from in range.clone().step_by(WRITTEN) {
-            let part = from..(from + WRITTEN).min(range.end);
+        for from in range.clone().step_by(UPLOAD) {
+            let part = from..(from + UPLOAD).min(range.end);
             let (points, further) = self.writer.placed(samples, part.clone());
             let (points, further) = (self.gpu.upload("samples", &points)?, self.gpu.upload("samples", &further)?);
             let labels = self.gpu.upload("samples", &self.writer.labels(samples, part.clone()))?;
-            let traced = TracedPoints { points: points.address(), labels: labels.address(), further: further.address() };
-            // SAFETY: these buffers hold as many entries and are freed in the order of the work stream.
-            unsafe { self.writer.place(ring, part, &unit, traced, base, None, 0) }?;
+            let (points, labels, count) = (points.address(), labels.address(), part.len());
+            let batch = TracedBatch { domain: &unit, points, labels, count, base, times: None, held_back: 0 };
+            // SAFETY: these buffers hold `count` entries and are freed in the order of the work stream.
+            unsafe { self.writer.write(ring, part.start, batch, further.address()) }?;
         }
         ring.filled.len = ring.filled.len.max(range.end);
         Ok(())
     }
 
-    /// Number of samples that can be learned from: those that are finite.
+    /// Number of samples with finite targets, which training uses.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn usable(&self, ring: &DeviceSamples) -> Result<usize, DeviceError> {
         if ring.is_empty() {
             return Ok(0);
         }
         let count = self.gpu.upload("a counter", &[0_u32])?;
         let (samples, n, to) = (ring.samples.address(), ring.len() as u32, count.address());
-        let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.writer.kernels.usable);
+        let mut call = self.gpu.work().launch_builder(&self.writer.kernels.usable);
         call.arg(&samples).arg(&n).arg(&to);
-        // SAFETY: the arguments of `network_usable`; the ring holds as many samples.
+        // SAFETY: the arguments of `network_usable`; the buffer holds `n` samples.
         unsafe { launch(&mut call, threads(ring.len(), 256)) }?;
         let mut found = [0];
         count.read(&mut found)?;
         Ok(found[0] as usize)
     }
 
-    /// Takes traced points on the device in: `count` points (three f32 each, coordinates of `domain`, times at the places of axes that are no
-    /// inputs) and their labels: log-stretch (f32 each), or for the flow map arrivals (three f32 each, coordinates of `domain`).
-    /// What is not finite is never learned from.
+    /// Appends traced points on the device: `count` points (three f32 each, coordinates of `domain`, with times at the places of unused axes)
+    /// and their labels: log-stretch (f32 each), or for a flow map arrivals (three f32 each, coordinates of `domain`). Training skips samples
+    /// that are not finite.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     ///
     /// # Panics
-    /// When the ring has no room for as many.
+    /// If `count` exceeds the buffer's capacity.
     ///
     /// # Safety
-    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
     pub unsafe fn append(
         &self,
         ring: &mut DeviceSamples,
@@ -410,36 +408,36 @@ impl DeviceTraining {
         base: Option<&DeviceTable>,
     ) -> Result<(), DeviceError> {
         let capacity = ring.capacity();
-        assert!(count <= capacity, "a ring of {capacity} for {count} samples");
-        // SAFETY: the caller's.
-        unsafe { self.writer.append(ring, domain, points, labels, count, base, None, 0) }
+        assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
+        // SAFETY: as required of the caller.
+        unsafe { self.writer.append(ring, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
     }
 
-    /// Fills `points` with uniform points of the domain, a function of `seed` and their numbers, `first` and on.
+    /// Fills `points` with uniform points of the domain, a function of `seed` and of their numbers from `first` on.
     ///
     /// # Errors
-    /// What the device says.
+    /// Error of the driver.
     pub fn draw_points(&self, domain: &Domain, seed: u64, first: u64, points: &mut Buffer<[f32; 3]>) -> Result<(), DeviceError> {
         let (domain, n, to) = (unit_box(domain), points.len() as u32, points.address());
-        let stream = self.gpu.work();
-        let mut call = stream.launch_builder(&self.writer.kernels.points);
+        let mut call = self.gpu.work().launch_builder(&self.writer.kernels.points);
         call.arg(&domain).arg(&seed).arg(&first).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_points`.
         unsafe { launch(&mut call, threads(points.len(), 256)) }
     }
 
-    /// What turns traced points into samples of this network, without the network.
+    /// Writer of samples for this network, which does not keep the network's parameters.
     pub(super) fn writer(&self) -> SampleWriter {
         self.writer.clone()
     }
 
-    /// Takes the steps in order and waits for the last; the loss of each, before it. Steps that draw do so from `samples` and `more` alike.
+    /// Takes the steps in order and waits for the last one. Returns the loss before each step. Random steps draw from `samples` and `more`
+    /// together.
     ///
     /// # Errors
-    /// What the device says; parameters are then lost.
+    /// Error of the driver; the parameters are then lost.
     ///
     /// # Panics
-    /// When a step takes more samples in order than there are, or there are none.
+    /// If there are no samples, or a step takes more samples in order than there are.
     pub fn train_steps(
         &mut self,
         samples: &DeviceSamples,
@@ -485,10 +483,9 @@ impl DeviceTraining {
             means: 0,
         };
         let (halves, loss) = (self.halves.address(), self.losses.address_of(number));
-        let [table_parameters, table_first, table_second, table_gradient] =
-            [&tables.parameters, &tables.first, &tables.second, &tables.gradient].map(Buffer::address);
-        let [layer_parameters, layer_first, layer_second, layer_gradient] =
-            [&layers.parameters, &layers.first, &layers.second, &layers.gradient].map(Buffer::address);
+        let addresses = |of: &Moments| [&of.parameters, &of.first, &of.second, &of.gradient].map(Buffer::address);
+        let [table_parameters, table_first, table_second, table_gradient] = addresses(tables);
+        let [layer_parameters, layer_first, layer_second, layer_gradient] = addresses(layers);
         if has_penalty(objective) {
             let batch = match batch.take().filter(|batch| batch.points.len() >= step.count) {
                 Some(batch) => batch,

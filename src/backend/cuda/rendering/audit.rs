@@ -3,7 +3,7 @@
 
 use crate::backend::audit::{AuditFindings, AuditRequest, draws};
 use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, LandArgument, Outputs};
+use crate::backend::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
 use crate::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
 use crate::backend::router::unit_arrival;
 use crate::field::Domain;
@@ -134,12 +134,12 @@ impl Audits {
             stream: stream_words,
             min: domain.min,
             extent: domain.extent(),
-            land: tracer.missing_cells().map_or(LandArgument::NONE, DeviceMissingCells::argument),
+            missing_cells: tracer.missing_cells().map_or_else(bytemuck::Zeroable::zeroed, DeviceMissingCells::argument),
         };
         let points = AuditPointsArgument {
             unit: memory.unit.address(),
             points: memory.points.address(),
-            land: memory.land.address(),
+            is_missing: memory.land.address(),
             traced: memory.traced.address(),
             lived: memory.lived.address(),
             predicted: memory.predicted.address(),

@@ -1,7 +1,7 @@
 //! Routes a frame's log-stretch queries on the device, by the rule of [`crate::backend::QueryRouter`], and keeps labels of the traced ones.
 
 use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{ChoiceArgument, LandArgument, ListsArgument, Outputs};
+use crate::backend::cuda::layout::{ChoiceArgument, ListsArgument, Outputs};
 use crate::backend::cuda::rendering::labels::{HELD_BACK, Labels};
 use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
 use crate::field::Domain;
@@ -182,7 +182,7 @@ impl QueryRouter {
             gate_shape: queries.gate.shape().map(|n| n as i32),
             gate_pad: 0,
             trusted: trusted.as_ref().map_or(0, Buffer::address),
-            land: queries.missing_cells.map_or(LandArgument::NONE, DeviceMissingCells::argument),
+            missing_cells: queries.missing_cells.map_or_else(bytemuck::Zeroable::zeroed, DeviceMissingCells::argument),
             budget_spent: 0,
             pad: 0,
         };

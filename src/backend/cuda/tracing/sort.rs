@@ -1,4 +1,4 @@
-//! Points in the order of their cells.
+//! Sorts points by cell along a Morton curve, so that neighbouring threads read neighbouring memory.
 
 use crate::backend::cuda::layout::SortFrame;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
@@ -6,9 +6,9 @@ use crate::field::{Domain, Grid};
 use cudarc::driver::{CudaFunction, PushKernelArg};
 use std::sync::Arc;
 
-/// Most points sorted at once: bounds the scratch memory.
-pub const MOST: usize = 1 << 24;
-/// Bytes of a point in the scratch memory.
+/// Maximum number of points that are sorted together. It bounds the scratch memory.
+pub const MAX_POINTS: usize = 1 << 24;
+/// Bytes per point in the scratch memory.
 const POINT: u64 = 26;
 /// `SCAN_TILE` of `sort.cu`.
 const TILE: usize = 4096;
@@ -44,12 +44,12 @@ pub struct SortCells {
 }
 
 impl SortCells {
-    /// The grid's cells; on uneven axes as many even ones.
+    /// The grid's cells; on an uneven axis the same number of even ones.
     pub fn of_grid(grid: &Grid) -> Self {
         Self::of_domain(&grid.domain(), std::array::from_fn(|k| grid.axes.get(k).map_or(1, |axis| axis.cells())))
     }
 
-    /// The domain in `cells` parts along each axis; axes beyond its dimensions play no part.
+    /// The domain divided into `cells` parts along each axis. Axes beyond its dimensions are not used.
     pub fn of_domain(domain: &Domain, cells: [usize; 3]) -> Self {
         let cells = std::array::from_fn(|k| if k < domain.dimensions { cells[k].max(1) } else { 1 });
         let extent = domain.extent();
@@ -60,12 +60,12 @@ impl SortCells {
         }
     }
 
-    /// Bits of each axis, and how many of the key are dropped for `count` points; then the number of buckets.
+    /// Kernel argument for `count` points, and the number of buckets.
     fn frame(&self, count: usize) -> (SortFrame, usize) {
-        // Two points a bucket on average, were the key's values all taken; about a third of them is.
+        // Two points per bucket on average if all keys were in use; about a third of them is.
         let wanted = (count / 2).max(1024).ilog2();
         let bits = self.cells.map(|n| n.next_power_of_two().trailing_zeros().min(10) as i32);
-        // An axis with more cells than 10 bits can name is sorted by groups of cells.
+        // An axis with more than 2^10 cells is sorted by groups of cells.
         let shrink = |k: usize| self.cells[k].div_ceil(1 << bits[k]) as f32;
         let all = bits.iter().sum::<i32>() as u32;
         let shift = all.saturating_sub(wanted);
@@ -82,6 +82,9 @@ impl SortCells {
 
 impl Sorter {
     /// Compiles the kernels.
+    ///
+    /// # Errors
+    /// A kernel does not compile or load.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernel = |name| gpu.kernel("sort.cu", &[], name);
         Ok(Self {
@@ -96,52 +99,56 @@ impl Sorter {
     }
 
     fn scratch(&mut self, count: usize, buckets: usize) -> Result<&mut Scratch, DeviceError> {
-        let fits = |s: &Scratch| s.capacity >= count && s.counts.len() >= buckets;
-        if !self.scratch.as_ref().is_some_and(fits) {
-            // The old one goes first, so that both never need room together.
-            self.scratch = None;
-            let capacity = count.next_power_of_two().clamp(1 << 12, MOST);
-            let most = buckets.max(capacity / 2);
-            self.scratch = Some(Scratch {
-                capacity,
-                counts: self.gpu.alloc("sorting", most)?,
-                tiles: self.gpu.alloc("sorting", most.div_ceil(TILE))?,
-                places: self.gpu.alloc("sorting", capacity)?,
-                sorted: self.gpu.alloc("sorting", capacity)?,
-            });
-        }
-        self.scratch.as_mut().ok_or_else(|| DeviceError::Unsupported { what: "sorting without scratch memory".into() })
+        // A memory that is too small is freed first, so that both never need room together.
+        let scratch = match self.scratch.take().filter(|s| s.capacity >= count && s.counts.len() >= buckets) {
+            Some(scratch) => scratch,
+            None => {
+                let capacity = count.next_power_of_two().clamp(1 << 12, MAX_POINTS);
+                let counts = buckets.max(capacity / 2);
+                Scratch {
+                    capacity,
+                    counts: self.gpu.alloc("sorting", counts)?,
+                    tiles: self.gpu.alloc("sorting", counts.div_ceil(TILE))?,
+                    places: self.gpu.alloc("sorting", capacity)?,
+                    sorted: self.gpu.alloc("sorting", capacity)?,
+                }
+            }
+        };
+        Ok(self.scratch.insert(scratch))
     }
 
-    /// Points that are best sorted together: as many as there is scratch memory for, or may be.
+    /// Number of points that should be sorted together: the capacity of the scratch memory, or the one that it may grow to.
     pub fn at_once(&self) -> usize {
-        // The scratch memory is for a power of two.
-        let may_be = 1 << self.gpu.batch(MOST, POINT).ilog2();
+        // The capacity is a power of two.
+        let may_be = 1 << self.gpu.batch(MAX_POINTS, POINT).ilog2();
         self.scratch.as_ref().map_or(0, |scratch| scratch.capacity).max(may_be)
     }
 
-    /// Lets go of the scratch memory until it is needed again.
+    /// Frees the scratch memory until it is needed again.
     pub fn release(&mut self) {
         self.scratch = None;
     }
 
-    /// Memory for at most `MOST` points `{x, y, z, index as bits}` in an order of the caller's making.
+    /// Address of memory for at most [`MAX_POINTS`] entries `{x, y, z, index as bits}`, which the caller fills.
+    ///
+    /// # Errors
+    /// Out of memory.
     pub fn buffer(&mut self, count: usize) -> Result<u64, DeviceError> {
         Ok(self.scratch(count, 1024)?.sorted.address())
     }
 
-    /// Sorts `count` points (3 f32 each at the device address `points`), at most `MOST`. Returns the address of `{x, y, z, index as
+    /// Sorts `count` points (3 f32 each at the device address `points`), at most `MAX_POINTS`. Returns the address of `{x, y, z, index as
     /// bits}`, valid until the next call.
     ///
+    /// # Errors
+    /// Out of memory, or an error of the driver.
+    ///
     /// # Safety
-    /// `points` holds `count` points until the work stream has passed this.
+    /// `points` holds `count` points until the work stream has passed this call.
     pub unsafe fn sort(&mut self, points: u64, count: usize, cells: &SortCells) -> Result<u64, DeviceError> {
-        assert!(count <= MOST, "a batch of at most {MOST} points");
+        assert!(count <= MAX_POINTS, "a batch of at most {MAX_POINTS} points");
         let (frame, buckets) = cells.frame(count);
-        self.scratch(count, buckets)?;
-        let Some(scratch) = &mut self.scratch else {
-            return Err(DeviceError::Unsupported { what: "sorting without scratch memory".into() });
-        };
+        let scratch = self.scratch(count, buckets)?;
         let (n, buckets_n, tiles_n) = (count as u32, buckets as u32, buckets.div_ceil(TILE) as u32);
         scratch.counts.zero_front(buckets)?;
         let (counts, tiles, places, sorted) =

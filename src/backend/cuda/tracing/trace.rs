@@ -1,27 +1,26 @@
-//! Tracing on the device: from addresses of seeds to addresses of results, sorted by cell where velocities are read from memory.
+//! Tracing on the device: seeds and results are at device addresses. Seeds in a window of snapshots are sorted by cell first.
 
-use crate::backend::cuda::layout::{ClosedData, DeviceReal, Outputs, Verdict, Words, words};
-use crate::backend::cuda::tracing::sort::{MOST, SortCells, Sorter};
+use crate::backend::cuda::layout::{ClosedData, DeviceReal, Outputs, ResultPolicy, Words, words};
+use crate::backend::cuda::tracing::sort::{MAX_POINTS, SortCells, Sorter};
 use crate::backend::cuda::window::DeviceWindow;
-use crate::backend::cuda::window::grid::GridArguments;
+use crate::backend::cuda::window::grid::{GridArguments, WindowFlowMap};
 use crate::backend::cuda::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
 use crate::field::analytic::{Analytic, ClosedForm, Constants, Form};
 use crate::field::{Domain, Geometry};
 use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
-use crate::simd::Real;
 use cudarc::driver::{CudaFunction, PushKernelArg};
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// In which order seeds are traced, and how velocities are read: for measurements.
+/// Order in which seeds are traced, and format in which velocities are read. Other values than the default are for measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Tuning {
-    /// How the window is held.
+    /// Format of the window.
     pub storage: Storage,
-    /// Whether batches are sorted by cell.
+    /// True if batches are sorted by cell.
     pub sorted: bool,
-    /// Whether the current cell stays in registers, where it fits; otherwise every stage reads its corners (the plain kernel).
+    /// True if the current cell stays in registers when it fits; otherwise every stage reads its corners.
     pub keep: bool,
-    /// Whether the particles of a seed's differences, sorted and in a window, are traced by a lane each; otherwise by one thread in turn.
+    /// True if each particle of a seed's differences has its own lane (sorted seeds in a window only); otherwise one thread traces them in turn.
     pub spread: bool,
 }
 
@@ -31,7 +30,7 @@ impl Default for Tuning {
     }
 }
 
-/// Batches below this are not worth sorting.
+/// Size of the smallest batch that is sorted.
 const SORT_FROM: usize = 1 << 12;
 
 /// One flow map on the device, ready for seeds.
@@ -40,7 +39,7 @@ pub struct DeviceTracer {
     gpu: Arc<Gpu>,
     plain: CudaFunction,
     sorted: CudaFunction,
-    /// Seeds that a warp of the sorted kernel traces.
+    /// Seeds per warp of the sorted kernel.
     seeds_a_warp: usize,
     block: u32,
     data: Words,
@@ -48,19 +47,19 @@ pub struct DeviceTracer {
     times: u64,
     step: [u64; 1],
     gap: f64,
-    verdict: Verdict,
+    result_policy: ResultPolicy,
     cells: Option<SortCells>,
     sorter: Mutex<Option<Sorter>>,
-    // Memory that the kernels read.
+    // Owners of the memory that the kernels read.
     _window: Option<DeviceWindow>,
     _memory: Vec<Buffer<u8>>,
 }
 
 impl DeviceTracer {
-    /// For seeds at `t0`, with this many steps. What [`crate::flow::cpu_tracer`] refuses is not checked again.
+    /// Tracer of seeds at time `t0`, with this many steps. Settings that [`crate::flow::cpu_tracer`] refuses are not checked again.
     ///
     /// # Errors
-    /// The adaptive integrator; a window that does not fit; kernels that do not compile.
+    /// The adaptive integrator is not supported, the window does not fit into memory, or a kernel does not compile.
     pub fn new(
         store: &SnapshotStore,
         gpu: &Arc<Gpu>,
@@ -71,7 +70,7 @@ impl DeviceTracer {
         tuning: Tuning,
     ) -> Result<Self, DeviceError> {
         if map.integrator == Integrator::DormandPrince {
-            return Err(DeviceError::Unsupported { what: "the adaptive reference integrator; it runs on the CPU".into() });
+            return Err(DeviceError::Unsupported { what: "the adaptive reference integrator, which runs on the CPU only".into() });
         }
         match map.precision {
             Precision::F32 => Self::of_real::<f32>(store, gpu, source, map, t0, steps, tuning),
@@ -79,14 +78,13 @@ impl DeviceTracer {
         }
     }
 
-    /// For seeds with start times of their own: x, y and start. Only a closed form of two dimensions that depends on time by a phase, the double
-    /// gyre, can be traced so.
+    /// Tracer of seeds with individual start times: x, y and start. Only the double gyre is supported, whose dependence on time is a phase.
     ///
     /// # Errors
-    /// Other flows, the adaptive integrator; kernels that do not compile.
+    /// Other flows and the adaptive integrator are not supported; a kernel does not compile.
     pub fn with_starts(gpu: &Arc<Gpu>, flow: &Analytic, domain: &Domain, map: &FlowMap, steps: usize) -> Result<Self, DeviceError> {
         if !matches!(flow.form(), Form::DoubleGyre(_)) || map.integrator == Integrator::DormandPrince {
-            let what = format!("start times of each seed's own with {:?} and the flow {flow:?}", map.integrator);
+            let what = format!("individual start times of seeds with {:?} and the flow {flow:?}", map.integrator);
             return Err(DeviceError::Unsupported { what });
         }
         match map.precision {
@@ -95,7 +93,7 @@ impl DeviceTracer {
         }
     }
 
-    /// `t0`: none where every seed has its own.
+    /// `t0`: `None` if every seed has its own start time.
     fn of_closed<R: DeviceReal>(
         gpu: &Arc<Gpu>,
         flow: &Analytic,
@@ -115,7 +113,7 @@ impl DeviceTracer {
             times: stages.address(),
             step: step_word::<R>(map, steps),
             gap: map.gap,
-            verdict: verdict(map, steps),
+            result_policy: result_policy(map, steps),
             cells: None,
             sorter: Mutex::new(None),
             _window: None,
@@ -148,11 +146,13 @@ impl DeviceTracer {
                     Ok(address)
                 };
                 let spread = tuning.spread && tuning.sorted && map.integrator == Integrator::Differences;
-                // In double precision, and with levels on the sphere, the kept cell takes registers that other warps need, and is slower
+                // In double precision, and with levels on the sphere, caching the cell takes registers from other warps and is slower
                 // (docs/performance.md).
                 let layered = matches!(grid.geometry, Geometry::Sphere { .. }) && grid.dimensions() == 3;
                 let keep = tuning.keep && map.precision == Precision::F32 && !layered;
-                let arguments = GridArguments::new::<R>(&mut put, &held.nodes(), &times, &grid, map, (t0, to), steps, keep)?;
+                let nodes = held.nodes();
+                let flow = WindowFlowMap { nodes: &nodes, times: &times, grid: &grid, map, span: (t0, to), steps, keep };
+                let arguments = GridArguments::new::<R>(&mut put, flow)?;
                 let kernel = |name| gpu.kernel("trace_grid.cu", &arguments.defines, name);
                 Ok(Self {
                     plain: kernel("trace")?,
@@ -163,7 +163,7 @@ impl DeviceTracer {
                     times: arguments.steps,
                     step: step_word::<R>(map, steps),
                     gap: map.gap,
-                    verdict: verdict(map, steps),
+                    result_policy: result_policy(map, steps),
                     cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
                     sorter: Mutex::new(None),
                     _window: Some(held),
@@ -179,7 +179,10 @@ impl DeviceTracer {
         &self.gpu
     }
 
-    /// Registers a thread and bytes of local memory a thread of the kernel in use.
+    /// Registers and bytes of local memory per thread of the kernel in use.
+    ///
+    /// # Errors
+    /// Error of the driver.
     pub fn resources(&self) -> Result<(i32, i32), DeviceError> {
         let doing = DeviceError::driver("asking for a kernel's resources");
         let kernel = if self.cells.is_some() { &self.sorted } else { &self.plain };
@@ -189,22 +192,25 @@ impl DeviceTracer {
     /// Traces `count` seeds on the device: `seeds` is the address of 3 f32 each, in domain coordinates; results go to `out` in the order of
     /// the seeds. Returns as soon as the work is queued on the work stream.
     ///
+    /// # Errors
+    /// Out of memory for sorting, or an error of the driver.
+    ///
     /// # Safety
-    /// The memory at these addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    /// The memory at these addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
     pub unsafe fn trace(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         let Some(cells) = self.cells.as_ref().filter(|_| count >= SORT_FROM) else {
-            // SAFETY: the caller's.
+            // SAFETY: as required of the caller.
             return unsafe { self.in_given_order(seeds, count, out) };
         };
         let mut sorter = self.sorter.lock().unwrap_or_else(PoisonError::into_inner);
-        if sorter.is_none() {
-            *sorter = Some(Sorter::new(&self.gpu)?);
-        }
-        let Some(sorter) = sorter.as_mut() else { return Err(DeviceError::Unsupported { what: "sorting".into() }) };
+        let sorter = match &mut *sorter {
+            Some(sorter) => sorter,
+            none => none.insert(Sorter::new(&self.gpu)?),
+        };
         let most = sorter.at_once();
         for first in (0..count).step_by(most) {
             let part = (count - first).min(most);
-            // SAFETY: the caller's; the sorted points are read by the launch behind it on the same stream.
+            // SAFETY: as required of the caller; the launch that reads the sorted points is next on the same stream.
             unsafe {
                 let sorted = sorter.sort(seeds + 12 * first as u64, part, cells)?;
                 self.launch(&self.sorted, self.seeds_a_warp, sorted, part, &shifted(out, first))?;
@@ -213,28 +219,28 @@ impl DeviceTracer {
         Ok(())
     }
 
-    /// Traces `count` seeds that are in a good order already: `{x, y, z, index as bits}`; results go to their index, and index 0xffffffff
-    /// is no seed.
+    /// Traces `count` seeds that are in an order of good locality already: `{x, y, z, index as bits}`. Results go to their index; index
+    /// 0xffffffff marks an entry without a seed.
     ///
     /// # Safety
     /// As for [`Self::trace`], with room for every index.
     pub(in crate::backend::cuda) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
-        // SAFETY: the caller's.
+        // SAFETY: as required of the caller.
         unsafe { self.launch(&self.sorted, self.seeds_a_warp, sorted, count, out) }
     }
 
     /// # Safety
     /// As for [`Self::trace`].
     unsafe fn in_given_order(&self, seeds: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
-        for first in (0..count).step_by(MOST) {
-            // SAFETY: the caller's.
-            unsafe { self.launch(&self.plain, 32, seeds + 12 * first as u64, (count - first).min(MOST), &shifted(out, first))? };
+        for first in (0..count).step_by(MAX_POINTS) {
+            // SAFETY: as required of the caller.
+            unsafe { self.launch(&self.plain, 32, seeds + 12 * first as u64, (count - first).min(MAX_POINTS), &shifted(out, first))? };
         }
         Ok(())
     }
 
     /// # Safety
-    /// `seeds` is what the kernel reads, for `count` seeds; `out` has room.
+    /// `seeds` holds `count` seeds in the kernel's format, and `out` has room for their results.
     unsafe fn launch(
         &self,
         kernel: &CudaFunction,
@@ -248,13 +254,13 @@ impl DeviceTracer {
         }
         let n = count as u32;
         let mut call = self.gpu.work().launch_builder(kernel);
-        call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.verdict).arg(&seeds).arg(&n).arg(out);
-        // SAFETY: the caller's; all that the data points to is held by `self`.
+        call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.result_policy).arg(&seeds).arg(&n).arg(out);
+        // SAFETY: as required of the caller; `self` owns all memory that the data points to.
         unsafe { launch(&mut call, threads(32 * count.div_ceil(seeds_a_warp), self.block)) }
     }
 }
 
-/// The same outputs from entry `first` on.
+/// Outputs from entry `first` on.
 fn shifted(out: &Outputs, first: usize) -> Outputs {
     let by = |address: u64, bytes: usize| if address == 0 { 0 } else { address + (first * bytes) as u64 };
     Outputs {
@@ -266,12 +272,12 @@ fn shifted(out: &Outputs, first: usize) -> Outputs {
     }
 }
 
-/// The length of a step, with its sign, as the kernels take it.
+/// Signed length of a step, as a kernel parameter.
 fn step_word<R: DeviceReal>(map: &FlowMap, steps: usize) -> [u64; 1] {
     [words(&R::from_f64(map.direction.sign() * map.tau / steps as f64))[0]]
 }
 
-/// What `trace_closed.cu` is compiled with and launched with.
+/// Launch arguments and macros of `trace_closed.cu`.
 pub(in crate::backend::cuda) struct ClosedArguments {
     pub(in crate::backend::cuda) data: Words,
     /// Constants of every stage, as bytes.
@@ -280,7 +286,7 @@ pub(in crate::backend::cuda) struct ClosedArguments {
 }
 
 impl ClosedArguments {
-    /// `t0`: none where every seed of a double gyre has its own.
+    /// `t0`: `None` if every seed of a double gyre has its own start time.
     pub(in crate::backend::cuda) fn new<R: DeviceReal>(
         flow: &Analytic,
         domain: &Domain,
@@ -312,11 +318,11 @@ fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<S
     ]
 }
 
-/// What `give` does with a path.
-pub(in crate::backend::cuda) fn verdict(map: &FlowMap, steps: usize) -> Verdict {
-    Verdict {
-        zero_where_left: i32::from(map.boundary == Boundary::Zero),
-        by_lived: i32::from(map.normalisation == Normalisation::Lived),
+/// Edge policy and normalisation of results.
+pub(in crate::backend::cuda) fn result_policy(map: &FlowMap, steps: usize) -> ResultPolicy {
+    ResultPolicy {
+        zero_if_left: i32::from(map.boundary == Boundary::Zero),
+        by_lifetime: i32::from(map.normalisation == Normalisation::Lived),
         steps: steps as i32,
     }
 }
@@ -332,7 +338,7 @@ fn boundary_number(boundary: Boundary) -> u8 {
     }
 }
 
-fn closed_data<R: Real>(domain: &Domain, boundary: Boundary, rate: f64) -> ClosedData<R> {
+fn closed_data<R: DeviceReal>(domain: &Domain, boundary: Boundary, rate: f64) -> ClosedData<R> {
     let (low, high) = (domain.min.map(R::from_f64), domain.max.map(R::from_f64));
     let (inner_low, inner_high) = match boundary {
         Boundary::Zero => (low.map(R::above), high.map(R::below)),
@@ -342,13 +348,12 @@ fn closed_data<R: Real>(domain: &Domain, boundary: Boundary, rate: f64) -> Close
 }
 
 /// Constants of every stage as bytes.
-fn stages<R: Real>(constants: impl Fn(f64) -> Constants<f64>, from: f64, to: f64, steps: usize) -> Vec<u8> {
+fn stages<R: DeviceReal>(constants: impl Fn(f64) -> Constants<f64>, from: f64, to: f64, steps: usize) -> Vec<u8> {
     let halves = 2 * steps;
     let mut bytes = Vec::new();
     for i in 0..=halves {
         for constant in constants(from + (to - from) * (i as f64 / halves as f64)) {
-            let constant = R::from_f64(constant);
-            bytes.extend_from_slice(&words(&constant)[0].to_le_bytes()[..size_of::<R>()]);
+            bytes.extend_from_slice(bytemuck::bytes_of(&R::from_f64(constant)));
         }
     }
     bytes

@@ -1,55 +1,73 @@
-//! A window and a flow map as kernels see them.
+//! Launch arguments and macros of the kernels that trace in a window of snapshots.
 
 use crate::backend::cuda::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
 use crate::backend::cuda::{DeviceError, Storage};
 use crate::field::{Geometry, Grid};
 use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
+use bytemuck::{Zeroable, cast_slice};
 
-/// What a kernel for a window is launched with.
+/// Launch arguments and macros of `trace_grid.cu`.
 #[derive(Debug)]
 pub struct GridArguments {
     /// `GridData`.
     pub data: Words,
     /// Address of the steps.
     pub steps: u64,
-    /// Macros of `trace_grid.cu`.
+    /// Macros.
     pub defines: Vec<String>,
 }
 
-/// The snapshots of a window as kernels see them.
+/// The snapshots of a window on the device.
 #[derive(Debug, Clone)]
 pub struct Nodes {
     /// Addresses, oldest first.
     pub addresses: Vec<u64>,
-    /// How velocities are held.
+    /// Format of the velocities.
     pub storage: Storage,
-    /// What stored velocities are multiplied by.
+    /// Factor of the stored velocities.
     pub scale: f32,
-    /// Whether some node is missing.
+    /// True if some node is missing.
     pub missing: bool,
 }
 
-/// Beyond these times of an interval, a time is that of a snapshot (as the CPU's sampler has it).
+/// A flow map in a window: everything that [`GridArguments`] depend on.
+#[derive(Debug, Clone, Copy)]
+pub struct WindowFlowMap<'a> {
+    /// The snapshots on the device.
+    pub nodes: &'a Nodes,
+    /// Their times.
+    pub times: &'a [f64],
+    /// Their grid.
+    pub grid: &'a Grid,
+    /// The flow map.
+    pub map: &'a FlowMap,
+    /// Times at which paths start and end.
+    pub span: (f64, f64),
+    /// Steps between them.
+    pub steps: usize,
+    /// True if threads cache their cell in registers (see `grid.cuh`).
+    pub keep: bool,
+}
+
+/// A time within this share of an interval of a snapshot's time counts as this snapshot's, as in the CPU's sampler.
 const SAME_TIME: f64 = 1e-9;
 
 impl GridArguments {
-    /// Everything for `steps` steps over `span`. `keep`: keep the current cell in registers (see `grid.cuh`). `put` copies bytes to where
-    /// the kernel can read them and returns their address.
+    /// Arguments in the precision `R`. `put` copies bytes to memory that the kernel can read and returns their address.
+    ///
+    /// # Errors
+    /// Those of `put`.
     pub fn new<R: DeviceReal>(
         put: &mut dyn FnMut(&[u8]) -> Result<u64, DeviceError>,
-        nodes: &Nodes,
-        times: &[f64],
-        grid: &Grid,
-        map: &FlowMap,
-        span: (f64, f64),
-        steps: usize,
-        keep: bool,
+        flow: WindowFlowMap<'_>,
     ) -> Result<Self, DeviceError> {
+        let WindowFlowMap { nodes, times, grid, map, span, steps, keep } = flow;
+        let real = R::from_f64;
         let maps: Vec<AxisMap<R>> = grid.axes.iter().map(|axis| AxisMap::new(axis, map.boundary)).collect();
         let (mut even, mut wrap, mut seam) = (0, 0, 0);
         let mut axes = Vec::new();
         for k in 0..3 {
-            // A third axis that is not there is never read.
+            // Kernels for the plane never read a third axis.
             let axis = &maps[k.min(maps.len() - 1)];
             let mut data = AxisData {
                 positions: 0,
@@ -57,17 +75,18 @@ impl GridArguments {
                 begins: 0,
                 first: axis.first,
                 spacing: axis.spacing,
-                density: R::from_f64(0.0),
+                density: real(0.0),
                 high: axis.high,
-                wrap: axis.wrap_length().unwrap_or(R::from_f64(0.0)),
+                wrap: axis.wrap_length().unwrap_or(real(0.0)),
                 nodes: axis.nodes as i32,
                 last_cell: axis.last_cell as i32,
                 intervals: 0,
+                pad: R::IntPad::zeroed(),
             };
             if let Some(table) = axis.table() {
-                data.positions = put(bytes_of(table.positions))?;
-                data.inverse = put(bytes_of(table.inverse))?;
-                data.begins = put(bytes_of(table.begins))?;
+                data.positions = put(cast_slice(table.positions))?;
+                data.inverse = put(cast_slice(table.inverse))?;
+                data.begins = put(cast_slice(table.begins))?;
                 data.density = table.density;
                 data.intervals = table.begins.len() as i32;
             } else {
@@ -85,17 +104,14 @@ impl GridArguments {
             Geometry::Sphere { radius } => ([scale / radius, scale / radius, scale / radius, scale / spacing[2]], radius),
         };
         let ends: [[f64; 2]; 3] = std::array::from_fn(|k| maps[k.min(maps.len() - 1)].ends());
-        // As on the CPU: an angle computed from a unit vector may miss by a few units in the last place.
-        let slack = |k: usize| if sphere && k < 2 { angle_slack(R::from_f64(1f64.to_degrees() / spacing[k])) } else { R::from_f64(0.0) };
-        let end = |i: usize| -> [R; 3] {
-            std::array::from_fn(|k| if i == 0 { R::from_f64(ends[k][i]) - slack(k) } else { R::from_f64(ends[k][i]) + slack(k) })
-        };
+        // As on the CPU: rounding of an angle computed from a unit vector must not end a path.
+        let slack = |k: usize| if sphere && k < 2 { angle_slack(real(1f64.to_degrees() / spacing[k])) } else { real(0.0) };
+        let end = |i: usize| -> [R; 3] { std::array::from_fn(|k| real(ends[k][i]) + if i == 0 { -slack(k) } else { slack(k) }) };
         let [low, high] = bounds(map.boundary, end(0), end(1));
         let [nx, ny, _] = grid.shape();
         let (longitude, latitude) = (&maps[0], &maps[1]);
         let middle = longitude.coordinate(longitude.high.to_f64() / 2.0);
         let (sine, cosine) = middle.to_radians().sin_cos();
-        let real = R::from_f64;
         let data = GridData {
             row: nx as u32,
             plane: (nx * ny) as u32,
@@ -108,6 +124,7 @@ impl GridArguments {
             origin: [real(longitude.state(middle)), real(latitude.state(0.0))],
             turn: [real(cosine), real(sine)],
             poles: poles(latitude).map(real),
+            pad: R::RealPad::zeroed(),
             middle,
             radius,
             level: spacing[2] / radius,
@@ -118,11 +135,11 @@ impl GridArguments {
                 first: step.map(|(interval, _)| nodes.addresses[interval]),
                 second: step.map(|(interval, _)| nodes.addresses[interval + 1]),
                 weight: step.map(|(_, weight)| real(weight)),
+                pad: R::RealPad::zeroed(),
             })
             .collect();
-        let steps = put(bytes_of(&stages))?;
-        let one = R::from_f64(1.0);
-        let scaled = data.rate[..grid.dimensions() + usize::from(sphere)].iter().any(|r| *r != one);
+        let steps = put(cast_slice(&stages))?;
+        let scaled = data.rate[..grid.dimensions() + usize::from(sphere)].iter().any(|r| *r != real(1.0));
         let cubic = map.interpolation == Interpolation::Cubic;
         let flag = |name: &str, value: bool| format!("{name}={}", u8::from(value));
         let defines = vec![
@@ -131,7 +148,7 @@ impl GridArguments {
             flag("RW_SPHERE", sphere),
             storage_define(nodes.storage),
             flag("RW_CUBIC", cubic),
-            flag("RW_MARKS", nodes.missing),
+            flag("RW_MISSING", nodes.missing),
             flag("RW_KEEP", keep),
             flag("RW_SCALED", scaled),
             format!("RW_EVEN={even}"),
@@ -148,15 +165,8 @@ pub(in crate::backend::cuda) fn storage_define(storage: Storage) -> String {
     format!("RW_STORAGE={}", storage as u8)
 }
 
-/// The bytes of plain numbers.
-fn bytes_of<T: Copy>(values: &[T]) -> &[u8] {
-    // SAFETY: callers pass numbers and structures of numbers without padding between or behind them that matters: kernels read fields
-    // alone. `u8` has no alignment.
-    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), size_of_val(values)) }
-}
-
-/// For start, middle and end of every step: the interval between snapshots, and the weight of its later one. A snapshot's own time is put
-/// into the interval that the particle comes to next: the end of a step then reads the cell that the next one starts with.
+/// Interval between snapshots and weight of its later snapshot, at start, middle and end of every step. A snapshot's own time belongs to the
+/// interval that the particle enters next, so that the end of a step reads the same cell as the start of the next one.
 pub fn stages(times: &[f64], from: f64, to: f64, steps: usize) -> Vec<[(usize, f64); 3]> {
     let last = times.len() - 1;
     let forward = to > from;
@@ -186,7 +196,7 @@ mod tests {
             for steps in [1, 3, 6, 12] {
                 let stages = stages(&times, from, to, steps);
                 assert!(stages.windows(2).all(|pair| pair[0][2] == pair[1][0]), "{from} {to} {steps}: {stages:?}");
-                // One change an interval, and none at the end, where there is nothing to come.
+                // One change per interval, and none at the end.
                 let changes = stages.iter().filter(|step| step[0].0 != step[2].0).count();
                 assert!(steps < 3 || changes == 2, "{from} {to} {steps}: {changes}");
             }

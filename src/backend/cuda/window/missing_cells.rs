@@ -1,13 +1,14 @@
 //! The cells in which no particle can start, on the device.
 
-use crate::backend::cuda::layout::{LandArgument, LandAxis};
+use crate::backend::cuda::layout::{MissingCellsArgument, MissingCellsAxis};
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use crate::flow::Voids;
+use bytemuck::Zeroable;
 
 /// Land under the seeds of one window.
 #[derive(Debug)]
 pub struct DeviceMissingCells {
-    argument: LandArgument,
+    argument: MissingCellsArgument,
     // Memory that the argument points to.
     _nodes: Vec<Buffer<f64>>,
     _empty: Buffer<u8>,
@@ -17,22 +18,23 @@ impl DeviceMissingCells {
     /// None where particles can start everywhere.
     pub(in crate::backend::cuda) fn new(gpu: &Gpu, voids: &Voids) -> Result<Option<Self>, DeviceError> {
         let Some((grid, empty)) = voids.cells() else { return Ok(None) };
-        let mut argument = LandArgument { dimensions: grid.axes.len() as i32, ..LandArgument::NONE };
+        let mut argument = MissingCellsArgument { dimensions: grid.axes.len() as i32, ..Zeroable::zeroed() };
         let mut nodes = Vec::new();
         for (k, axis) in grid.axes.iter().enumerate() {
             let held = gpu.upload("land", axis.coordinates())?;
-            argument.axes[k] = LandAxis { nodes: held.address(), period: axis.period().unwrap_or(0.0), count: axis.len() as i32, pad: 0 };
+            argument.axes[k] =
+                MissingCellsAxis { nodes: held.address(), period: axis.period().unwrap_or(0.0), count: axis.len() as i32, pad: 0 };
             argument.cells[k] = axis.cells() as i32;
             nodes.push(held);
         }
         let empty: Vec<u8> = empty.into_iter().map(u8::from).collect();
         let empty = gpu.upload("land", &empty)?;
-        argument.empty = empty.address();
+        argument.missing = empty.address();
         Ok(Some(Self { argument, _nodes: nodes, _empty: empty }))
     }
 
-    /// `Land` of `land.cuh`.
-    pub(in crate::backend::cuda) fn argument(&self) -> LandArgument {
+    /// `MissingCells` of `missing_cells.cuh`.
+    pub(in crate::backend::cuda) fn argument(&self) -> MissingCellsArgument {
         self.argument
     }
 }
