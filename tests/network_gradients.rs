@@ -8,7 +8,7 @@ use network_support::reference::{Kernel, Reference, Rounding, labels, norm};
 use network_support::{Case, cases, uniform_points};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Model, Objective, Pick, Row, Step, Target, autodiff_gradient, operation_step, row, stock_step,
+    Architecture, Average, Fused, Model, Objective, PlannedStep, Row, Step, Target, autodiff_gradient, operation_step, row, stock_step,
 };
 
 fn prepare(case: &Case) -> (Model, Objective, Samples) {
@@ -32,7 +32,8 @@ fn fused_steps(model: &mut Model, objective: &Objective, samples: &Samples, rate
     fused.steps(model, objective, &mut average, |done, loss| {
         losses.extend(loss);
         let rate = *rates.get(done as usize)?;
-        Some(Step { samples, pick: Pick::InOrder, count: samples.len(), rate, average_share: 1.0, lazy: false, base: None })
+        let planned = PlannedStep { count: samples.len(), drawn: None, hold_out: false, rate, average_share: 1.0, lazy: false };
+        Some(Step::of(&planned, samples, None, None))
     });
     losses
 }

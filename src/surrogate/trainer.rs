@@ -226,7 +226,7 @@ impl Trainer {
     pub(super) fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.asked = self.times.unit(tracer.start(), tracer.tau());
         let before = std::mem::replace(&mut self.start, tracer.start());
-        if self.times.hold(before, self.start) {
+        if self.times.labels_stay_valid(before, self.start) {
             return;
         }
         self.disown_kept();
@@ -299,7 +299,7 @@ impl Trainer {
     ) -> Result<(), NotTaken> {
         let samples = ring.samples();
         let mut labels = Labels { samples, among: None, base: base.map(|base| base as &dyn Field) };
-        if !self.standardised && (0..samples.len()).any(|index| self.objective.usable(samples, index)) {
+        if !self.standardised && (0..samples.len()).any(|index| self.objective.is_usable(samples, index)) {
             self.objective.standardise(&self.model.shape, samples, labels.base);
             self.standardised = true;
         }
@@ -328,7 +328,7 @@ impl Trainer {
         } else {
             // Training reads the table in pieces by many threads: it had better be here before they start.
             base.map(Table::values);
-            sieved = self.objective.sieve(samples);
+            sieved = self.objective.usable_samples(samples);
             labels.among = sieved.as_deref();
             let usable = labels.among.map_or(samples.len(), <[u32]>::len);
             Brought { usable, dropped: samples.len() - usable }

@@ -11,9 +11,7 @@ use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
 use ridgewatch::engine::cuda::{CudaOffload, DeviceNetwork, is_fused};
 use ridgewatch::flow::Tracer;
-use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, row,
-};
+use ridgewatch::surrogate::network::{Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, row};
 use ridgewatch::surrogate::{Kind, Offload, SampleRing, Samples, SurrogateSettings, build};
 use std::ops::Range;
 use std::sync::Arc;
@@ -183,8 +181,7 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let mut expected = Vec::new();
     Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
         expected.extend(loss);
-        let pick = Pick::Random { seed: 21, counter: done * count as u64, among: None, hold_out: true };
-        (done < all).then_some(Step { samples: &samples, pick, count, rate: 1e-2, average_share: share(done), lazy: true, base: None })
+        steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
     });
     // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
     assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "{name}: first losses {} and {}", found[0], expected[0]);

@@ -360,7 +360,7 @@ impl OffloadedTraining for Network {
         // The values alone: a slide wants the memory of what the device holds.
         let nodes = base.and_then(nodes_of);
         (self.mark, self.base) = (Some(ring.mark()), nodes.map(|nodes| &nodes.table).or(base).cloned());
-        let usable = self.objective.sieve(&self.samples).map_or(self.samples.len(), |usable| usable.len());
+        let usable = self.objective.usable_samples(&self.samples).map_or(self.samples.len(), |usable| usable.len());
         Ok(Brought { usable, dropped: self.samples.len() - usable })
     }
     fn steps(&mut self, steps: &[PlannedStep]) -> Result<Vec<f64>, NotTaken> {
@@ -368,7 +368,7 @@ impl OffloadedTraining for Network {
         self.there.line.steps.fetch_add(steps.len(), Ordering::Relaxed);
         self.seconds += STEP_SECONDS * steps.len() as f64;
         let Self { fused, model, objective, average, samples, base, .. } = self;
-        let (among, base) = (objective.sieve(samples), base.as_ref().map(|base| base as &dyn Field));
+        let (among, base) = (objective.usable_samples(samples), base.as_ref().map(|base| base as &dyn Field));
         let mut losses = Vec::new();
         fused.steps(model, objective, average, |done, loss| {
             losses.extend(loss);

@@ -59,7 +59,7 @@ impl Cycle<'_> {
             }
             self.trust.window_slid();
             let before = std::mem::replace(&mut self.start, tracer.start());
-            if !self.times.hold(before, self.start) {
+            if !self.times.labels_stay_valid(before, self.start) {
                 self.ring.mark_stale();
                 let holding = self.threads.render().install(|| self.share_of_labels_that_hold(&tracer));
                 heed(self.stop)?;
@@ -103,7 +103,7 @@ impl Cycle<'_> {
 
     /// What should be told of a window's start time.
     pub(super) fn beyond_the_range(&self, start: f64) -> Option<String> {
-        let [first, last] = self.times.starts.filter(|_| self.live.is_some() && !self.times.tells(start))?;
+        let [first, last] = self.times.starts.filter(|_| self.live.is_some() && !self.times.covers_start(start))?;
         Some(format!(
             "start time {start} lies beyond network.start_range, {first} to {last}: the network takes it for the nearer end, and labels of other windows are not kept"
         ))
