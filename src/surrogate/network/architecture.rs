@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 
 /// Inputs of a hash grid at most: every input doubles the corners of a cell.
 pub(crate) const GRID_INPUTS: usize = 4;
-/// Multipliers of the spatial hash for each input (the first three: Teschner et al. 2003, as in Müller et al. 2022; the fourth: tiny-cuda-nn).
+/// Multipliers of the spatial hash for each input (the first three: Teschner et al. 2003, as in Müller et al. 2022; the fourth:
+/// tiny-cuda-nn).
 pub(crate) const HASH: [u32; GRID_INPUTS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
 /// One level of the hash grid.
@@ -56,8 +57,8 @@ pub struct Architecture {
 }
 
 impl Architecture {
-    /// Resolves `settings` for inputs along `axes` of the domain and the times in the settings. `lengths` are the lengths of the domain's edges
-    /// along x, y and z, in one unit ([`crate::field::Domain::lengths`]).
+    /// Resolves `settings` for inputs along `axes` of the domain and the times in the settings. `lengths` are the lengths of the domain's
+    /// edges along x, y and z, in one unit ([`crate::field::Domain::lengths`]).
     ///
     /// # Errors
     /// [`SurrogateError::Setting`] if a setting is out of range, the axes are not ascending, or a hash grid would get too many inputs.

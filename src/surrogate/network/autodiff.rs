@@ -27,8 +27,8 @@ pub fn operation_step(model: &mut Model, objective: &Objective, samples: &Sample
     step(model, &plain, samples, count, rate, |network, shape, points, _| vec![network.forward_fused(shape, points)])
 }
 
-/// Loss, module and gradients of the first `count` samples by burn's autodiff. `forward` evaluates the network at unit coordinates `[samples, inputs]`; it
-/// returns the outputs and, if its last argument is true, their derivatives along each axis.
+/// Loss, module and gradients of the first `count` samples by burn's autodiff. `forward` evaluates the network at unit coordinates
+/// `[samples, inputs]`; it returns the outputs and, if its last argument is true, their derivatives along each axis.
 pub fn autodiff_gradient(
     model: &Model,
     objective: &Objective,

@@ -71,7 +71,7 @@ impl Batch {
         loss: impl Fn(usize, &mut Tile) -> f64 + Sync,
     ) -> f64 {
         let share = count.div_ceil(self.chunks.len());
-        assert!(share <= self.max_share, "a batch of {count} samples in memory for {} a chunk", self.max_share);
+        assert!(share <= self.max_share, "a batch of {count} samples in memory for {} per chunk", self.max_share);
         self.chunks.par_iter_mut().enumerate().with_max_len(1).for_each(|(number, chunk)| {
             let Chunk { tile, features, gradient, loss: sum } = chunk;
             (number * share..count.min(number * share + tile.capacity)).for_each(&prefetch);
@@ -115,8 +115,8 @@ impl Batch {
     }
 }
 
-/// Evaluates the network for `out.len() / width` samples on all cores. `write` puts an evaluated tile into its part of `out`, `width` values a
-/// sample.
+/// Evaluates the network for `out.len() / width` samples on all cores. `write` puts an evaluated tile into its part of `out`, `width`
+/// values per sample.
 pub(super) fn predict(
     network: Parameters<'_>,
     row: impl Fn(usize) -> Row + Sync,
@@ -126,7 +126,7 @@ pub(super) fn predict(
     write: impl Fn(&Tile, &mut [f32]) + Sync,
 ) {
     let capacity = Tile::new(network.shape, derivatives, false).capacity;
-    // Sixteen tiles a task: large enough to hide the scheduling, small enough to distribute a frame's batch.
+    // Sixteen tiles per task: large enough to hide the scheduling, small enough to distribute a frame's batch.
     let share = 16 * capacity;
     out.par_chunks_mut(share * width).enumerate().for_each_init(
         || Tile::new(network.shape, derivatives, false),

@@ -156,8 +156,8 @@ impl<'a> Product<'a> {
         for row in (0..rows.all).step_by(BLOCK) {
             let is_value = row < rows.values;
             let value_row = row % rows.values;
-            // SAFETY: `check` bounds every buffer: a block has BLOCK whole rows, the panels have `depth` rows, and the columns end at most at
-            // the padded number of columns, which is at most `y_stride`.
+            // SAFETY: `check` bounds every buffer: a block has BLOCK whole rows, the panels have `depth` rows, and the columns end at most
+            // at the padded number of columns, which is at most `y_stride`.
             unsafe {
                 let panels = columns.map(|column| self.panels.as_ptr().add(in_panels(column, depth)));
                 let start = match self.biases {
@@ -401,8 +401,8 @@ mod tests {
         }
     }
 
-    /// Widths with whole and half panels, an odd number of them, inputs that are no multiple of the block, tangent rows, and a NaN; registers
-    /// of one and of sixteen lanes, and those of this processor.
+    /// Widths with whole and half panels, an odd number of them, inputs that are no multiple of the block, tangent rows, and a NaN;
+    /// registers of one and of sixteen lanes, and those of this processor.
     #[test]
     fn registers_of_all_widths_give_the_same_bits() {
         for (inputs, outputs, all, values) in [(24, 64, 48, 48), (64, 64, 36, 12), (40, 33, 12, 12), (7, 16, 6, 6), (64, 1, 24, 24)] {

@@ -1,8 +1,8 @@
 //! Encodings of the positions of a tile, their derivatives along the axes, and the gradient of the hash tables.
 //!
-//! Hash grid: Müller, Evans, Schied and Keller 2022 (Instant neural graphics primitives with a multiresolution hash encoding, ACM Transactions
-//! on Graphics 41). On every level, the features of a position are interpolated multilinearly between the table entries of the corners
-//! of its cell. Entries of fine levels are found by a spatial hash; collisions are left to the MLP.
+//! Hash grid: Müller, Evans, Schied and Keller 2022 (Instant neural graphics primitives with a multiresolution hash encoding, ACM
+//! Transactions on Graphics 41). On every level, the features of a position are interpolated multilinearly between the table entries of the
+//! corners of its cell. Entries of fine levels are found by a spatial hash; collisions are left to the MLP.
 //!
 //! Frequencies: Mildenhall et al. 2020 (NeRF: representing scenes as neural radiance fields for view synthesis, ECCV), equation 4, with
 //! half the base frequency: sin and cos of 2^l (pi / 2) p for p = 2x - 1 in [-1, 1].

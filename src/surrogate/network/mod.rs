@@ -3,8 +3,8 @@
 //! In: samples. Out: trained parameters and predictions. Calls `flow` for the log-stretch of a Jacobian, and burn.
 //!
 //! burn owns the parameters ([`Network`]) and Adam's moments ([`Model`]); the fused kernels (`tile`, `dense`, `encode`, `adam`) read and
-//! write the same buffers. A tile of about fifty samples passes through encoding, layers, loss and back within the first two cache
-//! levels; then each level of the hash grid sums its gradient and takes its Adam step as one task. `module` and `autodiff` hold the same network in
+//! write the same buffers. A tile of about fifty samples passes through encoding, layers, loss and back within the first two cache levels;
+//! then each level of the hash grid sums its gradient and takes its Adam step as one task. `module` and `autodiff` hold the same network in
 //! burn's stock operations, as the reference.
 
 mod adam;
@@ -35,7 +35,7 @@ pub use autodiff::{autodiff_gradient, operation_step, stock_step};
 pub use model::Model;
 pub use module::Network;
 pub use objective::{Field, Objective, Scale, signed_exp, signed_log};
-pub use operation::FusedNetwork;
+pub use operation::{FusedNetwork, NetworkInputs};
 pub(crate) use predictor::Predictor;
 pub(crate) use random::{draw, uniform};
 pub use settings::{Encoding, Input, Loss, NetworkSettings, Size, Target};

@@ -19,7 +19,8 @@ pub struct Network<B: Backend> {
 }
 
 impl<B: Backend> Network<B> {
-    /// Draws the parameters: tables from +-1e-4, weights from He's uniform distribution, biases 0. `zero_output` sets the output layer to 0.
+    /// Draws the parameters: tables from +-1e-4, weights from He's uniform distribution, biases 0. `zero_output` sets the output layer to
+    /// 0.
     pub fn new(shape: &Architecture, seed: u64, zero_output: bool, device: &B::Device) -> Self {
         let entries = shape.table_entries();
         let tables = (entries > 0).then(|| {

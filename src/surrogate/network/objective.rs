@@ -1,7 +1,7 @@
 //! Meaning of the outputs, and the loss of training.
 //!
-//! Losses: the mean square of standardised outputs; the loss of Xi, Luan and Tao 2023 ([`Loss::Published`]) on signed logarithms; and for flow
-//! maps, optionally, the squared error of their Jacobians (Sobolev training, Czarnecki et al. 2017).
+//! Losses: the mean square of standardised outputs; the loss of Xi, Luan and Tao 2023 ([`Loss::Published`]) on signed logarithms; and for
+//! flow maps, optionally, the squared error of their Jacobians (Sobolev training, Czarnecki et al. 2017).
 
 use super::architecture::Architecture;
 use super::memory::Outputs;
@@ -128,8 +128,8 @@ impl Objective {
         values
     }
 
-    /// Sets mean and deviation from about 4096 usable samples, spread over all. The published loss keeps its own scale. With a `base`, targets
-    /// are relative to it, and the mean stays 0, so that an output of 0 stays 0.
+    /// Sets mean and deviation from about 4096 usable samples, spread over all. The published loss keeps its own scale. With a `base`,
+    /// targets are relative to it, and the mean stays 0, so that an output of 0 stays 0.
     pub fn standardise(&mut self, shape: &Architecture, samples: &Samples, base: Option<&dyn Field>) {
         if self.is_published() {
             return;
@@ -194,8 +194,8 @@ impl Objective {
         }
     }
 
-    /// Log-stretch from the derivatives of the `flow_map` target: ln sigma_max of d arrival / d point in domain coordinates (Shadden, Lekien
-    /// and Marsden 2005). `derivative(along, output)` is that of the network.
+    /// Log-stretch from the derivatives of the `flow_map` target: ln sigma_max of d arrival / d point in domain coordinates (Shadden,
+    /// Lekien and Marsden 2005). `derivative(along, output)` is that of the network.
     pub(super) fn log_stretch_of_map(&self, dimensions: usize, derivative: impl Fn(usize, usize) -> f32) -> f32 {
         let mut jacobian = [[0.0_f64; 3]; 3];
         for row in 0..dimensions {

@@ -1,4 +1,4 @@
-//! The output layer: at most three dot products a row, for which a panel of sixteen columns would be mostly padding.
+//! The output layer: at most three dot products per row, for which a panel of sixteen columns would be mostly padding.
 
 use super::architecture::Layer;
 use super::dense::Rows;

@@ -95,8 +95,8 @@ pub struct NetworkSettings {
     pub batch: usize,
     /// Gives shorter axes of the domain fewer cells, so that cells are about as wide as high.
     pub scale_levels_by_aspect: bool,
-    /// Weight of the flow map's derivatives in the loss (target `flow_map`). 0 trains on arrivals alone, which renders better after the same
-    /// time: every derivative costs a pass, and the derivatives of a hash grid jump from cell to cell.
+    /// Weight of the flow map's derivatives in the loss (target `flow_map`). 0 trains on arrivals alone, which renders better after the
+    /// same time: every derivative costs a pass, and the derivatives of a hash grid jump from cell to cell.
     pub jacobian_weight: f32,
     /// Share of the steps so far over which the weights for prediction are averaged; 0 predicts with the latest weights.
     pub averaging: f32,

@@ -1,7 +1,8 @@
 //! A tile of samples on its way through the network and back.
 //!
 //! Source: the fully fused MLP of Müller et al. 2021 (Real-time neural radiance caching for path tracing, ACM Transactions on Graphics 40),
-//! for a CPU: about fifty samples pass through the encoding, all layers and back while everything that they touch stays in the first two cache levels.
+//! for a CPU: about fifty samples pass through the encoding, all layers and back while everything that they touch stays in the first two
+//! cache levels.
 
 use super::architecture::Architecture;
 use super::dense::{self, PackedLayer, Rows};
@@ -34,7 +35,7 @@ impl Weights {
     }
 }
 
-/// Gradient of the weights of all layers, one packed buffer a layer.
+/// Gradient of the weights of all layers, one packed buffer per layer.
 pub(super) struct WeightGradient(Vec<Aligned>);
 
 impl WeightGradient {
@@ -168,8 +169,8 @@ impl Tile {
         weights.output.forward(last, row_stride(shape.output_layer().inputs), rows, &mut self.outputs);
     }
 
-    /// Gradient of `sum(d_outputs * outputs)` after a `forward`: added to `gradient` for the layers, and written to `d_encoded`, if given, for
-    /// the features (rows [`row_stride`] apart).
+    /// Gradient of `sum(d_outputs * outputs)` after a `forward`: added to `gradient` for the layers, and written to `d_encoded`, if given,
+    /// for the features (rows [`row_stride`] apart).
     pub(super) fn backward(&mut self, network: Parameters<'_>, gradient: &mut WeightGradient, d_encoded: Option<&mut [f32]>) {
         let Parameters { shape, weights, .. } = network;
         for group in self.d_outputs.chunks_exact_mut(self.capacity) {

@@ -7,8 +7,8 @@ pub(super) const COLUMN_NAMES: [&str; 5] = ["x", "y", "z", "start", "duration"];
 /// First column after the coordinates.
 pub(super) const FIRST_TIME: usize = 3;
 
-/// All possible inputs of one sample: unit coordinates along x, y and z, then start time and duration in the unit intervals of their ranges.
-/// [`super::Architecture::axes`] lists the columns that a network reads.
+/// All possible inputs of one sample: unit coordinates along x, y and z, then start time and duration in the unit intervals of their
+/// ranges. [`super::Architecture::axes`] lists the columns that a network reads.
 pub type Row = [f32; COLUMN_NAMES.len()];
 
 /// Start time and duration of samples without times.
@@ -47,8 +47,8 @@ impl Times {
         [start, duration / self.tau].map(|time| time.clamp(0.0, 1.0) as f32)
     }
 
-    /// Labels of a window that begins at `before` stay valid beside those of one that begins at `now`: both starts are in range. A start out
-    /// of range is clamped, so its labels contradict those at the end of the range.
+    /// Labels of a window that begins at `before` stay valid beside those of one that begins at `now`: both starts are in range. A start
+    /// out of range is clamped, so its labels contradict those at the end of the range.
     pub fn labels_stay_valid(&self, before: f64, now: f64) -> bool {
         self.covers_start(before) && self.covers_start(now)
     }

@@ -15,8 +15,8 @@ use rayon::prelude::*;
 /// One sample of this many is held out, if a step asks for it.
 pub const HELD_OUT: usize = 64;
 
-/// Running mean of the parameters (Polyak and Juditsky 1992). Prediction uses it, since it takes the noise of a high learning rate out of the
-/// weights.
+/// Running mean of the parameters (Polyak and Juditsky 1992). Prediction uses it, since it takes the noise of a high learning rate out of
+/// the weights.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Average {
     /// Tables.
@@ -105,8 +105,8 @@ impl Fused {
         }
     }
 
-    /// Takes steps until `next` returns `None`; it gets the number of steps taken and the loss before the last one. Between the first and the last
-    /// step the buffers belong to the kernels; nothing is copied.
+    /// Takes steps until `next` returns `None`; it gets the number of steps taken and the loss before the last one. Between the first and
+    /// the last step the buffers belong to the kernels; nothing is copied.
     pub fn steps<'a>(
         &mut self,
         model: &mut Model,
@@ -229,8 +229,8 @@ impl Fused {
     }
 }
 
-/// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`super::Loss::Published`]), and the factor of
-/// exp|output| in its gradient. It needs the mean over the whole batch before any gradient, hence a forward pass of its own.
+/// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`super::Loss::Published`]), and the factor
+/// of exp|output| in its gradient. It needs the mean over the whole batch before any gradient, hence a forward pass of its own.
 fn mean_penalty(network: Parameters<'_>, objective: &Objective, samples: &Samples, drawn: &[usize]) -> (f64, f32) {
     let penalty = f64::from(objective.penalty());
     if penalty == 0.0 {
