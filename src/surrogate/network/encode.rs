@@ -128,14 +128,15 @@ impl Corners {
             let mut gradient = [0.0_f32; F];
             gradient.copy_from_slice(&row[columns.first..columns.first + F]);
             for (entry, factor) in entries.iter().zip(factors) {
-                let entry = entry[sample] as usize;
+                // Read before any store, so that the features are updated as one vector.
+                let (entry, factor) = (entry[sample] as usize, factor[sample]);
                 // SAFETY: as in `gather`; the entry's line has a mark.
                 let features = unsafe {
                     *touched.get_unchecked_mut(entry * F / LINE) = 1;
                     table.get_unchecked_mut(entry)
                 };
-                for (feature, gradient) in features.iter_mut().zip(gradient) {
-                    *feature = factor[sample].mul_add(gradient, *feature);
+                for (feature, gradient) in features.iter_mut().zip(&gradient) {
+                    *feature = factor.mul_add(*gradient, *feature);
                 }
             }
         }
