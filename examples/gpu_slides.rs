@@ -52,7 +52,7 @@ impl Backend for Timed {
         let tracer = self.inner.tracer(velocity, map, t0);
         let mut clock = self.clock.lock().unwrap();
         clock.tracer_seconds.push(began.elapsed().as_secs_f64());
-        (clock.uploaded, clock.ahead) = (self.inner.snapshots().brought(), self.inner.snapshots().brought_ahead());
+        (clock.uploaded, clock.ahead) = (self.inner.snapshots().uploaded(), self.inner.snapshots().prefetched());
         tracer
     }
     fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &CudaTracer) -> Result<CudaSurrogate, BackendError> {

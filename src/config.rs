@@ -213,7 +213,7 @@ impl SceneFile {
             ("network.log2_table", hashed, HASHED),
             ("network.base_resolution", hashed, HASHED),
             ("network.growth", hashed, HASHED),
-            ("network.follow_aspect", hashed, HASHED),
+            ("network.scale_levels_by_aspect", hashed, HASHED),
             ("network.octaves", !hashed, "only with network.encoding = \"frequency\""),
             ("network.mean_penalty", network.loss == Loss::Published, "only with network.loss = \"published\""),
             ("network.jacobian_weight", network.target == Target::FlowMap, "only with network.target = \"flow_map\""),

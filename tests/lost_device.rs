@@ -308,7 +308,7 @@ impl Surrogate for BreakingSurrogate {
         self.0.load(path)
     }
     fn bytes(&self) -> usize {
-        self.0.bytes()
+        Predict::bytes(&self.0)
     }
     fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
         self.0.to_host(from)

@@ -1,13 +1,13 @@
-//! Surrogates through their trait: learning, divergence, bad samples, checkpoints, the slide of the window.
+//! Surrogates through their trait: learning, divergence, bad samples, checkpoints, slides of the window.
 
 #![allow(clippy::unwrap_used)]
 
 mod network_support;
 
-use network_support::{DoubleGyre, traced, uniform_points};
+use network_support::{DoubleGyre, rms, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
-use ridgewatch::surrogate::{CheckpointError, HostSurrogate, Kind, ReplayBuffer, Samples, SurrogateSettings, Trace, build};
+use ridgewatch::surrogate::{CheckpointError, HostSurrogate, Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace, build};
 
 fn small() -> NetworkSettings {
     NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }
@@ -18,19 +18,12 @@ fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Trace) -> HostS
     build(&settings, network, tracer.flow().domain(), 5, tracer).unwrap()
 }
 
-fn rms(surrogate: &HostSurrogate, samples: &Samples) -> f64 {
-    let mut predicted = vec![0.0; samples.len()];
-    surrogate.predict(&samples.points, &mut predicted).unwrap();
-    let sum: f64 = predicted.iter().zip(&samples.log_stretch).map(|(p, t)| f64::from(p - t).powi(2)).sum();
-    (sum / samples.len() as f64).sqrt()
-}
-
 fn psnr(surrogate: &HostSurrogate, samples: &Samples) -> f64 {
     let peak = samples.log_stretch.iter().copied().fold(f32::MIN, f32::max);
     20.0 * (f64::from(peak) / rms(surrogate, samples)).log10()
 }
 
-/// Every kind of network learns the double gyre: the error of a constant is 1 deviation; what is reached by 300 small steps is a fraction of it.
+/// Every kind of network learns the double gyre. The error of a constant is 1 deviation; 300 small steps reach a fraction of it.
 #[test]
 fn every_variant_learns() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
@@ -53,7 +46,7 @@ fn every_variant_learns() {
     }
 }
 
-/// The FTLE comes from derivatives of the network, which are worse than its values; but it must have learned something of them.
+/// The FTLE comes from derivatives of the network, which are less accurate than its values, but must improve too.
 #[test]
 fn the_flow_map_learns_arrivals_and_jacobians() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
@@ -72,7 +65,7 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
         let error = rms(&surrogate, &held_out);
         assert!(error < 0.7 * identity, "weight {jacobian_weight}: {error} of {identity}");
     }
-    // Labels that lack what the target asks for are dropped, not trained on.
+    // Samples without the labels of the target are dropped.
     let network = NetworkSettings { target: Target::FlowMap, ..small() };
     assert_eq!(
         surrogate(Kind::Network, &network, &tracer).learn(&ReplayBuffer::holding(&held_out), f64::INFINITY, 20).unwrap().dropped,
@@ -94,7 +87,7 @@ fn a_residual_starts_as_its_table_and_improves_on_it() {
     residual.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 40_000), false)), f64::INFINITY, 400).unwrap();
     let after = psnr(&residual, &held_out);
     assert!(after > before + 2.0, "{before} dB, then {after} dB");
-    // Another start time: the table is traced anew; a residual that no longer fits is forgotten at the next samples.
+    // At another start time, the table is traced anew, and the next samples reset a residual that no longer fits.
     let later = DoubleGyre::new(5.0, 10.0, 40);
     let held_out = traced(&later, uniform_points(3, 4_000), false);
     residual.window_slid(&later).unwrap();
@@ -137,7 +130,7 @@ fn samples_without_a_value_are_dropped_and_counted() {
 fn a_diverging_loss_is_rolled_back_and_counted() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
     let samples = traced(&tracer, uniform_points(1, 5_000), false);
-    // A rate at which Adam throws every weight across the whole landscape.
+    // At this rate Adam diverges.
     let network = NetworkSettings { learning_rate: Some(1.0), ..small() };
     let mut wild = surrogate(Kind::Network, &network, &tracer);
     let learned = wild.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 300).unwrap();
@@ -146,7 +139,7 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     let error = rms(&wild, &held_out);
     let scale = held_out.log_stretch.iter().map(|s| f64::from(*s).powi(2)).sum::<f64>().sqrt() / (held_out.len() as f64).sqrt();
     assert!(error.is_finite() && error < 4.0 * scale, "{error} beside labels of {scale}");
-    // A label from hell: finite, but its square is not.
+    // Finite labels whose squares overflow.
     let mut calm = surrogate(Kind::Network, &small(), &tracer);
     calm.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 100).unwrap();
     let before = rms(&calm, &held_out);
@@ -157,7 +150,7 @@ fn a_diverging_loss_is_rolled_back_and_counted() {
     assert_eq!(rms(&calm, &held_out), before);
 }
 
-/// A flow that stretches three times as much from window to window: losses grow by 9, but nothing has diverged.
+/// A flow that stretches three times as much from window to window: losses grow by 9 without divergence.
 #[test]
 fn a_flow_that_grows_is_not_taken_for_a_divergence() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
@@ -206,15 +199,15 @@ fn a_resumed_run_goes_on_bit_for_bit() {
         first.predict(&samples.points, &mut a).unwrap();
         second.predict(&samples.points, &mut b).unwrap();
         assert!(a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()), "{kind:?}");
-        // Saving again gives the same file: weights, both moments, averages and all that is noted.
+        // Saving again gives the same file: weights, both moments, averages and notes.
         let again = [folder.path().join("a"), folder.path().join("b")];
         first.save(&again[0]).unwrap();
         second.save(&again[1]).unwrap();
         assert_eq!(std::fs::read(&again[0]).unwrap(), std::fs::read(&again[1]).unwrap(), "{kind:?}");
     }
-    // Nothing but the checkpoints is left in the folder.
+    // The folder holds only the checkpoints.
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 8);
-    // The range of an input is part of what must fit.
+    // The range of an input must match.
     let other = NetworkSettings { start_range: Some([0.0, 4.0]), ..of_start };
     let fault = surrogate(Kind::Network, &other, &tracer).load(&folder.path().join("4")).unwrap_err().to_string();
     assert!(fault.contains("start_range 0 3") && fault.contains("start_range 0 4"), "{fault}");
@@ -251,7 +244,7 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     }
     assert!(matches!(network.load(&folder.path().join("missing")), Err(CheckpointError::Io { .. })));
 
-    // A sound checkpoint of another shape, kind or scene.
+    // A valid checkpoint of another shape, kind or scene.
     std::fs::write(&path, &good).unwrap();
     let wider = NetworkSettings { width: 48, ..small() };
     assert!(matches!(surrogate(Kind::Network, &wider, &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));

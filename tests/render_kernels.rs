@@ -490,7 +490,7 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
     }
     let output = ask("audit", &input);
     let mut output = &output[..];
-    let expected = Audited::of(&residuals(&Given(predicted), &samples, &transfer, tau), strata.clone());
+    let expected = Audited::of(&residuals(&Given(predicted), &samples, &transfer, tau).unwrap(), strata.clone());
     let (mut number, mut points, mut peak) = (0, 0.0, f64::NEG_INFINITY);
     for (cell, &drawn) in strata.drawn.iter().enumerate() {
         for _ in 0..drawn {

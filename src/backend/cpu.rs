@@ -119,7 +119,7 @@ impl Surrogate for HostSurrogate {
         self.load(path)
     }
     fn bytes(&self) -> usize {
-        self.bytes()
+        Predict::bytes(self)
     }
     fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
         self.to_host(from)

@@ -95,7 +95,7 @@ impl Run<'_> {
     /// Takes trust and labels to the session's window: old labels are used on if a re-test says that they hold.
     pub(super) fn slide_labels<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let flow = on.tracer().flow();
-        let holds = self.learning.times.hold(self.learning.start, flow.start());
+        let holds = self.learning.times.labels_stay_valid(self.learning.start, flow.start());
         let share = if holds { None } else { Some(self.share_of_labels_that_hold(on)?) };
         let learning = &mut self.learning;
         learning.trust.window_slid();
@@ -143,7 +143,7 @@ impl Run<'_> {
             .learning
             .times
             .starts
-            .filter(|_| self.plan.scene.render.method != Method::Reference && !self.learning.times.tells(start))?;
+            .filter(|_| self.plan.scene.render.method != Method::Reference && !self.learning.times.covers_start(start))?;
         Some(format!(
             "start time {start} lies beyond network.start_range, {first} to {last}: the network takes it for the nearer end, and labels of other windows are not kept"
         ))

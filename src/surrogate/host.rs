@@ -143,7 +143,7 @@ impl Training for HostTraining {
 
     fn sync(&mut self, objective: &Objective, labels: Labels<'_, Table>) -> Result<SyncedSamples, DeviceError> {
         let samples = labels.buffer.samples();
-        self.among = objective.sieve(samples);
+        self.among = objective.usable_samples(samples);
         let usable = self.among.as_ref().map_or(samples.len(), Vec::len);
         Ok(SyncedSamples { usable, dropped: samples.len() - usable })
     }
@@ -199,7 +199,7 @@ impl Training for HostTraining {
     }
 
     fn zero_output(&mut self) -> Result<(), DeviceError> {
-        let output = self.network.model.shape.output_layer();
+        let output = self.network.model.shape.output_parameters();
         self.network.model.zero_output();
         Arc::make_mut(&mut self.network.average).layers[output].fill(0.0);
         self.settle();

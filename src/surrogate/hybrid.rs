@@ -61,6 +61,21 @@ impl<D: SurrogateDevice> Predict for FrozenHybrid<D> {
     }
 }
 
+impl<D: SurrogateDevice> Predict for Hybrid<D> {
+    fn name(&self) -> &'static str {
+        self.kind.name()
+    }
+
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        self.freeze()?.predict(points, out)
+    }
+
+    fn bytes(&self) -> usize {
+        let table = if self.kind == Kind::Network { 0 } else { self.nodes.iter().product::<usize>() * size_of::<f32>() };
+        table + self.trainer.as_ref().map_or(0, |trainer| trainer.training.shape().parameters() * size_of::<f32>())
+    }
+}
+
 /// Refuses targets and losses for which table and network do not add up.
 pub(super) fn check_residual(network: &NetworkSettings) -> Result<(), SurrogateError> {
     let refuse = |key: &str, found: &str, accepted: &str| {
@@ -114,11 +129,6 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(())
     }
 
-    /// `table`, `network` or `residual`.
-    pub fn name(&self) -> &'static str {
-        self.kind.name()
-    }
-
     /// The table, if there is one.
     pub fn table(&self) -> Option<&D::Table> {
         self.table.as_ref()
@@ -142,12 +152,6 @@ impl<D: SurrogateDevice> Hybrid<D> {
     /// Factor on the network's output above a table.
     pub fn shrinkage(&self) -> f32 {
         self.shrinkage
-    }
-
-    /// Memory that prediction reads, bytes.
-    pub fn bytes(&self) -> usize {
-        let table = if self.kind == Kind::Network { 0 } else { self.nodes.iter().product::<usize>() * size_of::<f32>() };
-        table + self.trainer.as_ref().map_or(0, |trainer| trainer.training.shape().parameters() * size_of::<f32>())
     }
 
     /// Whether [`Hybrid::learn`] does anything.
@@ -175,14 +179,6 @@ impl<D: SurrogateDevice> Hybrid<D> {
             kind: self.kind,
             bytes: self.bytes(),
         })
-    }
-
-    /// Writes the log-stretch at unit points into `out` (same length).
-    ///
-    /// # Errors
-    /// The device fails or lacks memory; `out` is then unspecified.
-    pub fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
-        self.freeze()?.predict(points, out)
     }
 
     /// Trains on the buffer's samples for at most `seconds` of wall clock and at most `max_steps` optimizer steps.

@@ -113,7 +113,7 @@ impl<T: Training> Trainer<T> {
     pub(super) fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.asked = self.times.unit(tracer.start(), tracer.tau());
         let before = std::mem::replace(&mut self.start, tracer.start());
-        if self.times.hold(before, self.start) {
+        if self.times.labels_stay_valid(before, self.start) {
             return;
         }
         self.disown_kept();
@@ -168,7 +168,7 @@ impl<T: Training> Trainer<T> {
         learned: &mut Learned,
     ) -> Result<(), DeviceError> {
         let samples = labels.buffer.samples();
-        if !self.standardised && (0..samples.len()).any(|index| self.objective.usable(samples, index)) {
+        if !self.standardised && (0..samples.len()).any(|index| self.objective.is_usable(samples, index)) {
             let base = labels.base.map(DeviceTable::to_host).transpose()?;
             self.objective.standardise(self.training.shape(), samples, base.as_ref().map(|base| base as &dyn Field));
             self.standardised = true;

@@ -10,10 +10,8 @@ use burn::module::Param;
 use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceNetwork, Tuning, is_fused};
-use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, row,
-};
-use ridgewatch::surrogate::{Kind, ReplayBuffer, Samples};
+use ridgewatch::surrogate::network::{Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, row};
+use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, Samples};
 use std::ops::Range;
 
 /// Weights as training leaves them: halves then decide which neurons near 0 pass. How far that takes a gradient from the exact one is no
@@ -181,8 +179,7 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let mut expected = Vec::new();
     Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
         expected.extend(loss);
-        let pick = Pick::Random { seed: 21, counter: done * count as u64, among: None, hold_out: true };
-        (done < all).then_some(Step { samples: &samples, pick, count, rate: 1e-2, average_share: share(done), lazy: true, base: None })
+        steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
     });
     // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
     assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "{name}: first losses {} and {}", found[0], expected[0]);

@@ -25,7 +25,7 @@ fn a_slide_brings_only_what_is_new() {
     for slide in 0..12u32 {
         let source = VelocitySource::Window(Arc::new(window.clone()));
         let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, f64::from(slide), Tuning::default()).unwrap();
-        assert_eq!(store.brought(), 4 + u64::from(slide));
+        assert_eq!(store.uploaded(), 4 + u64::from(slide));
         let seeds = fresh(&grid.domain(), 5000);
         let mut out = Traced::default();
         tracer.trace(&seeds, Extras::default(), &mut out).unwrap();
@@ -51,8 +51,8 @@ fn a_slide_brings_only_what_is_new() {
 /// Waits until `count` snapshots came over in all.
 fn until_brought(store: &SnapshotStore, count: u64) {
     let began = std::time::Instant::now();
-    while store.brought() < count {
-        assert!(began.elapsed().as_secs() < 20, "{} of {count} came over", store.brought());
+    while store.uploaded() < count {
+        assert!(began.elapsed().as_secs() < 20, "{} of {count} came over", store.uploaded());
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
 }
@@ -96,14 +96,14 @@ fn what_is_expected_is_there_before_the_window_wants_it() {
             let most = errors[errors.len() * 99 / 100];
             assert!(most < if storage == Storage::F32 { 2e-9 } else { 2e-2 }, "{storage:?}, snapshot {i}: {most}");
             if storage == Storage::F32 {
-                assert_eq!(store.brought_ahead(), i as u64 - 3, "snapshot {i}");
+                assert_eq!(store.prefetched(), i as u64 - 3, "snapshot {i}");
                 // The stray one stays until the window has passed it by.
                 if i >= 6 && i != 12 {
                     assert_eq!(*taken.get_or_insert(gpu.memory().0), gpu.memory().0, "memory is flat, snapshot {i}");
                 }
             }
         }
-        assert!(store.brought_ahead() >= 5, "{storage:?}");
+        assert!(store.prefetched() >= 5, "{storage:?}");
         drop(store);
         assert_eq!(Arc::strong_count(&gpu), 1, "the thread has let go of the device");
     }
@@ -130,7 +130,7 @@ fn nothing_comes_ahead_where_memory_is_short() {
             CudaTracer::new(&store, &gpu, source, &map, f64::from(t) - 3.0, Tuning::default()).unwrap();
         }
     }
-    assert_eq!((store.brought(), store.brought_ahead()), (8, 0));
+    assert_eq!((store.uploaded(), store.prefetched()), (8, 0));
 }
 
 #[test]
@@ -200,7 +200,7 @@ fn pairs_lead_to_the_snapshot_that_follows_in_this_window() {
         let odd = (0..seeds.len()).filter(|&i| (out.log_stretch_f64[i] - exact.log_stretch_f64[i]).abs() > 2e-2).count();
         assert!(odd <= seeds.len() / 50, "{odd} differ");
     }
-    assert_eq!(store.brought(), 4 + 1 + 2, "the first snapshot for each window, and the one that was left out");
+    assert_eq!(store.uploaded(), 4 + 1 + 2, "the first snapshot for each window, and the one that was left out");
 }
 
 #[test]
@@ -217,7 +217,7 @@ fn a_window_that_grows_beyond_half_precision_is_encoded_anew() {
     window.push(snapshot(&grid, 2.0, 1.0, false)).unwrap();
     let source = VelocitySource::Window(Arc::new(window));
     let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map, 1.0, tuning).unwrap();
-    assert_eq!(store.brought(), 4, "the snapshot that is still needed came over again");
+    assert_eq!(store.uploaded(), 4, "the snapshot that is still needed came over again");
     let seeds = fresh(&grid.domain(), 5000);
     let (mut out, exact) = (Traced::default(), on_cpu(&source, &map, 1.0, &seeds));
     tracer.trace(&seeds, Extras::default(), &mut out).unwrap();

@@ -280,7 +280,7 @@ impl Surrogate for CudaSurrogate {
         either!(CudaSurrogate, self, hybrid => hybrid.load(path))
     }
     fn bytes(&self) -> usize {
-        either!(CudaSurrogate, self, hybrid => hybrid.bytes())
+        either!(CudaSurrogate, self, hybrid => Predict::bytes(hybrid))
     }
     fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
         either!(CudaSurrogate, self, hybrid => hybrid.to_host(from))

@@ -421,7 +421,7 @@ impl Training for CudaTraining {
     }
 
     fn zero_output(&mut self) -> Result<(), DeviceError> {
-        let output = self.shape().output_layer();
+        let output = self.shape().output_parameters();
         let Some(resident) = &mut self.resident else { return self.host.zero_output() };
         resident.frozen = OnceLock::new();
         resident.training.zero_layers(output)
