@@ -42,7 +42,7 @@ def main():
             print(f"record {record['frame']}: traced {100 * record['traced_share']:.1f} %", flush=True)
             continue
         header, payload = json.loads(parts[0]), parts[1]
-        if header["protocol"] != 2 or len(payload) != header["payload_bytes"]:
+        if header["protocol"] != 3 or len(payload) != header["payload_bytes"]:
             print(f"not understood: protocol {header['protocol']}, {len(payload)} bytes", file=sys.stderr)
             continue
         now, record = time.monotonic(), header["record"]

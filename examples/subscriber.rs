@@ -52,7 +52,7 @@ fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyho
     let (Some(header), Some(payload)) = (message.get(1), message.get(2)) else { bail!("{} parts", message.len()) };
     let header: Value = serde_json::from_slice(header)?;
     let length = header["payload_bytes"].as_u64().context("no payload_bytes")?;
-    if header["protocol"] != 2 || length != payload.len() as u64 {
+    if header["protocol"] != 3 || length != payload.len() as u64 {
         bail!("protocol {}, {} of {length} bytes", header["protocol"], payload.len());
     }
     let number = header["frame"].as_u64().context("no frame number")?;

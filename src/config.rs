@@ -4,8 +4,12 @@
 //! are defined in that room; this file puts them together.
 
 mod error;
+mod renamed;
+
+use error::KeyError;
 
 pub use error::ConfigError;
+pub use renamed::{RENAMED, renamed};
 
 use crate::engine::{DeviceSettings, Settings, TimeSettings, TrainingSettings};
 use crate::flow::{FlowSettings, Integrator, StepsSetting};
@@ -136,8 +140,12 @@ impl SceneFile {
 
     /// Checks the text of a scene file; `path` appears in errors only.
     pub fn parse(path: &Path, text: &str, overrides: &[String]) -> Result<Self, ConfigError> {
-        let plain: Self = toml::from_str(text).map_err(|e| ConfigError::from_toml(path, text, &e))?;
-        let table: toml::Table = text.parse().map_err(|e| ConfigError::from_toml(path, text, &e))?;
+        let read = || {
+            let syntax = |error: toml::de::Error| KeyError::syntax(&error);
+            let plain: Self = error::read(toml::Deserializer::parse(text).map_err(syntax)?)?;
+            Ok((plain, text.parse::<toml::Table>().map_err(syntax)?))
+        };
+        let (plain, table) = read().map_err(|error: KeyError| ConfigError::from_toml(path, text, &error))?;
         Self::complete(plain, Origin::new(path, text, overrides), &keys_of(&table), overrides)
     }
 
@@ -155,7 +163,7 @@ impl SceneFile {
 
     fn bare(kind: &str) -> Result<Self, ConfigError> {
         let text = format!("[source]\nkind = \"{kind}\"\n");
-        toml::from_str(&text).map_err(|e| ConfigError::from_toml(Path::new(COMMAND_LINE), &text, &e))
+        toml::from_str(&text).map_err(|e| ConfigError::from_toml(Path::new(COMMAND_LINE), &text, &KeyError::syntax(&e)))
     }
 
     /// Applies the overrides and checks all. `keys` are those that the file of `plain` sets.
@@ -199,9 +207,9 @@ impl SceneFile {
             ("archive.synthetic", self.archive.files.is_empty(), "only without archive.files"),
             ("live", *kind == Live, "only with source.kind = \"live\""),
             ("time.start", !gridded, "only with closed forms; snapshots have times of their own"),
-            ("time.step", !gridded, "only with closed forms; time.stride says how far the window of snapshots moves"),
-            ("time.stride", gridded, "only with snapshots; time.step says how far the seed time of a closed form moves"),
-            ("flow.gap", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
+            ("time.seed_step", !gridded, "only with closed forms; time.snapshots_per_slide says how far the window of snapshots moves"),
+            ("time.snapshots_per_slide", gridded, "only with snapshots; time.seed_step says how far the seed time of a closed form moves"),
+            ("flow.difference_step", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
             ("flow.steps", !adaptive, "left out with flow.integrator = \"dormand_prince\", which chooses its own"),
             ("flow.tolerance", !adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\""),
             ("flow.interpolation", gridded, "only with snapshots; a closed form is known everywhere"),
@@ -212,7 +220,7 @@ impl SceneFile {
             ("network.log2_table", hashed, HASHED),
             ("network.base_resolution", hashed, HASHED),
             ("network.growth", hashed, HASHED),
-            ("network.follow_aspect", hashed, HASHED),
+            ("network.scale_levels_by_aspect", hashed, HASHED),
             ("network.octaves", !hashed, "only with network.encoding = \"frequency\""),
             ("network.mean_penalty", network.loss == Loss::Published, "only with network.loss = \"published\""),
             ("network.jacobian_weight", network.target == Target::FlowMap, "only with network.target = \"flow_map\""),
@@ -336,9 +344,10 @@ impl SceneFile {
         ConfigError::locate(refused, path, text, set)
     }
 
-    /// The scene with `table.key=value` applied.
+    /// Applies `table.key=value`.
     fn overridden(scene: &Self, overrides: &[String]) -> Result<Self, ConfigError> {
         let mut tree = toml::Table::try_from(scene).map_err(|e| ConfigError::Override { given: String::new(), message: e.to_string() })?;
+        let mut changed = scene.clone();
         for given in overrides {
             let fail = |message: String| ConfigError::Override { given: given.clone(), message };
             let (key, value) = given.split_once('=').ok_or_else(|| fail("accepted: table.key=value".into()))?;
@@ -355,10 +364,10 @@ impl SceneFile {
                 table = entry.as_table_mut().ok_or_else(|| fail(format!("`{part}` is a value, not a table")))?;
             }
             table.insert(last.to_owned(), value);
-            // Deserialise after each, so that the error names the one at fault.
-            let _: Self = tree.clone().try_into().map_err(|e: toml::de::Error| fail(error::in_plain_words(e.message())))?;
+            // After each override, so that the error names the one at fault.
+            changed = error::read(tree.clone()).map_err(|error| fail(error.message))?;
         }
-        tree.try_into().map_err(|e: toml::de::Error| ConfigError::Override { given: overrides.join(" "), message: e.message().to_owned() })
+        Ok(changed)
     }
 }
 

@@ -132,7 +132,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 1
+seed_step = 1
 slides = 4
 frames_per_slide = 3
 [flow]
@@ -149,28 +149,28 @@ fn labels_outlive_a_slide_where_the_start_is_an_input() {
     for first in [3, 6, 9] {
         assert_eq!((told[first].slide, told[first - 1].slide), (first as u64 / 3, first as u64 / 3 - 1));
         assert!(
-            told[first].sample_ring > told[first - 1].sample_ring,
+            told[first].replay_samples > told[first - 1].replay_samples,
             "frame {first}: {} samples, then {}",
-            told[first - 1].sample_ring,
-            told[first].sample_ring
+            told[first - 1].replay_samples,
+            told[first].replay_samples
         );
         assert!(
-            blind[first].sample_ring < blind[first - 1].sample_ring,
+            blind[first].replay_samples < blind[first - 1].replay_samples,
             "frame {first}: {} samples, then {}",
-            blind[first - 1].sample_ring,
-            blind[first].sample_ring
+            blind[first - 1].replay_samples,
+            blind[first].replay_samples
         );
-        assert!(told[first].trusted_share <= told[first - 1].trusted_share, "frame {first} is not trusted more for the slide");
+        assert!(told[first].trusted_volume <= told[first - 1].trusted_volume, "frame {first} is not trusted more for the slide");
     }
     assert!(told.iter().chain(&blind).all(|record| record.warnings.is_empty()));
     // Beyond a range that the scene gives, labels are set aside as without the input, and the record says so.
     let past = run(&["network.inputs=[\"start\"]", "network.start_range=[0, 2]"]);
     let said = |record: &FrameRecord| record.warnings.iter().any(|w| w.contains("start time 3 lies beyond network.start_range, 0 to 2"));
-    assert!(past[6].sample_ring > past[5].sample_ring && past[9].sample_ring < past[8].sample_ring);
+    assert!(past[6].replay_samples > past[5].replay_samples && past[9].replay_samples < past[8].replay_samples);
     assert!(said(&past[9]) && past.iter().filter(|record| said(record)).count() == 1);
     // The first window too: its labels are not those of the range's begin.
     let before = run(&["network.inputs=[\"start\"]", "network.start_range=[0.5, 3]"]);
-    assert!(before[3].sample_ring < before[2].sample_ring && before[6].sample_ring > before[5].sample_ring);
+    assert!(before[3].replay_samples < before[2].replay_samples && before[6].replay_samples > before[5].replay_samples);
     assert!(before[0].warnings.iter().any(|w| w.contains("start time 0 lies beyond network.start_range, 0.5 to 3")));
 }
 

@@ -26,9 +26,9 @@ pub struct Options {
     /// Length of the integration, in the simulation's time; overrides the scene's.
     #[arg(long, value_name = "TIME")]
     tau: Option<String>,
-    /// Ends when the simulation ends; otherwise its restart is waited for.
+    /// Exit when the simulation ends, instead of waiting for its restart.
     #[arg(long)]
-    once: bool,
+    exit_at_end: bool,
     #[command(flatten)]
     nice: Nice,
     #[command(flatten)]
@@ -86,7 +86,7 @@ fn scene(common: &Common, options: &Options) -> Result<SceneFile> {
         // Before anything is said of a simulation that the scene does not follow.
         bail!(Usage("the scene's source.kind is not \"live\"; archives and closed forms are for `ridgewatch replay`".into()));
     }
-    if options.once {
+    if options.exit_at_end {
         overrides.push("live.at_end=\"stop\"".into());
     }
     match places.as_slice() {

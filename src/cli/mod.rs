@@ -15,8 +15,9 @@ mod replay;
 mod synthesize;
 
 use anyhow::{Context, Result, bail};
-use clap::{Args, Parser, Subcommand};
-use ridgewatch::config::{ConfigError, SceneFile};
+use clap::error::{ContextKind, ContextValue, ErrorKind};
+use clap::{Args, CommandFactory, Parser, Subcommand};
+use ridgewatch::config::{ConfigError, SceneFile, renamed};
 use ridgewatch::engine::{Device, DeviceChoice, EngineError, Setup};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
@@ -80,6 +81,22 @@ enum Command {
     Synthesize(synthesize::Options),
     /// Says which devices and libraries are found.
     Doctor,
+}
+
+impl Arguments {
+    /// Parses the process's command line.
+    ///
+    /// # Errors
+    /// clap's, which also stands for `--help` and `--version`. An option that was renamed is refused with its new name.
+    pub fn read() -> Result<Self, clap::Error> {
+        Self::try_parse().map_err(|error| {
+            let Some(ContextValue::String(option)) = error.get(ContextKind::InvalidArg) else { return error };
+            match renamed(option).filter(|_| error.kind() == ErrorKind::UnknownArgument) {
+                Some(new) => Self::command().error(ErrorKind::UnknownArgument, format!("`{option}` has a new name; accepted: `{new}`")),
+                None => error,
+            }
+        })
+    }
 }
 
 /// Runs a command.

@@ -250,16 +250,16 @@ pub(super) fn line(record: &FrameRecord) -> String {
     if record.missing > 0 {
         text += &format!(", {} more on land", record.missing);
     }
-    if record.audited > 0 && record.lived_share < 0.9995 {
-        text += &format!(", particles live {:.1} % of tau", 100.0 * record.lived_share);
+    if record.audited > 0 && record.mean_lifetime_share < 0.9995 {
+        text += &format!(", particles live {:.1} % of tau", 100.0 * record.mean_lifetime_share);
     }
-    if let Some(error) = &record.trusted {
+    if let Some(error) = &record.trusted_error {
         text += &format!(
             ", error where trusted {:.4} [{:.4}, {:.4}] rms",
             error.optical_rms, error.optical_rms_interval[0], error.optical_rms_interval[1]
         );
     }
-    if let Some(over) = record.over_tolerance {
+    if let Some(over) = record.tolerance_excess {
         text += &format!(", OVER TOLERANCE by {over:.4}");
     }
     text + &format!(", {:.2} s", record.seconds.total)

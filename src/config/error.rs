@@ -1,6 +1,8 @@
 //! Errors that point at the line.
 
+use super::renamed::renamed;
 use crate::setting::Refused;
+use serde::{Deserialize, Deserializer};
 use std::path::{Path, PathBuf};
 use thiserror::Error;
 
@@ -74,11 +76,36 @@ impl ConfigError {
         Self::Value { place, key, found, accepted, line }
     }
 
-    /// From a TOML error, with its line and, for an unknown key, the nearest known one.
-    pub(super) fn from_toml(path: &Path, text: &str, error: &toml::de::Error) -> Self {
-        let (line, excerpt) = line_at(text, error.span().map_or(0, |s| s.start));
-        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: in_plain_words(error.message()) }
+    /// Adds the file and the line.
+    pub(super) fn from_toml(path: &Path, text: &str, error: &KeyError) -> Self {
+        let (line, excerpt) = line_at(text, error.at.unwrap_or(0));
+        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: error.message.clone() }
     }
+}
+
+/// A fault of TOML text: which key, what was found, what is accepted.
+#[derive(Debug)]
+pub(super) struct KeyError {
+    /// Byte offset. `None` if the value is not of a text.
+    at: Option<usize>,
+    pub(super) message: String,
+}
+
+impl KeyError {
+    pub(super) fn syntax(error: &toml::de::Error) -> Self {
+        Self { at: error.span().map(|span| span.start), message: error.message().to_owned() }
+    }
+}
+
+/// Deserialises TOML.
+///
+/// # Errors
+/// The dotted key at fault, in the words of a scene file.
+pub(super) fn read<'de, T: Deserialize<'de>>(toml: impl Deserializer<'de, Error = toml::de::Error>) -> Result<T, KeyError> {
+    serde_path_to_error::deserialize(toml).map_err(|error| {
+        let path = error.path().to_string();
+        KeyError { message: in_plain_words(&path, error.inner().message()), ..KeyError::syntax(error.inner()) }
+    })
 }
 
 /// Byte offset of the value at a dotted key, or of the nearest table above it.
@@ -102,15 +129,22 @@ fn line_at(text: &str, at: usize) -> (usize, String) {
     (number + 1, text.lines().nth(number).unwrap_or("").to_owned())
 }
 
-/// serde's message in the words of a scene file, with the nearest accepted name where one is unknown.
-pub(super) fn in_plain_words(message: &str) -> String {
+/// Translates serde's message on the key at `path` (`.` is the file) into the words of a scene file, with the nearest accepted name if one is
+/// unknown.
+fn in_plain_words(path: &str, message: &str) -> String {
+    if let Some(field) = message.strip_prefix("missing field `") {
+        let table = if path == "." { String::new() } else { format!("{path}.") };
+        return format!("`{table}{field} is missing");
+    }
+    if message.starts_with("unknown field")
+        && let Some(new) = renamed(path)
+    {
+        return format!("`{path}` has a new name; accepted: `{new}`");
+    }
     let wrong = ["invalid type: ", "invalid value: ", "invalid length "].into_iter().find_map(|start| message.strip_prefix(start));
     match wrong.and_then(|rest| rest.split_once(", expected ")) {
-        Some((found, expected)) => format!("is {}; accepted: {}", found_in_words(found), expected_in_words(expected)),
-        None => match message.strip_prefix("missing field ") {
-            Some(field) => format!("{field} is missing"),
-            None => with_suggestion(message),
-        },
+        Some((found, expected)) => format!("`{path}` is {}; accepted: {}", found_in_words(found), expected_in_words(expected)),
+        None => format!("`{path}`: {}", with_suggestion(message)),
     }
 }
 

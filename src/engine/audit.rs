@@ -53,7 +53,7 @@ pub struct Audit {
     /// Points drawn, voids included.
     pub drawn: usize,
     /// Mean lived share over points that are not void.
-    pub lived_share: f64,
+    pub mean_lifetime_share: f64,
 }
 
 /// Traces `unit` points; samples come with `extras`.
@@ -86,8 +86,8 @@ pub fn trace(tracer: &dyn Tracer, unit: &[[f32; 3]], extras: Extras) -> Audit {
         samples.jacobian.append(&mut part.jacobian);
         lived += part_lived;
     }
-    let lived_share = lived / samples.len().max(1) as f64;
-    Audit { samples, numbers, drawn: points.len(), lived_share }
+    let mean_lifetime_share = lived / samples.len().max(1) as f64;
+    Audit { samples, numbers, drawn: points.len(), mean_lifetime_share }
 }
 
 /// Residuals of `surrogate` on traced samples that it has not seen, NaN where the trace gave no number. `tau` turns log-stretch into FTLE
@@ -144,7 +144,7 @@ pub struct AuditFindings {
     /// Of them, those that do not lie on land.
     pub points: usize,
     /// Mean lived share over these.
-    pub lived_share: f64,
+    pub mean_lifetime_share: f64,
     /// Largest finite log-stretch; minus infinity where there is none.
     pub peak: f32,
     /// These points, where they were asked for.
@@ -156,11 +156,11 @@ pub struct AuditFindings {
 /// Draws, traces and holds `surrogate` to what was traced, on the CPU (the tracer's device may be another).
 pub fn audit(request: AuditRequest<'_>, tracer: &dyn Tracer, surrogate: Option<&dyn Predict>) -> AuditFindings {
     let unit = stratified_points(&request.strata, request.seed, request.stream);
-    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, request.samples.unwrap_or_default());
+    let Audit { samples, numbers, drawn, mean_lifetime_share } = trace(tracer, &unit, request.samples.unwrap_or_default());
     AuditFindings {
         drawn,
         points: samples.len(),
-        lived_share,
+        mean_lifetime_share,
         peak: samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max),
         errors: surrogate.map(|surrogate| {
             let mut in_order = vec![(f32::NAN, f32::NAN); drawn];

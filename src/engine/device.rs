@@ -118,7 +118,7 @@ pub struct DeviceSettings {
     /// work is no failure: the CPU does what wanted it, with a warning. Only a window that no longer fits is one.
     pub when_lost: WhenLost,
     /// Lowest stream priority, for life beside a solver.
-    pub polite: bool,
+    pub low_priority: bool,
 }
 
 impl DeviceSettings {
@@ -171,7 +171,7 @@ impl Device {
         let wanted = GpuSettings {
             memory_cap: settings.memory_mib.map(|mib| mib << 20),
             cache: None,
-            polite: settings.polite,
+            low_priority: settings.low_priority,
             when_lost: settings.when_lost,
             poison: false,
         };

@@ -150,7 +150,14 @@ impl Feed {
             (Some(flow), _) => {
                 let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
                 let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
-                Ok(Feed::Closed { flow, domain, start: scene.time.start, step: scene.time.step, given: 0, slides: slides.unwrap_or(1) })
+                Ok(Feed::Closed {
+                    flow,
+                    domain,
+                    start: scene.time.start,
+                    step: scene.time.seed_step,
+                    given: 0,
+                    slides: slides.unwrap_or(1),
+                })
             }
             (None, Some(source)) => {
                 let times = source.times();
@@ -162,7 +169,7 @@ impl Feed {
                     dates,
                     window: Window::new(tau),
                     direction,
-                    stride: scene.time.stride,
+                    stride: scene.time.snapshots_per_slide,
                     given: 0,
                     slides: slides.unwrap_or(u64::MAX),
                     taken: 0,

@@ -53,36 +53,36 @@ pub struct FrameRecord {
     pub traced_share: f64,
     /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within. Where the tracing budget
     /// was spent: measured on the untrusted points, and 0 when they are within.
-    pub over_tolerance: Option<f64>,
+    pub tolerance_excess: Option<f64>,
     /// Error measured on audit points of the trusted region; none when nothing is trusted.
-    pub trusted: Option<TrustedError>,
+    pub trusted_error: Option<TrustedError>,
     /// PSNR in decibels of the surrogate alone over the whole domain, trusted or not, on the audit points; peak: their largest traced
     /// log-stretch. None for `reference`.
     #[serde(default)]
     pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
-    pub trusted_share: f64,
+    pub trusted_volume: f64,
     /// The same error measured on fresh points with the same weights after the frame (`--verify`).
-    pub verified: Option<TrustedError>,
+    pub verified_error: Option<TrustedError>,
     /// Runge-Kutta steps a path; none where each path chooses its own (Dormand-Prince).
     pub integration_steps: Option<u64>,
     /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it: the error of "the truth" itself.
     pub integration_difference: Option<f64>,
     /// Points traced before this frame to open the gate and to tighten the majorants (first frame of a slide).
-    pub probed: u64,
+    pub preparation_traces: u64,
     /// Audit points traced for this frame, land left out.
     pub audited: u64,
     /// Mean lived share of the audit points (1 when every particle lived the whole tau).
-    pub lived_share: f64,
+    pub mean_lifetime_share: f64,
     /// Queries whose extinction exceeded the majorant in force.
     pub majorant_exceeded: u64,
     /// Training since the last frame.
     pub training: Option<crate::surrogate::Learned>,
-    /// Samples in the ring of samples (`training.ring`).
-    pub sample_ring: u64,
+    /// Samples in the ring of samples (`training.replay_buffer`).
+    pub replay_samples: u64,
     /// Points that a GPU traced ahead of flights that ended before them: work, but no queries, and not among `traced`.
     #[serde(default)]
-    pub traced_ahead: u64,
+    pub speculative_traces: u64,
     /// The checkpoint that was under way since the last frame; none when there was none.
     #[serde(default)]
     pub checkpoint: Option<CheckpointRecord>,
@@ -112,7 +112,7 @@ pub struct CheckpointRecord {
     /// Seconds that the loop stood still for the copy.
     pub copy_seconds: f64,
     /// Whether the numbers were brought together behind the loop's back; otherwise it waited for all of them.
-    pub behind: bool,
+    pub asynchronous: bool,
     /// Seconds since the copy began: until it was written, or so far.
     pub seconds: f64,
     /// Bytes of the file; none where it is not written yet, or was not.

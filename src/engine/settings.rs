@@ -127,11 +127,11 @@ pub struct TimeSettings {
     /// Closed forms: seed time of the first slide.
     pub start: f64,
     /// Closed forms: how far the seed time moves from slide to slide.
-    pub step: f64,
+    pub seed_step: f64,
     /// Closed forms: number of slides. Archives: an upper bound; none: as many as the archive gives.
     pub slides: Option<usize>,
     /// Archives: snapshots that the window moves from slide to slide.
-    pub stride: usize,
+    pub snapshots_per_slide: usize,
     /// Frames rendered at each slide.
     pub frames_per_slide: usize,
     /// Further frames at the first slide, in which the surrogate is trained up.
@@ -146,9 +146,9 @@ impl Default for TimeSettings {
             tau: None,
             direction: None,
             start: 0.0,
-            step: 1.0,
+            seed_step: 1.0,
             slides: None,
-            stride: 1,
+            snapshots_per_slide: 1,
             frames_per_slide: 1,
             warmup_frames: 0,
             warmup_samples: None,
@@ -173,15 +173,15 @@ impl TimeSettings {
             None => {}
         }
         require(time.start.is_finite(), "time.start", time.start, "a finite number")?;
-        require(time.step.is_finite(), "time.step", time.step, "a finite number")?;
-        if time.step == 0.0 && time.slides.is_some_and(|slides| slides > 1) {
-            let refused = Refused::new("time.step", "is 0", "a number other than 0: all slides would be of one time");
+        require(time.seed_step.is_finite(), "time.seed_step", time.seed_step, "a finite number")?;
+        if time.seed_step == 0.0 && time.slides.is_some_and(|slides| slides > 1) {
+            let refused = Refused::new("time.seed_step", "is 0", "a number other than 0: all slides would be of one time");
             return Err(refused.beside(&["time.slides"]));
         }
         if let Some(slides) = time.slides {
             count("time.slides", slides, 1, 10_000_000)?;
         }
-        count("time.stride", time.stride, 1, 1_000_000)?;
+        count("time.snapshots_per_slide", time.snapshots_per_slide, 1, 1_000_000)?;
         count("time.frames_per_slide", time.frames_per_slide, 1, 1_000_000)?;
         count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)?;
         count("time.warmup_samples", time.warmup_samples.unwrap_or(1), 1, MAX_SAMPLES)
@@ -201,14 +201,14 @@ pub struct TrainingSettings {
     /// Exactly so many optimizer steps a frame instead: slower, but the same on every run.
     pub steps_per_frame: Option<u64>,
     /// Samples that the ring holds.
-    pub ring: usize,
+    pub replay_buffer: usize,
     /// Checkpoint to go on from.
     pub resume: Option<std::path::PathBuf>,
 }
 
 impl Default for TrainingSettings {
     fn default() -> Self {
-        Self { share: 0.5, seconds_per_frame: None, steps_per_frame: None, ring: 1 << 22, resume: None }
+        Self { share: 0.5, seconds_per_frame: None, steps_per_frame: None, replay_buffer: 1 << 22, resume: None }
     }
 }
 
@@ -234,7 +234,7 @@ impl TrainingSettings {
         if let Some(steps) = t.steps_per_frame {
             require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
         }
-        count("training.ring", t.ring, 1024, 1 << 28)
+        count("training.replay_buffer", t.replay_buffer, 1024, 1 << 28)
     }
 }
 

@@ -1,6 +1,6 @@
 //! The thread that writes the run folder, behind a short queue.
 
-use super::{ExrFrames, FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
+use super::{ExrFrames, FileStatistics, PublishError, PublishSettings, RunFolder, WhenDiskSlow};
 use crate::engine::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -20,7 +20,7 @@ pub(super) struct FileWriter {
     shared: Arc<Shared>,
     /// None once finished.
     thread: Option<JoinHandle<RunFolder>>,
-    when_full: WhenFull,
+    when_disk_slow: WhenDiskSlow,
     limit: Duration,
 }
 
@@ -69,24 +69,24 @@ impl FileWriter {
 
     fn start_with_limit(folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
         let shared = Arc::new(Shared::default());
-        let (theirs, when_full) = (Arc::clone(&shared), settings.when_full.unwrap_or(WhenFull::Wait));
+        let (theirs, when_disk_slow) = (Arc::clone(&shared), settings.when_disk_slow.unwrap_or(WhenDiskSlow::Wait));
         let name = "ridgewatch-files";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
             .spawn(move || write_all(&theirs, folder, &settings))
             .map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { shared, thread: Some(thread), when_full, limit })
+        Ok(Self { shared, thread: Some(thread), when_disk_slow, limit })
     }
 
-    /// Hands a frame over. With [`WhenFull::Wait`] it waits for a place in the queue, a minute at most.
+    /// Hands a frame over. With [`WhenDiskSlow::Wait`] it waits for a place in the queue, a minute at most.
     pub(super) fn frame(&self, frame: Frame) {
         let mut state = self.shared.lock();
-        if self.when_full == WhenFull::Wait {
+        if self.when_disk_slow == WhenDiskSlow::Wait {
             let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.pictures >= PICTURES_WAITING);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
         if state.pictures >= PICTURES_WAITING {
-            state.drop_oldest_pictures(self.when_full);
+            state.drop_oldest_pictures(self.when_disk_slow);
         }
         if state.queue.len() >= RECORDS_WAITING {
             // Only records wait in front, since their pictures were dropped long before.
@@ -123,14 +123,14 @@ impl FileWriter {
 }
 
 impl State {
-    fn drop_oldest_pictures(&mut self, when_full: WhenFull) {
+    fn drop_oldest_pictures(&mut self, when_disk_slow: WhenDiskSlow) {
         let oldest = self.queue.iter_mut().find(|job| matches!(job, Job::Whole(_)));
         if let Some(job) = oldest {
             if let Job::Whole(frame) = job {
                 *job = Job::Record(Arc::clone(&frame.record));
             }
             self.pictures -= 1;
-            if when_full == WhenFull::Wait {
+            if when_disk_slow == WhenDiskSlow::Wait {
                 // It was to be waited for, and was, for as long as may be.
                 self.statistics.pictures_failed += 1;
                 return;
@@ -245,9 +245,9 @@ mod tests {
         text.lines().map(|l| serde_json::from_str::<FrameRecord>(l).unwrap().frame).collect()
     }
 
-    fn run(when_full: WhenFull, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
+    fn run(when_disk_slow: WhenDiskSlow, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
         let folder = tempfile::tempdir().unwrap();
-        let settings = PublishSettings { when_full: Some(when_full), ..Default::default() };
+        let settings = PublishSettings { when_disk_slow: Some(when_disk_slow), ..Default::default() };
         let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), settings).unwrap();
         // One picture for all, so that frames come at once.
         let film = frame(0, edge).film;
@@ -260,7 +260,7 @@ mod tests {
 
     #[test]
     fn waiting_loses_nothing() {
-        let (statistics, records) = run(WhenFull::Wait, 40, 64);
+        let (statistics, records) = run(WhenDiskSlow::Wait, 40, 64);
         assert_eq!((statistics.pictures_written, statistics.records_written), (40, 40));
         assert_eq!(records, (0..40).collect::<Vec<u64>>());
     }
@@ -282,7 +282,7 @@ mod tests {
     #[test]
     fn dropping_loses_pictures_but_no_record() {
         // Frames of a megapixel come far faster than they can be compressed.
-        let (statistics, records) = run(WhenFull::Drop, 30, 1024);
+        let (statistics, records) = run(WhenDiskSlow::Drop, 30, 1024);
         assert!(statistics.pictures_dropped >= 20, "{statistics:?}");
         assert_eq!(statistics.pictures_written + statistics.pictures_dropped, 30);
         assert_eq!(records, (0..30).collect::<Vec<u64>>(), "every record, in order");

@@ -108,7 +108,7 @@ impl Mailbox {
         state.next_ticket += 1;
         state.on_their_way.push(Part { ticket, generation, kind, bytes: bytes.len() as u64, since: Instant::now() });
         let held = state.on_their_way.iter().map(|p| p.bytes).sum();
-        state.statistics.peak_held_bytes = state.statistics.peak_held_bytes.max(held);
+        state.statistics.peak_queued_bytes = state.statistics.peak_queued_bytes.max(held);
         drop(state);
         Bytes::from_owner(Counted { bytes, ticket, mailbox: Arc::clone(self) })
     }

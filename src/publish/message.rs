@@ -9,7 +9,7 @@ pub const FRAME_TOPIC: &str = "frame";
 /// First part of a message with a record alone.
 pub const RECORD_TOPIC: &str = "record";
 /// Version of the messages; grows when a client would have to change.
-pub const PROTOCOL: u32 = 2;
+pub const PROTOCOL: u32 = 3;
 
 /// Second part of a `frame` message, as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -26,6 +26,6 @@ pub use output::Output;
 pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};
 pub use scene::{refuse_foreign_scene, write_scene};
-pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, PublishSettings, WhenFull};
+pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, PublishSettings, WhenDiskSlow};
 pub use summary::{FileStatistics, Summary, Totals, peak_memory_bytes};
 pub use zmq::{PublishStatistics, Publisher};

@@ -49,7 +49,7 @@ impl Output {
         self.folder.as_deref()
     }
 
-    /// Hands a frame over; never fails. With `when_full = "drop"` it does not wait either; with `"wait"` it waits while four frames
+    /// Hands a frame over; never fails. With `when_disk_slow = "drop"` it does not wait either; with `"wait"` it waits while four frames
     /// wait for the disk, a minute at most.
     pub fn frame(&mut self, frame: Frame) {
         self.frames += 1;

@@ -47,7 +47,7 @@ pub enum ExrFrames {
 /// What happens to a frame when the disk is slower than the cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum WhenFull {
+pub enum WhenDiskSlow {
     /// The cycle waits for the disk (replay: nothing is lost), for a minute at most.
     Wait,
     /// The oldest waiting picture is dropped and counted (live: the cycle never waits). Its record is still written.
@@ -79,7 +79,7 @@ pub struct PublishSettings {
     /// Of which frames an EXR is written.
     pub exr: ExrFrames,
     /// What happens when the disk is slower than the cycle; None waits, but of a live run see [`PublishSettings::of_live_run`].
-    pub when_full: Option<WhenFull>,
+    pub when_disk_slow: Option<WhenDiskSlow>,
 }
 
 impl Default for PublishSettings {
@@ -94,7 +94,7 @@ impl Default for PublishSettings {
             records_bytes: None,
             preview: true,
             exr: ExrFrames::Slide,
-            when_full: None,
+            when_disk_slow: None,
         }
     }
 }
@@ -114,7 +114,7 @@ impl PublishSettings {
         Self {
             keep: if bounded { self.keep } else { Some(LIVE_FRAMES) },
             records_bytes: self.records_bytes.or(Some(LIVE_RECORDS)),
-            when_full: self.when_full.or(Some(WhenFull::Drop)),
+            when_disk_slow: self.when_disk_slow.or(Some(WhenDiskSlow::Drop)),
             ..self
         }
     }

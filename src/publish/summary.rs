@@ -39,7 +39,7 @@ pub struct Totals {
     /// Queries whose extinction exceeded the majorant in force.
     pub majorant_exceeded: u64,
     /// Frames whose estimated residual exceeded the tolerance.
-    pub over_tolerance_frames: u64,
+    pub tolerance_exceeded_frames: u64,
     /// Optimizer steps.
     pub training_steps: u64,
     /// Times the weights were rolled back.
@@ -57,7 +57,7 @@ impl Totals {
         self.traced_share = self.traced as f64 / (self.queries - self.missing).max(1) as f64;
         self.audited += record.audited;
         self.majorant_exceeded += record.majorant_exceeded;
-        self.over_tolerance_frames += u64::from(record.over_tolerance.is_some());
+        self.tolerance_exceeded_frames += u64::from(record.tolerance_excess.is_some());
         if let Some(training) = &record.training {
             self.training_steps += training.steps;
             self.rollbacks += training.rollbacks;
@@ -138,9 +138,9 @@ mod tests {
     #[test]
     fn totals_add_up() {
         let mut totals = Totals::default();
-        totals.add(&FrameRecord { queries: 100, traced: 100, over_tolerance: Some(0.01), ..Default::default() });
+        totals.add(&FrameRecord { queries: 100, traced: 100, tolerance_excess: Some(0.01), ..Default::default() });
         totals.add(&FrameRecord { queries: 300, traced: 0, warnings: vec!["odd".into()], ..Default::default() });
-        assert_eq!((totals.queries, totals.traced_share, totals.over_tolerance_frames, totals.warnings), (400, 0.25, 1, 1));
+        assert_eq!((totals.queries, totals.traced_share, totals.tolerance_exceeded_frames, totals.warnings), (400, 0.25, 1, 1));
         totals.add(&FrameRecord { queries: 600, traced: 0, missing: 600, ..Default::default() });
         assert_eq!((totals.missing, totals.traced_share), (600, 0.25), "land is not traced, and no share of it");
     }

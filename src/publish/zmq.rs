@@ -28,7 +28,7 @@ const SHUTDOWN_LIMIT: Duration = Duration::from_millis(500);
 /// Attempts to open a new socket after a cut-off, one a [`TICK`].
 const REOPEN_ATTEMPTS: u32 = 100;
 
-/// What became of the frames on the socket. `frames = sent + superseded + unheard + failed`, once finished.
+/// What became of the frames on the socket. `frames = sent + superseded + without_subscriber + failed`, once finished.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PublishStatistics {
     /// Frames that the cycle handed over.
@@ -38,7 +38,7 @@ pub struct PublishStatistics {
     /// Pictures replaced by a newer one before they could be sent.
     pub superseded: u64,
     /// Pictures that nobody subscribed to (no encoding is spent on them).
-    pub unheard: u64,
+    pub without_subscriber: u64,
     /// Pictures that could not be encoded or sent.
     pub failed: u64,
     /// Records given to the socket, or heard by nobody.
@@ -46,13 +46,13 @@ pub struct PublishStatistics {
     /// Records dropped because too many waited.
     pub records_dropped: u64,
     /// Times that all connections were closed because a subscriber stalled.
-    pub cut_offs: u64,
+    pub stall_disconnects: u64,
     /// Most subscribers at once.
-    pub subscribers: u64,
+    pub peak_subscribers: u64,
     /// Most bytes that the socket held at once, beside one copy a subscriber of the frame being written to it.
-    pub peak_held_bytes: u64,
+    pub peak_queued_bytes: u64,
     /// Whether publishing ended early because no new socket could be opened.
-    pub lost: bool,
+    pub socket_lost: bool,
 }
 
 /// Publishes frames until it is finished.
@@ -236,7 +236,7 @@ impl Worker {
             if let Some(generation) = &mut current {
                 let subscribers = generation.subscribers() as u64;
                 let mut state = self.mailbox.lock();
-                state.statistics.subscribers = state.statistics.subscribers.max(subscribers);
+                state.statistics.peak_subscribers = state.statistics.peak_subscribers.max(subscribers);
             }
             match self.next_step() {
                 Step::Records(records) => self.send_records(current.as_mut(), &records),
@@ -324,7 +324,7 @@ impl Worker {
 
     fn send_picture(&self, generation: Option<&mut Generation>, frame: &Frame) {
         let Some(generation) = generation.filter(|g| !g.subscribers.is_empty()) else {
-            self.mailbox.lock().statistics.unheard += 1;
+            self.mailbox.lock().statistics.without_subscriber += 1;
             return;
         };
         let sent = encode_frame(frame, self.payload).and_then(|(header, payload)| {
@@ -350,7 +350,7 @@ impl Worker {
             old.cut();
         }
         self.generation += 1;
-        self.mailbox.lock().statistics.cut_offs += 1;
+        self.mailbox.lock().statistics.stall_disconnects += 1;
         for attempt in 1..=REOPEN_ATTEMPTS {
             match Generation::open(&self.listener, self.generation) {
                 Ok(generation) => return Some(generation),
@@ -363,7 +363,7 @@ impl Worker {
             std::thread::sleep(TICK);
         }
         tracing::error!("publishing ends: no new socket after {REOPEN_ATTEMPTS} attempts; the run goes on");
-        self.mailbox.lock().statistics.lost = true;
+        self.mailbox.lock().statistics.socket_lost = true;
         None
     }
 }

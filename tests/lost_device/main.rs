@@ -194,7 +194,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.1
+seed_step = 0.1
 slides = 2
 frames_per_slide = 2
 [flow]
@@ -653,7 +653,7 @@ fn checkpoints_while_a_device_trains() {
     let under_way: Vec<&FrameRecord> = found.records.iter().filter(behind).collect();
     assert!(under_way.len() >= 3);
     assert_eq!(slow.line.waited_for.load(Ordering::Relaxed), 0, "frames waited for it");
-    assert!(under_way.iter().all(|record| record.checkpoint.as_ref().unwrap().behind), "{under_way:?}");
+    assert!(under_way.iter().all(|record| record.checkpoint.as_ref().unwrap().asynchronous), "{under_way:?}");
     assert!(under_way[2].checkpoint.as_ref().unwrap().postponed >= 1, "one at a time: {:?}", under_way[2].checkpoint);
 
     let full = whole();
@@ -663,7 +663,7 @@ fn checkpoints_while_a_device_trains() {
     let told = found.records.iter().flat_map(|record| &record.warnings).filter(|warning| warning.contains("refused by the test")).count();
     assert!(told >= 1, "a record says that frames waited");
     let not_there = found.records.iter().filter_map(|record| record.checkpoint.as_ref()).filter(|checkpoint| checkpoint.frame > Some(0));
-    assert!(not_there.map(|checkpoint| checkpoint.behind).all(|behind| !behind));
+    assert!(not_there.map(|checkpoint| checkpoint.asynchronous).all(|behind| !behind));
 
     for kind in ["copying a network", "reading a copy"] {
         // The second: the first checkpoint is on the disk.

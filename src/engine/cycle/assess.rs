@@ -18,11 +18,11 @@ impl Cycle<'_> {
     pub(super) fn assess(&mut self, front: &dyn Predict, tracer: &dyn Tracer, gate: &Gate, work: &Rendered, record: &mut FrameRecord) {
         let Some(audited) = &work.audit.errors else { return };
         let tolerance = self.plan.scene.trust.tolerance;
-        record.trusted_share = gate.share();
-        record.trusted = audit::trusted_error(audited, gate);
+        record.trusted_volume = gate.share();
+        record.trusted_error = audit::trusted_error(audited, gate);
         self.peak = self.peak.max(work.audit.peak);
         record.surrogate_psnr = audit::psnr(audited, self.peak);
-        record.over_tolerance = over_tolerance(&work.tally, record.trusted, audited, gate, tolerance);
+        record.tolerance_excess = tolerance_excess(&work.tally, record.trusted_error, audited, gate, tolerance);
         if work.tally.over_budget > 0 {
             record.warnings.push(format!(
                 "the tracing budget was spent: {} queries of untrusted cells were answered by the surrogate",
@@ -67,7 +67,7 @@ impl Cycle<'_> {
 
 /// By how much the optical residual of a frame exceeds `tolerance`, or none when it does not. A frame whose tracing budget was spent is
 /// flagged whatever the points say: the surrogate answered where it is not trusted, so that those points speak for it.
-fn over_tolerance(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
+fn tolerance_excess(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
     if tally.over_budget == 0 {
         return trusted.map(|e| e.optical_rms - tolerance).filter(|over| *over > 0.0);
     }
@@ -90,7 +90,7 @@ mod tests {
     fn flagged(over_budget: u64, gate: &Gate, tolerance: f64) -> Option<f64> {
         let points = Audited::of(&points(), Strata::even([1; 3], 20));
         let trusted = audit::trusted_error(&points, gate);
-        over_tolerance(&Tally { over_budget, ..Tally::default() }, trusted, &points, gate, tolerance)
+        tolerance_excess(&Tally { over_budget, ..Tally::default() }, trusted, &points, gate, tolerance)
     }
 
     #[test]

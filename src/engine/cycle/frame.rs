@@ -82,11 +82,11 @@ impl Cycle<'_> {
         if work.audit.drawn > 0 && work.audit.points == 0 {
             record.warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
         }
-        let dying = record.audited > 0 && record.lived_share < SHORT_LIVED;
+        let dying = record.audited > 0 && record.mean_lifetime_share < SHORT_LIVED;
         if dying && !std::mem::replace(&mut self.told_of_deaths, true) {
             record.warnings.push(format!(
                 "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value, another unit?), and their FTLE is that of the path so far",
-                100.0 * record.lived_share
+                100.0 * record.mean_lifetime_share
             ));
         }
         let auditing = Instant::now();
@@ -97,7 +97,7 @@ impl Cycle<'_> {
         let total = stood_still + start.elapsed().as_secs_f64();
         if let Some(front) = front.as_deref() {
             // The measurement's time, not the frame's.
-            record.verified = self.verify(front, tracer, &gate);
+            record.verified_error = self.verify(front, tracer, &gate);
         }
         self.options.device.check()?;
         if let Some(failure) = self.options.device.failure().filter(|_| !std::mem::replace(&mut self.told_of_failure, true)) {
@@ -115,7 +115,7 @@ impl Cycle<'_> {
             }
         }
         record.training = learned;
-        record.sample_ring = self.ring.len() as u64;
+        record.replay_samples = self.ring.len() as u64;
         record.checkpoint = self.checkpoints.as_mut().and_then(Checkpoints::look);
         if let Some(failed) = record.checkpoint.as_ref().and_then(|checkpoint| checkpoint.failed.as_ref()) {
             record.warnings.push(failed.clone());
@@ -158,7 +158,7 @@ impl Cycle<'_> {
     ) -> Result<(Rendered, Option<Learned>), EngineError> {
         let scene = &self.plan.scene;
         let waits = !live || scene.training.steps_per_frame.is_some();
-        let per_cell = scene.trust.audit_per_cell;
+        let per_cell = scene.trust.audit_min_per_cell;
         let cells = self.trust.shape();
         let samples_per_pixel = scene.time.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
         // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
@@ -314,11 +314,11 @@ impl Cycle<'_> {
             traced_share: work.tally.traced as f64 / (work.tally.queries - work.tally.missing).max(1) as f64,
             integration_steps: fixed_steps(tracer).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
-            probed: std::mem::take(&mut self.probed),
+            preparation_traces: std::mem::take(&mut self.preparation_traces),
             audited: work.audit.points as u64,
-            lived_share: work.audit.lived_share,
+            mean_lifetime_share: work.audit.mean_lifetime_share,
             majorant_exceeded: work.stats.majorant_exceeded,
-            traced_ahead: work.stats.ahead,
+            speculative_traces: work.stats.ahead,
             warnings: std::mem::take(&mut slide.warnings),
             ..FrameRecord::default()
         }

@@ -122,7 +122,7 @@ struct Cycle<'a> {
     resize: Option<Resize>,
     frame: u64,
     /// Points traced since the last frame to prepare the next.
-    probed: u64,
+    preparation_traces: u64,
     /// Frames that were no warm-up.
     pictures: u64,
     /// Whether a lost device was told of.
@@ -258,7 +258,7 @@ impl<'a> Cycle<'a> {
             heed(stop)?;
         }
         let times = Times::new(&scene.network, tracer.tau());
-        let mut ring = SampleRing::new(scene.training.ring);
+        let mut ring = SampleRing::new(scene.training.replay_buffer);
         if !scene.network.inputs.is_empty() {
             ring.set_now(times.unit(tracer.start(), tracer.tau()));
         }
@@ -280,7 +280,7 @@ impl<'a> Cycle<'a> {
             resize: None,
             live,
             frame: 0,
-            probed: 0,
+            preparation_traces: 0,
             pictures: 0,
             told_of_failure: false,
             told_of_deaths: false,

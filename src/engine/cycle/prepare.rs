@@ -125,7 +125,7 @@ impl Cycle<'_> {
             let points: Vec<[f32; 3]> = probe.samples.points.par_iter().with_min_len(1 << 12).map(|&unit| domain.from_unit(unit)).collect();
             self.renderer.observe(&points, &probe.samples.log_stretch);
         });
-        self.probed += probe.drawn as u64;
+        self.preparation_traces += probe.drawn as u64;
         self.learn_of(tracer, &probe.samples, Some(&strata));
         Ok(())
     }
@@ -140,7 +140,7 @@ impl Cycle<'_> {
         self.threads.render().install(|| frames.render(renderer, PILOT_PICTURE, 1, tracer, &mut answers, None, stop))?;
         heed(stop)?;
         let (samples, traced) = (answers.samples, answers.tally.traced);
-        self.probed += traced;
+        self.preparation_traces += traced;
         self.learn_of(tracer, &samples, None);
         Ok(())
     }
@@ -148,7 +148,7 @@ impl Cycle<'_> {
     /// Traced samples that a frame keeps, at most: what training can use of them, or what trust can where nothing is trained here. (A device
     /// that trains learns from all that it traces.)
     pub(super) fn keep_a_frame(&self) -> usize {
-        let ring = self.plan.scene.training.ring / KEEP_A_FRAME;
+        let ring = self.plan.scene.training.replay_buffer / KEEP_A_FRAME;
         let trains_here = |live: &dyn Surrogate| live.learns() && !live.is_offloaded();
         self.live.as_ref().map_or(0, |live| if trains_here(&**live) { ring } else { ring.min(RENDER_RESIDUALS) })
     }
@@ -206,7 +206,7 @@ impl Cycle<'_> {
             let interruptible = Interruptible::new(&*shorter, self.stop);
             let mut found = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras));
             found.samples.times = vec![self.times.unit(slide.time, duration); found.samples.len()];
-            self.probed += found.drawn as u64;
+            self.preparation_traces += found.drawn as u64;
             self.ring.push(&found.samples);
         }
         Ok(())

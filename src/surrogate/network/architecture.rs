@@ -195,7 +195,7 @@ fn levels(settings: &NetworkSettings, axes: &[usize], lengths: [f64; 3]) -> Vec<
             let mut cells = [1_u32; GRID_INPUTS];
             for (slot, &axis) in axes.iter().enumerate() {
                 let share = match lengths.get(axis) {
-                    Some(edge) if settings.follow_aspect && longest > 0.0 => (edge / longest).clamp(0.125, 1.0),
+                    Some(edge) if settings.scale_levels_by_aspect && longest > 0.0 => (edge / longest).clamp(0.125, 1.0),
                     _ => 1.0,
                 };
                 // 2^20 cells are finer than f32 can place a point.

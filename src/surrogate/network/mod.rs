@@ -127,7 +127,7 @@ pub struct NetworkSettings {
     /// Samples an optimizer step.
     pub batch: usize,
     /// Whether shorter axes of the domain get fewer cells, so that cells are about as wide as high.
-    pub follow_aspect: bool,
+    pub scale_levels_by_aspect: bool,
     /// Weight of the flow map's derivatives in the loss (target `flow_map`); 0 trains on arrivals alone, which has rendered better in the
     /// same time: derivatives of the network cost a pass each, and those of a hash grid jump from cell to cell.
     pub jacobian_weight: f32,
@@ -155,7 +155,7 @@ impl Default for NetworkSettings {
             mean_penalty: 1.0,
             learning_rate: None,
             batch: 1 << 14,
-            follow_aspect: true,
+            scale_levels_by_aspect: true,
             jacobian_weight: 0.0,
             averaging: 0.1,
         }
