@@ -3,6 +3,7 @@
 use super::scene::{is_ours, refuse_foreign_scene, write_scene};
 use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
 use crate::engine::{Frame, FrameRecord};
+use crate::files::write_whole;
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -20,21 +21,6 @@ const PREVIOUS: &str = ".previous";
 const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
-
-/// Writes a whole file beside its place and renames it, so that nothing half-written has its final name.
-pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no file name"))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(name);
-    hidden.push(".part");
-    let part = path.with_file_name(hidden);
-    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
-    if written.is_err() {
-        // It may not exist; what matters is already in `written`.
-        let _ = fs::remove_file(&part);
-    }
-    written
-}
 
 /// A folder that this run alone writes.
 #[derive(Debug)]
