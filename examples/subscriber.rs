@@ -21,7 +21,7 @@ async fn main() -> anyhow::Result<()> {
     }
 
     let mut socket = SubSocket::new();
-    // Waits for the publisher if it is not there yet, and reconnects by itself after a cut-off.
+    // Waits for the publisher if it is not there yet, and reconnects by itself after a disconnect.
     socket.connect(&endpoint).await.with_context(|| endpoint.clone())?;
     socket.subscribe("frame").await?;
 
@@ -34,7 +34,7 @@ async fn main() -> anyhow::Result<()> {
         let message = match message {
             Ok(message) => message,
             Err(error) => {
-                // A message torn by a cut-off ends up here; the connection comes back in the background.
+                // A message torn by a disconnect is an error; the connection is restored in the background.
                 eprintln!("{error}");
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 continue;

@@ -186,41 +186,40 @@ impl SceneFile {
     /// files are open.
     fn idle(&self) -> impl Iterator<Item = (&'static str, &'static str)> {
         use SourceKind::{Archive, Live, Turbulence};
-        const LEARNS: &str = "only with surrogate.kind = \"network\" or \"residual\"; a table learns nothing";
-        const HASHED: &str = "only with network.encoding = \"hash_grid\"";
+        const LEARNS: &str = "only with surrogate.kind = \"network\" or \"residual\"; a table is not trained";
+        const HASHED: [&str; 6] = [
+            "network.levels",
+            "network.features",
+            "network.log2_table",
+            "network.base_resolution",
+            "network.growth",
+            "network.scale_levels_by_aspect",
+        ];
         let Self { source: SourceSettings { kind, .. }, flow, network, training, .. } = self;
         let gridded = matches!(kind, Archive | Live | Turbulence);
         let adaptive = flow.integrator == Integrator::DormandPrince;
         let (learns, hashed) = (self.surrogate.kind != Kind::Table, network.encoding == Encoding::HashGrid);
-        let keys = [
-            ("archive", *kind == Archive, "only with source.kind = \"archive\""),
-            ("archive.synthetic", self.archive.files.is_empty(), "only without archive.files"),
-            ("live", *kind == Live, "only with source.kind = \"live\""),
-            ("time.start", !gridded, "only with closed forms; snapshots have times of their own"),
-            ("time.seed_step", !gridded, "only with closed forms; time.snapshots_per_slide says how far the window of snapshots moves"),
-            ("time.snapshots_per_slide", gridded, "only with snapshots; time.seed_step says how far the seed time of a closed form moves"),
-            ("flow.difference_step", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
-            ("flow.steps", !adaptive, "left out with flow.integrator = \"dormand_prince\", which chooses its own"),
-            ("flow.tolerance", !adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\""),
-            ("flow.interpolation", gridded, "only with snapshots; a closed form is known everywhere"),
-            ("surrogate.table_nodes", self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\""),
-            ("network", learns || network.size == Size::Auto, LEARNS),
-            ("network.levels", hashed, HASHED),
-            ("network.features", hashed, HASHED),
-            ("network.log2_table", hashed, HASHED),
-            ("network.base_resolution", hashed, HASHED),
-            ("network.growth", hashed, HASHED),
-            ("network.scale_levels_by_aspect", hashed, HASHED),
-            ("network.octaves", !hashed, "only with network.encoding = \"frequency\""),
-            ("network.mean_penalty", network.loss == Loss::Published, "only with network.loss = \"published\""),
-            ("network.jacobian_weight", network.target == Target::FlowMap, "only with network.target = \"flow_map\""),
-            ("training.share", learns, LEARNS),
-            ("training.seconds_per_frame", learns, LEARNS),
-            ("training.steps_per_frame", learns, LEARNS),
-            ("training.resume", learns, LEARNS),
-            ("training.seconds_per_frame", training.steps_per_frame.is_none(), "only without training.steps_per_frame"),
+        let rules: [(bool, &'static str, &'static [&'static str]); 18] = [
+            (*kind == Archive, "only with source.kind = \"archive\"", &["archive"]),
+            (self.archive.files.is_empty(), "only without archive.files", &["archive.synthetic"]),
+            (*kind == Live, "only with source.kind = \"live\"", &["live"]),
+            (!gridded, "only with closed forms; snapshots have their own times", &["time.start"]),
+            (!gridded, "only with closed forms; time.snapshots_per_slide is the step of snapshots", &["time.seed_step"]),
+            (gridded, "only with snapshots; time.seed_step is the step of closed forms", &["time.snapshots_per_slide"]),
+            (flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\"", &["flow.difference_step"]),
+            (!adaptive, "only without flow.integrator = \"dormand_prince\", which chooses its steps", &["flow.steps"]),
+            (!adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\"", &["flow.tolerance"]),
+            (gridded, "only with snapshots; a closed form is known everywhere", &["flow.interpolation"]),
+            (self.surrogate.kind != Kind::Network, "only with surrogate.kind = \"table\" or \"residual\"", &["surrogate.table_nodes"]),
+            (learns || network.size == Size::Auto, LEARNS, &["network"]),
+            (hashed, "only with network.encoding = \"hash_grid\"", &HASHED),
+            (!hashed, "only with network.encoding = \"frequency\"", &["network.octaves"]),
+            (network.loss == Loss::Published, "only with network.loss = \"published\"", &["network.mean_penalty"]),
+            (network.target == Target::FlowMap, "only with network.target = \"flow_map\"", &["network.jacobian_weight"]),
+            (learns, LEARNS, &["training.share", "training.seconds_per_frame", "training.steps_per_frame", "training.resume"]),
+            (training.steps_per_frame.is_none(), "only without training.steps_per_frame", &["training.seconds_per_frame"]),
         ];
-        keys.into_iter().filter(|(_, works, _)| !works).map(|(key, _, accepted)| (key, accepted))
+        rules.into_iter().filter(|(works, ..)| !works).flat_map(|(_, accepted, keys)| keys.iter().map(move |key| (*key, accepted)))
     }
 
     /// Returns what is accepted instead of a key without effect in this scene. `None` if the key has an effect.

@@ -55,7 +55,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
     if !options.run.overwrite {
         let out = RunFolder::vacant(&options.run.out)?;
         if out != options.run.out {
-            messages::note(format_args!("{} holds an earlier run: this one goes to {}", options.run.out.display(), out.display()));
+            messages::note(format_args!("{} holds an earlier run: this run is written to {}", options.run.out.display(), out.display()));
             options.run.out = out;
         }
     }

@@ -26,7 +26,7 @@ pub struct Common {
     /// Seed of every random number; overrides the scene's.
     #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
     pub seed: Option<u64>,
-    /// Print a machine-readable result on standard output; everything else goes to standard error.
+    /// Print a machine-readable result on standard output; everything else is printed on standard error.
     #[arg(long, global = true)]
     pub json: bool,
     /// Print more on standard error; twice for details.

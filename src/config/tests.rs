@@ -115,7 +115,7 @@ fn paths_in_a_scene_are_relative_to_it_and_those_of_the_command_line_are_not() {
     assert_eq!((scene.archive.files[0].to_str(), scene.training.resume.unwrap().to_str()), (Some("b.nc"), Some("v.safetensors")));
 }
 
-/// A range has two ends: the one that was just set is to be blamed, whichever is reported.
+/// Of the two ends of a range, the error names the one just set.
 #[test]
 fn of_two_keys_at_fault_together_the_one_on_the_command_line_is_named() {
     let said = error(GYRE, &["domain.min=[3, 0, 0]"]);
@@ -148,13 +148,12 @@ fn an_old_key_is_refused_with_its_new_name() {
             let said = error(GYRE, &[&set]);
             assert!(said.starts_with("--set ") && said.ends_with(&words), "{said}");
         }
-        // The new one is a key: whatever is wrong with this value, it is not its name.
+        // The new name is accepted; only this value is wrong.
         let said = error(&with_fault(table, &format!("{} = {{ a = 1 }}", new.split_once('.').unwrap().1)).0, &[]);
         assert!(said.contains(&format!("`{new}` is ")) && said.contains("; accepted: "), "{said}");
     }
 }
 
-/// What a key of the wrong type is told.
 #[test]
 fn types_are_said_in_plain_words() {
     for (set, words) in [
@@ -177,7 +176,7 @@ fn types_are_said_in_plain_words() {
     assert!(error("[source]\nomega = 1\n", &[]).contains("`source.kind` is missing"));
 }
 
-/// A key that is read and does nothing is a mistake that nobody would notice.
+/// Otherwise nobody would notice the mistake.
 #[test]
 fn keys_that_do_nothing_are_refused_where_they_stand() {
     for (section, line, key) in [
@@ -212,14 +211,14 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
             .starts_with("--set flow.difference_step=1e-3: `flow.difference_step` does nothing here")
     );
     assert!(error(GYRE, &["time.seed_step=0", "time.slides=2"]).starts_with("--set time.slides=2: `time.seed_step` is 0"));
-    // An option that makes a part of the file idle is no fault of the file.
+    // An option that leaves a part of the file without effect is no fault of the file.
     let text = format!("{GYRE}[surrogate]\ntable_nodes = [8, 8, 8]\n");
     let parsed = |text: &str, set: &str| SceneFile::parse(Path::new("s"), text, &[set.to_owned()]);
     assert!(parsed(&text, "surrogate.kind=network").is_ok());
-    // One that gives a part of it work mends it.
+    // One that gives a part effect mends it.
     let text = format!("{GYRE}[surrogate]\nkind = \"table\"\n[training]\nsteps_per_frame = 9\n");
     assert!(parsed(&text, "surrogate.kind=residual").is_ok() && parsed(&text, "surrogate.table_nodes=[8, 8, 8]").is_err());
-    // The method is changed by an option.
+    // Options change the method.
     assert!(parsed(&format!("{GYRE}[network]\nwidth = 32\n"), "render.method=reference").is_ok());
     let files = "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[archive.synthetic]\nshape = \"flame\"\n";
     let said = error(files, &[]);
@@ -234,7 +233,7 @@ fn a_name_cut_short_is_recognised() {
 }
 
 #[test]
-fn a_live_run_neither_waits_for_the_disk_nor_fills_it_unless_told() {
+fn a_live_run_neither_waits_for_the_disk_nor_fills_it_by_default() {
     use crate::publish::WhenDiskSlow::{Drop, Wait};
     let told = |overrides: &[&str]| {
         let overrides: Vec<String> = overrides.iter().chain(&["time.tau=1"]).map(|s| (*s).to_owned()).collect();

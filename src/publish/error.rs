@@ -15,7 +15,7 @@ pub enum PublishError {
     Endpoint {
         /// As given.
         endpoint: String,
-        /// What is wrong with it.
+        /// Reason.
         problem: String,
     },
     /// Another program listens at the endpoint.

@@ -167,7 +167,7 @@ async fn pass(from: impl AsyncRead + Unpin, to: impl AsyncWrite + Unpin, has_sub
     Ok(())
 }
 
-/// Frames of a peer on their way to the socket.
+/// Stream of frames from a peer to the socket.
 struct Frames<R, W> {
     from: BufReader<R>,
     to: W,

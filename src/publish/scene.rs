@@ -25,9 +25,9 @@ pub fn refuse_foreign_scene(path: &Path) -> Result<(), PublishError> {
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
         Ok(false) => Err(PublishError::File {
             path: path.to_owned(),
-            problem: "no run wrote it, and the scene of this one goes there: choose another folder or name".to_owned(),
+            problem: "no run wrote it, so it is not replaced by the scene of this run: choose another folder or name".to_owned(),
         }),
-        Err(error) => Err(PublishError::File { path: path.to_owned(), problem: format!("what is there cannot be read: {error}") }),
+        Err(error) => Err(PublishError::File { path: path.to_owned(), problem: format!("cannot be read: {error}") }),
     }
 }
 
