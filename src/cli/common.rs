@@ -151,12 +151,15 @@ pub fn check_folder(out: &Path) -> Result<()> {
     Ok(())
 }
 
+/// Parses a word of a scene file.
+pub fn word<T: serde::de::DeserializeOwned>(word: &str, accepted: &str) -> Result<T, String> {
+    let word: serde::de::value::StrDeserializer<serde::de::value::Error> = serde::de::IntoDeserializer::into_deserializer(word);
+    T::deserialize(word).map_err(|_| format!("accepted: {accepted}"))
+}
+
 /// Parses a method.
-pub fn method(word: &str) -> Result<Method, String> {
-    use serde::Deserialize;
-    use serde::de::{IntoDeserializer, value::Error};
-    Method::deserialize(IntoDeserializer::<Error>::into_deserializer(word))
-        .map_err(|_| "accepted: reference, surrogate, neural, gated".to_owned())
+pub fn method(text: &str) -> Result<Method, String> {
+    word(text, "reference, surrogate, neural, gated")
 }
 
 /// Parses a number of threads.

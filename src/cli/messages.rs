@@ -41,7 +41,7 @@ pub fn note(text: impl std::fmt::Display) {
     let _ = writeln!(stderr(), "ridgewatch: {text}");
 }
 
-/// A progress bar over `length` steps (a spinner where unknown), drawn only when standard error is a terminal.
+/// A progress bar over `length` steps (a spinner if unknown), drawn only when standard error is a terminal.
 pub fn progress(length: Option<u64>) -> ProgressBar {
     let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let (bar, style) = match length {

@@ -1,6 +1,6 @@
 //! `ridgewatch synthesize`: archives of the standard turbulence.
 
-use super::common::{Common, Usage, dimensions, print_json, print_text};
+use super::common::{Common, Usage, dimensions, print_json, print_text, word};
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::source::{SyntheticSettings, SyntheticShape};
@@ -31,13 +31,8 @@ fn nodes(text: &str) -> Result<[usize; 3], String> {
     dimensions(text).and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "accepted: NXxNYxNZ".into())
 }
 
-fn shape(word: &str) -> Result<SyntheticShape, String> {
-    match word {
-        "ecmwf" => Ok(SyntheticShape::Ecmwf),
-        "globe" => Ok(SyntheticShape::Globe),
-        "flame" => Ok(SyntheticShape::Flame),
-        _ => Err("accepted: ecmwf, globe, flame".into()),
-    }
+fn shape(text: &str) -> Result<SyntheticShape, String> {
+    word(text, "ecmwf, globe, flame")
 }
 
 /// Writes.

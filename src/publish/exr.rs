@@ -163,7 +163,7 @@ mod tests {
         write_exr(&path, &film, Some(&FrameRecord { frame: 3, time: 1.5, ..Default::default() })).unwrap();
         let back = read_exr(&path).unwrap();
         assert_eq!((back.width, back.height, &back.rgba), (7, 3, &film.rgba));
-        // Through the bits, since NaN marks pixels without a collision.
+        // Compares bits, since NaN marks pixels without a collision.
         assert_eq!(bits(&back.ftle_mean), bits(&film.ftle_mean));
         assert_eq!((&back.traced, &back.variance, &back.samples), (&film.traced, &film.variance, &film.samples));
         assert_eq!((&back.missing, &back.queries), (&film.missing, &film.queries));

@@ -309,7 +309,7 @@ mod tests {
         let limit = Duration::from_millis(200);
         let run = RunFolder::create(folder.path(), false).unwrap();
         let writer = FileWriter::start_with_limit(run, PublishSettings::default(), limit).unwrap();
-        // Opening a pipe that nobody reads hangs like a disk that went away.
+        // Opening a pipe without a reader hangs like a lost disk.
         let pipe = folder.path().join("frames/.frame_000000.exr.part");
         assert!(std::process::Command::new("mkfifo").arg(pipe).status().unwrap().success());
         for n in 0..2 {

@@ -7,7 +7,6 @@ use super::settings::PublishSettings;
 use super::summary::{Summary, Totals, peak_memory_bytes};
 use super::zmq::Publisher;
 use crate::engine::Frame;
-use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 /// Longest wait at the end of a run for subscribers to receive the last frame.
@@ -16,7 +15,6 @@ const LINGER: Duration = Duration::from_millis(500);
 /// Writes frames to the run folder and to the socket, each at its own pace. Errors of either never reach the cycle.
 #[derive(Debug)]
 pub struct Output {
-    folder: Option<PathBuf>,
     files: Option<FileWriter>,
     publisher: Option<Publisher>,
     totals: Totals,
@@ -33,7 +31,7 @@ impl Output {
         settings.check()?;
         let publisher = settings.endpoint.as_deref().map(|endpoint| Publisher::start(endpoint, settings)).transpose()?;
         let (totals, frames, started) = (Totals::default(), 0, Instant::now());
-        let mut output = Self { folder: None, files: None, publisher, totals, frames, started };
+        let mut output = Self { files: None, publisher, totals, frames, started };
         folder.map_or(Ok(()), |folder| output.write_to(folder, settings))?;
         Ok(output)
     }
@@ -43,7 +41,6 @@ impl Output {
     /// # Errors
     /// A thread that cannot be started.
     pub fn write_to(&mut self, folder: RunFolder, settings: &PublishSettings) -> Result<(), PublishError> {
-        self.folder = Some(folder.path().to_owned());
         self.files = Some(FileWriter::start(folder, settings.clone())?);
         Ok(())
     }
@@ -51,11 +48,6 @@ impl Output {
     /// Endpoint of the socket, with the port that was bound. `None` without a socket.
     pub fn endpoint(&self) -> Option<&str> {
         self.publisher.as_ref().map(Publisher::endpoint)
-    }
-
-    /// The run folder. `None` without one.
-    pub fn folder(&self) -> Option<&Path> {
-        self.folder.as_deref()
     }
 
     /// Takes a frame; never fails. With `when_disk_slow = "wait"` it waits while four frames wait for the disk, a minute at most.

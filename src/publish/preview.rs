@@ -80,7 +80,7 @@ mod tests {
         let film = ramp(64, 32);
         let decoded = image::load_from_memory(&jpeg(&film, PLAIN).unwrap()).unwrap().to_rgb8().into_raw();
         let worst = decoded.iter().zip(film.tone_mapped(PLAIN)).map(|(a, b)| a.abs_diff(b)).max().unwrap();
-        // Quantisation at quality 88 moves a smooth ramp by a few levels of 255.
+        // Quantisation at quality 88 changes a smooth ramp by a few levels of 255.
         assert!(worst <= 12, "{worst}");
     }
 

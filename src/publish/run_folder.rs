@@ -432,7 +432,7 @@ mod tests {
         fs::remove_dir(&probe).unwrap();
         assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
         assert!(!folder.path().join(PREVIOUS).exists());
-        // Killed while it prepares: the earlier run is neither lost nor taken for nothing.
+        // Killed during its preparation: the earlier run is kept, and still occupies the folder.
         drop(RunFolder::create(folder.path(), true).unwrap());
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
         let mut second = RunFolder::create(folder.path(), true).unwrap();
@@ -490,7 +490,7 @@ mod tests {
         };
         assert_eq!((101..112).map(&mut appended).collect::<Vec<_>>(), [0, 0, 0, 0, 0, 3, 3, 3, 6, 6, 6]);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![106, 107, 108], vec![109, 110, 111]));
-        // A file that cannot be begun is a record lost, and told; nothing else is lost by it.
+        // A file that cannot be created loses one record, with an error, and nothing else.
         let (records, away) = (folder.path().join(RECORDS), folder.path().join("away"));
         fs::rename(folder.path().join(OLDER_RECORDS), &away).unwrap();
         fs::create_dir(folder.path().join(OLDER_RECORDS)).unwrap();
@@ -499,7 +499,7 @@ mod tests {
         run.append_record(&frame(113).record, cap).unwrap();
         assert_eq!(run.records_removed(), 9);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![109, 110, 111], vec![113]));
-        // Both are of the run: no other takes the folder, one that takes its place takes theirs.
+        // Both files belong to the run: another run is refused, and one with `overwrite` replaces both.
         fs::remove_file(&records).unwrap();
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
         drop(RunFolder::create(folder.path(), true).unwrap());
@@ -586,7 +586,7 @@ mod tests {
     fn a_failed_picture_leaves_nothing_under_its_name() {
         let folder = tempfile::tempdir().unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
-        // The PNG cannot take its place, since a folder is there: the EXR written before it must go again.
+        // A folder has the name of the PNG: the EXR written before it must be removed.
         fs::create_dir_all(folder.path().join("frames/frame_000000.png/x")).unwrap();
         assert!(run.write_pictures(&frame(0), &PublishSettings::default()).is_err());
         assert_eq!(names(folder.path()), ["frame_000000.png"]);

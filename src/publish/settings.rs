@@ -20,18 +20,6 @@ pub enum Payload {
     Raw,
 }
 
-impl Payload {
-    /// Name in the header's `encoding`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Payload::Jpeg => "jpeg",
-            Payload::Png => "png",
-            Payload::Exr => "exr",
-            Payload::Raw => "raw",
-        }
-    }
-}
-
 /// Frames whose EXR is written to the run folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]

@@ -141,10 +141,7 @@ impl FileStatistics {
 
 /// Largest resident memory of this process so far, in bytes: VmHWM of `/proc/self/status`. `None` if the file does not exist.
 pub fn peak_memory_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
-    let kibibytes: u64 = line.split_whitespace().next()?.parse().ok()?;
-    Some(kibibytes * 1024)
+    procfs::process::Process::myself().and_then(|process| process.status()).ok()?.vmhwm.map(|kibibytes| kibibytes * 1024)
 }
 
 #[cfg(test)]

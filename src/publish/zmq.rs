@@ -56,7 +56,7 @@ impl Publisher {
         let listener = bind(endpoint)?;
         let refuse = |source| PublishError::Bind { endpoint: endpoint.to_owned(), source };
         let resolved = format!("tcp://{}", listener.local_addr().map_err(refuse)?);
-        // In another thread, since the caller may be inside a runtime, which forbids to drive or drop one.
+        // In another thread, since a runtime cannot be driven or dropped inside another one.
         let first = std::thread::scope(|scope| scope.spawn(|| SocketInstance::open(&listener, 0)).join())
             .unwrap_or_else(|_| Err(std::io::Error::other("the socket could not be created")))
             .map_err(refuse)?;
@@ -244,7 +244,7 @@ impl Worker {
             if now >= until {
                 return Step::Update;
             }
-            // A millisecond more than needed, so that the deadline has passed on waking.
+            // A millisecond longer, so that the deadline has passed on waking.
             state = self.mailbox.wait(state, wake.saturating_duration_since(now) + Duration::from_millis(1));
         }
     }
