@@ -237,7 +237,7 @@ pub fn line(record: &FrameRecord) -> String {
     };
     text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries - record.missing);
     if record.missing > 0 {
-        text += &format!(", {} more at missing cells", record.missing);
+        text += &format!(", {} more on land", record.missing);
     }
     if record.audited > 0 && record.mean_lifetime_share < 0.9995 {
         text += &format!(", particles live {:.1} % of tau", 100.0 * record.mean_lifetime_share);
