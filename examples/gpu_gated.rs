@@ -104,7 +104,7 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
         format!("{} frames, median {:.1} ms, longest {:.1} ms", some.len(), some[some.len() / 2], some[some.len() - 1])
     };
     let ended: Vec<&CheckpointRecord> = records.iter().filter_map(|r| r.checkpoint.as_ref()).filter(|c| c.bytes.is_some()).collect();
-    let waited_for = ended.iter().filter(|c| !c.behind).count();
+    let waited_for = ended.iter().filter(|c| !c.asynchronous).count();
     let most = |value: fn(&CheckpointRecord) -> f64| ended.iter().map(|c| value(c)).fold(0.0, f64::max);
     format!(
         "{} checkpoints of {:.0} MB, {waited_for} of them waited for, {} postponed: the loop stood still for {:.1} ms at most, written after {:.2} s at most; with one under way: {}; others: {}",
@@ -194,7 +194,7 @@ fn main() {
         truth.seed,
         frame.seconds.total,
         frame.queries,
-        1e-6 * (frame.traced + frame.traced_ahead) as f64 / frame.seconds.trace
+        1e-6 * (frame.traced + frame.speculative_traces) as f64 / frame.seconds.trace
     );
 
     let begin = |block: &str, after: &str| {
@@ -233,7 +233,7 @@ fn main() {
         let (sum, records) = pictures(&scene, &device);
         let psnr = compare_films(&sum, &reference, scene.render.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
         let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
-        let over = records.iter().filter(|r| r.over_tolerance.is_some()).count();
+        let over = records.iter().filter(|r| r.tolerance_excess.is_some()).count();
         // Adding the pictures up is the measurement's time, not the loop's.
         let seconds: f64 = records.iter().map(|r| r.seconds.total).sum();
         println!(
@@ -250,12 +250,12 @@ fn main() {
             median(&records, |r| r.training.as_ref().map_or(0.0, |learned| learned.steps as f64)),
             median(&records, |r| r.queries as f64),
             100.0 * median(&records, |r| r.traced_share),
-            100.0 * median(&records, |r| r.trusted_share),
-            median(&records, |r| r.trusted.map_or(0.0, |e| e.optical_rms)),
+            100.0 * median(&records, |r| r.trusted_volume),
+            median(&records, |r| r.trusted_error.map_or(0.0, |e| e.optical_rms)),
             median(&records, |r| r.surrogate_psnr.unwrap_or(f64::INFINITY))
         );
         for record in &records {
-            assert!(record.device.starts_with("cuda") && record.traced_ahead > 0, "{:?}", record.warnings);
+            assert!(record.device.starts_with("cuda") && record.speculative_traces > 0, "{:?}", record.warnings);
             assert!(!is_network || record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
         }
     }

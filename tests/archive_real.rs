@@ -39,7 +39,7 @@ fn replay(files: &Path, tau: f64) -> Film {
     let records = std::fs::read_to_string(out.join("records.jsonl")).unwrap();
     let records: Vec<FrameRecord> = records.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let last = &records[7];
-    assert!(last.over_tolerance.is_none() && last.traced_share < 1.0 && last.trusted.is_some(), "{last:?}");
+    assert!(last.tolerance_excess.is_none() && last.traced_share < 1.0 && last.trusted_error.is_some(), "{last:?}");
     let frame = out.join("frames/frame_000007");
     assert_eq!(image::image_dimensions(frame.with_extension("png")).unwrap(), (128, 64));
     read_exr(&frame.with_extension("exr")).unwrap()

@@ -68,7 +68,7 @@ fn an_archive_with_land_goes_through_the_whole_loop() {
         assert_eq!((record.direction.as_str(), record.tau), ("backward", 6.0 * 86_400.0));
         let missing = record.missing as f64 / record.queries as f64;
         assert!(missing > 0.0 && missing < 0.5, "land is a part of the domain: {missing}");
-        assert!(record.lived_share < 1.0, "some particles met land");
+        assert!(record.mean_lifetime_share < 1.0, "some particles met land");
         assert!(record.integration_steps.is_some() && record.traced <= record.queries - record.missing);
     }
     let summary: serde_json::Value = serde_json::from_slice(&std::fs::read(run.join("summary.json")).unwrap()).unwrap();

@@ -80,7 +80,7 @@ fn a_checkpoint_holds_the_weights_after_its_frame() {
                 shown = std::fs::metadata(file("weights")).ok().map(|metadata| metadata.ino());
             }
         }
-        assert_eq!((&checkpoint.failed, checkpoint.behind), (&None, true));
+        assert_eq!((&checkpoint.failed, checkpoint.asynchronous), (&None, true));
         if let Some(bytes) = checkpoint.bytes {
             let frame = checkpoint.frame.unwrap();
             // The next one begins after this.

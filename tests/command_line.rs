@@ -35,7 +35,7 @@ fn refused(arguments: &[&str], status: i32, parts: &[&str]) {
 fn small_scene(folder: &Path, more: &str) -> String {
     let path = folder.join("scene.toml");
     let text = format!(
-        "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 2\nstep = 0.1\nslides = 2\n\
+        "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 2\nseed_step = 0.1\nslides = 2\n\
          [flow]\nsteps = 20\n[render]\nwidth = 32\nheight = 16\nsamples = 2\n[training]\nsteps_per_frame = 20\n[surrogate]\nkind = \"network\"\n{more}"
     );
     std::fs::write(&path, text).unwrap();
@@ -46,6 +46,7 @@ fn small_scene(folder: &Path, more: &str) -> String {
 fn bad_usage_is_status_2() {
     refused(&["replay"], 2, &["CONFIG | FILES"]);
     refused(&["dance"], 2, &["dance"]);
+    refused(&["attach", "--exit-at-end"], 2, &["`--exit-at-end` has a new name; accepted: `--exit-at-end`"]);
     refused(&["replay", &config("saddle.toml"), "--threads", "99999999999"], 2, &["--threads", "0 to 1024"]);
     for rate in ["1e-300", "0", "-1", "nan", "inf"] {
         refused(&["publish", &config("turbulence_easy.toml"), &format!("--rate={rate}")], 2, &["--rate", "from 0.000001"]);
@@ -104,8 +105,8 @@ fn settings_that_only_the_data_show_to_be_wrong_are_status_2_and_point_at_the_li
         2,
         &["scene.toml:", "`transfer.extinction`", "| extinction = 1e6"],
     );
-    let gap = ["--set", "flow.integrator=differences", "--set", "flow.gap=1e-9"];
-    refused(&[&["ftle", &scene("")][..], &gap].concat(), 2, &["--set flow.gap=1e-9", "`flow.gap`", "at least"]);
+    let gap = ["--set", "flow.integrator=differences", "--set", "flow.difference_step=1e-9"];
+    refused(&[&["ftle", &scene("")][..], &gap].concat(), 2, &["--set flow.difference_step=1e-9", "`flow.difference_step`", "at least"]);
     refused(&["replay", &scene("[publish]\nendpoint = \"udp://x\"\n")], 2, &["scene.toml:", "`publish.endpoint`", "tcp://HOST:PORT"]);
     refused(&["replay", &scene(""), "--publish", "udp://x"], 2, &["--publish udp://x", "`publish.endpoint`"]);
     refused(&["render", &scene(""), "--spp", "0"], 2, &["--spp 0", "`render.samples`"]);
@@ -171,7 +172,7 @@ fn a_replay_leaves_a_complete_folder_and_refuses_to_mix_runs() {
     for record in &records {
         let number = |key: &str| record[key].as_f64().unwrap();
         assert!((number("traced_share") - number("traced") / number("queries")).abs() < 1e-12);
-        assert!(number("trusted_share") < 1.0, "an untrained network is not trusted everywhere: {record}");
+        assert!(number("trusted_volume") < 1.0, "an untrained network is not trusted everywhere: {record}");
     }
     assert!(records.iter().all(|r| r["queries"].as_u64() > Some(0)));
     for name in ["frame_000000.exr", "frame_000001.exr", "frame_000000.png", "frame_000001.png"] {

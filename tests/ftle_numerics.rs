@@ -524,7 +524,7 @@ fn what_has_no_meaning_is_refused() {
     assert!(matches!(refused(&window, backward.clone(), 1.0), FlowError::WindowTooShort { .. }));
     assert!(cpu_tracer(window.clone(), &backward, 4.0).is_ok());
     let gap = |gap| FlowMap { integrator: Integrator::Differences, gap, boundary: Boundary::Stop, ..short.clone() };
-    assert!(matches!(refused(&window, gap(0.0), 0.0), FlowError::OutOfRange { key: "gap", .. }));
+    assert!(matches!(refused(&window, gap(0.0), 0.0), FlowError::OutOfRange { key: "difference_step", .. }));
     assert!(matches!(refused(&window, gap(1e-8), 0.0), FlowError::GapVanishes { .. }));
     assert!(cpu_tracer(window.clone(), &FlowMap { precision: Precision::F64, ..gap(1e-8) }, 0.0).is_ok());
     let gyre_map = |map: FlowMap| refused(&double_gyre().0, map, 0.0);

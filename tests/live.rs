@@ -135,7 +135,7 @@ fn attached(place: &Place, name: &str, blocks: &str) -> (Vec<serde_json::Value>,
     let run = place.files.join(name);
     let ring = text(&place.ring);
     let live = place.live();
-    let attach = start(&mut ridgewatch(&["attach", text(&live), ring, "--once", "--set", "live.follow=every", "--out", text(&run)]));
+    let attach = start(&mut ridgewatch(&["attach", text(&live), ring, "--exit-at-end", "--set", "live.follow=every", "--out", text(&run)]));
     until("the ring's folder", || place.ring.join("followers.lock").exists());
     let publish = ridgewatch(&["publish", text(&place.archive()), "--ring", ring, "--wait", "60000", "--blocks", blocks]).output().unwrap();
     good(&publish);
@@ -207,7 +207,7 @@ fn frames_resume_when_the_simulation_comes_back_in_other_blocks() {
         if relayed {
             until("the connection file", || connection.exists());
         }
-        let incomplete = ["--set", "live.incomplete_seconds=0.5"];
+        let incomplete = ["--set", "live.block_timeout_seconds=0.5"];
         let _sidecar = start(ridgewatch(&["attach", text(&live), way, "--out", text(&run)]).args(incomplete));
         for (restarts, blocks) in ["2x2x1", "1x2x1", "1x1x1"].into_iter().enumerate() {
             let publish = ["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000", "--blocks", blocks];
@@ -394,7 +394,7 @@ fn every_step_is_taken_through_a_relay() {
     let (archive, live) = (place.archive(), place.live());
     let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)]));
     until("the connection file", || connection.exists());
-    let every = ["--once", "--set", "live.follow=every"];
+    let every = ["--exit-at-end", "--set", "live.follow=every"];
     let attach = start(ridgewatch(&["attach", text(&live), text(&connection), "--out", text(&run)]).args(every));
     good(&ridgewatch(&["publish", text(&archive), "--ring", &ring, "--wait", "60000", "--blocks", "2x1x1"]).output().unwrap());
     good(&wait(attach));
@@ -413,7 +413,7 @@ fn a_run_that_ends_with_its_simulation_ends_with_its_relay_too() {
     let (archive, live) = (place.archive(), place.live());
     let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)]));
     until("the connection file", || connection.exists());
-    let once = ["--once", "--set", "live.relay_seconds=1"];
+    let once = ["--exit-at-end", "--set", "live.relay_timeout_seconds=1"];
     let attach = start(ridgewatch(&["attach", text(&live), text(&connection), "--out", text(&run)]).args(once));
     let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
     until("the first frame", || !records(&run).is_empty());
@@ -452,7 +452,7 @@ fn a_frame_goes_out_before_the_rest_of_its_training() {
     let scene = ["live.follow=every", "training.seconds_per_frame=600", "network.batch=1024", "surrogate.kind=network"];
     let overrides = scene.iter().flat_map(|one| ["--set", one]);
     // What is trained until the next step is there hangs on the cores it gets.
-    let attach = ["attach", text(&live), ring, "--once", "--method", "gated", "--out", text(&run), "--nice", "0"];
+    let attach = ["attach", text(&live), ring, "--exit-at-end", "--method", "gated", "--out", text(&run), "--nice", "0"];
     let attach = start(ridgewatch(&attach).args(overrides));
     until("the ring's folder", || place.ring.join("followers.lock").exists());
     good(&ridgewatch(&["publish", text(&archive), "--ring", ring, "--wait", "60000"]).output().unwrap());

@@ -451,7 +451,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.1
+seed_step = 0.1
 slides = 2
 frames_per_slide = 2
 [flow]
@@ -656,7 +656,7 @@ fn checkpoints_while_a_device_trains() {
     let found = run(&slow, Some(0.0), Some(8));
     assert!(found.films == expected.films && tensors() == last, "checkpoints change nothing");
     let under_way: Vec<_> = found.records.iter().filter_map(|record| record.checkpoint.as_ref()).filter(|c| c.frame > Some(0)).collect();
-    assert!(under_way.len() >= 3 && under_way.iter().all(|checkpoint| checkpoint.behind), "{under_way:?}");
+    assert!(under_way.len() >= 3 && under_way.iter().all(|checkpoint| checkpoint.asynchronous), "{under_way:?}");
     assert!(under_way.iter().any(|checkpoint| checkpoint.postponed >= 1), "one at a time: {under_way:?}");
 
     let full = Line::new(usize::MAX, How::Fault);

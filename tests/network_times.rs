@@ -125,7 +125,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 1
+seed_step = 1
 slides = 4
 frames_per_slide = 3
 [flow]
@@ -142,28 +142,28 @@ fn labels_outlive_a_slide_where_the_start_is_an_input() {
     for first in [3, 6, 9] {
         assert_eq!((with[first].slide, with[first - 1].slide), (first as u64 / 3, first as u64 / 3 - 1));
         assert!(
-            with[first].sample_ring > with[first - 1].sample_ring,
+            with[first].replay_samples > with[first - 1].replay_samples,
             "frame {first}: {} samples, then {}",
-            with[first - 1].sample_ring,
-            with[first].sample_ring
+            with[first - 1].replay_samples,
+            with[first].replay_samples
         );
         assert!(
-            without[first].sample_ring < without[first - 1].sample_ring,
+            without[first].replay_samples < without[first - 1].replay_samples,
             "frame {first}: {} samples, then {}",
-            without[first - 1].sample_ring,
-            without[first].sample_ring
+            without[first - 1].replay_samples,
+            without[first].replay_samples
         );
-        assert!(with[first].trusted_share <= with[first - 1].trusted_share, "frame {first} is not trusted more for the slide");
+        assert!(with[first].trusted_volume <= with[first - 1].trusted_volume, "frame {first} is not trusted more for the slide");
     }
     assert!(with.iter().chain(&without).all(|record| record.warnings.is_empty()));
     // Outside the scene's range of starts, labels are dropped as without the input, with a warning in the record.
     let past = run(&["network.inputs=[\"start\"]", "network.start_range=[0, 2]"]);
     let warns = |record: &FrameRecord| record.warnings.iter().any(|w| w.contains("start time 3 lies beyond network.start_range, 0 to 2"));
-    assert!(past[6].sample_ring > past[5].sample_ring && past[9].sample_ring < past[8].sample_ring);
+    assert!(past[6].replay_samples > past[5].replay_samples && past[9].replay_samples < past[8].replay_samples);
     assert!(warns(&past[9]) && past.iter().filter(|record| warns(record)).count() == 1);
     // The same holds for the first window: its labels are not those at the beginning of the range.
     let before = run(&["network.inputs=[\"start\"]", "network.start_range=[0.5, 3]"]);
-    assert!(before[3].sample_ring < before[2].sample_ring && before[6].sample_ring > before[5].sample_ring);
+    assert!(before[3].replay_samples < before[2].replay_samples && before[6].replay_samples > before[5].replay_samples);
     assert!(before[0].warnings.iter().any(|w| w.contains("start time 0 lies beyond network.start_range, 0.5 to 3")));
 }
 

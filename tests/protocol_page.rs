@@ -28,7 +28,7 @@ fn quoted(text: &str, column: bool) -> BTreeSet<String> {
 fn the_page_names_every_key_of_a_record_and_no_other() {
     let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/protocol.md")).unwrap();
     let record = page.split("## The record").nth(1).unwrap().split("\n## ").next().unwrap();
-    let (fields, rest) = record.split_once("`trusted` and `verified`:").unwrap();
+    let (fields, rest) = record.split_once("`trusted_error` and `verified_error`:").unwrap();
     let (fields, live) = fields.split_once("`live`, of a simulation that runs now").unwrap();
     assert_eq!(quoted(fields, true), keys(&FrameRecord::default()));
     assert_eq!(quoted(live, true), keys(&LiveRecord::default()));

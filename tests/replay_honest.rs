@@ -14,7 +14,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.1
+seed_step = 0.1
 slides = 4
 frames_per_slide = 5
 [flow]
@@ -49,7 +49,7 @@ fn records(options: &[&str]) -> Vec<FrameRecord> {
 #[test]
 fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
     let records = records(&["--verify", "100000"]);
-    let pairs: Vec<_> = records.iter().filter_map(|r| Some((r.trusted?, r.verified?))).collect();
+    let pairs: Vec<_> = records.iter().filter_map(|r| Some((r.trusted_error?, r.verified_error?))).collect();
     assert!(pairs.len() >= 20, "{} of {} frames state an error", pairs.len(), records.len());
     // The bounds are those of the promise: 20 % in root mean square over frames, and the interval holds in 90 % of the frames.
     let relative = |(stated, verified): &(ridgewatch::trust::TrustedError, _)| -> f64 {
@@ -75,8 +75,8 @@ fn a_run_knows_its_error_and_loses_and_regains_trust_on_a_slide() {
     for slide in 1..4 {
         let before = of_slide(slide - 1).next_back().unwrap();
         let (first, last) = (of_slide(slide).next().unwrap(), of_slide(slide).next_back().unwrap());
-        assert!(first.trusted_share < before.trusted_share, "slide {slide} costs trust");
-        assert!(last.trusted_share > first.trusted_share, "slide {slide}: trust is earned again");
+        assert!(first.trusted_volume < before.trusted_volume, "slide {slide} costs trust");
+        assert!(last.trusted_volume > first.trusted_volume, "slide {slide}: trust is earned again");
     }
     // The traced share follows.
     let share = |record: Option<&FrameRecord>| record.unwrap().traced_share;
@@ -95,9 +95,9 @@ fn a_spent_tracing_budget_is_said_and_flagged() {
     for record in &records {
         let said = record.warnings.iter().any(|w| w.contains("the tracing budget was spent"));
         assert_eq!(said, record.over_budget > 0, "frame {}: {:?}", record.frame, record.warnings);
-        assert!(record.over_budget == 0 || record.over_tolerance.is_some(), "frame {} is flagged", record.frame);
+        assert!(record.over_budget == 0 || record.tolerance_excess.is_some(), "frame {} is flagged", record.frame);
         assert!(record.traced + record.over_budget <= record.queries);
     }
     // Untrained, the network is far off where it is not trusted, and the frame says by how much.
-    assert!(spent[0].over_tolerance.unwrap() > 0.0, "{:?}", spent[0].over_tolerance);
+    assert!(spent[0].tolerance_excess.unwrap() > 0.0, "{:?}", spent[0].tolerance_excess);
 }

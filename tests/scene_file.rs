@@ -8,7 +8,7 @@ use ridgewatch::render::Method;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-const SMALL: &str = "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 2\nstep = 0.1\nslides = 2\n\
+const SMALL: &str = "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 0.2]\n[time]\ntau = 2\nseed_step = 0.1\nslides = 2\n\
                      [flow]\nsteps = 20\n[surrogate]\ntable_nodes = [33, 17, 2]\n[network]\nlevels = 4\nlog2_table = 12\nwidth = 16\nbatch = 512\n\
                      [training]\nseconds_per_frame = 0.1\n[render]\nwidth = 32\nheight = 16\nsamples = 2\n[publish]\nexr = \"every\"\n";
 
@@ -65,7 +65,13 @@ fn every_scene_reads_back_as_it_is() {
             "light.radiance=[1, 1, 1]",
             "light.position=[1, 1, 9]",
         ],
-        &["flow.integrator=differences", "flow.gap=1e-3", "flow.boundary=clamp", "seed=9223372036854775807", "title=\"two\\nlines\""],
+        &[
+            "flow.integrator=differences",
+            "flow.difference_step=1e-3",
+            "flow.boundary=clamp",
+            "seed=9223372036854775807",
+            "title=\"two\\nlines\"",
+        ],
         &["device.storage=f16_pairs", "device.memory_mib=9", "device.when_lost=stop", "render.tone_map=[1.1, 1e-300, 0.1]"],
     ] {
         let source = "[source]\nkind = \"double_gyre\"\n[domain]\nmin = [0, 0, 0]\nmax = [2, 1, 1]\n[time]\ntau = 0.1\n[light]\nradiance = [1, 1, 1]\n";

@@ -2,7 +2,7 @@
 
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::config::SceneFile;
+use ridgewatch::config::{RENAMED, SceneFile};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -36,11 +36,17 @@ fn back_quoted(cell: &str) -> Option<&str> {
     cell.split('`').nth(1)
 }
 
+/// The page up to its table of renamed keys, and that table.
+fn text() -> (String, String) {
+    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/scene.md")).unwrap();
+    let (keys, renamed) = text.split_once("\n## Renamed keys\n").unwrap();
+    (keys.to_owned(), renamed.to_owned())
+}
+
 /// Dotted keys of the page's tables with the cell of their default.
 fn page() -> BTreeMap<String, String> {
-    let text = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/scene.md")).unwrap();
     let (mut table, mut found) = (String::new(), BTreeMap::new());
-    for line in text.lines() {
+    for line in text().0.lines() {
         if line.starts_with('#') {
             table = back_quoted(line).unwrap_or_default().trim_matches(['[', ']']).to_owned();
         } else if line.starts_with("| `") {
@@ -53,6 +59,18 @@ fn page() -> BTreeMap<String, String> {
         }
     }
     found
+}
+
+#[test]
+fn the_page_names_every_renamed_key() {
+    let table = text().1;
+    let rows: Vec<(&str, &str)> = table
+        .lines()
+        .filter(|line| line.starts_with("| `"))
+        .map(|line| line.split('|').collect())
+        .map(|cells: Vec<&str>| (back_quoted(cells[1]).unwrap(), back_quoted(cells[2]).unwrap()))
+        .collect();
+    assert_eq!(rows, RENAMED);
 }
 
 #[test]

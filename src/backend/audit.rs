@@ -54,7 +54,7 @@ pub struct Audit {
     /// Points drawn, voids included.
     pub drawn: usize,
     /// Mean lived share over points that are not void.
-    pub lived_share: f64,
+    pub mean_lifetime_share: f64,
 }
 
 /// Traces `unit` points; samples come with `extras`.
@@ -90,8 +90,8 @@ pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Au
         samples.jacobian.append(&mut part.jacobian);
         lived += part_lived;
     }
-    let lived_share = lived / samples.len().max(1) as f64;
-    Ok(Audit { samples, numbers, drawn: points.len(), lived_share })
+    let mean_lifetime_share = lived / samples.len().max(1) as f64;
+    Ok(Audit { samples, numbers, drawn: points.len(), mean_lifetime_share })
 }
 
 /// Residuals of `surrogate` on traced samples that it has not seen, NaN where the trace gave no number. `tau` turns log-stretch into FTLE
@@ -151,7 +151,7 @@ pub struct AuditFindings {
     /// Of them, those that do not lie on land.
     pub points: usize,
     /// Mean lived share over these.
-    pub lived_share: f64,
+    pub mean_lifetime_share: f64,
     /// Largest finite log-stretch; minus infinity where there is none.
     pub peak: f32,
     /// These points, where they were asked for.
@@ -166,7 +166,7 @@ pub struct AuditFindings {
 /// A device fails.
 pub fn audit(request: &AuditRequest<'_>, tracer: &dyn Trace, surrogate: Option<&dyn Predict>) -> Result<AuditFindings, DeviceError> {
     let unit = stratified_points(&request.strata, request.seed, request.stream);
-    let Audit { samples, numbers, drawn, lived_share } = trace(tracer, &unit, request.samples.unwrap_or_default())?;
+    let Audit { samples, numbers, drawn, mean_lifetime_share } = trace(tracer, &unit, request.samples.unwrap_or_default())?;
     let in_order = |surrogate: &dyn Predict| -> Result<Audited, DeviceError> {
         let mut in_order = vec![(f32::NAN, f32::NAN); drawn];
         let residuals = residuals(surrogate, &samples, request.transfer, tracer.flow().tau())?;
@@ -178,7 +178,7 @@ pub fn audit(request: &AuditRequest<'_>, tracer: &dyn Trace, surrogate: Option<&
     Ok(AuditFindings {
         drawn,
         points: samples.len(),
-        lived_share,
+        mean_lifetime_share,
         peak: samples.log_stretch.iter().copied().filter(|s| s.is_finite()).fold(f32::NEG_INFINITY, f32::max),
         errors: surrogate.map(in_order).transpose()?,
         samples: if request.samples.is_some() { samples } else { Samples::default() },

@@ -118,7 +118,7 @@ pub struct DeviceSettings {
     /// work is no failure: the CPU does what wanted it, with a warning. Only a window that no longer fits is one.
     pub when_lost: WhenLost,
     /// Lowest stream priority, for life beside a solver.
-    pub polite: bool,
+    pub low_priority: bool,
 }
 
 impl DeviceSettings {
@@ -178,7 +178,7 @@ impl Device {
             DeviceChoice::Cuda(n) => n,
         };
         let memory_cap = settings.memory_mib.map(|mib| mib << 20);
-        match Gpu::open(ordinal, &GpuSettings { memory_cap, cache: None, polite: settings.polite, poison: false }) {
+        match Gpu::open(ordinal, &GpuSettings { memory_cap, cache: None, low_priority: settings.low_priority, poison: false }) {
             Ok(gpu) => {
                 let may_fall_back = choice == DeviceChoice::Auto;
                 Ok(Self::Cuda(CudaDevice { gpu, storage: settings.storage, when_lost: settings.when_lost, may_fall_back }))

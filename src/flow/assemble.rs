@@ -68,7 +68,7 @@ impl<'a> Assembly<'a> {
             VelocitySource::Window(window) => covering(window, t0.min(to), t0.max(to))?,
         };
         if map.integrator == Integrator::Differences {
-            positive("gap", map.gap)?;
+            positive("difference_step", map.gap)?;
             if map.precision == Precision::F32 {
                 let used = 0..domain.dimensions;
                 let coordinate = used.flat_map(|k| [domain.min[k].abs(), domain.max[k].abs()]).fold(0.0, f64::max);

@@ -113,7 +113,7 @@ impl FlowError {
                 Refused::new("flow.boundary", format_args!("is {}", shown(boundary)), "stop, clamp, periodic or zero on gridded velocity")
             }
             FlowError::GapVanishes { gap, precision, coordinate, least } => Refused::new(
-                "flow.gap",
+                "flow.difference_step",
                 format_args!("is {gap}, which vanishes in {} beside coordinates of {coordinate}", word(precision)),
                 format!("at least {least}, or flow.precision = \"f64\""),
             )

@@ -60,7 +60,7 @@ pub struct FlowSettings {
     /// converges slowly. What was reached is in the summary.
     pub tolerance: Option<f64>,
     /// Distance of difference particles, in coordinate units.
-    pub gap: f64,
+    pub difference_step: f64,
     /// Edge policy; none: `unbounded` for closed forms, `stop` for archives, `clamp` for the synthetic turbulence.
     pub boundary: Option<Boundary>,
     /// Divisor for particles that stopped early.
@@ -76,7 +76,7 @@ impl Default for FlowSettings {
             precision: Precision::F32,
             steps: StepsSetting::Auto,
             tolerance: None,
-            gap: 1e-4,
+            difference_step: 1e-4,
             boundary: None,
             normalisation: Normalisation::Tau,
             interpolation: None,
@@ -94,7 +94,7 @@ impl FlowSettings {
         if let Some(tolerance) = flow.tolerance {
             positive("flow.tolerance", tolerance)?;
         }
-        positive("flow.gap", flow.gap)?;
+        positive("flow.difference_step", flow.difference_step)?;
         if gridded && flow.boundary == Some(Boundary::Unbounded) {
             refuse("flow.boundary", "is \"unbounded\"", "stop, clamp, periodic or zero: gridded velocity ends at its grid")?;
         }

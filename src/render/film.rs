@@ -20,7 +20,7 @@ pub struct Film {
     /// Samples in the pixel.
     pub samples: Vec<f32>,
     /// Share of paths that left without scattering and saw missing values (land) at a point drawn uniformly along their way through
-    /// the box. Their colour is `render.missing`; for a map seen from above it is 1 on land and 0 elsewhere.
+    /// the box. Their colour is `render.missing_color`; for a map seen from above it is 1 on land and 0 elsewhere.
     pub missing: Vec<f32>,
     /// Log-stretch queries made for the pixel.
     pub queries: Vec<f32>,

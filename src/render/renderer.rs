@@ -174,7 +174,7 @@ impl Renderer {
     pub fn set_up(&mut self, frame: u64, samples: Range<u32>) -> Result<FrameSetup<'_>, RenderError> {
         self.begin(frame, &samples)?;
         let settings = &self.scene.settings;
-        let colours = [settings.background, settings.missing].map(|colour| colour.map(|c| c as f32));
+        let colours = [settings.background, settings.missing_color].map(|colour| colour.map(|c| c as f32));
         Ok(FrameSetup {
             parameters: FrameParameters::new(
                 &self.camera,
@@ -219,7 +219,7 @@ impl Renderer {
             width: settings.width,
             height: settings.height,
             background: settings.background.map(|c| c as f32),
-            missing: settings.missing.map(|c| c as f32),
+            missing: settings.missing_color.map(|c| c as f32),
             per_tau: self.per_tau,
         };
         let mut film = Film::new(settings.width, settings.height);

@@ -111,7 +111,7 @@ pub struct RenderSettings {
     /// Background colour, linear.
     pub background: [f64; 3],
     /// Colour, linear, of camera paths that leave and saw missing values: land, as opposed to background.
-    pub missing: [f64; 3],
+    pub missing_color: [f64; 3],
     /// Majorant cells along x, y, z; None: chosen from the domain.
     pub majorant_cells: Option<[usize; 3]>,
     /// Tone map: `((c - 0.5) * contrast + brightness)^(1/gamma)`: `[contrast, brightness, gamma]`.
@@ -126,7 +126,7 @@ impl Default for RenderSettings {
             height: 160,
             samples: 8,
             background: [1.0; 3],
-            missing: [0.3; 3],
+            missing_color: [0.3; 3],
             majorant_cells: None,
             tone_map: [1.85, 0.75, 1.4],
         }
@@ -150,7 +150,7 @@ impl RenderSettings {
         require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
-        require(colour(settings.missing), "render.missing", settings.missing, "three finite numbers, 0 or above")?;
+        require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;
         let [contrast, brightness, gamma] = settings.tone_map;
         let tone_map = "[contrast, brightness, gamma]: finite numbers, gamma above 0";
         require(contrast.is_finite() && brightness.is_finite(), "render.tone_map", settings.tone_map, tone_map)?;

@@ -15,8 +15,8 @@ use std::sync::atomic::Ordering;
 /// The error of a frame's surrogate, before it counts.
 pub(super) struct Assessment {
     trusted: Option<TrustedError>,
-    trusted_share: f64,
-    over_tolerance: Option<f64>,
+    trusted_volume: f64,
+    tolerance_excess: Option<f64>,
     /// Queries of untrusted cells that the surrogate answered.
     over_budget: u64,
     /// Residuals of the rendered samples.
@@ -38,8 +38,8 @@ pub(super) fn assess<S: FrameSamples>(
     let (transfer, tau) = (run.renderer.transfer(), tracer.flow().tau());
     Ok(Some(Assessment {
         trusted,
-        trusted_share: gate.share(),
-        over_tolerance: over_tolerance(tally, trusted, audited, gate, run.plan.scene.trust.tolerance),
+        trusted_volume: gate.share(),
+        tolerance_excess: tolerance_excess(tally, trusted, audited, gate, run.plan.scene.trust.tolerance),
         over_budget: tally.over_budget,
         rendered: run.threads.render().install(|| residuals(frozen, &some, transfer, tau))?,
     }))
@@ -56,10 +56,10 @@ impl Run<'_> {
         record: &mut FrameRecord,
     ) {
         let Some(audited) = &findings.errors else { return };
-        let Assessment { trusted, trusted_share, over_tolerance, over_budget, rendered } = assessment;
+        let Assessment { trusted, trusted_volume, tolerance_excess, over_budget, rendered } = assessment;
         let learning = &mut self.learning;
         learning.peak = learning.peak.max(findings.peak);
-        (record.trusted, record.trusted_share, record.over_tolerance) = (trusted, trusted_share, over_tolerance);
+        (record.trusted_error, record.trusted_volume, record.tolerance_excess) = (trusted, trusted_volume, tolerance_excess);
         record.surrogate_psnr = audit::psnr(audited, learning.peak);
         if over_budget > 0 {
             record
@@ -99,7 +99,7 @@ impl Run<'_> {
 
 /// By how much the optical residual of a frame exceeds `tolerance`, or none when it does not. A frame whose tracing budget was spent is
 /// flagged whatever the points say: the surrogate answered where it is not trusted, so that those points speak for it.
-fn over_tolerance(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
+fn tolerance_excess(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
     if tally.over_budget == 0 {
         return trusted.map(|e| e.optical_rms - tolerance).filter(|over| *over > 0.0);
     }
@@ -122,7 +122,7 @@ mod tests {
     fn flagged(over_budget: u64, gate: &Gate, tolerance: f64) -> Option<f64> {
         let points = Audited::of(&points(), Strata::even([1; 3], 20));
         let trusted = audit::trusted_error(&points, gate);
-        over_tolerance(&Tally { over_budget, ..Tally::default() }, trusted, &points, gate, tolerance)
+        tolerance_excess(&Tally { over_budget, ..Tally::default() }, trusted, &points, gate, tolerance)
     }
 
     #[test]

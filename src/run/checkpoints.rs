@@ -86,7 +86,7 @@ impl Checkpoints {
         let copy_seconds = begun.elapsed().as_secs_f64();
         self.totals.longest_copy_seconds = self.totals.longest_copy_seconds.max(copy_seconds);
         let told = state.wait_reason().map(|why| format!("the frames waited {copy_seconds:.2} s for a checkpoint: {why}"));
-        let record = CheckpointRecord { frame: Some(frame), copy_seconds, behind: told.is_none(), ..CheckpointRecord::default() };
+        let record = CheckpointRecord { frame: Some(frame), copy_seconds, asynchronous: told.is_none(), ..CheckpointRecord::default() };
         self.write(record, begun, state);
         Ok((copy_seconds, told))
     }
@@ -198,7 +198,7 @@ mod tests {
     fn slow(folder: &std::path::Path) -> (Checkpoints, Sender<Result<u64, CheckpointError>>) {
         let mut checkpoints = Checkpoints::new(folder.join("weights"), Some(0.0));
         let (end, told) = channel();
-        let record = CheckpointRecord { frame: Some(0), behind: true, ..CheckpointRecord::default() };
+        let record = CheckpointRecord { frame: Some(0), asynchronous: true, ..CheckpointRecord::default() };
         checkpoints.start(record, Instant::now(), move || told.recv().unwrap());
         (checkpoints, end)
     }

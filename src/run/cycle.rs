@@ -341,7 +341,7 @@ impl<'a> Run<'a> {
         let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
         let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
         let times = Times::new(&scene.network, flow.tau());
-        let mut buffer = ReplayBuffer::new(scene.training.ring);
+        let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
         if !scene.network.inputs.is_empty() {
             buffer.set_now(times.unit(flow.start(), flow.tau()));
         }

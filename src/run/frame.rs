@@ -100,7 +100,7 @@ impl Run<'_> {
         // Nothing fails from here on.
         let mut record = self.record(on, slide, &work);
         record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
-        record.verified = verified;
+        record.verified_error = verified;
         let samples = work.rendered.samples.commit();
         if let Some(assessment) = assessment {
             self.take_in(on, assessment, &work.audit, samples, &mut record);
@@ -117,7 +117,7 @@ impl Run<'_> {
             }
         }
         record.training = learned;
-        record.sample_ring = self.learning.buffer.len() as u64;
+        record.replay_samples = self.learning.buffer.len() as u64;
         record.checkpoint = self.checkpoints.as_mut().and_then(Checkpoints::look);
         if let Some(failed) = record.checkpoint.as_ref().and_then(|checkpoint| checkpoint.failed.as_ref()) {
             record.warnings.push(failed.clone());
@@ -197,7 +197,7 @@ impl Run<'_> {
             let strata = match frozen {
                 Some(_) => {
                     let wanted = (scene.trust.audit_share * rendered.tally.queries as f64).ceil() as usize;
-                    trust.audit_strata(picture.gate, scene.trust.audit_per_cell.max(wanted.div_ceil(cells.iter().product())))
+                    trust.audit_strata(picture.gate, scene.trust.audit_min_per_cell.max(wanted.div_ceil(cells.iter().product())))
                 }
                 None => Strata::even(cells, 1),
             };
@@ -292,11 +292,11 @@ impl Run<'_> {
         if work.audit.drawn > 0 && work.audit.points == 0 {
             warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
         }
-        let dying = work.audit.points > 0 && work.audit.lived_share < SHORT_LIVED;
+        let dying = work.audit.points > 0 && work.audit.mean_lifetime_share < SHORT_LIVED;
         if dying && !std::mem::replace(&mut self.progress.has_warned_of_deaths, true) {
             warnings.push(format!(
                 "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value, another unit?), and their FTLE is that of the path so far",
-                100.0 * work.audit.lived_share
+                100.0 * work.audit.mean_lifetime_share
             ));
         }
         FrameRecord {
@@ -325,11 +325,11 @@ impl Run<'_> {
             traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,
             integration_steps: fixed_steps(flow).map(|steps| steps as u64),
             integration_difference: self.report.integration_difference,
-            probed: std::mem::take(&mut self.progress.preparation_traces),
+            preparation_traces: std::mem::take(&mut self.progress.preparation_traces),
             audited: work.audit.points as u64,
-            lived_share: work.audit.lived_share,
+            mean_lifetime_share: work.audit.mean_lifetime_share,
             majorant_exceeded: work.rendered.stats.majorant_exceeded,
-            traced_ahead: work.rendered.stats.ahead,
+            speculative_traces: work.rendered.stats.ahead,
             warnings,
             ..FrameRecord::default()
         }

@@ -42,7 +42,7 @@ impl Run<'_> {
             network: &network,
             domain: &self.plan.domain,
             seed: scene.seed,
-            replay_buffer: scene.training.ring,
+            replay_buffer: scene.training.replay_buffer,
             stop: self.stop,
         };
         let On { backend, tracer, surrogate } = on;
@@ -208,7 +208,7 @@ impl Run<'_> {
     /// Traced samples that a frame keeps on the host, at most: as many as training can use, or as many as trust can use if the device trains (it learns
     /// from all that it traces).
     pub(super) fn labels_per_frame<B: Backend>(&self, on: &On<B>) -> usize {
-        let share = self.plan.scene.training.ring / FRAMES_IN_BUFFER;
+        let share = self.plan.scene.training.replay_buffer / FRAMES_IN_BUFFER;
         let trains_here = |surrogate: &B::Surrogate| surrogate.learns() && !surrogate.trains_on_device();
         on.surrogate.as_ref().map_or(0, |surrogate| if trains_here(surrogate) { share } else { share.min(MAX_RENDER_RESIDUALS) })
     }

@@ -1,99 +1,99 @@
-//! What is recorded of every frame. One line of `records.jsonl`, and the JSON header of a published frame.
+//! Record of a frame: a line of `records.jsonl`, and part of the header of a published frame.
 
 use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
 
-/// One frame's figures, all of them finite: what is not known is none (`null`), never a number that is none. Shares are in [0, 1]; residuals of `optical` kind have no unit, those of `log_stretch` kind neither.
+/// Figures of one frame. All values are finite; unknown ones are `None` (`null`). Shares are in [0, 1]; residuals have no unit.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 pub struct FrameRecord {
     /// Frame number in this run, from 0.
     pub frame: u64,
-    /// Window slide that the frame belongs to, from 0.
+    /// Slide of the window, from 0.
     pub slide: u64,
     /// Seed time t0 of the FTLE, in time units of the source.
     pub time: f64,
-    /// The same as a date, where the source has a calendar.
+    /// `time` as a date. `None` if the source has no calendar.
     pub date: Option<String>,
-    /// Of a simulation that runs now; none otherwise.
+    /// Values of a running simulation. `None` for other sources.
     #[serde(default)]
     pub live: Option<crate::source::live::LiveRecord>,
     /// |tau|.
     pub tau: f64,
-    /// Unit of `time` and `tau`, and with a minus of the FTLE: `s`, `snapshots`, a simulation's own; empty where they have none.
+    /// Unit of `time`, `tau` and 1/FTLE: `s`, `snapshots`, or the simulation's; empty if they have none.
     #[serde(default)]
     pub time_unit: String,
-    /// What the velocities are, in words: what is made up says so.
+    /// Description of the velocity; names synthetic data as such.
     #[serde(default)]
     pub source: String,
-    /// What the picture's colours and densities stand for.
+    /// Transfer function of the picture.
     #[serde(default)]
     pub transfer: TransferRecord,
     /// `forward` or `backward`.
     pub direction: String,
     /// `reference`, `surrogate` or `gated`.
     pub method: String,
-    /// What traced: `cpu`, or `cuda:N` with the device's name.
+    /// Device that traces: `cpu`, or `cuda:N` with its name.
     #[serde(default)]
     pub device: String,
-    /// `table`, `network` or `residual`; none for `reference`.
+    /// `table`, `network` or `residual`. `None` for `reference`.
     pub surrogate: Option<String>,
-    /// Pixels across and down.
+    /// Width and height in pixels.
     pub size: [usize; 2],
     /// Samples a pixel.
     pub samples_per_pixel: usize,
-    /// Log-stretch queries that the renderer made.
+    /// Log-stretch queries of the renderer.
     pub queries: u64,
-    /// Of them, answered by RK4.
+    /// Queries answered by RK4.
     pub traced: u64,
-    /// Of them, without a value (land).
+    /// Queries without a value, at missing cells.
     pub missing: u64,
-    /// Of them, answered by the surrogate in untrusted cells because the tracing budget was spent.
+    /// Queries in untrusted cells answered by the surrogate, since the tracing budget was spent.
     pub over_budget: u64,
     /// `traced / (queries - missing)`.
     pub traced_share: f64,
-    /// By how much the estimated optical residual of the picture exceeds the tolerance; none when within. Where the tracing budget
-    /// was spent: measured on the untrusted points, and 0 when they are within.
-    pub over_tolerance: Option<f64>,
-    /// Error measured on audit points of the trusted region; none when nothing is trusted.
-    pub trusted: Option<TrustedError>,
-    /// PSNR in decibels of the surrogate alone over the whole domain, trusted or not, on the audit points; peak: their largest traced
-    /// log-stretch. None for `reference`.
+    /// Estimated optical residual of the picture above the tolerance. `None` if within it. With a spent tracing budget it is measured on the
+    /// untrusted points, and 0 if they are within the tolerance.
+    pub tolerance_excess: Option<f64>,
+    /// Error of the surrogate on audit points of the trusted region. `None` if nothing is trusted.
+    pub trusted_error: Option<TrustedError>,
+    /// PSNR in decibels of the surrogate over the whole domain, on the audit points; peak: their largest traced log-stretch. `None` for
+    /// `reference`.
     #[serde(default)]
     pub surrogate_psnr: Option<f64>,
     /// Share of the domain's volume that is trusted.
-    pub trusted_share: f64,
-    /// The same error measured on fresh points with the same weights after the frame (`--verify`).
-    pub verified: Option<TrustedError>,
-    /// Runge-Kutta steps a path; none where each path chooses its own (Dormand-Prince).
+    pub trusted_volume: f64,
+    /// `trusted_error` on new points with the same weights, measured after the frame (`--verify`).
+    pub verified_error: Option<TrustedError>,
+    /// Runge-Kutta steps a path. `None` for Dormand-Prince.
     pub integration_steps: Option<u64>,
-    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it: the error of "the truth" itself.
+    /// Difference of the log-stretch from twice as many steps: the error of the truth itself. `None` if the steps were given.
     pub integration_difference: Option<f64>,
-    /// Points traced before this frame to open the gate and to tighten the majorants (first frame of a slide).
-    pub probed: u64,
-    /// Audit points traced for this frame, land left out.
+    /// Points traced before the frame, to open the gate and tighten the majorants (first frame of a slide).
+    pub preparation_traces: u64,
+    /// Audit points traced for the frame, except at missing cells.
     pub audited: u64,
-    /// Mean lived share of the audit points (1 when every particle lived the whole tau).
-    pub lived_share: f64,
-    /// Queries whose extinction exceeded the majorant in force.
+    /// Mean lifetime of the audit particles as a share of tau.
+    pub mean_lifetime_share: f64,
+    /// Queries whose extinction exceeded the majorant.
     pub majorant_exceeded: u64,
     /// Training since the last frame.
     pub training: Option<crate::surrogate::Learned>,
-    /// Samples in the ring of samples (`training.ring`).
-    pub sample_ring: u64,
-    /// Points that a GPU traced ahead of flights that ended before them: work, but no queries, and not among `traced`.
+    /// Samples in the replay buffer (`training.replay_buffer`).
+    pub replay_samples: u64,
+    /// Points that a GPU traced for flights that ended before they reached them; not queries, and not among `traced`.
     #[serde(default)]
-    pub traced_ahead: u64,
-    /// The checkpoint that was under way since the last frame; none when there was none.
+    pub speculative_traces: u64,
+    /// Checkpoint in progress since the last frame. `None` without one.
     #[serde(default)]
     pub checkpoint: Option<CheckpointRecord>,
     /// Wall-clock seconds of each stage.
     pub seconds: StageSeconds,
-    /// Warnings that arose since the last frame, in words.
+    /// Warnings since the last frame.
     pub warnings: Vec<String>,
 }
 
-/// The transfer function in force. Where the scene leaves them open, `low` and `high` are the median and the 99.5th percentile of the FTLE on
-/// stratified points of the whole domain at the first slide.
+/// Transfer function. By default `low` and `high` are the median and the 99.5th percentile of the FTLE on stratified points of the domain at the
+/// first slide.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
 pub struct TransferRecord {
     /// FTLE (1/time) at which extinction begins.
@@ -104,29 +104,29 @@ pub struct TransferRecord {
     pub extinction: f64,
 }
 
-/// One checkpoint. It stands in the record of every frame during which it was under way, the last time with its end.
+/// A checkpoint, in the record of every frame during which it is in progress.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
 pub struct CheckpointRecord {
-    /// The frame after which it was copied, with what was learned until then; none before the first.
+    /// Last frame before the copy. `None` before the first frame.
     pub frame: Option<u64>,
-    /// Seconds that the loop stood still for the copy.
+    /// Pause of the loop for the copy, in seconds.
     pub copy_seconds: f64,
-    /// Whether the numbers were brought together behind the loop's back; otherwise it waited for all of them.
-    pub behind: bool,
-    /// Seconds since the copy began: until it was written, or so far.
+    /// Whether frames continued during the readback.
+    pub asynchronous: bool,
+    /// Seconds from the start of the copy until the file was written, or until now.
     pub seconds: f64,
-    /// Bytes of the file; none where it is not written yet, or was not.
+    /// Bytes of the file. `None` until it is written.
     pub bytes: Option<u64>,
-    /// Why it was not written; what was there before stays.
+    /// Why it was not written. The previous file remains.
     pub failed: Option<String>,
-    /// Others that fell due meanwhile, and were left for the next time.
+    /// Further checkpoints that became due meanwhile.
     pub postponed: u64,
 }
 
-/// Where a frame's time went.
+/// Wall-clock seconds of the stages of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
 pub struct StageSeconds {
-    /// Preparing the slide before its first frame: steps, tables, probes.
+    /// Preparing the slide before its first frame: steps, tables, preparation traces.
     pub slide: f64,
     /// Waiting for snapshots.
     pub waiting: f64,
@@ -140,16 +140,16 @@ pub struct StageSeconds {
     pub audit: f64,
     /// Training.
     pub train: f64,
-    /// Of rendering, tracing and predicting, by a GPU's own clock; 0 where the CPU rendered. Its time for training is
+    /// GPU time of rendering, tracing and predicting; 0 on the CPU. The GPU time of training is
     /// [`crate::surrogate::Learned::device_seconds`].
     #[serde(default)]
     pub device: f64,
-    /// The loop standing still for a checkpoint's copy before the frame.
+    /// Pause for a checkpoint's copy before the frame.
     #[serde(default)]
     pub checkpoint: f64,
-    /// The frame, without `waiting` and `slide`, with `checkpoint`.
+    /// The frame without `waiting` and `slide`, with `checkpoint`.
     pub total: f64,
-    /// Since the run began, reading and preparing included.
+    /// Since the run began, including reading and preparation.
     #[serde(default)]
     pub elapsed: f64,
 }

@@ -1,4 +1,4 @@
-//! What a run is told: `[time]` and `[training]`, and the settings of all rooms that the cycle calls.
+//! Settings of a run: `[time]`, `[training]`, and those of all rooms that the cycle calls.
 
 use crate::flow::{Direction, FlowSettings};
 use crate::render::{Camera, CameraSettings, Light, LightSettings, MAX_SAMPLES, RenderSettings, Transfer, TransferSettings};
@@ -12,45 +12,48 @@ use crate::surrogate::{
 use crate::trust::TrustSettings;
 use serde::{Deserialize, Serialize};
 
-/// Everything that decides what a run computes.
+/// Settings that determine the results of a run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
-    /// A line for people.
+    /// Title for people.
     pub title: String,
     /// Seed of every random number.
     pub seed: u64,
-    /// Where velocity comes from.
+    /// Source of the velocity.
     pub source: SourceSettings,
-    /// Which files, variables and metric, for archives.
+    /// Files, variables and metric of archives.
     pub archive: ArchiveSettings,
-    /// Which simulation, for those that run now.
+    /// The running simulation.
     pub live: LiveSettings,
-    /// The box in which seeds lie; needed by closed forms.
+    /// Box of the seeds; required by closed forms.
     pub domain: Option<DomainSettings>,
     /// Integration time, direction and the slides of the window.
     pub time: TimeSettings,
     /// Integration.
     pub flow: FlowSettings,
-    /// Which surrogate.
+    /// Kind of surrogate.
     pub surrogate: SurrogateSettings,
-    /// Its network.
+    /// Network of the surrogate.
     pub network: NetworkSettings,
-    /// How much training a frame gets.
+    /// Amount of training a frame.
     pub training: TrainingSettings,
-    /// When the surrogate is believed.
+    /// Error up to which the surrogate answers.
     pub trust: TrustSettings,
-    /// The picture.
+    /// Picture.
     pub render: RenderSettings,
-    /// View; none: an overview of the domain.
+    /// View; `None`: an overview of the domain.
     pub camera: Option<CameraSettings>,
-    /// Light; none: from above, over the shoulder.
+    /// Light; `None`: from above, over the shoulder.
     pub light: Option<LightSettings>,
-    /// Extinction and albedo; none: scaled to the first frame's FTLE.
+    /// Extinction and albedo; `None`: scaled to the FTLE of the first slide.
     pub transfer: Option<TransferSettings>,
 }
 
 impl Settings {
-    /// Checks all that can be checked before the source is opened.
+    /// Checks everything that does not need the open source.
+    ///
+    /// # Errors
+    /// The first setting that is not accepted.
     pub fn check(&self) -> Result<(), Refused> {
         let kind = self.source.kind;
         self.source.check(self.domain.as_ref(), &self.archive)?;
@@ -73,14 +76,14 @@ impl Settings {
             Light::new(light)?;
         }
         if let Some(transfer) = &self.transfer {
-            // What is left open is scaled later, to values that are accepted, and so is the length that extinction is measured in.
+            // Values that are not set, and the unit of extinction, are chosen later and are always accepted.
             Transfer::new(&transfer.scaled_to(&[0.0, 1.0]), 1.0)?;
         }
         Ok(())
     }
 }
 
-/// A number in the source's time unit, or words such as `"30 days"` where that unit is the second.
+/// A number in the source's time unit, or words such as `"30 days"` if that unit is the second.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(untagged, expecting = "a number, or words such as \"30 days\"")]
 pub enum TimeSpan {
@@ -91,7 +94,7 @@ pub enum TimeSpan {
 }
 
 impl TimeSpan {
-    /// The span in seconds where it has a unit; the plain number otherwise. None where the words make no sense.
+    /// Returns the seconds of a span with a unit, or the plain number. `None` if the words are not a span.
     pub fn value(&self) -> Option<f64> {
         let words = match self {
             TimeSpan::Number(n) => return Some(*n),
@@ -110,7 +113,7 @@ impl TimeSpan {
         number.trim().parse::<f64>().ok().map(|n| n * factor)
     }
 
-    /// Whether the span names a unit.
+    /// Whether the span has a unit.
     pub fn has_unit(&self) -> bool {
         matches!(self, TimeSpan::Words(_))
     }
@@ -120,23 +123,23 @@ impl TimeSpan {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TimeSettings {
-    /// |tau|; none: half of the archive's span, at least two intervals (closed forms need it).
+    /// |tau|; `None`: half of the archive's span, at least two intervals. Required by other sources.
     pub tau: Option<TimeSpan>,
-    /// Forward or backward; none: backward for archives, forward for closed forms.
+    /// Direction; `None`: backward for archives and live runs, forward otherwise.
     pub direction: Option<Direction>,
     /// Closed forms: seed time of the first slide.
     pub start: f64,
-    /// Closed forms: how far the seed time moves from slide to slide.
-    pub step: f64,
-    /// Closed forms: number of slides. Archives: an upper bound; none: as many as the archive gives.
+    /// Closed forms: step of the seed time from slide to slide.
+    pub seed_step: f64,
+    /// Maximum number of slides; `None`: 1 for closed forms, all for snapshots.
     pub slides: Option<usize>,
-    /// Archives: snapshots that the window moves from slide to slide.
-    pub stride: usize,
+    /// Number of snapshots by which the window moves from slide to slide.
+    pub snapshots_per_slide: usize,
     /// Frames rendered at each slide.
     pub frames_per_slide: usize,
-    /// Further frames at the first slide, in which the surrogate is trained up.
+    /// Further frames at the first slide, which train the surrogate.
     pub warmup_frames: usize,
-    /// Samples a pixel of those; none: as many as of the others.
+    /// Samples a pixel of warm-up frames; `None`: as for other frames.
     pub warmup_samples: Option<usize>,
 }
 
@@ -146,9 +149,9 @@ impl Default for TimeSettings {
             tau: None,
             direction: None,
             start: 0.0,
-            step: 1.0,
+            seed_step: 1.0,
             slides: None,
-            stride: 1,
+            snapshots_per_slide: 1,
             frames_per_slide: 1,
             warmup_frames: 0,
             warmup_samples: None,
@@ -157,7 +160,10 @@ impl Default for TimeSettings {
 }
 
 impl TimeSettings {
-    /// Checks ranges; closed forms need tau, in plain numbers.
+    /// Checks ranges. Closed forms require tau as a plain number.
+    ///
+    /// # Errors
+    /// The first setting that is not accepted.
     pub fn check(&self, kind: SourceKind) -> Result<(), Refused> {
         let time = self;
         let refuse = |key: &str, found: &str, accepted: &str| Err(Refused::new(key, found, accepted));
@@ -173,15 +179,15 @@ impl TimeSettings {
             None => {}
         }
         require(time.start.is_finite(), "time.start", time.start, "a finite number")?;
-        require(time.step.is_finite(), "time.step", time.step, "a finite number")?;
-        if time.step == 0.0 && time.slides.is_some_and(|slides| slides > 1) {
-            let refused = Refused::new("time.step", "is 0", "a number other than 0: all slides would be of one time");
+        require(time.seed_step.is_finite(), "time.seed_step", time.seed_step, "a finite number")?;
+        if time.seed_step == 0.0 && time.slides.is_some_and(|slides| slides > 1) {
+            let refused = Refused::new("time.seed_step", "is 0", "a number other than 0: otherwise all slides have one time");
             return Err(refused.beside(&["time.slides"]));
         }
         if let Some(slides) = time.slides {
             count("time.slides", slides, 1, 10_000_000)?;
         }
-        count("time.stride", time.stride, 1, 1_000_000)?;
+        count("time.snapshots_per_slide", time.snapshots_per_slide, 1, 1_000_000)?;
         count("time.frames_per_slide", time.frames_per_slide, 1, 1_000_000)?;
         count("time.warmup_frames", time.warmup_frames, 0, 1_000_000)?;
         count("time.warmup_samples", time.warmup_samples.unwrap_or(1), 1, MAX_SAMPLES)
@@ -192,39 +198,41 @@ impl TimeSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TrainingSettings {
-    /// Share of the threads that train while the others render (at least one thread each; with a single thread they take turns). Where a GPU
-    /// trains: of the device's time, in turns with the picture.
+    /// On the CPU, share of the threads that train while the others render (at least one thread each; a single thread alternates). On a GPU,
+    /// share of the device's time.
     pub share: f64,
-    /// Wall-clock seconds of training that every frame gets: at least, where the CPU trains (the next frame waits for them), and at most while
-    /// a simulation is waited for. None: 1 where the CPU trains; where a GPU does, what `share` gives.
+    /// Seconds of training a frame: a minimum, for which the next frame waits, and the maximum while waiting for a simulation. `None`: 1 on the
+    /// CPU, given by `share` on a GPU.
     pub seconds_per_frame: Option<f64>,
-    /// Exactly so many optimizer steps a frame instead: slower, but the same on every run.
+    /// Exact number of optimizer steps a frame instead, for reproducible runs.
     pub steps_per_frame: Option<u64>,
-    /// Samples that the ring holds.
-    pub ring: usize,
-    /// Checkpoint to go on from.
+    /// Capacity of the replay buffer, in samples.
+    pub replay_buffer: usize,
+    /// Checkpoint to start from.
     pub resume: Option<std::path::PathBuf>,
 }
 
 impl Default for TrainingSettings {
     fn default() -> Self {
-        Self { share: 0.5, seconds_per_frame: None, steps_per_frame: None, ring: 1 << 22, resume: None }
+        Self { share: 0.5, seconds_per_frame: None, steps_per_frame: None, replay_buffer: 1 << 22, resume: None }
     }
 }
 
 impl TrainingSettings {
-    /// Seconds of training that a frame gets at least where the CPU trains.
+    /// Minimum seconds of training a frame on the CPU.
     pub fn seconds(&self) -> f64 {
         self.seconds_per_frame.unwrap_or(1.0)
     }
 
-    /// Seconds of training that follow `picture` seconds of rendering where a device does both in turns, so that `share` of its time is
-    /// training's.
+    /// Seconds of training after `picture` seconds of rendering on a device that does both, so that training takes `share` of its time.
     pub fn turn(&self, picture: f64) -> f64 {
         (self.share / (1.0 - self.share) * picture).max(self.seconds_per_frame.unwrap_or(0.0))
     }
 
     /// Checks ranges.
+    ///
+    /// # Errors
+    /// The first value out of its range.
     pub fn check(&self) -> Result<(), Refused> {
         let t = self;
         require((0.0..1.0).contains(&t.share), "training.share", t.share, "a number from 0 up to, not including, 1")?;
@@ -234,7 +242,7 @@ impl TrainingSettings {
         if let Some(steps) = t.steps_per_frame {
             require((1..=100_000_000).contains(&steps), "training.steps_per_frame", steps, "a whole number from 1 to 100000000")?;
         }
-        count("training.ring", t.ring, 1024, 1 << 28)
+        count("training.replay_buffer", t.replay_buffer, 1024, 1 << 28)
     }
 }
 

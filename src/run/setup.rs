@@ -120,7 +120,7 @@ impl Setup {
                 StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
-            gap: scene.flow.gap,
+            gap: scene.flow.difference_step,
             boundary,
             normalisation: scene.flow.normalisation,
             interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
@@ -144,7 +144,7 @@ impl Setup {
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let slides = match live {
-            Some(live) => live_slides(&scene, live.follow(tau, scene.time.stride)?, direction),
+            Some(live) => live_slides(&scene, live.follow(tau, scene.time.snapshots_per_slide)?, direction),
             None => open_slides(&scene, snapshots, tau, direction)?,
         };
         if let (Some(times), Some(grid)) = (&times, &grid) {
@@ -181,7 +181,7 @@ fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, directio
             }
         }
         (None, _) => {
-            let TimeSettings { start, step, slides, .. } = scene.time;
+            let TimeSettings { start, seed_step: step, slides, .. } = scene.time;
             let last = start + step * slides.unwrap_or(1).saturating_sub(1) as f64;
             [start.min(last), start.max(last)]
         }
@@ -196,12 +196,12 @@ fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, directio
 
 /// Refuses times so far from 0 that adding tau to them is lost in their last place: nothing would move, and the FTLE would be 0.
 fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> {
-    let last = time.start + time.step * time.slides.unwrap_or(1).saturating_sub(1) as f64;
+    let last = time.start + time.seed_step * time.slides.unwrap_or(1).saturating_sub(1) as f64;
     for start in [time.start, last] {
         let moved = ((start + sign * tau) - start).abs();
         // A millionth of tau is far below what a step resolves.
         require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")
-            .map_err(|refused| refused.beside(&["time.step", "time.slides", "time.tau"]))?;
+            .map_err(|refused| refused.beside(&["time.seed_step", "time.slides", "time.tau"]))?;
     }
     Ok(())
 }

@@ -236,7 +236,7 @@ pub(super) fn open_slides(
         (Some(flow), _) => {
             let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
             let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
-            Ok(Box::new(ClosedForm { flow, domain, start: scene.time.start, step: scene.time.step, count: Count::new(scene, 1) }))
+            Ok(Box::new(ClosedForm { flow, domain, start: scene.time.start, step: scene.time.seed_step, count: Count::new(scene, 1) }))
         }
         (None, Some(source)) => {
             source.check_tau(tau)?;
@@ -247,7 +247,7 @@ pub(super) fn open_slides(
                 dates,
                 window: Window::new(tau),
                 direction,
-                stride: scene.time.stride,
+                stride: scene.time.snapshots_per_slide,
                 count: Count::new(scene, u64::MAX),
                 taken: 0,
             }))

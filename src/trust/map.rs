@@ -221,7 +221,7 @@ impl TrustMap {
         }
         // The relative error of a root is half of that of the square.
         let needed = (spreads / cells as f64 / (2.0 * self.settings.audit_precision * mean_square)).powi(2);
-        let more = needed.min((self.settings.audit_most_per_cell.saturating_sub(least) * cells) as f64);
+        let more = needed.min((self.settings.audit_max_per_cell.saturating_sub(least) * cells) as f64);
         for ((drawn, cell), trusted) in strata.drawn.iter_mut().zip(&self.cells).zip(&gate.trusted) {
             if *trusted {
                 *drawn += (more * spread(cell) / spreads).round() as u32;
@@ -382,7 +382,7 @@ mod tests {
 
     #[test]
     fn audits_go_where_the_error_is_spread() {
-        let settings = TrustSettings { audit_most_per_cell: 32, ..TrustSettings::default() };
+        let settings = TrustSettings { audit_max_per_cell: 32, ..TrustSettings::default() };
         let mut map = TrustMap::new(&settings, &domain());
         filled(&mut map, 0.001, 64);
         let ridge = [0.51, 0.51, 0.0];

@@ -27,16 +27,16 @@ pub struct TrustSettings {
     /// Share of all queries that is drawn uniformly over the domain and traced whatever the gate says.
     pub audit_share: f64,
     /// Audit points a frame and cell at least: enough that a trusted cell keeps its trust by audits alone.
-    pub audit_per_cell: usize,
+    pub audit_min_per_cell: usize,
     /// Standard error of the stated error, as a share of it, up to which trusted cells get more audit points.
     pub audit_precision: f64,
     /// Audit points a frame and cell on average at most (unless `audit_share` asks for more).
-    pub audit_most_per_cell: usize,
+    pub audit_max_per_cell: usize,
     /// Factor on every cell's mean square residual when the window slides, at least; the growth measured at the last slide counts
     /// where it is larger.
     pub slide_inflation: f64,
     /// Seconds a frame may spend on tracing; beyond it untrusted cells are answered by the surrogate all the same and the frame is
-    /// flagged `over_tolerance`.
+    /// flagged `tolerance_excess`.
     pub trace_budget: Option<f64>,
 }
 
@@ -47,9 +47,9 @@ impl Default for TrustSettings {
             cells: None,
             min_samples: 16.0,
             audit_share: 0.01,
-            audit_per_cell: 8,
+            audit_min_per_cell: 8,
             audit_precision: 0.1,
-            audit_most_per_cell: 32,
+            audit_max_per_cell: 32,
             slide_inflation: 4.0,
             trace_budget: None,
         }
@@ -61,8 +61,8 @@ impl TrustSettings {
     pub fn check(&self) -> Result<(), Refused> {
         positive("trust.tolerance", self.tolerance)?;
         require((0.01..=1.0).contains(&self.audit_share), "trust.audit_share", self.audit_share, "a number from 0.01 to 1")?;
-        count("trust.audit_per_cell", self.audit_per_cell, 1, 4096)?;
-        count("trust.audit_most_per_cell", self.audit_most_per_cell, 1, 65_536)?;
+        count("trust.audit_min_per_cell", self.audit_min_per_cell, 1, 4096)?;
+        count("trust.audit_max_per_cell", self.audit_max_per_cell, 1, 65_536)?;
         require((0.001..=1.0).contains(&self.audit_precision), "trust.audit_precision", self.audit_precision, "a number from 0.001 to 1")?;
         require((4.0..=4096.0).contains(&self.min_samples), "trust.min_samples", self.min_samples, "a number from 4 to 4096")?;
         let inflation = self.slide_inflation;
@@ -76,14 +76,14 @@ impl TrustSettings {
             }
             count("trust.cells", cells.iter().product(), 1, 1 << 20)?;
             // Every frame draws and traces this many points.
-            let a_cell = self.min_samples.ceil().max(self.audit_per_cell.max(self.audit_most_per_cell) as f64);
+            let a_cell = self.min_samples.ceil().max(self.audit_min_per_cell.max(self.audit_max_per_cell) as f64);
             let points = a_cell * cells.iter().product::<usize>() as f64;
             if points > f64::from(1 << 26) {
                 let found = format_args!("is {cells:?}, which asks for {points:.0} points a frame");
                 return Err(Refused::new("trust.cells", found, "at most 2^26 points (cells x samples a cell)").beside(&[
                     "trust.min_samples",
-                    "trust.audit_per_cell",
-                    "trust.audit_most_per_cell",
+                    "trust.audit_min_per_cell",
+                    "trust.audit_max_per_cell",
                 ]));
             }
         }

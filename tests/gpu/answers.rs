@@ -378,17 +378,17 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
             let (gpu, cpu) = (&found.record, &expected.record);
-            println!("{method}: trusted share {:.3} and {:.3}, {:?}", gpu.trusted_share, cpu.trusted_share, gpu.seconds);
+            println!("{method}: trusted share {:.3} and {:.3}, {:?}", gpu.trusted_volume, cpu.trusted_volume, gpu.seconds);
             assert!(gpu.device.starts_with("cuda:0") && gpu.warnings == cpu.warnings, "{:?}", gpu.warnings);
             // Points ahead of their flights are answered by a GPU that walks, and by nobody else.
-            assert!(gpu.traced_ahead > 0 && cpu.traced_ahead == 0);
+            assert!(gpu.speculative_traces > 0 && cpu.speculative_traces == 0);
             assert!((gpu.queries as f64 / cpu.queries as f64 - 1.0).abs() < 0.01, "{} and {}", gpu.queries, cpu.queries);
             // Cells at the edge of the tolerance may fall to either side: other labels are kept.
-            assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_share - cpu.trusted_share).abs() < 0.05);
+            assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_volume - cpu.trusted_volume).abs() < 0.05);
             let psnr = compare_films(&found.film, &expected.film, found.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
             measured!("a run, `{method}`: {psnr:.1} dB; traced share {:.3} and {:.3}", gpu.traced_share, cpu.traced_share);
-            println!("stated {:?} and {:?}", gpu.trusted, cpu.trusted);
-            if let (Some(gpu), Some(cpu)) = (gpu.trusted.filter(|_| method == "surrogate"), cpu.trusted) {
+            println!("stated {:?} and {:?}", gpu.trusted_error, cpu.trusted_error);
+            if let (Some(gpu), Some(cpu)) = (gpu.trusted_error.filter(|_| method == "surrogate"), cpu.trusted_error) {
                 // The same points, unless rounding puts one more into a cell.
                 assert!((gpu.optical_rms / cpu.optical_rms - 1.0).abs() < 0.02, "{gpu:?} for {cpu:?}");
             }

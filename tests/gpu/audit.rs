@@ -27,7 +27,7 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
         assert_eq!(land, found.points < found.drawn);
         assert_eq!(found.peak, expected.peak);
         // Sums of the same numbers in f64, in another order.
-        assert!((found.lived_share - expected.lived_share).abs() < 1e-12);
+        assert!((found.mean_lifetime_share - expected.mean_lifetime_share).abs() < 1e-12);
         assert_eq!(found.samples.points, expected.samples.points);
         assert_eq!(found.samples.log_stretch, expected.samples.log_stretch);
         assert_eq!(found.samples.arrival, expected.samples.arrival);

@@ -26,7 +26,7 @@ follow = \"every\"
 at_end = \"stop\"
 [time]
 tau = 8
-stride = 1
+snapshots_per_slide = 1
 [flow]
 steps = 16
 boundary = \"clamp\"

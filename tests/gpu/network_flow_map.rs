@@ -132,7 +132,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.5
+seed_step = 0.5
 slides = 2
 frames_per_slide = 3
 [flow]
@@ -182,7 +182,7 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
                 assert!(record.warnings.is_empty(), "{name}: {:?}", record.warnings);
                 assert_eq!(record.training.as_ref().unwrap().device_seconds.is_some(), there, "{name}");
                 // A GPU that walks answers points ahead of their flights; one that only traces does not.
-                assert_eq!(record.traced_ahead > 0, there, "{name}");
+                assert_eq!(record.speculative_traces > 0, there, "{name}");
             }
         }
         if small() {

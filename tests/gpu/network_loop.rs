@@ -98,7 +98,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.5
+seed_step = 0.5
 slides = 4
 frames_per_slide = 4
 [flow]
@@ -126,11 +126,11 @@ samples = 4
         for pair in frames.windows(2) {
             let [before, after] = [&pair[0].record, &pair[1].record];
             assert!(
-                after.sample_ring > before.sample_ring,
+                after.replay_samples > before.replay_samples,
                 "frame {}: {} samples, then {}",
                 after.frame,
-                before.sample_ring,
-                after.sample_ring
+                before.replay_samples,
+                after.replay_samples
             );
             assert!(after.warnings.is_empty(), "{:?}", after.warnings);
             assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
@@ -211,7 +211,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
         let record = &frame.record;
         assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
         // A GPU that walks answers points ahead of their flights; one that only traces does not.
-        assert!(record.traced_ahead > 0, "the device walks");
+        assert!(record.speculative_traces > 0, "the device walks");
         assert!(record.traced_share > 0.05 && record.traced_share < 0.9, "traced: {}", record.traced_share);
     }
     if small() {
@@ -290,7 +290,7 @@ fn without_memory_for_training_frames_stay_on_the_device() {
         "network.learning_rate=1e-4",
     ];
     let cases: [(u64, &str, &[&str]); 3] = [
-        (512, "surrogate and training need", &["training.ring=67108864"]),
+        (512, "surrogate and training need", &["training.replay_buffer=67108864"]),
         (192, "surrogate and training need", &["network.levels=8", "network.log2_table=21"]),
         (2048, "the layers' values", &published),
     ];
@@ -303,7 +303,7 @@ fn without_memory_for_training_frames_stay_on_the_device() {
         for (i, Frame { record, .. }) in frames.iter().enumerate() {
             let learned = record.training.as_ref().unwrap();
             assert_eq!((learned.steps, learned.device_seconds), (5, None), "{what}, frame {i}");
-            assert!(record.device.starts_with("cuda:0") && record.traced_ahead > 0, "{what}, frame {i}: the device walks");
+            assert!(record.device.starts_with("cuda:0") && record.speculative_traces > 0, "{what}, frame {i}: the device walks");
             assert_eq!(record.warnings.len(), usize::from(i == 0), "{what}, frame {i}: {:?}", record.warnings);
         }
         let told = &frames[0].record.warnings[0];

@@ -33,7 +33,7 @@ impl Link {
             // A file that cannot be believed is refused now; later it is read before each connection.
             ConnectionFile::read(path).map_err(SourceError::Live)?;
             let path = path.clone();
-            let gone = Duration::from_secs_f64(settings.relay_seconds);
+            let gone = Duration::from_secs_f64(settings.relay_timeout_seconds);
             relays.push(RelayFollower::begin(Box::new(move || ConnectionFile::read(&path)), limits, gone).map_err(SourceError::Live)?);
         }
         Ok((Self::Relays(relays), format!("waiting for {} relay(s)", settings.connections.len())))

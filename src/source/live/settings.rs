@@ -41,9 +41,9 @@ pub struct LiveSettings {
     /// Wait for a restart or stop.
     pub at_end: AtEnd,
     /// Seconds that a step waits for its missing blocks.
-    pub incomplete_seconds: f64,
+    pub block_timeout_seconds: f64,
     /// Seconds that a relay may be out of reach before its blocks count as ended.
-    pub relay_seconds: f64,
+    pub relay_timeout_seconds: f64,
 }
 
 impl Default for LiveSettings {
@@ -54,8 +54,8 @@ impl Default for LiveSettings {
             memory_gib: 4.0,
             follow: Follow::default(),
             at_end: AtEnd::default(),
-            incomplete_seconds: 10.0,
-            relay_seconds: 30.0,
+            block_timeout_seconds: 10.0,
+            relay_timeout_seconds: 30.0,
         }
     }
 }
@@ -68,7 +68,9 @@ impl LiveSettings {
         }
         let memory = self.memory_gib;
         require(memory.is_finite() && (1e-3..=65_536.0).contains(&memory), "live.memory_gib", memory, "a number from 0.001 to 65536")?;
-        for (key, seconds) in [("live.incomplete_seconds", self.incomplete_seconds), ("live.relay_seconds", self.relay_seconds)] {
+        for (key, seconds) in
+            [("live.block_timeout_seconds", self.block_timeout_seconds), ("live.relay_timeout_seconds", self.relay_timeout_seconds)]
+        {
             require((0.01..=86_400.0).contains(&seconds), key, seconds, "a number from 0.01 to 86400")?;
         }
         Ok(())

@@ -42,20 +42,20 @@ pub struct LiveRecord {
     /// Blocks of steps that were overwritten before they were read, or passed over since another block of the step was, in all.
     pub missed_blocks: u64,
     /// Steps left out for want of memory, in all.
-    pub thinned: u64,
+    pub steps_skipped: u64,
     /// Least distance in time of the steps that are kept.
     pub spacing: f64,
     /// What leaving steps out costs: difference of one that was left out from linear interpolation, over its size (root mean squares); null where
     /// none was.
     pub interpolation_error: Option<f64>,
     /// Steps given up because blocks were missing, in all.
-    pub incomplete: u64,
+    pub steps_incomplete: u64,
     /// Times that the simulation was started or set back while it was followed.
     pub restarts: u64,
     /// Snapshots in the window.
     pub snapshots: usize,
     /// Seconds from the window's first snapshot until it covered one tenth, two tenths and so on of tau: ten numbers, since a frame needs all of it.
-    pub filling: Vec<f64>,
+    pub fill_seconds: Vec<f64>,
 }
 
 /// The window at one moment.
@@ -108,7 +108,7 @@ impl State {
     fn begin_anew(&mut self) {
         self.window = Window::new(self.window.span());
         self.begun_at = None;
-        self.live.filling.clear();
+        self.live.fill_seconds.clear();
     }
 
     /// Share of tau that the window covers.
@@ -122,8 +122,8 @@ impl State {
         let begun = *self.begun_at.get_or_insert_with(Instant::now);
         // The hair's breadth by which a sum of steps may miss tau is the window's own.
         let tenths = if self.window.is_full() { 10 } else { (10.0 * self.filled()) as usize };
-        let known = self.live.filling.len().max(tenths);
-        self.live.filling.resize(known, begun.elapsed().as_secs_f64());
+        let known = self.live.fill_seconds.len().max(tenths);
+        self.live.fill_seconds.resize(known, begun.elapsed().as_secs_f64());
     }
 
     /// Whether a slide is due.
@@ -265,7 +265,7 @@ struct Reader {
 
 impl Reader {
     fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
-        let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
+        let limit = Duration::from_secs_f64(live.settings.block_timeout_seconds);
         let assembler = Assembler::new(&live.description, limit, PENDING);
         Self { live, shared, assembler, conversion, thinning, stride, late: 0, large: LARGE }
     }
@@ -363,7 +363,7 @@ impl Reader {
             }
         }
         let mut state = self.shared.lock();
-        (state.live.thinned, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
+        (state.live.steps_skipped, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
         state.live.interpolation_error = self.thinning.error;
         let Some(kept) = kept else { return };
         let newest = state.window.newest();
@@ -420,7 +420,7 @@ impl Reader {
         }
         let mut state = self.shared.lock();
         for one in given_up {
-            state.live.incomplete += 1;
+            state.live.steps_incomplete += 1;
             state.warn(format!(
                 "step {} (time {}) was given up with {} of {} blocks: {}",
                 one.step, one.time, one.blocks, one.wanted, one.why

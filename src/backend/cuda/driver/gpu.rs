@@ -21,7 +21,7 @@ pub struct GpuSettings {
     /// Where compiled kernels are kept; none: the user's cache folder.
     pub cache: Option<std::path::PathBuf>,
     /// Lowest stream priority, for life beside a solver.
-    pub polite: bool,
+    pub low_priority: bool,
     /// Fills fresh device memory with bytes that make NaN and far indices, so that a kernel that reads what nothing has written shows. For
     /// tests.
     pub poison: bool,
@@ -116,7 +116,7 @@ impl Gpu {
         // `Buffer::read_by`).
         unsafe { context.disable_event_tracking() };
         let stream = || {
-            if settings.polite {
+            if settings.low_priority {
                 let (least, _) = result::stream::get_priority_range()?;
                 context.new_stream_with_priority(least)
             } else {

@@ -180,7 +180,7 @@ impl Audits {
         Ok(AuditFindings {
             drawn: optical.len(),
             points: points as usize,
-            lived_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
+            mean_lifetime_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
             peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
             samples,
             errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),
