@@ -1,7 +1,7 @@
 //! HDF5 archives: known layouts, and those that the settings describe.
 
 use crate::{open_with, refused};
-use hdf5_metno::File;
+use hdf5_metno::{Dataset, File, Group};
 use ndarray::{Array, ArrayD, IxDyn};
 use ridgewatch::source::{Archive, Metric, SnapshotSource};
 use std::path::PathBuf;
@@ -36,6 +36,10 @@ fn array(order: &str, component: usize, time: usize) -> ArrayD<f32> {
     })
 }
 
+fn store(group: &Group, name: &str, order: &str, component: usize, time: usize) -> Dataset {
+    group.new_dataset_builder().with_data(&array(order, component, time)).create(name).unwrap()
+}
+
 fn coordinates(file: &File, names: [&str; 3]) {
     for (k, name) in names.into_iter().enumerate() {
         let values: Vec<f32> = (0..N[k]).map(|i| 0.5 * i as f32).collect();
@@ -62,7 +66,7 @@ fn both_layouts_of_the_turbulence_database() {
     let current = dir.path().join("current.h5");
     let file = File::create(&current).unwrap();
     for (t, name) in ["Velocity_0011", "Velocity_0013"].into_iter().enumerate() {
-        file.new_dataset_builder().with_data(&array("zyxc", 0, t)).create(name).unwrap();
+        store(&file, name, "zyxc", 0, t);
     }
     coordinates(&file, ["xcoor", "ycoor", "zcoor"]);
     drop(file);
@@ -75,7 +79,7 @@ fn both_layouts_of_the_turbulence_database() {
     for t in 0..2 {
         let path = dir.path().join(format!("legacy_{t}.h5"));
         let file = File::create(&path).unwrap();
-        file.new_dataset_builder().with_data(&array("zyxc", 0, t)).create(format!("u{:05}", 10 * (t + 1)).as_str()).unwrap();
+        store(&file, &format!("u{:05}", 10 * (t + 1)), "zyxc", 0, t);
         file.new_dataset_builder().with_data(&[3i32]).create("_contents").unwrap();
         paths.push(path);
     }
@@ -96,7 +100,7 @@ fn any_datasets_in_any_order_are_read() {
             let file = File::create(&path).unwrap();
             let group = file.create_group("fields").unwrap();
             for (c, name) in ["vel_x", "vel_y", "vel_z"].into_iter().enumerate() {
-                group.new_dataset_builder().with_data(&array(order, c, t)).create(name).unwrap();
+                store(&group, name, order, c, t);
             }
             coordinates(&file, ["gx", "gy", "gz"]);
             file.new_attr::<f64>().create("time").unwrap().write_scalar(&(0.25 * t as f64)).unwrap();
@@ -109,7 +113,7 @@ fn any_datasets_in_any_order_are_read() {
         // All components and times in one dataset.
         let path = dir.path().join(format!("whole_{n}.h5"));
         let file = File::create(&path).unwrap();
-        file.new_dataset_builder().with_data(&array(order, 0, 0)).create("velocity").unwrap();
+        store(&file, "velocity", order, 0, 0);
         file.new_dataset_builder().with_data(&[3.0f64, 4.5]).create("time").unwrap();
         coordinates(&file, ["x", "y", "z"]);
         drop(file);
@@ -120,7 +124,7 @@ fn any_datasets_in_any_order_are_read() {
     let file = File::create(&path).unwrap();
     for t in 0..2 {
         for (c, name) in ["u", "v", "w"].into_iter().enumerate() {
-            let dataset = file.new_dataset_builder().with_data(&array("zyx", c, t)).create(format!("{name}_{t}").as_str()).unwrap();
+            let dataset = store(&file, &format!("{name}_{t}"), "zyx", c, t);
             dataset.new_attr::<f64>().create("t").unwrap().write_scalar(&(7.0 + t as f64)).unwrap();
         }
     }
@@ -133,7 +137,7 @@ fn any_datasets_in_any_order_are_read() {
         let path = dir.path().join(format!("plain_{}.h5", 100 + t));
         let file = File::create(&path).unwrap();
         for (c, name) in ["u", "v", "w"].into_iter().enumerate() {
-            file.new_dataset_builder().with_data(&array("zyx", c, t)).create(name).unwrap();
+            store(&file, name, "zyx", c, t);
         }
         coordinates(&file, ["x", "y", "z"]);
         paths.push(path);
@@ -146,9 +150,9 @@ fn what_does_not_fit_is_said() {
     let dir = tempdir().unwrap();
     let path = dir.path().join("odd.h5");
     let file = File::create(&path).unwrap();
-    file.new_dataset_builder().with_data(&array("zyxc", 0, 0)).create("velocity").unwrap();
-    file.new_dataset_builder().with_data(&array("zyx", 0, 0)).create("a").unwrap();
-    file.new_dataset_builder().with_data(&array("zy", 0, 0)).create("b").unwrap();
+    store(&file, "velocity", "zyxc", 0, 0);
+    store(&file, "a", "zyx", 0, 0);
+    store(&file, "b", "zy", 0, 0);
     coordinates(&file, ["x", "y", "z"]);
     drop(file);
     refused(&[&path], "", &["no velocity found"]);

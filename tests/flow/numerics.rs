@@ -176,7 +176,9 @@ fn plane(x: Axis, y: Axis) -> Arc<Grid> {
 /// A window of snapshots at given times.
 fn window_of(times: &[f64], snapshot: impl Fn(f64) -> Snapshot) -> Arc<Window> {
     let mut window = Window::new(times[times.len() - 1] - times[0]);
-    times.iter().for_each(|&time| window.push(Arc::new(snapshot(time))).unwrap());
+    for &time in times {
+        window.push(Arc::new(snapshot(time))).unwrap();
+    }
     Arc::new(window)
 }
 
