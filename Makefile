@@ -25,7 +25,7 @@ NVRTC_VERSION := 13.0.88
 MYPY_VERSION := 2.4.1
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-# The collection of real archives that tests/archive_real.rs reads.
+# The collection of real archives that tests/archive/real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
 # What `make adapters` builds goes here; where it is installed.
@@ -87,7 +87,7 @@ test: packages python-packages
 	  echo "NOT RUN: the tests of the NumPy reader of networks, since NumPy could not be fetched (needs the network)"; fi
 
 test-data: packages .venv/installed
-	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive_real -- --ignored --nocapture
+	RIDGEWATCH_DATA="$(RIDGEWATCH_DATA)" $(CARGO) test --release --test archive -- --ignored --nocapture
 
 test-reader: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test network_reader -- --ignored
@@ -153,7 +153,7 @@ test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-adapter
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release -p ridgewatch-adapter --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes && $(CARGO) test --release --test publish_full_disk -- --ignored; else \
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes && $(CARGO) test --release --test publish -- --ignored; else \
 	  echo "NOT RUN: a ring or a run folder on a full file system, files of another user, since these tests need root"; fi
 	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release -p ridgewatch-wire --test follow -- --ignored gigabytes; else \
 	  echo "NOT RUN: a relay of steps of 2 GB, since that test needs 16 GB of memory"; fi

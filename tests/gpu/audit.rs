@@ -7,8 +7,8 @@ use ridgewatch::backend::{AuditRequest, stratified_points};
 use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Precision, VelocitySource};
 use ridgewatch::render::{Transfer, TransferSettings};
 use ridgewatch::surrogate::Kind;
-use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::Predict;
+use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::trust::{CellErrors, Strata};
 
 fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], strata: &Strata, land: bool) {
