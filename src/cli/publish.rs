@@ -56,7 +56,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     let spinner = super::opening(&scene);
     let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
     drop(spinner);
-    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+    let named = ridgewatch_wire::ring_from_environment;
     let Some(ring) = options.ring.clone().or_else(named) else {
         bail!(Usage(format!("no ring: --ring names its folder, or the environment variable {}", ridgewatch_wire::RING_VARIABLE)));
     };

@@ -40,7 +40,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     if !common.overrides.is_empty() {
         bail!(Usage("--set: relay takes no scene; accepted: RING, --listen, --connection, --nice".into()));
     }
-    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+    let named = ridgewatch_wire::ring_from_environment;
     let Some(ring) = options.ring.clone().or_else(named) else {
         bail!(Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE)));
     };

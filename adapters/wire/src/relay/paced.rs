@@ -1,56 +1,59 @@
-//! The pace that a connection must keep.
+//! Minimum pace of a connection, and the intervals of its heartbeats.
 
 use crate::WireError;
 use crate::bytes::PIECE;
 use crate::message::Session;
 use std::io::{ErrorKind, Read, Write};
 use std::net::TcpStream;
-use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// Longest that a peer may take for a piece of a message: 1 MiB, or what is left of it.
-pub const PATIENCE: Duration = Duration::from_secs(5);
-/// The longest that a wait lasts before it is looked whether to stop.
+/// Longest time that a peer may take for a piece of a message: 1 MiB, or the rest of it.
+pub const PEER_TIMEOUT: Duration = Duration::from_secs(5);
+/// Interval of heartbeats on either side of a connection.
+pub(super) const PULSE: Duration = Duration::from_secs(1);
+/// Pause of an idle thread between two looks for work.
+pub(super) const IDLE: Duration = Duration::from_millis(1);
+/// Longest blocking call between two checks of the stop flag.
 const TICK: Duration = Duration::from_millis(200);
 
-/// A stream of which each [`PIECE`] of a message must be through within [`PATIENCE`], however slowly the peer dribbles; a wait ends with `stop`.
+/// A stream that fails if a [`PIECE`] of a message takes longer than [`PEER_TIMEOUT`], however few bytes the peer sends at a time, or if `stop` is set.
 pub(super) struct Paced<'a> {
     pub stream: &'a TcpStream,
     stop: &'a AtomicBool,
-    /// Until when the piece must be through; none before its first byte was tried.
-    until: Option<Instant>,
-    /// Bytes of the piece that are through.
-    through: usize,
+    /// Deadline of the piece; `None` before its first byte.
+    deadline: Option<Instant>,
+    /// Transferred bytes of the piece.
+    transferred: usize,
 }
 
 impl<'a> Paced<'a> {
     pub fn new(stream: &'a TcpStream, stop: &'a AtomicBool) -> Self {
-        Self { stream, stop, until: None, through: 0 }
+        Self { stream, stop, deadline: None, transferred: 0 }
     }
 
-    /// Begins a piece.
+    /// Begins a piece and its deadline.
     pub fn begin(&mut self) -> &mut Self {
-        (self.until, self.through) = (Some(Instant::now() + PATIENCE), 0);
+        (self.deadline, self.transferred) = (Some(Instant::now() + PEER_TIMEOUT), 0);
         self
     }
 
-    /// One attempt to pass bytes on, at most a [`TICK`] long; the callers try again after an interruption.
-    fn attempt(&mut self, pass: impl FnOnce(&TcpStream) -> std::io::Result<usize>) -> std::io::Result<usize> {
+    /// One attempt to transfer bytes, at most a [`TICK`] long. The callers repeat it after an interruption.
+    fn attempt(&mut self, transfer: impl FnOnce(&TcpStream) -> std::io::Result<usize>) -> std::io::Result<usize> {
         if self.stop.load(Ordering::Relaxed) {
-            return Err(std::io::Error::new(ErrorKind::ConnectionAborted, "told to stop"));
+            return Err(std::io::Error::new(ErrorKind::ConnectionAborted, "stopped"));
         }
-        let until = *self.until.get_or_insert_with(|| Instant::now() + PATIENCE);
-        match pass(self.stream) {
+        let deadline = *self.deadline.get_or_insert_with(|| Instant::now() + PEER_TIMEOUT);
+        match transfer(self.stream) {
             Err(e) if e.kind() == ErrorKind::WouldBlock => {
-                let late = Instant::now() >= until;
+                let late = Instant::now() >= deadline;
                 Err(if late { ErrorKind::TimedOut } else { ErrorKind::Interrupted }.into())
             }
             Ok(bytes) => {
-                self.through += bytes;
-                if self.through >= PIECE {
+                self.transferred += bytes;
+                if self.transferred >= PIECE {
                     self.begin();
-                } else if Instant::now() >= until {
+                } else if Instant::now() >= deadline {
                     return Err(ErrorKind::TimedOut.into());
                 }
                 Ok(bytes)
@@ -76,14 +79,13 @@ impl Write for Paced<'_> {
     }
 }
 
-/// Both sides' greetings take [`PATIENCE`] in all; afterwards each piece of a message may.
+/// Exchanges both sides' greetings within [`PEER_TIMEOUT`].
 pub(super) fn greet(
     stream: &TcpStream,
     stop: &AtomicBool,
     greeting: impl FnOnce(&mut Paced) -> Result<Session, WireError>,
 ) -> Result<Session, WireError> {
-    let broken = |e| WireError::io(Path::new("connection"), "broke", e);
     let timeouts = || stream.set_read_timeout(Some(TICK)).and_then(|()| stream.set_write_timeout(Some(TICK)));
-    stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true)).and_then(|()| timeouts()).map_err(broken)?;
+    stream.set_nonblocking(false).and_then(|()| stream.set_nodelay(true)).and_then(|()| timeouts()).map_err(WireError::connection)?;
     greeting(&mut Paced::new(stream, stop))
 }
