@@ -99,7 +99,8 @@ rw_status rw_describe_slots(rw_description *description, uint32_t slots);
 
 // Sets the longest wait, in milliseconds, for ridgewatch to take the step that would be overwritten. After a timeout the next wait begins only
 // when ridgewatch has taken a step. 0 (default): overwrite, never wait.
-rw_status rw_describe_wait(rw_description *description, uint32_t milliseconds);
+rw_status rw_describe_wait(rw_description *description,
+                           uint32_t milliseconds);
 
 // Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, or `RW_OFF` if it is not set. All memory is allocated here.
 // `*field` is null unless `RW_OK` is returned. The ring of an earlier run is replaced: followers read it to its end if there is room for
