@@ -26,7 +26,7 @@ NVRTC_VERSION := 13.0.88
 MYPY_VERSION := 2.4.1
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
-# Folder of the real archives that tests/archive_real.rs reads.
+# Folder of the real archives that tests/archive/real.rs reads.
 RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 
 # Output folder of `make adapters`, and where `make install-adapters` installs it.
@@ -154,7 +154,7 @@ test-adapters: packages python-packages adapter-packages adapters
 	$(CARGO) test --release -p ridgewatch-wire -p ridgewatch-adapter
 	@if command -v gfortran >/dev/null; then $(CARGO) test --release -p ridgewatch-adapter --test fortran_module -- --ignored; else \
 	  echo "NOT RUN: the tests of the Fortran module, since gfortran is not installed"; fi
-	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes && $(CARGO) test --release --test publish_full_disk -- --ignored; else \
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-wire -- --ignored --skip gigabytes && $(CARGO) test --release --test publish -- --ignored; else \
 	  echo "NOT RUN: the tests of full file systems and of files of another user, since they need root"; fi
 	@if [ "$$(awk '/^MemAvailable/ { print int($$2 / 1000000) }' /proc/meminfo)" -ge 16 ]; then $(CARGO) test --release -p ridgewatch-wire --test follow -- --ignored gigabytes; else \
 	  echo "NOT RUN: the relay test with steps of 2 GB, since it needs 16 GB of memory"; fi

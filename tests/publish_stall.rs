@@ -8,7 +8,6 @@ use kit::publishing::{GREETING, frame};
 use ridgewatch::publish::{FRAME_TOPIC, FrameHeader, Payload, PublishSettings, PublishStatistics, Publisher, peak_memory_bytes};
 use ridgewatch::render::Film;
 use ridgewatch::run::FrameRecord;
-use ridgewatch::run::{Frame, FrameRecord};
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};

@@ -117,9 +117,8 @@ pub fn opening(scene: &SceneFile) -> indicatif::ProgressBar {
 
 /// Ring folder of an option, or of the environment.
 pub fn ring_folder(option: Option<&Path>) -> Result<PathBuf> {
-    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
     let missing = || Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE));
-    Ok(option.map(Path::to_owned).or_else(named).ok_or_else(missing)?)
+    Ok(option.map(Path::to_owned).or_else(ridgewatch_wire::ring_from_environment).ok_or_else(missing)?)
 }
 
 /// Describes a number of steps that was chosen by its error.

@@ -200,7 +200,7 @@ fn another_grid_in_mid_run_is_refused_and_the_old_one_taken_again() {
     let solver = producer(&folder, plane(8));
     publish(&solver, 10, 10.0, 1.0);
     let (_, warnings) = take(&window, |taken| newest(taken) == 10.0);
-    assert!(has(&warnings, "another grid needs a run of its own"), "{warnings:?}");
+    assert!(has(&warnings, "another grid needs another run"), "{warnings:?}");
 }
 
 #[test]
@@ -355,7 +355,7 @@ fn a_step_that_lacks_a_block_is_given_up_after_its_time_and_later_ones_come() {
         solvers.iter().for_each(|solver| publish(solver, n, n as f64, 1.0));
     }
     let (taken, warnings) = take(&window, |taken| newest(taken) == 19.0);
-    assert!(has(&warnings, "step 3 (time 3) was given up with 1 of 2 blocks: blocks did not come in time"), "{warnings:?}");
+    assert!(has(&warnings, "step 3 (time 3) was given up with 1 of 2 blocks: blocks did not arrive in time"), "{warnings:?}");
     assert!(taken.live.steps_incomplete >= 1 && taken.live.steps + taken.live.steps_incomplete == 17, "{:?}", taken.live);
 }
 

@@ -4,7 +4,6 @@ use crate::network_support::{DoubleGyre, traced, uniform_points};
 use crate::page;
 use ridgewatch::flow::Tracer;
 use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
-use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings};
 use ridgewatch::surrogate::{Kind, Learned, ReplayBuffer, SurrogateSettings, build};

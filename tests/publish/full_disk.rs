@@ -5,7 +5,6 @@ use crate::kit::publishing;
 use ridgewatch::publish::{ExrFrames, Output, PublishSettings, RunFolder, read_exr};
 use ridgewatch::render::Film;
 use ridgewatch::run::{Frame, FrameRecord};
-use ridgewatch::run::{Frame, FrameRecord};
 use std::process::Command;
 
 /// A file system of one megabyte, removed at the end of the test.

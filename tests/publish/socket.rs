@@ -6,7 +6,6 @@ use ridgewatch::publish::{
 };
 use ridgewatch::render::Film;
 use ridgewatch::run::{Frame, FrameRecord};
-use ridgewatch::run::{Frame, FrameRecord};
 use std::sync::Arc;
 use std::time::Duration;
 use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};

@@ -4,7 +4,6 @@ use crate::kit::program::until;
 use crate::kit::scene::{self, SMALL_NETWORK, double_gyre};
 use crate::network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
-use ridgewatch::run::{Event, FrameRecord, RunOptions, RunReport, Setup, run};
 use ridgewatch::run::{FrameRecord, RunOptions, RunReport};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, SurrogateSettings, build};

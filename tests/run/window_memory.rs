@@ -18,7 +18,7 @@ fn snapshots_that_have_left_the_window_are_dropped() {
     let setup = scene::setup(&scene::scene("turbulence", [8, 4, 1], keys), &[]);
     let read: Arc<Mutex<Vec<Weak<Snapshot>>>> = Arc::default();
     let told = read.clone();
-    setup.feed.tell(Box::new(move |snapshot| told.lock().unwrap().push(Arc::downgrade(snapshot))));
+    setup.slides.listen(Box::new(move |snapshot| told.lock().unwrap().push(Arc::downgrade(snapshot))));
     let mut held = Vec::new();
     scene::run_frames(setup, &RunOptions { threads: 1, ..RunOptions::default() }, |_| {
         held.push(read.lock().unwrap().iter().filter(|s| s.strong_count() > 0).count());

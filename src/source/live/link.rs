@@ -88,7 +88,7 @@ impl Link {
 
 /// The ring's folder.
 pub fn ring_of(settings: &LiveSettings) -> Result<PathBuf, SourceError> {
-    let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
+    let named = ridgewatch_wire::ring_from_environment;
     settings.ring.clone().or_else(named).ok_or_else(|| SourceError::Setting {
         key: "live.ring",
         found: "missing".into(),
