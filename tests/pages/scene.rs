@@ -1,7 +1,7 @@
 //! The page of all keys of a scene file, compared with the keys that are read.
 
 use crate::page;
-use ridgewatch::config::SceneFile;
+use ridgewatch::config::{RENAMED, SceneFile};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
