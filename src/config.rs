@@ -201,7 +201,7 @@ impl SceneFile {
             ("time.start", !gridded, "only with closed forms; snapshots have times of their own"),
             ("time.step", !gridded, "only with closed forms; time.stride says how far the window of snapshots moves"),
             ("time.stride", gridded, "only with snapshots; time.step says how far the seed time of a closed form moves"),
-            ("flow.gap", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
+            ("flow.difference_step", flow.integrator == Integrator::Differences, "only with flow.integrator = \"differences\""),
             ("flow.steps", !adaptive, "left out with flow.integrator = \"dormand_prince\", which chooses its own"),
             ("flow.tolerance", !adaptive && flow.steps == StepsSetting::Auto, "only with flow.steps = \"auto\""),
             ("flow.interpolation", gridded, "only with snapshots; a closed form is known everywhere"),

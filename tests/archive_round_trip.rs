@@ -34,7 +34,7 @@ fn trace(window: &Arc<Window>, seeds: &[[f32; 3]]) -> Traced {
         integrator: Integrator::Tangent,
         precision: Precision::F64,
         steps: Steps::Fixed(64),
-        gap: 1e-3,
+        difference_step: 1e-3,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Cubic,

@@ -199,7 +199,7 @@ fn missing_values_are_empty_and_shown_as_land() {
     // Land where x < 0.5; beyond it nothing but empty sea.
     let land = |p: [f32; 3]| if p[0] < 0.5 { f32::NAN } else { -1.0 };
     let mut map = scene(16, LightSettings::directional([0.0, 0.0, -1.0], FOUR_PI));
-    map.settings.missing = [0.25; 3];
+    map.settings.missing_color = [0.25; 3];
     map.transfer.extinction = Some(20.0);
     let (film, stats) = picture(map, 4, land);
     for (i, pixel) in film.rgba.iter().enumerate() {

@@ -25,7 +25,7 @@ impl DoubleGyre {
             integrator: Integrator::Tangent,
             precision: Precision::F32,
             steps: Steps::Fixed(steps),
-            gap: 1e-6,
+            difference_step: 1e-6,
             boundary: Boundary::Zero,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -230,7 +230,7 @@ fn bad_scenes_name_the_key() {
     assert!(fault(|s| s.settings.samples = 0).starts_with("`render.samples` is 0"));
     assert!(fault(|s| s.settings.tone_map[2] = 0.0).starts_with("`render.tone_map`"));
     assert!(fault(|s| s.settings.background[1] = -1.0).starts_with("`render.background`"));
-    assert!(fault(|s| s.settings.missing[1] = f64::NAN).starts_with("`render.missing`"));
+    assert!(fault(|s| s.settings.missing_color[1] = f64::NAN).starts_with("`render.missing_color`"));
     assert!(fault(|s| s.settings.majorant_cells = Some([0, 1, 1])).starts_with("`render.majorant_cells` is [0, 1, 1]"));
     assert!(fault(|s| s.settings.majorant_cells = Some([1024; 3])).contains("in all"));
     assert!(fault(|s| s.camera.look_at = s.camera.eye).starts_with("`camera.look_at`"));

@@ -18,7 +18,7 @@ fn map(tau: f64, steps: usize, precision: Precision, interpolation: Interpolatio
         integrator: Integrator::Tangent,
         precision,
         steps: Steps::Fixed(steps),
-        gap: 1e-3,
+        difference_step: 1e-3,
         boundary: Boundary::Stop,
         normalisation: Normalisation::Tau,
         interpolation,

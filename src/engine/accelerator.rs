@@ -8,7 +8,7 @@ use super::audit::{AuditFindings, AuditRequest};
 use super::cuda::{CudaTracerError, DeviceError};
 use super::device::WhenLost;
 use crate::field::{Domain, Snapshot};
-use crate::flow::{Chosen, Extras, FlowMap, Traced, TracedNodes, Tracer, VelocitySource};
+use crate::flow::{Extras, FlowMap, StepChoice, Traced, TracedNodes, Tracer, VelocitySource};
 use crate::render::{Film, RenderStats, Renderer};
 use crate::surrogate::{DeviceLost, NotTaken, Offload, Predict, Table};
 use std::collections::BTreeMap;
@@ -290,11 +290,11 @@ impl<T: DeviceTrace> Tracer for Backed<T> {
     fn steps(&self) -> usize {
         self.host.steps()
     }
-    fn chosen(&self) -> Option<Chosen> {
-        self.host.chosen()
+    fn step_choice(&self) -> Option<StepChoice> {
+        self.host.step_choice()
     }
-    fn is_void(&self, seed: [f32; 3]) -> bool {
-        self.host.is_void(seed)
+    fn is_missing(&self, seed: [f32; 3]) -> bool {
+        self.host.is_missing(seed)
     }
     fn as_any(&self) -> Option<&dyn std::any::Any> {
         Some(self)

@@ -174,7 +174,7 @@ impl LogStretch for Answers<'_> {
         scratch.to_predict.clear();
         let spent = self.budget_spent();
         for (i, &point) in points.iter().enumerate() {
-            if self.tracer.is_void(point) {
+            if self.tracer.is_missing(point) {
                 log_stretch[i] = f32::NAN;
                 traced[i] = false;
                 self.tally.missing += 1;

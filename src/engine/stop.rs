@@ -2,7 +2,7 @@
 
 use super::EngineError;
 use crate::field::Domain;
-use crate::flow::{Chosen, Extras, Traced, TracedNodes, Tracer};
+use crate::flow::{Extras, StepChoice, Traced, TracedNodes, Tracer};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
@@ -78,12 +78,12 @@ impl Tracer for Interruptible<'_> {
         self.tracer.steps()
     }
 
-    fn chosen(&self) -> Option<Chosen> {
-        self.tracer.chosen()
+    fn step_choice(&self) -> Option<StepChoice> {
+        self.tracer.step_choice()
     }
 
-    fn is_void(&self, seed: [f32; 3]) -> bool {
-        self.tracer.is_void(seed)
+    fn is_missing(&self, seed: [f32; 3]) -> bool {
+        self.tracer.is_missing(seed)
     }
 
     /// In one go: a device that traces all nodes does so in a second or two.

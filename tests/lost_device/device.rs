@@ -534,7 +534,7 @@ impl DeviceRenderer for Render {
         if asked.surrogate.is_some() || asked.keep > 1 {
             return Ok(None);
         }
-        renderer.set_up(picture, 0..samples as u32)?;
+        renderer.frame_setup(picture, 0..samples as u32)?;
         for wave in 0..3_u8 {
             self.line.call("a wave of a frame")?;
             if let Some(progress) = progress {

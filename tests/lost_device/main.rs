@@ -268,7 +268,7 @@ fn a_device_chosen_by_itself_may_refuse_its_first_work_alone() {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(8),
-        gap: 1e-3,
+        difference_step: 1e-3,
         boundary: Boundary::Unbounded,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,

@@ -59,21 +59,21 @@ impl GridArguments {
                 spacing: axis.spacing,
                 density: R::from_f64(0.0),
                 high: axis.high,
-                wrap: axis.wrap_length().unwrap_or(R::from_f64(0.0)),
+                wrap: axis.wrap.unwrap_or(R::from_f64(0.0)),
                 nodes: axis.nodes as i32,
                 last_cell: axis.last_cell as i32,
                 intervals: 0,
             };
-            if let Some(table) = axis.table() {
-                data.positions = put(bytes_of(table.positions))?;
-                data.inverse = put(bytes_of(table.inverse))?;
-                data.begins = put(bytes_of(table.begins))?;
+            if let Some(table) = &axis.table {
+                data.positions = put(bytes_of(&table.positions))?;
+                data.inverse = put(bytes_of(&table.inverse))?;
+                data.begins = put(bytes_of(&table.begins))?;
                 data.density = table.density;
                 data.intervals = table.begins.len() as i32;
             } else {
                 even |= 1 << k;
             }
-            wrap |= i32::from(axis.wrap_length().is_some()) << k;
+            wrap |= i32::from(axis.wrap.is_some()) << k;
             seam |= i32::from(axis.seam) << k;
             axes.push(data);
         }

@@ -71,7 +71,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
                 addresses,
                 storage,
                 scale: if storage != Storage::F32 { HALF_SCALE } else { 1.0 },
-                missing: window.snapshots().any(|s| s.missing() > 0),
+                missing: window.snapshots().any(|s| s.missing_nodes() > 0),
             };
             let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
             let arguments =
@@ -101,7 +101,16 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
     unsafe {
         let trace: libloading::Symbol<HostTrace> = library.get(b"host_trace").unwrap();
         let step = (&raw const step).cast();
-        trace(data.as_ptr().cast(), times as *const c_void, step, map.gap, &verdict(map, steps), seeds.as_ptr().cast(), n as u32, &outputs);
+        trace(
+            data.as_ptr().cast(),
+            times as *const c_void,
+            step,
+            map.difference_step,
+            &verdict(map, steps),
+            seeds.as_ptr().cast(),
+            n as u32,
+            &outputs,
+        );
     }
     out
 }
@@ -162,7 +171,7 @@ fn map(tau: f64, steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F64,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Unbounded,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -370,12 +379,12 @@ fn windows_on_the_sphere() {
     let lat = Axis::uniform("lat", "", -90.0, 90.0, 37).unwrap();
     let globe = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
     // A particle at a pole, where the grid's cells meet, would be decided by rounding: Clamp lets all live.
-    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, difference_step: 1e-3, ..map(3.2, 16) };
     check("globe, cubic", &smooth(&globe, 1.0, false), &around, 0.1);
     let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
     let lat = Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap();
     let region = Arc::new(Grid { axes: vec![lon, lat], geometry: Geometry::Sphere { radius: 10.0 }, slab: (0.0, 1.0) });
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("region, linear, holes", &smooth(&region, 0.8, true), &stop, 3.4);
     check("region, differences", &smooth(&region, 0.8, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);
 }
@@ -396,9 +405,9 @@ fn levels_on_the_sphere() {
         let lon = Axis::uniform("lon", "", -30.0, 10.0, 21).unwrap();
         grid(lon, Axis::uniform("lat", "", 20.0, 60.0, 21).unwrap(), heights)
     };
-    let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, difference_step: 1e-3, ..map(3.2, 16) };
     check("globe", &smooth(&globe(&even), 0.8, false), &around, 0.1);
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("region, uneven levels, holes", &smooth(&region(&uneven), 0.5, true), &stop, 3.4);
     let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
     check("region, cubic", &smooth(&region(&uneven), 0.5, false), &cubic, 3.4);

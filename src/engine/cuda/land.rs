@@ -2,7 +2,7 @@
 
 use super::layout::{LandArgument, LandAxis};
 use super::{Buffer, DeviceError, Gpu};
-use crate::flow::Voids;
+use crate::flow::MissingCells;
 
 /// Land under the seeds of one window.
 #[derive(Debug)]
@@ -15,7 +15,7 @@ pub struct DeviceLand {
 
 impl DeviceLand {
     /// None where particles can start everywhere.
-    pub(super) fn new(gpu: &Gpu, voids: &Voids) -> Result<Option<Self>, DeviceError> {
+    pub(super) fn new(gpu: &Gpu, voids: &MissingCells) -> Result<Option<Self>, DeviceError> {
         let Some((grid, empty)) = voids.cells() else { return Ok(None) };
         let mut argument = LandArgument { dimensions: grid.axes.len() as i32, ..LandArgument::NONE };
         let mut nodes = Vec::new();

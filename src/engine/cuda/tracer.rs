@@ -5,7 +5,7 @@ use super::trace::{DeviceTracer, Tuning};
 use super::{Buffer, DeviceError, DeviceLand, DeviceTable, Gpu, SnapshotStore};
 use crate::engine::accelerator::{Backed, DeviceNodes, DeviceTrace};
 use crate::field::Domain;
-use crate::flow::{Extras, FlowError, FlowMap, Precision, Traced, VelocitySource, Voids, cpu_tracer};
+use crate::flow::{Extras, FlowError, FlowMap, MissingCells, Precision, Traced, VelocitySource, cpu_tracer};
 use std::sync::{Arc, Mutex, PoisonError};
 use thiserror::Error;
 
@@ -66,7 +66,7 @@ impl CudaTracer {
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
         let land = match &source {
             VelocitySource::Analytic(..) => None,
-            VelocitySource::Window(window) => DeviceLand::new(gpu, &Voids::at(window, t0, map.interpolation))?,
+            VelocitySource::Window(window) => DeviceLand::new(gpu, &MissingCells::at(window, t0, map.interpolation))?,
         };
         let trace = CudaTrace { device, land, double: map.precision == Precision::F64, room: Mutex::new(None) };
         Ok(Self::with(trace, host, gpu.health().clone()))

@@ -158,7 +158,7 @@ impl Cycle<'_> {
     ) -> Result<(Rendered, Option<Learned>), EngineError> {
         let scene = &self.plan.scene;
         let waits = !live || scene.training.steps_per_frame.is_some();
-        let per_cell = scene.trust.audit_per_cell;
+        let per_cell = scene.trust.audit_min_per_cell;
         let cells = self.trust.shape();
         let samples_per_pixel = scene.time.warmup_samples.filter(|_| place.warmup).unwrap_or(scene.render.samples);
         // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
@@ -318,7 +318,7 @@ impl Cycle<'_> {
             audited: work.audit.points as u64,
             lived_share: work.audit.lived_share,
             majorant_exceeded: work.stats.majorant_exceeded,
-            traced_ahead: work.stats.ahead,
+            traced_ahead: work.stats.speculative_queries,
             warnings: std::mem::take(&mut slide.warnings),
             ..FrameRecord::default()
         }

@@ -15,7 +15,7 @@ use super::setup::{Plan, Setup};
 use super::stop::{Halt, Interruptible, heed};
 use super::training::{Threads, Turns};
 use super::{Device, EngineError, Frame, Settings, TransferRecord};
-use crate::flow::{Chosen, FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{Learned, Resize, SampleRing, Sizing, Surrogate, SurrogateSettings};
@@ -75,7 +75,7 @@ pub struct RunReport {
     pub train_steps: u64,
     /// Runge-Kutta steps a path; none where each path chooses its own, or before there was a tracer.
     pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
     /// The transfer function in force; none before there was one.
     pub transfer: Option<TransferRecord>,
@@ -263,7 +263,7 @@ impl<'a> Cycle<'a> {
             ring.set_now(times.unit(tracer.start(), tracer.tau()));
         }
         report.integration_steps = fixed_steps(tracer);
-        report.integration_difference = tracer.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
+        report.integration_difference = tracer.step_choice().map(|c| c.difference).filter(|difference| difference.is_finite());
         Ok(Self {
             plan,
             options,
@@ -305,14 +305,14 @@ impl<'a> Cycle<'a> {
         sink: &mut (dyn FnMut(Event) + Send),
     ) -> Result<(), Halt> {
         slide.warnings.extend(self.uniform(tracer));
-        if let Some(chosen) = tracer.chosen().filter(|chosen| chosen.failed > 0) {
+        if let Some(chosen) = tracer.step_choice().filter(|chosen| chosen.not_finite > 0) {
             slide.warnings.push(format!(
                 "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
-                chosen.failed,
-                Chosen::POINTS
+                chosen.not_finite,
+                StepChoice::POINTS
             ));
         }
-        if let Some(chosen) = tracer.chosen().filter(|chosen| !chosen.met) {
+        if let Some(chosen) = tracer.step_choice().filter(|chosen| !chosen.within_tolerance) {
             slide.warnings.push(format!(
                 "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
                 chosen.steps, chosen.difference
