@@ -23,7 +23,7 @@ fn map(steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,

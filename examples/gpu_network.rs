@@ -166,7 +166,7 @@ mod bench {
             integrator: Integrator::Tangent,
             precision,
             steps: Steps::Fixed(steps),
-            gap: 0.05,
+            difference_step: 0.05,
             boundary: Boundary::Clamp,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -370,7 +370,7 @@ mod bench {
             "| | MB | 2^18 samples, ms | M/s | trained, M/s, batch 2^18 | PSNR, dB, at once or after 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |"
         );
         println!("|{}", "---|".repeat(11));
-        let six = FlowMap { integrator: Integrator::Differences, gap: 1e-6, ..map(110, Precision::F64) };
+        let six = FlowMap { integrator: Integrator::Differences, difference_step: 1e-6, ..map(110, Precision::F64) };
         let pairs = Tuning { storage: Storage::F16Pairs, ..Tuning::default() };
         // The order that the published way traces in is that of its seeds, whose number then makes no difference.
         let as_they_come = Tuning { sorted: false, keep: false, spread: false, ..Tuning::default() };

@@ -10,7 +10,7 @@ use ridgewatch::flow::{
 };
 use ridgewatch::render::rng::{FrameRandom, philox};
 use ridgewatch::render::{
-    Camera, CameraSettings, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, SeenInCells, Transfer,
+    Camera, CameraSettings, CellObservations, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, Transfer,
     TransferSettings,
 };
 use ridgewatch::surrogate::{Predict, Samples, Table};
@@ -113,7 +113,7 @@ fn rays_and_colours_are_the_same_numbers() {
         let camera = Camera::new(&scene.camera, 37.0 / 23.0).unwrap();
         let transfer = Transfer::new(&scene.transfer, 1.0).unwrap();
         let mut renderer = Renderer::new(scene, &domain(), 1.0).unwrap();
-        let mut input = renderer.set_up(0, 0..1).unwrap().parameters.as_bytes().to_vec();
+        let mut input = renderer.frame_setup(0, 0..1).unwrap().parameters.as_bytes().to_vec();
         let n = 5000_u32;
         input.extend(bytes(&[n]));
         let (mut random, mut asked) = (uniform(1), Vec::new());
@@ -153,7 +153,7 @@ struct Tracked {
     /// Queries, traced, missing, exceeded, paths, over budget.
     counts: [u64; 6],
     film: Film,
-    seen: SeenInCells,
+    seen: CellObservations,
 }
 
 /// Tracks samples of a frame with the kernels' code. A pixel's samples are divided into `parts`; a flight queues `ahead` collisions at once.
@@ -171,11 +171,11 @@ fn tracked_by(
     parts: u32,
     ahead: [u32; 2],
 ) -> Tracked {
-    let setup = renderer.set_up(frame, samples.clone()).unwrap();
+    let setup = renderer.frame_setup(frame, samples.clone()).unwrap();
     let (pixels, cells) = (setup.parameters.pixels(), setup.majorants.len());
     let mut input = [answer_setup, setup.parameters.as_bytes()].concat();
     input.extend(bytes(setup.majorants));
-    input.extend(bytes(setup.may_miss));
+    input.extend(bytes(setup.may_be_missing));
     input.extend(bytes(&[0, pixels as u32, parts, samples.start, samples.end - samples.start, 0]));
     input.extend(bytes(&ahead));
     let output = ask(request, &input);
@@ -183,7 +183,7 @@ fn tracked_by(
     let counts = read::<[u32; 6]>(&mut output, 1)[0].map(u64::from);
     let mut film = Film::new(37, 23);
     film.write_pixels(0, &read::<PixelValue>(&mut output, pixels));
-    let seen = SeenInCells { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
+    let seen = CellObservations { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
     assert!(output.is_empty());
     Tracked { counts, film, seen }
 }
@@ -213,8 +213,8 @@ fn whole_frames_are_the_same_bits() {
             assert!(bits(&found.film) == bits(&expected), "frame {frame}, cells {cells:?}");
             assert!(renderer.absorb(&found.seen));
         }
-        reference.set_up(3, 0..1).unwrap();
-        renderer.set_up(3, 0..1).unwrap();
+        reference.frame_setup(3, 0..1).unwrap();
+        renderer.frame_setup(3, 0..1).unwrap();
         assert_eq!(renderer.majorants().majorants(), reference.majorants().majorants());
     }
 }
@@ -329,7 +329,7 @@ fn holed(periodic: bool) -> Box<dyn Tracer> {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(2),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -360,7 +360,7 @@ fn missing_cells_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
     }
     for &z in &middles[2] {
         for &y in &middles[1] {
-            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_void([x as f32, y as f32, z as f32]))));
+            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_missing([x as f32, y as f32, z as f32]))));
         }
     }
     out
@@ -421,7 +421,7 @@ fn the_same_one_answers_at_every_point() {
             let who = read::<i32>(&mut output, 1)[0];
             let values = read::<f32>(&mut output, 4);
             let unit = domain.to_unit(point);
-            let expected = match (tracer.is_void(point), gate.trusts(unit), spent) {
+            let expected = match (tracer.is_missing(point), gate.trusts(unit), spent) {
                 (true, ..) => 0,
                 (_, true, _) => 1,
                 (.., true) => 2,
@@ -537,7 +537,7 @@ impl LogStretch for Gated<'_> {
         for (i, &p) in points.iter().enumerate() {
             let unit = domain().to_unit(p);
             traced[i] = false;
-            if self.tracer.is_void(p) {
+            if self.tracer.is_missing(p) {
                 log_stretch[i] = f32::NAN;
             } else if self.gate.is_some_and(|gate| self.spent || gate.trusts(unit)) {
                 self.over_budget += u64::from(self.gate.is_some_and(|gate| !gate.trusts(unit)));

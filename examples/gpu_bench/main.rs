@@ -67,7 +67,7 @@ mod bench {
             integrator,
             precision,
             steps: Steps::Fixed(steps),
-            gap,
+            difference_step: gap,
             boundary,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -375,7 +375,7 @@ mod bench {
                 println!("| tangent | f32 | - | {} | {rate:.0} | 1 | {psnr:.1} |", storage.name());
                 // In pairs only the best of them.
                 for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
-                    let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
+                    let changed = FlowMap { integrator, precision, difference_step: gap, ..turbulent(22) };
                     let tracer = self.tracer(&source, &changed, Tuning { keep, spread, ..held })?;
                     let ms = batch.time(&tracer, count)?;
                     let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
@@ -397,7 +397,8 @@ mod bench {
                 }
             }
             let random = KERNELS[2].1;
-            let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
+            let published =
+                FlowMap { integrator: Integrator::Differences, precision: Precision::F64, difference_step: 1e-6, ..turbulent(110) };
             let count = 1 << 18;
             let published = self.tracer(&source, &published, random)?;
             let slow = batch.time(&published, count)? / count as f64;

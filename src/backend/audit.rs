@@ -71,7 +71,7 @@ pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Au
         .map(|(chunk, points)| {
             let (mut samples, mut numbers, mut lived) = (Samples::default(), Vec::new(), 0.0);
             for (i, &point) in (chunk * CHUNK..).zip(points) {
-                if !tracer.flow().is_void(point) {
+                if !tracer.flow().is_missing(point) {
                     push_sample(&mut samples, domain, point, &traced, i, extras);
                     numbers.push(i);
                     lived += f64::from(traced.lived[i]);

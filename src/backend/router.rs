@@ -164,7 +164,7 @@ impl QueryRouter<'_> {
         scratch.to_trace.clear();
         scratch.to_predict.clear();
         for (i, &point) in points.iter().enumerate() {
-            if tracer.flow().is_void(point) {
+            if tracer.flow().is_missing(point) {
                 log_stretch[i] = f32::NAN;
                 traced[i] = false;
                 tally.missing += 1;

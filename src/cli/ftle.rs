@@ -155,9 +155,9 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
     let ftle: Vec<f64> =
-        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
+        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_missing(seed) { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
-    let missing = seeds.iter().filter(|seed| tracer.is_void(**seed)).count();
+    let missing = seeds.iter().filter(|seed| tracer.is_missing(**seed)).count();
     if options.check || options.convergence {
         spinner.set_message(format!("integrating {} seeds for comparison", seeds.len()));
     }
@@ -195,7 +195,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
 
 /// Difference of the log-stretch from twice as many steps. `None` if the steps were given.
 fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
-    tracer.chosen().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
+    tracer.step_choice().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
 }
 
 fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
@@ -264,7 +264,7 @@ fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]], ft
 /// Both values at every seed with a velocity. A value there that is not finite is an error.
 fn comparable(tracer: &dyn Tracer, seeds: &[[f32; 3]], a: &[f64], b: &[f64]) -> Result<Vec<(f64, f64)>> {
     let pairs = a.iter().copied().zip(b.iter().copied());
-    let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_void(**seed)).map(|(pair, _)| pair).collect();
+    let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_missing(**seed)).map(|(pair, _)| pair).collect();
     let failed = pairs.iter().filter(|(a, b)| !a.is_finite() || !b.is_finite()).count();
     match (pairs.len(), failed) {
         (0, _) => bail!("no seed has a velocity: there is nothing to compare"),

@@ -16,7 +16,7 @@ use super::{EngineError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
-use crate::flow::{Chosen, FlowMap, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{Method, Renderer, Scene};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{Learned, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
@@ -76,7 +76,7 @@ pub struct RunReport {
     pub train_steps: u64,
     /// Runge-Kutta steps a path; `None` if each path chooses its own, or before there was a tracer.
     pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::Chosen`]).
+    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
     /// The transfer function in force; `None` before there was one.
     pub transfer: Option<TransferRecord>,
@@ -347,7 +347,7 @@ impl<'a> Run<'a> {
         }
         report.transfer = Some(transfer);
         report.integration_steps = fixed_steps(flow);
-        report.integration_difference = flow.chosen().map(|c| c.difference).filter(|difference| difference.is_finite());
+        report.integration_difference = flow.step_choice().map(|c| c.difference).filter(|difference| difference.is_finite());
         let learning = Learning {
             trust: TrustMap::new(&scene.trust, &plan.domain),
             buffer,
@@ -498,14 +498,14 @@ impl Run<'_> {
     /// Warnings about the flow map of the first slide.
     fn flow_warnings(&self, flow: &dyn Tracer) -> Vec<String> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
-        if let Some(chosen) = flow.chosen().filter(|chosen| chosen.failed > 0) {
+        if let Some(chosen) = flow.step_choice().filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(
                 "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
-                chosen.failed,
-                Chosen::POINTS
+                chosen.not_finite,
+                StepChoice::POINTS
             ));
         }
-        if let Some(chosen) = flow.chosen().filter(|chosen| !chosen.met) {
+        if let Some(chosen) = flow.step_choice().filter(|chosen| !chosen.within_tolerance) {
             warnings.push(format!(
                 "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
                 chosen.steps, chosen.difference

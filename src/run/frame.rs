@@ -329,7 +329,7 @@ impl Run<'_> {
             audited: work.audit.points as u64,
             mean_lifetime_share: work.audit.mean_lifetime_share,
             majorant_exceeded: work.rendered.stats.majorant_exceeded,
-            speculative_traces: work.rendered.stats.ahead,
+            speculative_traces: work.rendered.stats.speculative_queries,
             warnings,
             ..FrameRecord::default()
         }

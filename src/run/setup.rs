@@ -120,7 +120,7 @@ impl Setup {
                 StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
-            gap: scene.flow.difference_step,
+            difference_step: scene.flow.difference_step,
             boundary,
             normalisation: scene.flow.normalisation,
             interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),

@@ -48,7 +48,7 @@ fn around(pole: f64, latitudes: &[f64]) {
     assert_eq!((archive.metric(), grid.axes[0].period()), (Metric::Sphere, Some(360.0)));
     let end = if pole > 0.0 { grid.axes[1].last() } else { grid.axes[1].first() };
     assert_eq!(end, pole, "the pole is inside");
-    assert!(archive.read(0).unwrap().missing() == 0);
+    assert!(archive.read(0).unwrap().missing_nodes() == 0);
     // From 40 degrees off the pole up to it: on their way of 30 degrees many cross it.
     let seeds: Vec<[f32; 3]> =
         (0..200).map(|i| [(i as f32 * 137.507_76) % 360.0, (pole - pole.signum() * f64::from(i) / 5.0) as f32, 3000.0]).collect();

@@ -245,7 +245,7 @@ fn pressure_levels_on_the_sphere_become_heights() {
         // The poles lie a cell beyond the last rows: they become rows.
         assert_eq!(grid.axes[1].coordinates(), [-90.0, -60.0, 0.0, 60.0, 90.0]);
         let snapshot = archive.read(0).unwrap();
-        assert_eq!(snapshot.missing(), 0);
+        assert_eq!(snapshot.missing_nodes(), 0);
         for (k, hpa) in [1000.0, 500.0, 100.0].into_iter().enumerate() {
             // The mark of a known node is its vertical velocity, m/s.
             let upward = f64::from(snapshot.nodes[k * 20 + 4][3]);
@@ -455,7 +455,7 @@ fn later_files_have_packing_and_time_units_of_their_own() {
     for (index, scale) in [(0, 0.25), (1, 0.5)] {
         let snapshot = archive.read(index).unwrap();
         assert_eq!((snapshot.nodes[4][0], snapshot.nodes[4][1]), (4.0 * scale, 0.04));
-        assert!(snapshot.nodes[3][3].is_nan() && snapshot.missing() == 1);
+        assert!(snapshot.nodes[3][3].is_nan() && snapshot.missing_nodes() == 1);
     }
     let turned = file("c.nc", "days since 2000-01-05", 1.0, true);
     refused(&[first, turned], "", &["c.nc", "do not belong to one archive"]);

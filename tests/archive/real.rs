@@ -73,7 +73,7 @@ fn globcurrent() {
     assert_eq!((archive.default_tau().unwrap(), archive.gaps().len()), (29.5 * 86_400.0, 0));
     let snapshot = archive.read(0).unwrap();
     // Counted with another tool: 769 of 3321 values are NaN.
-    assert_eq!(snapshot.missing(), 769);
+    assert_eq!(snapshot.missing_nodes(), 769);
     let fastest = snapshot.nodes.iter().map(|n| n[..3].iter().map(|v| v * v).sum::<f32>().sqrt()).fold(0.0, f32::max);
     assert!(fastest > 1.0 && fastest < 3.0, "the Agulhas current runs at {fastest} m/s");
 }
@@ -88,7 +88,7 @@ fn era5_on_a_projected_grid() {
     // Pressures of 1000 to 1 hPa become heights.
     assert_eq!((archive.metric(), archive.grid().axes[2].first()), (Metric::Cartesian, 0.0));
     assert!((archive.grid().axes[2].last() - 7000.0 * 1000f64.ln()).abs() < 1e-6);
-    let share = archive.read(1).unwrap().missing() as f64 / archive.grid().nodes() as f64;
+    let share = archive.read(1).unwrap().missing_nodes() as f64 / archive.grid().nodes() as f64;
     // Counted with another tool: 14.1 %.
     assert!((share - 0.141).abs() < 1e-3, "{share}");
 }
@@ -102,7 +102,7 @@ fn wrf_hurricane() {
     // 48 x 48 cells that follow the storm by 15 cells west and 12 north in nine hours.
     assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
     let snapshot = archive.read(0).unwrap();
-    let known = snapshot.nodes.len() - snapshot.missing();
+    let known = snapshot.nodes.len() - snapshot.missing_nodes();
     // Some nodes at the ground are missing.
     assert!((0.99..=1.0).contains(&(known as f64 / (95.0 * 95.0 * 28.0))), "{known}");
     let inspection = inspected(&[&file]);
@@ -143,7 +143,7 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
     // Seeds that stop are left out. More remain than are needed, since a neighbour of some stops.
     let seeds: Vec<[f32; 3]> = (0..2000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
     let out = trace(&source, &map, begin, &seeds, Extras::default());
-    let chosen: Vec<usize> = (0..seeds.len()).filter(|&i| out.lived[i] == 1.0 && !tracer.is_void(seeds[i])).take(2 * PAIRS).collect();
+    let chosen: Vec<usize> = (0..seeds.len()).filter(|&i| out.lived[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
     assert_eq!(chosen.len(), 2 * PAIRS);
     let task = serde_json::json!({
         "kind": kind,

@@ -137,7 +137,7 @@ fn double_gyre_and_abc_against_the_reference() {
             println!("{name}, tangent {precision:?}, {steps} steps: log-stretch rms {rms:.2e}, max {max:.2e}");
             assert!(rms < tolerance, "{name} {precision:?}: {rms:e}");
         }
-        let differences = FlowMap { integrator: Integrator::Differences, gap: 1e-5, ..map(tau, steps, Precision::F64) };
+        let differences = FlowMap { integrator: Integrator::Differences, difference_step: 1e-5, ..map(tau, steps, Precision::F64) };
         let errors = sorted_errors(&stretches(&run(&source, &differences, 0.0, &seeds)), &exact);
         let median = errors[errors.len() / 2];
         println!("{name}, differences F64, gap 1e-5: log-stretch median {median:.2e}, max {:.2e}", errors[errors.len() - 1]);
@@ -220,7 +220,7 @@ fn gridded_tangent_is_the_derivative_of_the_gridded_flow() {
         for interpolation in [Interpolation::Linear, Interpolation::Cubic] {
             for (direction, t0) in [(Direction::Forward, 0.0), (Direction::Backward, 3.0)] {
                 let tangent = FlowMap { boundary: Boundary::Clamp, interpolation, direction, ..map(3.0, 12, Precision::F64) };
-                let differences = FlowMap { integrator: Integrator::Differences, gap: 1e-7, ..tangent.clone() };
+                let differences = FlowMap { integrator: Integrator::Differences, difference_step: 1e-7, ..tangent.clone() };
                 let exact = stretches(&run(&source, &tangent, t0, &seeds));
                 let errors = sorted_errors(&exact, &stretches(&run(&source, &differences, t0, &seeds)));
                 let high = errors[errors.len() * 95 / 100];
@@ -263,7 +263,7 @@ fn vectors_equal_scalars_and_order_does_not_matter() {
         let seeds = lattice(&domain, [29, 17, 13]);
         for integrator in [Integrator::Tangent, Integrator::Differences] {
             for (precision, gap, tolerance) in [(Precision::F32, 1e-2, 2e-5), (Precision::F64, 1e-5, 1e-9)] {
-                let map = FlowMap { boundary, integrator, gap, ..map(tau, 20, precision) };
+                let map = FlowMap { boundary, integrator, difference_step: gap, ..map(tau, 20, precision) };
                 let sorted = run(&source, &map, 0.0, &seeds);
                 let given = run_tracer(&*tracer_in_order(source.clone(), &map, 0.0, Order::Given).unwrap(), &seeds);
                 assert_eq!(sorted.log_stretch, given.log_stretch, "the same numbers, bit by bit");
@@ -426,9 +426,9 @@ fn what_has_no_meaning_is_refused() {
     let backward = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, ..short.clone() };
     assert!(matches!(refused(&window, backward.clone(), 1.0), FlowError::WindowTooShort { .. }));
     assert!(cpu_tracer(window.clone(), &backward, 4.0).is_ok());
-    let gap = |gap| FlowMap { integrator: Integrator::Differences, gap, boundary: Boundary::Stop, ..short.clone() };
+    let gap = |gap| FlowMap { integrator: Integrator::Differences, difference_step: gap, boundary: Boundary::Stop, ..short.clone() };
     assert!(matches!(refused(&window, gap(0.0), 0.0), FlowError::OutOfRange { key: "difference_step", .. }));
-    assert!(matches!(refused(&window, gap(1e-8), 0.0), FlowError::GapVanishes { .. }));
+    assert!(matches!(refused(&window, gap(1e-8), 0.0), FlowError::DifferenceStepVanishes { .. }));
     assert!(cpu_tracer(window.clone(), &FlowMap { precision: Precision::F64, ..gap(1e-8) }, 0.0).is_ok());
     let gyre_map = |map: FlowMap| refused(&double_gyre().0, map, 0.0);
     assert!(matches!(gyre_map(FlowMap { tau: f64::NAN, ..short.clone() }), FlowError::OutOfRange { key: "tau", .. }));

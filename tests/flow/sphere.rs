@@ -9,7 +9,7 @@ use std::sync::Arc;
 const TOP: f64 = 20_000.0;
 
 fn map(tau: f64, steps: usize, precision: Precision, interpolation: Interpolation) -> FlowMap {
-    FlowMap { precision, gap: 1e-3, boundary: Boundary::Stop, interpolation, ..FlowMap::tangent(tau, steps) }
+    FlowMap { precision, difference_step: 1e-3, boundary: Boundary::Stop, interpolation, ..FlowMap::tangent(tau, steps) }
 }
 
 /// A steady flow `(u, v, w)` of longitude, latitude (radians) and height, on a globe in cells of `cell` degrees. With one level it has two

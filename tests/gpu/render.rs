@@ -134,7 +134,7 @@ fn map(tau: f64, steps: usize, boundary: Boundary) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,

@@ -117,7 +117,7 @@ pub fn map(tau: f64, steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F64,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Unbounded,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,

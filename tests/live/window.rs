@@ -260,7 +260,7 @@ fn odd_times_and_missing_values_are_told() {
         has(&warnings, "repeats time 3") && has(&warnings, "time 2.5 came after 3") && has(&warnings, "64 of 64 velocities"),
         "{warnings:?}"
     );
-    assert_eq!(taken.window.snapshots().last().unwrap().missing(), 64);
+    assert_eq!(taken.window.snapshots().last().unwrap().missing_nodes(), 64);
     // Times go back within one run: the first steps are late, then the window starts again.
     for n in 0..5 {
         publish(&solver, 7 + n, n as f64 - 10.0, 1.0);

@@ -72,7 +72,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
                 addresses,
                 storage,
                 scale: if storage != Storage::F32 { HALF_SCALE } else { 1.0 },
-                missing: window.snapshots().any(|s| s.missing() > 0),
+                missing: window.snapshots().any(|s| s.missing_nodes() > 0),
             };
             let times: Vec<f64> = window.snapshots().map(|s| s.time).collect();
             let keep = map.precision == Precision::F32;
@@ -107,7 +107,7 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
             data.as_ptr().cast(),
             times as *const c_void,
             step,
-            map.gap,
+            map.difference_step,
             &result_policy(map, steps),
             seeds.as_ptr().cast(),
             n as u32,
@@ -166,7 +166,7 @@ fn map(tau: f64, steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F64,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Unbounded,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -390,9 +390,9 @@ fn windows_in_space() {
 fn windows_on_the_sphere() {
     let (globe, region) = (sphere(globe_axes()), sphere(region_axes()));
     // Rounding would decide the end of a particle at a pole, where the grid's cells meet. With Clamp none ends.
-    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, difference_step: 1e-3, ..map(3.2, 16) };
     check("globe, cubic", &smooth(&globe, 1.0, false), &around, 0.1);
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("region, linear, holes", &smooth(&region, 0.8, true), &stop, 3.4);
     check("region, differences", &smooth(&region, 0.8, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);
 }
@@ -406,9 +406,9 @@ fn levels_on_the_sphere() {
         sphere(axes)
     };
     let region = |heights: &[f64]| levels(region_axes(), heights);
-    let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, difference_step: 1e-3, ..map(3.2, 16) };
     check("globe", &smooth(&levels(globe_axes(), &even), 0.8, false), &around, 0.1);
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("region, uneven levels, holes", &smooth(&region(&uneven), 0.5, true), &stop, 3.4);
     let cubic = FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() };
     check("region, cubic", &smooth(&region(&uneven), 0.5, false), &cubic, 3.4);

@@ -5,7 +5,7 @@
 
 use crate::backend::cuda::rendering::memory::{Control, Memory, Plan};
 use crate::backend::cuda::{DeviceAnswers, DeviceError, Gpu, launch, threads};
-use crate::render::{Film, FrameParameters, RenderError, RenderStats, Renderer, SeenInCells};
+use crate::render::{CellObservations, Film, FrameParameters, RenderError, RenderStats, Renderer};
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
 use std::ops::Range;
 use std::sync::Arc;
@@ -196,13 +196,13 @@ impl GpuRenderer {
         let (width, height) = (settings.width, settings.height);
         let pixels = width * height;
         let refused = |refused: RenderError| DeviceError::Unsupported { what: refused.to_string() };
-        let setup = renderer.set_up(frame, samples.clone()).map_err(refused)?;
+        let setup = renderer.frame_setup(frame, samples.clone()).map_err(refused)?;
         let count = samples.end - samples.start;
         self.timeline = Timeline::default();
         let own = self.memory.as_ref().map_or(0, |memory| memory.block.len() as u64);
         let allowed = self.allowed.min(own + self.gpu.memory_left() / MEMORY_SHARE);
         let plan = Plan::new(pixels, count, setup.majorants.len(), allowed);
-        self.reserve(plan)?.begin_frame(setup.majorants, setup.may_miss)?;
+        self.reserve(plan)?.begin_frame(setup.majorants, setup.may_be_missing)?;
         let parameters = setup.parameters;
         let mut stats = RenderStats::default();
         let band = |first: usize| BandArgument {
@@ -243,7 +243,7 @@ impl GpuRenderer {
         let known = renderer.absorb(&seen);
         debug_assert!(known);
         let timeline = self.timeline;
-        stats.ahead = timeline.points.saturating_sub(stats.queries);
+        stats.speculative_queries = timeline.points.saturating_sub(stats.queries);
         stats.waves = timeline.waves;
         stats.walk_seconds = timeline.start + timeline.advance + timeline.film;
         stats.evaluate_seconds = timeline.answer;
@@ -346,7 +346,7 @@ impl GpuRenderer {
     }
 
     /// What the frame counted and saw.
-    fn end_frame(&mut self, stats: &mut RenderStats) -> Result<SeenInCells, DeviceError> {
+    fn end_frame(&mut self, stats: &mut RenderStats) -> Result<CellObservations, DeviceError> {
         let gpu = self.gpu.clone();
         let (seen, control) = self.memory()?.end_frame(&gpu)?;
         [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, self.over_budget] = control.totals;
@@ -386,14 +386,14 @@ impl Memory {
         Ok(self.control.values()[0])
     }
 
-    fn end_frame(&mut self, gpu: &Gpu) -> Result<(SeenInCells, Control), DeviceError> {
+    fn end_frame(&mut self, gpu: &Gpu) -> Result<(CellObservations, Control), DeviceError> {
         let (from, count) = (self.at(self.layout.watch), self.watch.len());
         // SAFETY: the block holds three values a cell there.
         unsafe { self.watch.copy_from(gpu, from, count) }?;
         let control = self.end_wave(gpu)?;
         let (count, rest) = self.watch.values().split_at(count / 3);
         let (highest, missing) = rest.split_at(count.len());
-        Ok((SeenInCells { count: count.into(), highest: highest.into(), missing: missing.into() }, control))
+        Ok((CellObservations { count: count.into(), highest: highest.into(), missing: missing.into() }, control))
     }
 
     fn wave(&self, parameters: FrameParameters, band: BandArgument) -> Wave {

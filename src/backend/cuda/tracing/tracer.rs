@@ -4,7 +4,7 @@ use crate::backend::BackendError;
 use crate::backend::cuda::layout::Outputs;
 use crate::backend::cuda::tracing::trace::{DeviceTracer, Tuning};
 use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, Gpu, SnapshotStore};
-use crate::flow::{Extras, FlowMap, Precision, Traced, Tracer, VelocitySource, Voids, cpu_tracer};
+use crate::flow::{Extras, FlowMap, MissingCells, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
 use crate::surrogate::Trace;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -53,7 +53,7 @@ impl CudaTracer {
         let device = DeviceTracer::new(store, gpu, &source, map, t0, host.steps(), tuning)?;
         let missing_cells = match &source {
             VelocitySource::Analytic(..) => None,
-            VelocitySource::Window(window) => DeviceMissingCells::new(gpu, &Voids::at(window, t0, map.interpolation))?,
+            VelocitySource::Window(window) => DeviceMissingCells::new(gpu, &MissingCells::at(window, t0, map.interpolation))?,
         };
         Ok(Self { device, host, missing_cells, double: map.precision == Precision::F64, room: Mutex::new(None) })
     }

@@ -77,22 +77,22 @@ impl GridArguments {
                 spacing: axis.spacing,
                 density: real(0.0),
                 high: axis.high,
-                wrap: axis.wrap_length().unwrap_or(real(0.0)),
+                wrap: axis.wrap.unwrap_or(real(0.0)),
                 nodes: axis.nodes as i32,
                 last_cell: axis.last_cell as i32,
                 intervals: 0,
                 pad: R::IntPad::zeroed(),
             };
-            if let Some(table) = axis.table() {
-                data.positions = put(cast_slice(table.positions))?;
-                data.inverse = put(cast_slice(table.inverse))?;
-                data.begins = put(cast_slice(table.begins))?;
+            if let Some(table) = &axis.table {
+                data.positions = put(cast_slice(&table.positions))?;
+                data.inverse = put(cast_slice(&table.inverse))?;
+                data.begins = put(cast_slice(&table.begins))?;
                 data.density = table.density;
                 data.intervals = table.begins.len() as i32;
             } else {
                 even |= 1 << k;
             }
-            wrap |= i32::from(axis.wrap_length().is_some()) << k;
+            wrap |= i32::from(axis.wrap.is_some()) << k;
             seam |= i32::from(axis.seam) << k;
             axes.push(data);
         }

@@ -2,7 +2,7 @@
 
 use crate::backend::cuda::layout::{MissingCellsArgument, MissingCellsAxis};
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
-use crate::flow::Voids;
+use crate::flow::MissingCells;
 use bytemuck::Zeroable;
 
 /// Land under the seeds of one window.
@@ -16,7 +16,7 @@ pub struct DeviceMissingCells {
 
 impl DeviceMissingCells {
     /// None where particles can start everywhere.
-    pub(in crate::backend::cuda) fn new(gpu: &Gpu, voids: &Voids) -> Result<Option<Self>, DeviceError> {
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, voids: &MissingCells) -> Result<Option<Self>, DeviceError> {
         let Some((grid, empty)) = voids.cells() else { return Ok(None) };
         let mut argument = MissingCellsArgument { dimensions: grid.axes.len() as i32, ..Zeroable::zeroed() };
         let mut nodes = Vec::new();

@@ -93,6 +93,14 @@ impl SnapshotUploader {
             pieces.free[side] = Some(gpu.transfer().record_event(None).map_err(&doing)?);
         }
         let ready = gpu.transfer().record_event(None).map_err(&doing)?;
-        Ok(DeviceSnapshot { host: snapshot.clone(), nodes, storage, scale, missing: snapshot.missing() > 0, next: OnceLock::new(), ready })
+        Ok(DeviceSnapshot {
+            host: snapshot.clone(),
+            nodes,
+            storage,
+            scale,
+            missing: snapshot.missing_nodes() > 0,
+            next: OnceLock::new(),
+            ready,
+        })
     }
 }
