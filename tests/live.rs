@@ -207,7 +207,7 @@ fn frames_resume_when_the_simulation_comes_back_in_other_blocks() {
         if relayed {
             until("the connection file", || connection.exists());
         }
-        let incomplete = ["--set", "live.incomplete_seconds=0.5"];
+        let incomplete = ["--set", "live.block_timeout_seconds=0.5"];
         let _sidecar = start(ridgewatch(&["attach", text(&live), way, "--out", text(&run)]).args(incomplete));
         for (restarts, blocks) in ["2x2x1", "1x2x1", "1x1x1"].into_iter().enumerate() {
             let publish = ["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000", "--blocks", blocks];
@@ -413,7 +413,7 @@ fn a_run_that_ends_with_its_simulation_ends_with_its_relay_too() {
     let (archive, live) = (place.archive(), place.live());
     let relay = start(&mut ridgewatch(&["relay", &ring, "--connection", text(&connection)]));
     until("the connection file", || connection.exists());
-    let once = ["--once", "--set", "live.relay_seconds=1"];
+    let once = ["--once", "--set", "live.relay_timeout_seconds=1"];
     let attach = start(ridgewatch(&["attach", text(&live), text(&connection), "--out", text(&run)]).args(once));
     let _solver = start(&mut ridgewatch(&["publish", text(&archive), "--ring", &ring, "--rate", "50", "--steps", "100000"]));
     until("the first frame", || !records(&run).is_empty());

@@ -79,7 +79,7 @@ fn windows_waiting_steps_and_buffers_stay_below_the_limit() {
         if step % 12 == 11 {
             frame = None;
             if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_millis(200)) {
-                incomplete = taken.live.incomplete;
+                incomplete = taken.live.steps_incomplete;
                 frame = Some(taken);
             }
         }

@@ -100,7 +100,7 @@ fn the_window_fills_and_moves_with_the_simulation() {
     let (taken, warnings) = take(&window, |_| true);
     assert_eq!((taken.live.step, newest(&taken), taken.live.snapshots, taken.live.steps, taken.live.missed_blocks), (4, 2.0, 5, 5, 0));
     // A quarter of tau a step.
-    let filling = &taken.live.filling;
+    let filling = &taken.live.fill_seconds;
     assert!(filling.len() == 10 && filling.is_sorted() && filling[0] == filling[1] && filling[5] == filling[6], "{filling:?}");
     assert!(filling[9] - filling[6] >= 0.05, "{filling:?}: the last quarter was late");
     assert!(taken.live.delay <= taken.live.age && taken.live.age < 60.0 && warnings.is_empty(), "{warnings:?}");
@@ -147,7 +147,7 @@ fn memory_is_kept_to_by_leaving_steps_out() {
     }
     let (taken, _) = take(&window, |taken| newest(taken) > 19.0);
     assert!(taken.live.snapshots <= 12 && taken.live.snapshots >= 10, "{}", taken.live.snapshots);
-    assert!((taken.live.spacing - 1.0).abs() < 1e-9 && taken.live.thinned > 150, "{:?}", taken.live);
+    assert!((taken.live.spacing - 1.0).abs() < 1e-9 && taken.live.steps_skipped > 150, "{:?}", taken.live);
     // u = sin t, v = t: linear interpolation over 1 misses u by up to 1 / 8 of its amplitude; v exactly none.
     let error = taken.live.interpolation_error.unwrap();
     assert!(error > 1e-4 && error < 0.02, "{error}");
@@ -183,7 +183,7 @@ fn a_simulation_that_ends_and_starts_anew_is_gone_on_with() {
     (0..3).for_each(|n| publish(&solver, n, n as f64, 2.0));
     let (taken, warnings) = take(&window, |taken| newest(taken) == 2.0);
     assert!(has(&warnings, "went back from time 3.5 to 0"), "{warnings:?}");
-    assert_eq!((taken.window.oldest(), taken.live.restarts, taken.live.filling.len()), (Some(0.0), 2, 10));
+    assert_eq!((taken.window.oldest(), taken.live.restarts, taken.live.fill_seconds.len()), (Some(0.0), 2, 10));
     assert!(taken.window.snapshots().all(|s| s.nodes[0][0] == 2.0), "nothing of the run before");
 }
 
@@ -232,7 +232,7 @@ fn a_simulation_in_other_blocks_of_the_same_grid_is_gone_on_with() {
             let (taken, warnings) = take(window, |taken| newest(taken) == times[3] && taken.live.restarts == round);
             assert!(taken.window.snapshots().last().unwrap().nodes.iter().all(|node| node[0] == value), "{name}, round {round}");
             assert_eq!(has(&warnings, "started anew"), round > 0, "{name}, round {round}: {warnings:?}");
-            assert_eq!(taken.live.incomplete, round, "{name}, round {round}: {warnings:?}");
+            assert_eq!(taken.live.steps_incomplete, round, "{name}, round {round}: {warnings:?}");
             // It ends before the last block of its next step is there.
             for solver in solvers.iter().skip(1) {
                 publish(solver, 4, times[3] + 1.0, value);
@@ -243,7 +243,7 @@ fn a_simulation_in_other_blocks_of_the_same_grid_is_gone_on_with() {
         publish(&solver, 0, 20.0, 1.0);
         publish(&solver, 1, 21.0, 1.0);
         let (taken, _) = take(window.as_ref().unwrap(), |taken| newest(taken) == 21.0);
-        assert_eq!((taken.live.incomplete, taken.live.restarts), (3, 4), "{name}");
+        assert_eq!((taken.live.steps_incomplete, taken.live.restarts), (3, 4), "{name}");
     }
 }
 
@@ -289,12 +289,12 @@ fn times_that_fall_take_no_more_memory_than_times_that_rise() {
     (0..=195).for_each(|n| publish(10.0 - 0.05 * f64::from(n)));
     publish(11.0);
     let (taken, _) = take(&window, |taken| newest(taken) == 11.0);
-    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.thinned > 150, "{:?}", taken.live);
+    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.steps_skipped > 150, "{:?}", taken.live);
     // and times come between those that it holds.
     (1..100).for_each(|n| publish(11.0 - 0.07 * f64::from(n)));
     publish(12.0);
     let (taken, _) = take(&window, |taken| newest(taken) == 12.0);
-    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.thinned > 250, "{:?}", taken.live);
+    assert!((10..=12).contains(&taken.live.snapshots) && taken.live.steps_skipped > 250, "{:?}", taken.live);
 }
 
 #[test]
@@ -312,7 +312,7 @@ fn a_simulation_whose_numbers_fall_or_stay_is_followed_on() {
     // All of one number.
     (0..10).for_each(|n| publish(&solver, 0, n as f64 - 10.0, 3.0));
     let (taken, _) = take(&window, |taken| newest(taken) == -1.0);
-    assert_eq!((taken.live.steps, taken.live.incomplete), (30, 0));
+    assert_eq!((taken.live.steps, taken.live.steps_incomplete), (30, 0));
 }
 
 #[test]
@@ -351,14 +351,14 @@ fn blocks_meet() {
     let (taken, warnings) = take(&window, |taken| newest(taken) == 2.0);
     let nodes = &taken.window.snapshots().next().unwrap().nodes;
     assert!(nodes.iter().enumerate().all(|(i, node)| node[0] == if i % 8 < 4 { 1.0 } else { 2.0 }));
-    assert_eq!((taken.live.incomplete, taken.live.steps), (0, 3), "{warnings:?}");
+    assert_eq!((taken.live.steps_incomplete, taken.live.steps), (0, 3), "{warnings:?}");
 }
 
 #[test]
 fn a_step_that_lacks_a_block_is_given_up_after_its_time_and_later_ones_come() {
     let folder = Folder::new("lacks");
     let solvers: Vec<Producer> = columns(8, 2).into_iter().map(|block| producer(&folder, block)).collect();
-    let window = follow(&LiveSettings { incomplete_seconds: 0.2, ..settings(&folder) }, 2.0);
+    let window = follow(&LiveSettings { block_timeout_seconds: 0.2, ..settings(&folder) }, 2.0);
     publish(&solvers[0], 3, 3.0, 1.0);
     // Its time and more, also where the thread that reads comes late.
     std::thread::sleep(Duration::from_secs(3));
@@ -368,14 +368,14 @@ fn a_step_that_lacks_a_block_is_given_up_after_its_time_and_later_ones_come() {
     }
     let (taken, warnings) = take(&window, |taken| newest(taken) == 19.0);
     assert!(has(&warnings, "step 3 (time 3) was given up with 1 of 2 blocks: blocks did not come in time"), "{warnings:?}");
-    assert!(taken.live.incomplete >= 1 && taken.live.steps + taken.live.incomplete == 17, "{:?}", taken.live);
+    assert!(taken.live.steps_incomplete >= 1 && taken.live.steps + taken.live.steps_incomplete == 17, "{:?}", taken.live);
 }
 
 #[test]
 fn a_step_that_waits_for_its_blocks_does_not_grow_older_while_no_step_is_taken() {
     let folder = Folder::new("held");
     let solvers: Vec<Producer> = columns(9, 3).into_iter().map(|block| producer(&folder, block)).collect();
-    let window = follow(&LiveSettings { follow: Follow::Every, incomplete_seconds: 5.0, ..settings(&folder) }, 2.0);
+    let window = follow(&LiveSettings { follow: Follow::Every, block_timeout_seconds: 5.0, ..settings(&folder) }, 2.0);
     let publish = |block: usize, n: u64| publish(&solvers[block], n, n as f64, 1.0);
     // Until so many steps of a block were taken, as the follower's mark says.
     let taken = |block: u32, steps: u64| {
@@ -400,7 +400,7 @@ fn a_step_that_waits_for_its_blocks_does_not_grow_older_while_no_step_is_taken()
     taken(1, 4);
     publish(2, 3);
     let (taken, warnings) = take(&window, |taken| newest(taken) == 3.0);
-    assert_eq!((taken.live.incomplete, taken.live.steps), (0, 4), "{warnings:?}");
+    assert_eq!((taken.live.steps_incomplete, taken.live.steps), (0, 4), "{warnings:?}");
 }
 
 /// A relay of a folder's rings.
@@ -444,7 +444,7 @@ fn a_relay_whose_blocks_come_late_is_waited_for() {
             });
         }
         let (taken, warnings) = take(&window, |taken| newest(taken) == 39.0);
-        assert_eq!((taken.live.incomplete, taken.live.steps, taken.live.missed_blocks), (0, 40, 0), "{warnings:?}");
+        assert_eq!((taken.live.steps_incomplete, taken.live.steps, taken.live.missed_blocks), (0, 40, 0), "{warnings:?}");
     });
     drop((window, relays));
     connections.iter().for_each(|file| std::fs::remove_file(file).unwrap());

@@ -4,7 +4,7 @@
 mod netcdf_fixture;
 
 use netcdf_fixture::*;
-use ridgewatch::source::{Archive, ArchiveSettings, SnapshotSource, SourceError};
+use ridgewatch::source::{Archive, ArchiveSettings, FormatError, FormatFault, SnapshotSource, SourceError};
 use std::path::{Path, PathBuf};
 use tempfile::tempdir;
 
@@ -85,9 +85,9 @@ fn a_file_that_shrinks_after_opening() {
     let mut archive = Archive::open(&[first.clone(), second], &ArchiveSettings::default()).unwrap();
     let whole = std::fs::read(&first).unwrap();
     std::fs::write(&first, &whole[..whole.len() - 20]).unwrap();
-    assert!(matches!(archive.read(0), Err(SourceError::Truncated { .. })));
+    assert!(matches!(archive.read(0), Err(SourceError::Format(FormatError { fault: FormatFault::Truncated { .. }, .. }))));
     std::fs::remove_file(&first).unwrap();
-    assert!(matches!(archive.read(0), Err(SourceError::Open { .. })));
+    assert!(matches!(archive.read(0), Err(SourceError::Format(FormatError { fault: FormatFault::Open(_), .. }))));
     assert!(archive.read(1).is_ok(), "the other file is as good as before");
 }
 
