@@ -158,7 +158,7 @@ fn what_does_not_fit_is_said() {
     refused(&[&path], "", &["no velocity found"]);
     refused(&[&path], "velocity = \"velocities\"", &["`velocity = \"velocities\"`", "is `velocity` meant?"]);
     refused(&[&path], "velocity = \"velocity\"", &["time = \"...\""]);
-    refused(&[&path], "velocity = \"velocity\"\norder = \"zyx\"", &["`zyx` does not describe", "one letter an axis"]);
+    refused(&[&path], "velocity = \"velocity\"\norder = \"zyx\"", &["`zyx` does not describe", "one letter for each axis"]);
     refused(&[&path], "velocity = \"velocity\"\norder = \"zcyx\"", &["odd.h5", "component axis holds 4 entries"]);
     refused(&[&path], "velocity = \"velocity\"\nmetric = \"sphere\"", &["sphere", "cartesian"]);
     refused(&[&path], "u = \"a\"\nv = \"b\"", &["`b`", "shape"]);

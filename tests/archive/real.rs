@@ -115,7 +115,7 @@ fn wrf_hurricane() {
 #[ignore = "needs real archives: make test-data"]
 fn what_cannot_be_traced_says_why() {
     for (name, pieces) in [
-        ("jhtdb_iso1024coarse_pressure_64.h5", &["Pressure_0001", "one component a point: it is a scalar"][..]),
+        ("jhtdb_iso1024coarse_pressure_64.h5", &["Pressure_0001", "one component per point: it is a scalar"][..]),
         ("jhtdb_legacy_cutout_10x10.h5", &["`u01000`", "1 node(s) thick along z", "2 nodes or more"]),
     ] {
         refused(&[data(name)], "", &[pieces, &[name]].concat());

@@ -2,7 +2,7 @@
 
 use crate::kit::netcdf::*;
 use crate::{DAYS, open, open_with, refused};
-use ridgewatch::source::{SnapshotSource, SourceError};
+use ridgewatch::source::{FormatError, FormatFault, SnapshotSource, SourceError};
 use std::path::Path;
 use tempfile::tempdir;
 
@@ -80,9 +80,9 @@ fn a_file_that_shrinks_after_opening() {
     let mut archive = open(&[&first, &second]);
     let whole = std::fs::read(&first).unwrap();
     std::fs::write(&first, &whole[..whole.len() - 20]).unwrap();
-    assert!(matches!(archive.read(0), Err(SourceError::Truncated { .. })));
+    assert!(matches!(archive.read(0), Err(SourceError::Format(FormatError { fault: FormatFault::Truncated { .. }, .. }))));
     std::fs::remove_file(&first).unwrap();
-    assert!(matches!(archive.read(0), Err(SourceError::Open { .. })));
+    assert!(matches!(archive.read(0), Err(SourceError::Format(FormatError { fault: FormatFault::Open(_), .. }))));
     assert!(archive.read(1).is_ok(), "the other file can still be read");
 }
 
