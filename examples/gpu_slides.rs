@@ -5,7 +5,7 @@
 
 use ridgewatch::backend::cuda::{Cuda, CudaSamples, CudaSurrogate, CudaTracer, DeviceError, Gpu, GpuSettings};
 use ridgewatch::backend::{
-    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, Device, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest,
+    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest,
     WhenLost,
 };
 use ridgewatch::config::SceneFile;
@@ -78,6 +78,12 @@ impl Backend for Timed {
     ) -> Result<Option<String>, DeviceError> {
         self.inner.replan(shortage, tracer, surrogate)
     }
+    fn when_lost(&self) -> WhenLost {
+        self.inner.when_lost()
+    }
+    fn may_fall_back(&self) -> bool {
+        self.inner.may_fall_back()
+    }
 }
 
 struct Seen {
@@ -112,12 +118,14 @@ fn main() {
          frame to frame with a slide | without |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    // A measurement must not go on on the CPU.
+    let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
     let mut memory = Vec::new();
     for (what, ahead, slides, frames_per_slide) in
         [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)]
     {
         let clock = Arc::<Mutex<Clock>>::default();
-        let device = Timed { inner: Cuda::new(&gpu, Storage::F32), ahead, clock: clock.clone() };
+        let device = Timed { inner: Cuda::new(&chosen), ahead, clock: clock.clone() };
         let seen = stream(&gpu, device, [width, height], shape, slides, frames_per_slide);
         let clock = clock.lock().unwrap();
         let of = |with_slide: bool| seen.iter().filter(move |s| s.record.slide > 0 && (s.record.seconds.slide > 0.0) == with_slide);
@@ -165,8 +173,7 @@ fn stream(gpu: &Arc<Gpu>, device: Timed, size: [usize; 2], shape: [usize; 3], sl
     let times = (0..ready.len()).map(|t| t as f64).collect();
     let source = MemorySource::new("streamed turbulence", grid, times, move |index, _| ready[index].take().unwrap()).unwrap();
     let setup = Setup::over(scene.settings(), Some(Box::new(source))).unwrap();
-    let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
-    let options = RunOptions { device: Device::Cuda(chosen), ..RunOptions::default() };
+    let options = RunOptions::default();
     let (mut seen, mut last) = (Vec::new(), Instant::now());
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
