@@ -1,5 +1,5 @@
-//! Frames of the standard easy turbulence on a GPU, every query traced: frames a second, where the time goes, what a new snapshot costs.
-//! Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+//! Measures frames of the standard easy turbulence on a GPU with every query traced: frame rate, time by stage, cost of a new snapshot.
+//! Prints a table; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` sets another picture or grid.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -30,7 +30,7 @@ fn map(steps: usize) -> FlowMap {
     }
 }
 
-/// The scene that a bare file of this field would get, at this size.
+/// Default scene of a file of this field, at this size.
 fn scene(tracer: &CudaTracer, width: usize, height: usize, seed: u64) -> Scene {
     let domain = tracer.host().domain();
     let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
@@ -119,7 +119,7 @@ fn main() {
         }
     }
 
-    // A slide: one more snapshot, brought over and taken into the window, then a frame.
+    // A slide: uploads one more snapshot, adds it to the window, and renders a frame.
     let _ = window.push(next).unwrap();
     let tracer = CudaTracer::new(&store, &gpu, source, &map(22), 0.0, Tuning::default()).unwrap();
     device = device.with_look_ahead(LookAhead { camera: 4, shadow: 8 });

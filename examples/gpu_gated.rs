@@ -1,9 +1,12 @@
-//! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table, or a network that is trained
-//! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
-//! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
-//! traced share, with the device's memory over a thousand frames, and what checkpoints cost their length. Prints; needs a GPU.
-//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [published] [table.key=value]`, where keys are those of a scene.
-//! `published`: frames with the smallest of the published networks.
+//! Measures gated frames of the standard easy turbulence on a GPU, in the loop of `ridgewatch replay`. A traced table, or a network trained between
+//! the frames, answers in trusted cells, and RK4 elsewhere. Prints tables; needs a GPU.
+//!
+//! - Frame rate, time by stage, traced share and stated error.
+//! - PSNR of 64 accumulated frames against many samples of another seed, compared with 64 reference frames.
+//! - Effect of a sliding window on the traced share, device memory over a thousand frames, and cost of checkpoints.
+//!
+//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [published] [table.key=value]`, with the keys of a scene. `published` measures
+//! frames with the smallest of the published networks.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
@@ -24,18 +27,18 @@ const FRAMES: usize = 64;
 const WARM_UP: usize = 8;
 /// Rows before those of networks.
 const NETWORKS: usize = 3;
-/// In which a network is trained up.
+/// Frames in which a network is trained before the measurement.
 const LEARNING: usize = 240;
-/// The first is where all that is ever taken is; the others have a thousand frames.
+/// Number of slides. All memory is allocated by the end of the first one; the others have a thousand frames.
 const SLIDES: usize = 6;
 const FRAMES_A_SLIDE: usize = 200;
-/// Most that free memory may change by over them, as the driver sees it: two of the chunks in which its pool grows.
+/// Maximum change of free memory over these frames, as the driver reports it: two growth steps of its pool.
 const FLAT: usize = 64 << 20;
 /// Seconds between two checkpoints; a run beside a simulation has 30.
 const CHECKPOINT_SECONDS: f64 = 5.0;
 /// Frames of a slide whose traced share is shown, from 0.
 const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 199];
-/// A network of 71 MB: few levels, the finest as dense as its table can hold; and batches that keep the device busy.
+/// A network of 71 MB with few levels, the finest as dense as its table allows, and batches that keep the device busy.
 const NETWORK: [&str; 6] = [
     "network.levels=3",
     "network.features=4",
@@ -45,7 +48,7 @@ const NETWORK: [&str; 6] = [
     "network.batch=262144",
 ];
 
-/// `frames` pictures of a scene after its warm-up, added up, and their records.
+/// Sum of `frames` pictures of a scene after its warm-up, and their records.
 fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
     let mut sum = Film::new(settings.render.width, settings.render.height);
     let mut records = Vec::new();
@@ -64,7 +67,7 @@ fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
     (sum, records)
 }
 
-/// One transfer function for all pictures, scaled to this field as a bare file's would be.
+/// Transfer function for all pictures, scaled to this field as by default.
 fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let mut setup = Setup::new(settings.clone()).unwrap();
     let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
@@ -86,14 +89,14 @@ fn median_and_most(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64 
     format!("{:.1} ({:.1})", median(records, value), records.iter().map(value).fold(f64::NEG_INFINITY, f64::max))
 }
 
-/// Milliseconds of each frame but the first, from record to record: with what happens between frames, without slides and waiting for them.
+/// Milliseconds of each frame except the first, from record to record: includes the work between frames, but no slides and no waiting for them.
 fn lengths(records: &[&FrameRecord]) -> Vec<f64> {
     let between =
         |pair: &[&FrameRecord]| pair[1].seconds.elapsed - pair[0].seconds.elapsed - pair[1].seconds.slide - pair[1].seconds.waiting;
     records.windows(2).map(|pair| 1e3 * between(pair)).collect()
 }
 
-/// What checkpoints cost: the frames during which one was under way beside the others.
+/// Cost of checkpoints: frames during a checkpoint compared with other frames.
 fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
     let lengths = lengths(records);
     let frames = || lengths.iter().zip(&records[1..]);
@@ -118,7 +121,7 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
     )
 }
 
-/// Frames that are traced, and that a network of 8 layers of 256 above frequencies answers, which is trained between them.
+/// Measures traced frames, and frames answered by a network of 8 layers of 256 on a frequency encoding that is trained between them.
 fn published(mut scene: Settings, device: &Device, size: &str) {
     (scene.network.encoding, scene.network.hidden_layers, scene.network.width, scene.network.batch) =
         (Encoding::Frequency, 8, 256, 1 << 16);
@@ -234,7 +237,7 @@ fn main() {
         let psnr = compare_films(&sum, &reference, scene.render.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
         let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
         let over = records.iter().filter(|r| r.tolerance_excess.is_some()).count();
-        // Adding the pictures up is the measurement's time, not the loop's.
+        // Adding the pictures is not part of the loop's time.
         let seconds: f64 = records.iter().map(|r| r.seconds.total).sum();
         println!(
             "| {name} | {:.1} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {:.1} | {psnr:.1} |",
@@ -306,7 +309,7 @@ fn main() {
             let shown = SHOWN.map(|n| format!("{:.1} %, {:.0}", 100.0 * frames[n].0.traced_share, 1e3 * frames[n].0.seconds.total));
             println!("| {name} | {} | {} | {:.0} |", slide + 1, shown.join(" | "), 1e3 * frames[0].0.seconds.slide);
         }
-        // From the second slide on, everything that is ever taken has been.
+        // All memory is allocated before the second slide.
         let settled = &seen[FRAMES_A_SLIDE..];
         let taken = || settled.iter().map(|s| s.1 >> 20);
         let free = || settled.iter().map(|s| s.2);

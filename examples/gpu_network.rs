@@ -1,10 +1,10 @@
-//! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
-//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
+//! Measures the network on a GPU: rates of prediction and training, and its accuracy after some seconds of tracing and training from
+//! a new network. Prints blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
 //! [published-speed] [published] [seconds]`
 //!
-//! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
-//! it; the clock runs through making the network, tracing (of those labels too that say how large they are) and training: the window is there, kernels
-//! are compiled; it stands still while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
+//! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and stay there. The
+//! time includes building the network, tracing (also of the labels that determine the scale) and training; it excludes the upload of the window,
+//! the compilation of kernels, and the measurement of the error. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
 //! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y and the start time).
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
@@ -173,7 +173,7 @@ mod bench {
         }
     }
 
-    /// Points, and room for what is found at them.
+    /// Points, and buffers for their values.
     struct Batch {
         points: Buffer<[f32; 3]>,
         values: Buffer<f32>,
@@ -210,7 +210,7 @@ mod bench {
         20.0 * (peak / square.sqrt()).log10()
     }
 
-    /// Something that draws points.
+    /// Generator of points.
     fn drawer(gpu: &Arc<Gpu>, domain: &Domain) -> Outcome<DeviceTraining> {
         let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
         let shape = Architecture::new(&any, &[0, 1, 2], domain.lengths())?;
@@ -220,7 +220,7 @@ mod bench {
 
     /// Points where a field is known.
     struct KnownPoints {
-        /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
+        /// Points in domain coordinates, their traced values, and the points in unit coordinates.
         seeds: Batch,
         tested: Batch,
         truth: Vec<f32>,
@@ -273,7 +273,7 @@ mod bench {
         }
     }
 
-    /// What training takes.
+    /// Settings of training.
     #[derive(Clone, Copy)]
     struct Pace {
         batch: usize,
@@ -329,7 +329,7 @@ mod bench {
         Ok(Rates { few, predicted: MANY as f64 / many * 1e3, trained })
     }
 
-    /// What the published networks do in a second; with the operations of their products alone.
+    /// Rates of the published networks; operations are those of their matrix products only.
     pub fn published_speed() -> Outcome<()> {
         let gpu = Gpu::open(0, &GpuSettings::default())?;
         println!("<!-- block network-published-speed -->");
@@ -340,7 +340,7 @@ mod bench {
         for (name, settings) in published_settings() {
             let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3])?;
             let products: usize = shape.layers.iter().map(|layer| layer.inputs * layer.outputs).sum();
-            // Training: forward, backward but for the first layer, and the gradients of the weights.
+            // Training: forward pass, backward pass without the first layer, and the gradients of the weights.
             let (forward, all) =
                 (2e-12 * products as f64, 2e-12 * (3 * products - shape.layers[0].inputs * shape.layers[0].outputs) as f64);
             let Rates { few, predicted, trained } = rates(&gpu, &settings, 1e-3, &[FEW, 1 << 16, 1 << 14])?;
@@ -540,7 +540,7 @@ mod bench {
         Ok(())
     }
 
-    /// What a network knew after the seconds of [`MARKS`], and what it took.
+    /// Accuracy of a network after the seconds of [`MARKS`], and its cost.
     struct Learned {
         /// Of what prediction reads.
         megabytes: f64,
@@ -561,6 +561,7 @@ mod bench {
     }
 
     /// Trains for some seconds. `before`: seconds that the clock starts at, where there is a table to be traced.
+    #[allow(clippy::too_many_arguments)] // An experiment has as many parameters.
     fn learn(
         gpu: &Arc<Gpu>,
         domain: &Domain,

@@ -1,12 +1,11 @@
-//! What a new snapshot costs a running loop: the standard easy turbulence, streamed, every query traced; frames and slides by stage, and
-//! the device's memory over a thousand frames. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+//! Measures the cost of a new snapshot in a running loop: the standard easy turbulence, streamed, with every query traced. Times of frames and
+//! slides by stage, and device memory over a thousand frames. Prints a table; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` sets another picture or grid.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::backend::cuda::{Cuda, CudaSamples, CudaSurrogate, CudaTracer, DeviceError, Gpu, GpuSettings};
 use ridgewatch::backend::{
-    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest,
-    WhenLost,
+    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest, WhenLost,
 };
 use ridgewatch::config::SceneFile;
 use ridgewatch::field::Snapshot;
@@ -20,16 +19,16 @@ use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-/// Clock on what slides ask of a GPU.
+/// Timings of the work that slides request from a GPU.
 #[derive(Default)]
 struct Clock {
     tracer_seconds: Vec<f64>,
-    /// Snapshots uploaded as of the latest slide, and those of them that were uploaded before a window needed them.
+    /// Snapshots uploaded until the latest slide, and how many of them were prefetched.
     uploaded: u64,
     ahead: u64,
 }
 
-/// The GPU with a clock; uploads snapshots ahead or not.
+/// The GPU backend with timings, with or without prefetching of snapshots.
 struct Timed {
     inner: Cuda,
     ahead: bool,
@@ -90,7 +89,7 @@ struct Seen {
     record: Arc<FrameRecord>,
     /// Since the frame before.
     interval: f64,
-    /// Bytes that ridgewatch has taken, and bytes of the device that are free.
+    /// Bytes allocated by ridgewatch, and free bytes of the device.
     taken: u64,
     free: usize,
 }
@@ -118,7 +117,7 @@ fn main() {
          frame to frame with a slide | without |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
-    // A measurement must not go on on the CPU.
+    // A measurement must not fall back to the CPU.
     let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
     let mut memory = Vec::new();
     for (what, ahead, slides, frames_per_slide) in
@@ -141,7 +140,7 @@ fn main() {
             from_frame_to_frame(true),
             from_frame_to_frame(false)
         );
-        // From the third slide on, everything that is ever taken has been.
+        // All memory is allocated before the third slide.
         let settled: Vec<&Seen> = seen.iter().filter(|s| s.record.slide >= 2).collect();
         let (least, most) = (settled.iter().map(|s| s.taken).min().unwrap_or(0), settled.iter().map(|s| s.taken).max().unwrap_or(0));
         let (begin, end) = (settled.first().map_or(0, |s| s.free), settled.last().map_or(0, |s| s.free));

@@ -67,7 +67,7 @@ fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyho
     }
     let (record, shape) = (&header["record"], &header["shape"]);
     let traced = 100.0 * record["traced_share"].as_f64().unwrap_or(f64::NAN);
-    // Of a simulation that runs now: how long ago its newest step was published, by the clock of one machine.
+    // Live runs: age of the newest step, if both programs share a clock.
     let behind = record["live"]["published"].as_f64().map(|published| {
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
         format!(", {:.4} s behind the simulation", now - published)

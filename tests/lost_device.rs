@@ -1,7 +1,7 @@
 //! A device that fails at a random point of a run, with a fault or for want of memory. It computes on the CPU, so that machines without a GPU run these tests.
 //! (`tests/gpu/lost.rs` breaks a real GPU.)
 
-#![allow(clippy::unwrap_used)]
+#![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 use ridgewatch::backend::{
     AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, Rendered, Surrogate, SurrogateRequest,
@@ -10,7 +10,7 @@ use ridgewatch::backend::{
 use ridgewatch::config::SceneFile;
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch::render::Renderer;
-use ridgewatch::run::{EngineError, Event, FrameRecord, RunOptions, Setup, StageSeconds, run_on};
+use ridgewatch::run::{Event, FrameRecord, RunError, RunOptions, Setup, StageSeconds, run_on};
 use ridgewatch::source::Listener;
 use ridgewatch::surrogate::network::{Architecture, Objective, PlannedStep};
 use ridgewatch::surrogate::{
@@ -129,6 +129,11 @@ impl SurrogateDevice for OnLine {
     fn trace_table(tracer: &BreakingTracer, nodes: [usize; 3], old: Option<BreakingTable>) -> Result<BreakingTable, DeviceError> {
         drop(old);
         let line = &tracer.line;
+        // The thread that writes a checkpoint downloads the old table first, which is a moment's work.
+        let begin = Instant::now();
+        while line.tables.load(Ordering::Relaxed) > 0 && begin.elapsed() < Duration::from_secs(60) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
         line.tables_before.fetch_max(line.tables.load(Ordering::Relaxed), Ordering::Relaxed);
         line.call("tracing a table")?;
         Ok(BreakingTable::new(line, Table::trace(&tracer.host, nodes)?))
@@ -380,7 +385,7 @@ impl Backend for Breaking {
 struct Made {
     records: Vec<FrameRecord>,
     films: Vec<Vec<u32>>,
-    error: Option<EngineError>,
+    error: Option<RunError>,
     warnings: Vec<String>,
 }
 
@@ -504,7 +509,7 @@ fn break_at_random(scene: &SceneFile) {
         let frames = stopped.films.len();
         assert!(stopped.films[..] == expected.films[..frames] && stopped.count(ENDED) == 0, "{case}: the frames before it are whole");
         match &stopped.error {
-            Some(EngineError::Device(error)) => assert!(error.to_string().contains("broken by the test"), "{case}: {error}"),
+            Some(RunError::Device(error)) => assert!(error.to_string().contains("broken by the test"), "{case}: {error}"),
             error => assert!(error.is_none() && !stopping.has_failed(), "{case}: {error:?}"),
         }
     }
@@ -549,7 +554,7 @@ fn a_device_chosen_automatically_may_refuse_the_first_window() {
     let scene = scene(REFERENCE);
     let expected = made(ridgewatch::backend::Cpu, &scene);
     let by_name = made(Breaking::on(&Line::new(0, How::Shortage(usize::MAX))), &scene);
-    assert!(matches!(by_name.error, Some(EngineError::Device(_))) && by_name.films.is_empty(), "{:?}", by_name.error);
+    assert!(matches!(by_name.error, Some(RunError::Device(_))) && by_name.films.is_empty(), "{:?}", by_name.error);
     let automatic = Breaking { may_fall_back: true, ..Breaking::on(&Line::new(0, How::Shortage(usize::MAX))) };
     let found = made(automatic, &scene);
     assert!(found.error.is_none() && found.films == expected.films && found.records[0].device == "cpu");

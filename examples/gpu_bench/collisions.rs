@@ -1,4 +1,4 @@
-//! The points that a frame's waves ask about.
+//! Collision points that a frame's waves query.
 
 use cudarc::driver::result;
 use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, TraceAll};
@@ -10,20 +10,20 @@ use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
-/// Larger than a screen, so that there are enough.
+/// Picture size. Larger than a screen, to have enough points.
 const PICTURE: [usize; 2] = [3840, 2160];
 
 /// The first collision points of a reference frame, in the order in which its waves queue them.
 pub struct Collisions {
     pub points: Buffer<[f32; 3]>,
     pub first_wave: usize,
-    /// Waves that they are from.
+    /// Number of waves of these points.
     pub waves: usize,
     pub picture: [usize; 2],
 }
 
 impl Collisions {
-    /// At most `most` points of the scene that a bare file of this field would get, its majorants settled.
+    /// At most `most` points of the default scene of a file of this field, after its majorants have settled.
     pub fn new(gpu: &Arc<Gpu>, tracer: &CudaTracer, most: usize) -> Result<Self, Box<dyn Error>> {
         let (domain, tau) = (tracer.host().domain(), tracer.host().tau());
         let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
@@ -55,7 +55,7 @@ impl Collisions {
     }
 }
 
-/// Traces every query and copies what is asked, until there is no more room.
+/// Traces every query and copies its points until the buffer is full.
 struct Listening<'a> {
     inner: TraceAll<'a>,
     points: Buffer<[f32; 3]>,

@@ -1,8 +1,8 @@
-//! What the GPU traces in a second, and what bounds it: blocks of docs/performance.md. Times are medians of device time between events;
-//! seeds and results stay on the device; every batch is sorted anew, and the sort counts.
+//! Measures the tracing rate of a GPU and its bounds, as blocks of docs/performance.md. Times are medians of device time between events. Seeds and
+//! results stay on the device. Every batch is sorted, and the time includes the sort.
 //! `cargo run --release --example gpu_bench [quick|collisions|profile]`; `profile` launches each kernel once, for a profiler.
 
-// It talks to its user on standard output.
+// Prints its results to standard output.
 #![allow(clippy::print_stdout)]
 
 #[cfg(not(feature = "cuda"))]
@@ -43,7 +43,7 @@ mod bench {
     use std::sync::Arc;
     use std::time::Instant;
 
-    /// What is measured.
+    /// Selection of the measurements.
     #[derive(Clone, Copy, PartialEq)]
     pub enum Rows {
         All,
@@ -78,7 +78,7 @@ mod bench {
         map(SNAPSHOTS as f64 - 1.0, steps, Integrator::Tangent, Precision::F32, 0.05, Boundary::Clamp)
     }
 
-    /// Uniform points in no order.
+    /// Uniform points in random order.
     fn scattered(domain: &Domain, count: usize, seed: u64) -> Vec<[f32; 3]> {
         let mut state = 0x2545_f491_4f6c_dd1du64 ^ (seed << 17);
         let mut uniform = || {
@@ -302,8 +302,8 @@ mod bench {
             Ok(())
         }
 
-        /// Least milliseconds of a trace: the arithmetic of its stages at the device's rate of issue, or the window and the seeds read once at
-        /// the rate of a copy, whichever takes longer.
+        /// Lower bound of the milliseconds of a trace: the arithmetic of its stages at the device's rate of issue, or one read of the window and the
+        /// seeds at the rate of a copy, whichever takes longer.
         fn floor(&self, steps: usize, storage: Storage, count: usize) -> f64 {
             let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue;
             let node = storage.bytes() as f64;
@@ -373,7 +373,7 @@ mod bench {
                 let tangent = batch.time(&tracer, count)?;
                 let (rate, psnr) = (count as f64 / tangent / 1e3, truth.psnr_of(&tracer)?);
                 println!("| tangent | f32 | - | {} | {rate:.0} | 1 | {psnr:.1} |", storage.name());
-                // In pairs only the best of them.
+                // For storage in pairs only the best rivals.
                 for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
                     let changed = FlowMap { integrator, precision, difference_step: gap, ..turbulent(22) };
                     let tracer = self.tracer(&source, &changed, Tuning { keep, spread, ..held })?;
@@ -463,7 +463,7 @@ mod bench {
                 let ms = batch.time(&tracer, batch.count)?;
                 println!("| {integrator:?} | {precision:?} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
             }
-            // The same flow on a grid, interpolated by cubics.
+            // The same flow on a grid, with cubic interpolation.
             let axis = |name: &str, length: f64, nodes: usize| Axis::uniform(name, "", 0.0, length, nodes);
             let grid =
                 Arc::new(Grid { axes: vec![axis("x", 2.0, 401)?, axis("y", 1.0, 201)?], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
@@ -504,7 +504,7 @@ mod bench {
         ]
     };
 
-    /// What follows, up to the next such line, is a block of docs/performance.md (see scripts/gpu-check-write).
+    /// Starts a block of docs/performance.md, which ends at the next such line (see scripts/gpu-check-write).
     fn block(name: &str) {
         println!("<!-- block {} -->", name.to_lowercase());
     }

@@ -1,4 +1,8 @@
-//! Audit points: drawn evenly over the domain and traced whatever the gate says.
+//! Audit of a frame: measures the surrogate's error on points that are traced regardless of the gate.
+//!
+//! The points are a stratified random sample (Cochran 1977, *Sampling Techniques*, chapter 5): each cell of a regular grid gets its own number of
+//! uniform points, drawn with the counter-based generator Philox4x32-10 (Salmon et al. 2011). The same seed, stream and strata give the same points
+//! on every backend.
 
 use super::DeviceError;
 use super::router::push_sample;
@@ -9,17 +13,17 @@ use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata, TrustedError};
 use rayon::prelude::*;
 
-/// Points that a thread takes at a time.
+/// Points per parallel task.
 const CHUNK: usize = 1 << 12;
-/// Dimension that no path reaches.
+/// Philox counter word that separates audit points from the random numbers of light paths, which never reach this dimension.
 const AUDIT_DIMENSION: u32 = u32::MAX;
 
-/// Key and stream of the words that points are drawn with: [`philox`] of a point's number, the stream and a dimension that no path reaches.
+/// Returns the [`philox`] key, and the counter words after the point number: the stream (low, high) and [`AUDIT_DIMENSION`].
 pub(super) fn draws(seed: u64, stream: u64) -> ([u32; 2], [u32; 3]) {
     ([seed as u32, (seed >> 32) as u32], [stream as u32, (stream >> 32) as u32, AUDIT_DIMENSION])
 }
 
-/// Uniform points in each cell of the unit cube, as many as `strata` says, cell by cell.
+/// Draws the points of all strata in unit coordinates, cell by cell: `strata.drawn[cell]` uniform points in each cell.
 pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3]> {
     let cells = strata.shape;
     let (key, [low, high, dimension]) = draws(seed, stream);
@@ -37,7 +41,7 @@ pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3
             std::array::from_fn(|k| {
                 let at = |offset: f32| (index[k] as f32 + offset) / cells[k] as f32;
                 let drawn = at(unit(words[k]));
-                // Rounding takes one point in a million over the edge of its cell.
+                // Rounding moves about one point in a million across the edge of its cell; the cell's centre replaces it.
                 if (drawn * cells[k] as f32) as usize == index[k] { drawn } else { at(0.5) }
             })
         })
@@ -45,28 +49,28 @@ pub fn stratified_points(strata: &Strata, seed: u64, stream: u64) -> Vec<[f32; 3
     cell_starts.par_iter().with_min_len(64).flat_map_iter(in_cell).collect()
 }
 
-/// Traced audit points, voids (land) left out.
+/// Traced audit points. Points in missing cells are excluded.
 pub struct Audit {
-    /// As labelled samples for the ring.
+    /// The points as samples for the replay buffer.
     pub samples: Samples,
-    /// Which of the points drawn each of them is.
+    /// Index of each sample among the drawn points.
     pub numbers: Vec<usize>,
-    /// Points drawn, voids included.
+    /// Number of points drawn, including those in missing cells.
     pub drawn: usize,
-    /// Mean lived share over points that are not void.
+    /// Mean of the particle lifetime over tau, over the points outside missing cells.
     pub mean_lifetime_share: f64,
 }
 
-/// Traces `unit` points; samples come with `extras`.
+/// Traces points in unit coordinates. `extras` selects the arrival points and Jacobians of the samples.
 ///
 /// # Errors
-/// The tracer's device fails.
+/// The tracer's device fails or lacks memory.
 pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Audit, DeviceError> {
     let domain = tracer.flow().domain();
     let points: Vec<[f32; 3]> = unit.par_iter().with_min_len(CHUNK).map(|&u| domain.from_unit(u)).collect();
     let mut traced = Traced::default();
     tracer.trace(&points, extras, &mut traced)?;
-    // Sums are those of the chunks in order, on any number of threads.
+    // Chunks are summed in order, so that the result does not depend on the number of threads.
     let parts: Vec<(Samples, Vec<usize>, f64)> = (points.par_chunks(CHUNK).enumerate())
         .map(|(chunk, points)| {
             let (mut samples, mut numbers, mut lived) = (Samples::default(), Vec::new(), 0.0);
@@ -94,11 +98,11 @@ pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Au
     Ok(Audit { samples, numbers, drawn: points.len(), mean_lifetime_share })
 }
 
-/// Residuals of `surrogate` on traced samples that it has not seen, NaN where the trace gave no number. `tau` turns log-stretch into FTLE
-/// for the ramp.
+/// Returns the residuals of `surrogate` on traced samples that are not in its training set. A sample whose traced value is not finite has NaN
+/// residuals. `tau` is the integration time, in the unit of the data: FTLE = log-stretch / tau.
 ///
 /// # Errors
-/// The surrogate's device fails.
+/// The surrogate's device fails or lacks memory.
 pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer, tau: f64) -> Result<Vec<Residual>, DeviceError> {
     let mut predicted = vec![0.0; samples.len()];
     surrogate.predict(&samples.points, &mut predicted)?;
@@ -110,7 +114,7 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
             if !traced.is_finite() {
                 return Residual { point, optical: f32::NAN, log_stretch: f32::NAN };
             }
-            // A prediction that is no number is as wrong as can be.
+            // A prediction that is not finite counts as the largest possible error.
             let optical = if predicted.is_finite() { (ramp(predicted) - ramp(traced)).abs() } else { 1.0 };
             let log_stretch = if predicted.is_finite() { predicted - traced } else { traced.abs() };
             Residual { point, optical, log_stretch }
@@ -118,52 +122,52 @@ pub fn residuals(surrogate: &dyn Predict, samples: &Samples, transfer: &Transfer
         .collect())
 }
 
-/// Error over the audit points in cells that the gate trusts.
+/// Returns the error over the audit points in trusted cells. `None` if fewer than two points lie there.
 pub fn trusted_error(audited: &Audited, gate: &Gate) -> Option<TrustedError> {
     TrustedError::of(audited, |cell| gate.trusts(audited.strata().centre(cell)))
 }
 
-/// PSNR in decibels of the surrogate's log-stretch over the audit points, for the largest traced value `peak`. None where either has no
-/// finite value.
+/// Returns the PSNR, 20 log10(`peak` / RMS error), of the surrogate's log-stretch over the audit points, in decibels. `peak` is the largest
+/// traced value. `None` if the result is not finite.
 pub fn psnr(audited: &Audited, peak: f32) -> Option<f64> {
     Some(20.0 * (f64::from(peak) / audited.log_stretch_rms()).log10()).filter(|psnr| psnr.is_finite())
 }
 
-/// What a frame's audit asks for.
+/// Inputs of the audit of one frame.
 #[derive(Clone)]
 pub struct AuditRequest<'a> {
-    /// How many points are drawn in each cell.
+    /// Number of points in each cell.
     pub strata: Strata,
-    /// What they are drawn with.
+    /// Key of the random numbers.
     pub seed: u64,
-    /// As above; no two frames have the same.
+    /// Random stream, unique for each frame.
     pub stream: u64,
-    /// In whose ramp residuals are measured.
+    /// Transfer function whose ramp measures the optical residuals.
     pub transfer: &'a Transfer,
-    /// Whether what was traced is wanted as samples to learn from, and with what extras.
+    /// Extras of the samples to return for training. `None`: no samples are returned.
     pub samples: Option<Extras>,
 }
 
-/// What a frame's audit found.
+/// Result of the audit of one frame.
 pub struct AuditFindings {
-    /// Points drawn.
+    /// Number of points drawn.
     pub drawn: usize,
-    /// Of them, those that do not lie on land.
+    /// Number of points outside missing cells.
     pub points: usize,
-    /// Mean lived share over these.
+    /// Mean of the particle lifetime over tau, over the points outside missing cells.
     pub mean_lifetime_share: f64,
-    /// Largest finite log-stretch; minus infinity where there is none.
+    /// Largest finite traced log-stretch; minus infinity if no value is finite.
     pub peak: f32,
-    /// These points, where they were asked for.
+    /// The points outside missing cells as samples; empty if the request has `samples: None`.
     pub samples: Samples,
-    /// Residuals of the surrogate; none without one.
+    /// Residuals of the surrogate. `None` without a surrogate.
     pub errors: Option<Audited>,
 }
 
-/// Draws and traces audit points, and measures the surrogate on them, on the CPU. The tracer's device may be another.
+/// Audits a frame on the CPU: draws the points, traces them, and measures the surrogate on them. The tracer and the surrogate may run on a device.
 ///
 /// # Errors
-/// A device fails.
+/// A device fails or lacks memory.
 pub fn audit(request: &AuditRequest<'_>, tracer: &dyn Trace, surrogate: Option<&dyn Predict>) -> Result<AuditFindings, DeviceError> {
     let unit = stratified_points(&request.strata, request.seed, request.stream);
     let Audit { samples, numbers, drawn, mean_lifetime_share } = trace(tracer, &unit, request.samples.unwrap_or_default())?;

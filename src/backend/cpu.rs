@@ -1,4 +1,6 @@
-//! The CPU backend: plain Rust on all threads. It never fails, so every frame can be made here.
+//! The CPU backend: tracing, prediction, training and rendering in Rust on all threads.
+//!
+//! It uses no device, so it returns no device errors. This makes it the fallback for every other backend.
 
 use super::audit::{AuditFindings, AuditRequest, audit};
 use super::interruptible::Interruptible;
@@ -58,7 +60,7 @@ impl Backend for Cpu {
     }
 }
 
-/// A frame that the CPU renders. Another device may trace and predict for it.
+/// A frame that the CPU renders. The tracer and the surrogate may run on a device.
 pub struct HostFrame<'a> {
     tracer: &'a dyn Trace,
     surrogate: Option<&'a dyn Predict>,
@@ -70,7 +72,7 @@ pub struct HostFrame<'a> {
 }
 
 impl<'a> HostFrame<'a> {
-    /// The frame of a job of any backend.
+    /// Takes the settings of a backend's job, with `tracer` and `surrogate` as the CPU calls them.
     pub fn of<B: Backend>(job: &FrameJob<'a, B>, tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>) -> Self {
         let &FrameJob { routing, picture, samples, progress, stop, .. } = job;
         Self { tracer, surrogate, routing, picture, samples, progress, stop }
@@ -80,7 +82,7 @@ impl<'a> HostFrame<'a> {
 /// Renders a frame on the CPU.
 ///
 /// # Errors
-/// The device that traces or predicts fails; `renderer` is then unspecified.
+/// The device of the tracer or of the surrogate fails, or the renderer rejects the number of samples. The state of `renderer` is then unspecified.
 pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
     let mut router = QueryRouter::new(frame.tracer, frame.surrogate, frame.routing);
     let (film, stats) = renderer

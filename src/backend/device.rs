@@ -1,140 +1,22 @@
-//! The device that a run computes on: the option `--device`, the table `[device]`, and the device that they select on this machine.
+//! Device selection: the device of this machine that the option `--device` and the settings table `[device]` select.
 
 #[cfg(feature = "cuda")]
 use super::cuda::{CudaTracer, Gpu, GpuSettings, SnapshotStore, Tuning};
+use super::settings::{DeviceChoice, DeviceSettings, Storage, WhenLost};
 use super::{BackendError, DeviceError};
 use crate::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
-use crate::setting::{Refused, require};
 #[cfg(feature = "cuda")]
 use crate::surrogate::Trace;
-use serde::{Deserialize, Serialize};
-use std::fmt;
-use std::str::FromStr;
 #[cfg(feature = "cuda")]
 use std::sync::Arc;
 use std::time::Instant;
-use thiserror::Error;
 
-/// What was asked for.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum DeviceChoice {
-    /// The first usable GPU, otherwise the CPU.
-    #[default]
-    Auto,
-    /// The CPU.
-    Cpu,
-    /// This CUDA device, or an error.
-    Cuda(u32),
-}
-
-/// A device by no name.
-#[derive(Debug, Clone, PartialEq, Eq, Error)]
-#[error("--device {found}: accepted: auto, cpu, cuda:N")]
-pub struct UnknownDevice {
-    /// What was given.
-    pub found: String,
-}
-
-impl FromStr for DeviceChoice {
-    type Err = UnknownDevice;
-    fn from_str(text: &str) -> Result<Self, UnknownDevice> {
-        match text {
-            "auto" => Ok(Self::Auto),
-            "cpu" => Ok(Self::Cpu),
-            _ => text
-                .strip_prefix("cuda:")
-                .and_then(|n| n.parse().ok())
-                .map(Self::Cuda)
-                .ok_or_else(|| UnknownDevice { found: text.to_owned() }),
-        }
-    }
-}
-
-impl fmt::Display for DeviceChoice {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Auto => write!(f, "auto"),
-            Self::Cpu => write!(f, "cpu"),
-            Self::Cuda(n) => write!(f, "cuda:{n}"),
-        }
-    }
-}
-
-/// How node velocities are held on a GPU.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Storage {
-    /// 16 bytes a node.
-    #[default]
-    F32,
-    /// 8 bytes a node: velocities are rounded to 11 bits.
-    F16,
-    /// 16 bytes a node: rounded to 11 bits, with the change to the next snapshot beside it, so that a tracer asks once instead of twice.
-    F16Pairs,
-}
-
-impl Storage {
-    /// All of them.
-    pub const ALL: [Self; 3] = [Self::F32, Self::F16, Self::F16Pairs];
-
-    /// Bytes of a node.
-    pub fn bytes(self) -> u64 {
-        match self {
-            Self::F32 | Self::F16Pairs => 16,
-            Self::F16 => 8,
-        }
-    }
-
-    /// As written in settings.
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-            Self::F16Pairs => "f16_pairs",
-        }
-    }
-}
-
-/// What happens when work on a GPU fails.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum WhenLost {
-    /// The run goes on there, at a lower rate, and says so.
-    #[default]
-    Cpu,
-    /// The run ends with an error.
-    Stop,
-}
-
-/// `[device]`: how a GPU is used, where one is.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
-#[serde(deny_unknown_fields, default)]
-pub struct DeviceSettings {
-    /// How the velocity window is held.
-    pub storage: Storage,
-    /// Most device memory that is taken, MiB; none: nine tenths of what is free at start.
-    pub memory_mib: Option<u64>,
-    /// What happens when work on the device fails, for whatever reason: it is not tried again in this run. Memory that it lacks once it is at
-    /// work is no failure: the CPU does what wanted it, with a warning. Only a window that no longer fits is one.
-    pub when_lost: WhenLost,
-    /// Lowest stream priority, for life beside a solver.
-    pub low_priority: bool,
-}
-
-impl DeviceSettings {
-    /// Checks ranges.
-    pub fn check(&self) -> Result<(), Refused> {
-        let fits = self.memory_mib.is_none_or(|mib| (1..=1 << 24).contains(&mib));
-        require(fits, "device.memory_mib", self.memory_mib, "a whole number from 1 to 16777216")
-    }
-}
-
-/// The device that was selected.
+/// The selected device.
 #[derive(Debug, Clone)]
 pub enum Device {
-    /// The CPU, with the reason why no GPU is used; `None` if the CPU was asked for.
+    /// The CPU.
     Cpu {
-        /// In words.
+        /// Reason why no GPU is used. `None` if the CPU was requested.
         why: Option<String>,
     },
     /// A GPU.
@@ -142,17 +24,17 @@ pub enum Device {
     Cuda(CudaDevice),
 }
 
-/// An opened GPU, and how a run uses it.
+/// An opened GPU with its settings.
 #[cfg(feature = "cuda")]
 #[derive(Debug, Clone)]
 pub struct CudaDevice {
-    /// The device.
+    /// The GPU.
     pub gpu: Arc<Gpu>,
-    /// How the velocity window is held.
+    /// Storage format of the velocity window.
     pub storage: Storage,
-    /// What happens when the device is lost.
+    /// Reaction to a lost device.
     pub when_lost: WhenLost,
-    /// Whether the CPU computes if the first slide does not fit the device: the device was chosen automatically.
+    /// True if the CPU takes over when the first slide does not fit the device. This is so if the device was selected by `auto`.
     pub may_fall_back: bool,
 }
 
@@ -163,13 +45,13 @@ impl Default for Device {
 }
 
 impl Device {
-    /// The CPU, by choice.
+    /// The CPU, as requested by `--device cpu`.
     pub const CPU: Self = Self::Cpu { why: None };
 
-    /// Opens the device that was asked for. `auto` never fails.
+    /// Opens the requested device. `auto` never fails.
     ///
     /// # Errors
-    /// `cuda:N` cannot be used.
+    /// `cuda:N` is requested and cannot be used.
     #[cfg(feature = "cuda")]
     pub fn open(choice: DeviceChoice, settings: &DeviceSettings) -> Result<Self, DeviceError> {
         let ordinal = match choice {
@@ -188,10 +70,10 @@ impl Device {
         }
     }
 
-    /// Opens the device that was asked for. `auto` never fails.
+    /// Opens the requested device. `auto` never fails.
     ///
     /// # Errors
-    /// `cuda:N`, since this build has no CUDA backend.
+    /// `cuda:N` is requested; this build has no CUDA backend.
     #[cfg(not(feature = "cuda"))]
     pub fn open(choice: DeviceChoice, _: &DeviceSettings) -> Result<Self, DeviceError> {
         match choice {
@@ -201,15 +83,16 @@ impl Device {
         }
     }
 
-    /// Whether it is a GPU.
+    /// Returns true for a GPU.
     pub fn is_gpu(&self) -> bool {
         !matches!(self, Self::Cpu { .. })
     }
 
-    /// Traces seeds at `t0` once. If the device cannot and the settings allow it, the CPU does, and a note says why.
+    /// Traces one set of seeds (domain coordinates) at the start time `t0`. If the device cannot and the settings allow the CPU to take over, the CPU
+    /// traces them and a note says why.
     ///
     /// # Errors
-    /// A flow map that no tracer accepts; a device that fails, if the CPU must not take over.
+    /// The flow map is invalid, or the device fails and the settings do not allow the CPU to take over.
     pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Result<TracedOnce, BackendError> {
         let (mut traced, mut note) = (Traced::default(), None);
         let mut begun = Instant::now();
@@ -236,7 +119,7 @@ impl Device {
     }
 }
 
-/// Seeds that were traced.
+/// Result of [`Device::trace`].
 pub struct TracedOnce {
     /// The flow map on the CPU.
     pub flow: Box<dyn Tracer>,
@@ -244,7 +127,7 @@ pub struct TracedOnce {
     pub traced: Traced,
     /// Wall-clock seconds of tracing.
     pub seconds: f64,
-    /// Why the CPU traced in place of the device.
+    /// Reason why the CPU traced instead of the device. `None` if the selected device traced.
     pub note: Option<String>,
 }
 

@@ -1,4 +1,4 @@
-//! Traces in parts, so that a request to stop is met while a slide is prepared, which may take minutes.
+//! A tracer that can be stopped. It traces large batches in parts and checks the stop flag between them, because preparing a slide may take minutes.
 
 use super::DeviceError;
 use crate::flow::{Extras, Traced, Tracer};
@@ -7,22 +7,22 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Seeds of the first part, from which the speed is read off.
+/// Seeds of the first part, which measures the speed.
 const FIRST_PART: usize = 1 << 12;
-/// Seconds that a part should take: large parts sort better, small ones hear sooner.
+/// Target duration of a part in seconds. Larger parts sort better, smaller ones react sooner to a stop.
 const PART_SECONDS: f64 = 0.5;
 
-/// A tracer that gives up once a stop is requested: the seeds that it has not traced by then are NaN. The caller checks the stop before it uses the
-/// result.
+/// A tracer that ends early if the stop flag is set. The results of seeds that are not traced by then are NaN, so the caller must check the flag
+/// before it uses them.
 pub struct Interruptible<'a> {
     tracer: &'a dyn Trace,
     stop: &'a AtomicBool,
-    /// Seeds that a part should have, by the speed measured last.
+    /// Seeds of the next part, from the latest measured speed.
     part: Mutex<usize>,
 }
 
 impl<'a> Interruptible<'a> {
-    /// Gives up once `stop` is set.
+    /// Wraps `tracer`; setting `stop` ends its work early.
     pub fn new(tracer: &'a dyn Trace, stop: &'a AtomicBool) -> Self {
         Self { tracer, stop, part: Mutex::new(FIRST_PART) }
     }
@@ -31,11 +31,11 @@ impl<'a> Interruptible<'a> {
         self.part.lock().map_or(FIRST_PART, |part| *part)
     }
 
-    /// Takes the speed of `seeds` in `seconds` in.
+    /// Adapts the size of the next part to the measured speed.
     fn measured(&self, seeds: usize, seconds: f64) {
         if let Ok(mut part) = self.part.lock() {
             let wanted = (seeds as f64 * PART_SECONDS / seconds.max(1e-6)) as usize;
-            // Fourfold at most: a part of void seeds takes no time and says little about the next.
+            // Growth is limited to a factor of 4: a part of seeds in missing cells takes no time and does not predict the next part.
             *part = wanted.clamp(FIRST_PART / 8, part.saturating_mul(4));
         }
     }
@@ -67,7 +67,7 @@ impl Trace for Interruptible<'_> {
             self.measured(part.len(), start.elapsed().as_secs_f64());
         }
         if done < seeds.len() {
-            // Unrounded values are there for all seeds or for none.
+            // Either all seeds have f64 values or no seed has one.
             let double = !out.log_stretch_f64.is_empty();
             out.set_len(seeds.len(), extras, double);
         }

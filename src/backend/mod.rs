@@ -1,7 +1,7 @@
-//! Who computes: one trait for tracing, remembering, rendering and training, and its implementations.
+//! Compute backends: one trait for tracing, prediction, rendering, audits and training, with a CPU and a CUDA implementation.
 //!
-//! In: a slide's velocity and the requests of `run`. Out: frames, audits, weights. Calls `field`, `flow`, `surrogate`, `trust` and `render`. A device that
-//! fails returns [`DeviceError`]; `run` then discards the frame and makes it again elsewhere.
+//! In: the velocity of a slide and the requests of `run`. Out: frames, audits, checkpoints. Uses `field`, `flow`, `surrogate`, `trust` and `render`.
+//! If a device fails, the call returns [`DeviceError`]. `run` then discards the frame and computes it again on the CPU.
 
 pub mod audit;
 mod cpu;
@@ -12,16 +12,18 @@ mod error;
 mod interruptible;
 mod placement;
 mod router;
+mod settings;
 
 pub use audit::{Audit, AuditFindings, AuditRequest, residuals, stratified_points, trusted_error};
 pub use cpu::{Cpu, HostFrame, render_on_cpu};
 #[cfg(feature = "cuda")]
 pub use device::CudaDevice;
-pub use device::{Device, DeviceChoice, DeviceSettings, Storage, TracedOnce, UnknownDevice, WhenLost};
+pub use device::{Device, TracedOnce};
 pub use error::DeviceError;
 pub use interruptible::Interruptible;
 pub use placement::{Needs, Place, Placement};
 pub use router::{QueryRouter, Routing, Tally};
+pub use settings::{DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 
 use crate::field::Domain;
 use crate::flow::{FlowError, FlowMap, VelocitySource};
@@ -36,43 +38,43 @@ use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use thiserror::Error;
 
-/// Traces, remembers, renders and trains.
+/// A processor that traces, renders, audits and trains.
 pub trait Backend: Send + Sync + Sized {
-    /// A slide's flow map.
+    /// Flow map of a slide.
     type Tracer: Trace;
-    /// A memory of the log-stretch that learns.
+    /// Approximation of the log-stretch that learns from traced labels.
     type Surrogate: Surrogate<Tracer = Self::Tracer>;
-    /// The labels that a frame traced. They count once they are committed.
+    /// Labels that a frame traced. They take effect when they are committed.
     type Samples: FrameSamples;
 
-    /// The device for records, for example `cuda:0 NVIDIA H200`.
+    /// Device name in the records, for example `cuda:0 NVIDIA H200`.
     fn name(&self) -> String;
 
-    /// The listener that hears of snapshots as they are read, to upload them before the window needs them.
+    /// Returns a listener that is called with each snapshot that is read, to upload it before the window needs it. `None` on the CPU.
     fn prefetch(&self) -> Option<Listener>;
 
-    /// Uploads a slide's velocity and prepares its flow map for seeds at `t0`.
+    /// Uploads the velocity of a slide and prepares its flow map for seeds at the start time `t0`.
     ///
     /// # Errors
-    /// A flow map that no tracer accepts; a device that fails or lacks memory.
+    /// The flow map is invalid, or the device fails or lacks memory.
     fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<Self::Tracer, BackendError>;
 
-    /// Plans where the surrogate lives, and builds it.
+    /// Plans the placement of the surrogate and builds it.
     ///
     /// # Errors
-    /// Settings that are out of range; a device that fails or lacks memory.
+    /// A setting is out of range, or the device fails or lacks memory.
     fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &Self::Tracer) -> Result<Self::Surrogate, BackendError>;
 
-    /// Renders one frame. Nothing that outlives the frame changes until its samples are committed, apart from `renderer`.
+    /// Renders one frame. Until its samples are committed, the frame changes no lasting state except `renderer`.
     ///
     /// # Errors
-    /// A device that fails or lacks memory.
+    /// The device fails or lacks memory.
     fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<Self::Samples>, DeviceError>;
 
-    /// Draws and traces a frame's audit points and measures the surrogate on them.
+    /// Draws and traces the audit points of a frame, and measures the surrogate on them.
     ///
     /// # Errors
-    /// A device that fails or lacks memory.
+    /// The device fails or lacks memory.
     fn audit(
         &mut self,
         request: &AuditRequest<'_>,
@@ -80,10 +82,11 @@ pub trait Backend: Send + Sync + Sized {
         surrogate: Option<&FrozenOf<Self>>,
     ) -> Result<AuditFindings, DeviceError>;
 
-    /// Plans the slide anew after a shortage of memory: moves part of the work to the CPU, and says in words which. `None` if nothing can be moved.
+    /// Plans the slide again after the device ran out of memory: moves part of the work to the CPU and returns a warning that says which part.
+    /// `None` if nothing can be moved.
     ///
     /// # Errors
-    /// The device fails while the surrogate moves.
+    /// The device fails while the surrogate moves to the CPU.
     fn replan(
         &mut self,
         shortage: &DeviceError,
@@ -91,70 +94,73 @@ pub trait Backend: Send + Sync + Sized {
         surrogate: &mut Option<Self::Surrogate>,
     ) -> Result<Option<String>, DeviceError>;
 
-    /// What happens when the device is lost.
+    /// Reaction to a lost device.
     fn when_lost(&self) -> WhenLost {
         WhenLost::Cpu
     }
 
-    /// Whether the CPU computes if the first slide does not fit the device.
+    /// Returns true if the CPU takes over when the first slide does not fit the device.
     fn may_fall_back(&self) -> bool {
         true
     }
 
-    /// Warnings about the placement since the last call.
+    /// Returns the warnings about the placement since the last call.
     fn warnings(&mut self) -> Vec<String> {
         Vec::new()
     }
 }
 
-/// The frozen surrogate of a backend.
+/// Frozen surrogate of a backend.
 pub type FrozenOf<B> = <<B as Backend>::Surrogate as Surrogate>::Frozen;
 
-/// A memory of the log-stretch over the domain, which learns between or beside frames. Every call may fail with the device.
-#[allow(clippy::missing_errors_doc)] // said above
+/// An approximation of the log-stretch over the domain. It learns between frames or concurrently with them.
+///
+/// # Errors
+/// All methods that return a `Result` fail if the device fails or lacks memory; [`Surrogate::load`] also fails if the checkpoint does not fit.
+#[allow(clippy::missing_errors_doc)] // stated above
 pub trait Surrogate: Send + Sync + Sized {
-    /// Traces the tables.
+    /// Tracer that fills the table.
     type Tracer;
-    /// The surrogate at one moment.
+    /// Immutable copy of the surrogate for prediction.
     type Frozen: Predict + 'static;
 
-    /// The surrogate as it answers now: frames are rendered with it while training goes on.
+    /// Returns an immutable copy of the present state. Frames are rendered with it while training continues.
     fn freeze(&self) -> Result<Self::Frozen, DeviceError>;
-    /// Whether [`Surrogate::learn`] does anything.
+    /// Returns true if [`Surrogate::learn`] has an effect.
     fn learns(&self) -> bool;
-    /// Whether a device other than the CPU takes the optimizer steps.
+    /// Returns true if a device other than the CPU computes the optimizer steps.
     fn trains_on_device(&self) -> bool;
     /// Trains for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
     fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError>;
-    /// Takes the surrogate to a new window. Setting `stop` may end the tracing of its table early; the surrogate is then unusable.
+    /// Moves the surrogate to a new window. Setting `stop` may end the tracing of its table early; the surrogate is then unusable.
     fn window_slid(&mut self, tracer: &Self::Tracer, stop: &AtomicBool) -> Result<(), DeviceError>;
-    /// Frees device memory before another surrogate takes this one's place.
+    /// Frees device memory before another surrogate replaces this one.
     fn release(&mut self) -> Result<(), DeviceError> {
         Ok(())
     }
-    /// The state at this moment, which is waited for.
+    /// Returns the present state. Waits for the device.
     fn checkpoint(&self) -> Result<CheckpointState, DeviceError>;
-    /// The state without waiting; `None` while an earlier one is still being downloaded.
+    /// Returns the present state without waiting for its download. `None` while an earlier download is in progress.
     fn checkpoint_async(&mut self) -> Result<Option<CheckpointState>, DeviceError>;
     /// Restores a checkpoint.
     fn load(&mut self, path: &Path) -> Result<(), CheckpointError>;
-    /// Memory that prediction reads, bytes.
+    /// Memory that prediction reads, in bytes.
     fn bytes(&self) -> usize;
-    /// The surrogate on the CPU, still without its table.
+    /// Returns the surrogate on the CPU. Its table is not traced yet.
     fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError>;
 }
 
-/// What a surrogate is built from.
+/// Inputs for building a surrogate.
 pub struct SurrogateRequest<'a> {
-    /// Kind and table.
+    /// Kind of the surrogate and nodes of its table.
     pub settings: &'a SurrogateSettings,
-    /// The network.
+    /// Architecture and training of the network.
     pub network: &'a NetworkSettings,
-    /// Where seeds lie.
+    /// Domain of the seeds.
     pub domain: &'a Domain,
-    /// Draws the first weights and the batches.
+    /// Random seed of the initial weights and of the batches.
     pub seed: u64,
-    /// Samples that the replay buffer holds at most.
+    /// Capacity of the replay buffer, in samples.
     pub replay_buffer: usize,
     /// Setting it may end the tracing of the table early; the surrogate is then unusable.
     pub stop: &'a AtomicBool,
@@ -162,19 +168,19 @@ pub struct SurrogateRequest<'a> {
 
 /// One frame to render.
 pub struct FrameJob<'a, B: Backend> {
-    /// The slide's flow map.
+    /// Flow map of the slide.
     pub tracer: &'a B::Tracer,
-    /// The surrogate that answers where the gate trusts it; `None`: everything is traced.
+    /// Surrogate for cells that the gate trusts. `None`: every query is traced.
     pub surrogate: Option<&'a FrozenOf<B>>,
-    /// Who answers which query, and which labels are kept.
+    /// Routing of the queries, and which labels are kept.
     pub routing: Routing<'a>,
-    /// Number of the picture, which decides its random numbers.
+    /// Picture number; it selects the random stream.
     pub picture: u64,
-    /// Samples a pixel.
+    /// Samples per pixel.
     pub samples: usize,
-    /// Told the share that is rendered.
+    /// Called with the share of the frame that is rendered, from 0 to 1.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
-    /// Ends the frame after the wave in progress when it is set.
+    /// Setting it ends the frame after the wave in progress.
     pub stop: &'a AtomicBool,
 }
 
@@ -182,19 +188,19 @@ pub struct FrameJob<'a, B: Backend> {
 pub struct Rendered<S> {
     /// The picture.
     pub film: Film,
-    /// The renderer's counts and times.
+    /// Counts and times of the renderer.
     pub stats: RenderStats,
-    /// The router's counts and times.
+    /// Counts and times of the query router.
     pub tally: Tally,
-    /// The traced queries that were kept as labels.
+    /// Traced queries that are kept as labels.
     pub samples: S,
 }
 
-/// Labels of one frame. Dropped without [`FrameSamples::commit`], they leave no trace on the device either.
+/// Labels of one frame. If they are dropped without [`FrameSamples::commit`], they are removed from the device as well.
 pub trait FrameSamples: Send {
-    /// The labels on the host, before they count.
+    /// Returns the labels on the host, before the commit.
     fn on_host(&self) -> &Samples;
-    /// Makes the labels count. Returns those that are on the host.
+    /// Commits the labels for training. Returns the labels on the host.
     fn commit(self) -> Samples;
 }
 
@@ -208,13 +214,13 @@ impl FrameSamples for Samples {
     }
 }
 
-/// Why a backend cannot prepare a slide.
+/// Error in preparing a slide.
 #[derive(Debug, Error)]
 pub enum BackendError {
-    /// A flow map that no tracer accepts.
+    /// The flow map is invalid.
     #[error(transparent)]
     Flow(#[from] FlowError),
-    /// Settings of the surrogate.
+    /// A setting of the surrogate is out of range.
     #[error(transparent)]
     Surrogate(#[from] SurrogateError),
     /// The device fails or lacks memory.

@@ -1,9 +1,10 @@
-//! Which work runs on the device and which on the CPU, decided once a slide from a memory estimate.
+//! Placement of the work on the device or on the CPU, decided once per slide from a memory estimate.
 //!
-//! The window and the tracing are always on the device. The surrogate and the frames follow if the table fits; training follows if the network in
-//! training fits beside it. A shortage that the estimate did not foresee lowers the placement by one step, and the slide is planned anew.
+//! The window and the tracing are always on the device. The surrogate and the frames are on the device if the table and the network fit. Training is
+//! on the device if its memory fits as well. If memory runs out in spite of the estimate, the placement is lowered by one step and the slide is
+//! planned again.
 
-/// Where work runs.
+/// Processor that runs a piece of work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Place {
     /// On the device.
@@ -12,21 +13,21 @@ pub enum Place {
     Host,
 }
 
-/// Device memory that a surrogate needs, bytes.
+/// Device memory that a surrogate needs, in bytes.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Needs {
     /// The table; 0 without one.
     pub table: u64,
     /// The network for prediction; 0 without one.
     pub network: u64,
-    /// The network in training beside that, with its samples; 0 if the device does not train it.
+    /// Training state and samples, in addition to `network`; 0 if the device does not train it.
     pub training: u64,
 }
 
-/// A plan.
+/// Processors that render and train.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Placement {
-    /// Frames and the surrogate that answers them.
+    /// Frames, and the surrogate that they query.
     pub frames: Place,
     /// Optimizer steps.
     pub training: Place,
@@ -38,7 +39,7 @@ impl Placement {
     /// Only the window and the tracing on the device.
     pub const TRACING_ONLY: Self = Self { frames: Place::Host, training: Place::Host };
 
-    /// Plans within `left` bytes, at most up to `self`. The reason is given if the plan is lower than `self`.
+    /// Returns the highest placement, not above `self`, that needs at most `left` bytes. If it is lower than `self`, a warning says why.
     pub fn within(self, needs: Needs, left: u64) -> (Self, Option<String>) {
         let mib = |bytes: u64| bytes.div_ceil(1 << 20);
         let resident = needs.table + needs.network;
@@ -62,7 +63,7 @@ impl Placement {
         (self, None)
     }
 
-    /// The next lower placement; `None` if only tracing is left.
+    /// Returns the next lower placement. `None` if only tracing is on the device.
     pub fn lower(self, trains_on_device: bool) -> Option<Self> {
         match self {
             Self { training: Place::Device, .. } if trains_on_device => Some(Self { training: Place::Host, ..self }),

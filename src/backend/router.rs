@@ -1,8 +1,10 @@
-//! Routes a frame's log-stretch queries on the CPU, and keeps labels of the traced ones.
+//! Routes the log-stretch queries of a frame on the CPU, and keeps a sample of the traced ones as training labels.
 //!
-//! The rule, on every backend: a query on missing cells has no value. A query in a cell that the gate trusts is answered by the surrogate, any other
-//! query by tracing. Once the frame's tracing budget is spent, the surrogate answers everywhere, and these answers are counted. Without a surrogate
-//! every query is traced. `kernels/rendering/answer.cu` applies the same rule on a GPU.
+//! The rule is the same on every backend; `kernels/rendering/answer.cu` applies it on a GPU:
+//! 1. A query in a missing cell has the value NaN.
+//! 2. The surrogate predicts in cells that the gate trusts.
+//! 3. RK4 traces all other queries. After the tracing budget of the frame is spent, the surrogate predicts them instead, and they are counted.
+//! 4. Without a surrogate, every query outside missing cells is traced.
 
 use super::DeviceError;
 use crate::field::Domain;
@@ -12,50 +14,50 @@ use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::Gate;
 use std::time::Instant;
 
-/// What decides who answers a frame's queries, and which labels are kept.
+/// Inputs of the routing rule, and which labels are kept.
 #[derive(Clone, Copy)]
 pub struct Routing<'a> {
-    /// Where the surrogate is trusted.
+    /// Cells in which the surrogate is trusted.
     pub gate: &'a Gate,
-    /// Seconds of tracing after which the surrogate answers everywhere.
+    /// Seconds of tracing after which the surrogate predicts in untrusted cells too. `None`: no limit.
     pub trace_budget: Option<f64>,
-    /// Fewer than so many traced queries are kept as labels.
+    /// Upper bound (exclusive) on the traced queries that are kept as labels.
     pub keep: usize,
-    /// What is kept with each label.
+    /// Arrival points and Jacobians to keep with each label.
     pub extras: Extras,
 }
 
-/// Answers the queries of one frame.
+/// Evaluates the log-stretch queries of one frame.
 pub struct QueryRouter<'a> {
     tracer: &'a dyn Trace,
     surrogate: Option<&'a dyn Predict>,
     routing: Routing<'a>,
     stride: usize,
     since_kept: usize,
-    /// Traced queries, kept evenly over the frame (fewer than `keep`).
+    /// Labels: traced queries, spread evenly over the frame (fewer than `keep`).
     pub samples: Samples,
     /// Counts and times of the frame so far.
     pub tally: Tally,
-    /// The first failure of a device. Later queries have no value.
+    /// First device error. All later queries are NaN.
     failure: Option<DeviceError>,
     traced: Traced,
     scratch: Scratch,
 }
 
-/// Counts and times of one frame's answers.
+/// Query counts and times of one frame.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Tally {
-    /// Queries answered.
+    /// All queries.
     pub queries: u64,
-    /// Of them by RK4.
+    /// Queries traced with RK4.
     pub traced: u64,
-    /// Of them without a value (land).
+    /// Queries in missing cells.
     pub missing: u64,
-    /// Queries of untrusted cells that the surrogate answered because the tracing budget was spent.
+    /// Queries in untrusted cells that the surrogate predicted because the tracing budget was spent.
     pub over_budget: u64,
-    /// Seconds spent tracing: wall clock on the CPU, device time where a GPU answers.
+    /// Seconds of tracing: wall clock on the CPU, device time on a GPU.
     pub trace_seconds: f64,
-    /// Seconds spent predicting, likewise.
+    /// Seconds of prediction, measured in the same way.
     pub predict_seconds: f64,
 }
 
@@ -69,7 +71,7 @@ struct Scratch {
 }
 
 impl<'a> QueryRouter<'a> {
-    /// A router that traces everything if `surrogate` is `None`.
+    /// Creates a router. It traces every query if `surrogate` is `None`.
     pub fn new(tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>, routing: Routing<'a>) -> Self {
         Self {
             tracer,
@@ -85,10 +87,10 @@ impl<'a> QueryRouter<'a> {
         }
     }
 
-    /// Counts, times and labels of the frame.
+    /// Returns the counts, times and labels of the frame.
     ///
     /// # Errors
-    /// The device failed during the frame.
+    /// The first device error of the frame.
     pub fn finish(self) -> Result<(Tally, Samples), DeviceError> {
         self.failure.map_or(Ok((self.tally, self.samples)), Err)
     }
@@ -101,8 +103,8 @@ impl<'a> QueryRouter<'a> {
         self.routing.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget)
     }
 
-    /// Every stride-th traced query is kept; when there is no more room, every other one is let go and the stride doubles, so that
-    /// what is kept is spread evenly over the frame.
+    /// Keeps every stride-th traced query. At the limit, every other label is dropped and the stride doubles, so that the labels stay spread
+    /// evenly over the frame.
     fn keep_samples(&mut self, count: usize) {
         let domain = self.domain();
         let extras = self.routing.extras;
@@ -121,7 +123,7 @@ impl<'a> QueryRouter<'a> {
     }
 }
 
-/// Lets go of every other sample.
+/// Drops every other sample.
 fn halve(samples: &mut Samples) {
     fn every_other<T>(values: &mut Vec<T>) {
         let mut keep = false;
@@ -136,13 +138,13 @@ fn halve(samples: &mut Samples) {
     every_other(&mut samples.jacobian);
 }
 
-/// An arrival in unit coordinates; it may lie outside [0, 1].
+/// Converts an arrival point to unit coordinates, which may lie outside [0, 1].
 pub(super) fn unit_arrival(domain: &Domain, arrival: [f32; 3]) -> [f32; 3] {
     let extent = domain.extent();
     std::array::from_fn(|k| ((f64::from(arrival[k]) - domain.min[k]) / extent[k]) as f32)
 }
 
-/// Appends traced seed `i` to `samples`, in unit coordinates.
+/// Appends traced seed `i` to `samples` in unit coordinates. The Jacobian is scaled to unit coordinates on both sides.
 pub(super) fn push_sample(samples: &mut Samples, domain: &Domain, point: [f32; 3], traced: &Traced, i: usize, extras: Extras) {
     samples.points.push(domain.to_unit(point));
     samples.log_stretch.push(traced.log_stretch[i]);

@@ -7,7 +7,7 @@ use super::session::{RunArguments, Session};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::RunFolder;
-use ridgewatch::run::{EngineError, Setup};
+use ridgewatch::run::{RunError, Setup};
 use ridgewatch::source::live::Live;
 use ridgewatch::source::{SourceError, SourceKind};
 use ridgewatch::surrogate::network::Size;
@@ -64,7 +64,7 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         let refused = |error| located(scene, error, SourceError::refused);
         let Some(live) = Live::connect(&scene.live, stop, &mut messages::note).map_err(refused)? else { return Ok(None) };
         messages::note(format_args!("found {}", live.describe()));
-        Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, EngineError::refused))
+        Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, RunError::refused))
     };
     Session { common, options: &options.run, scene, text, checkpoint_seconds: Some(CHECKPOINT_SECONDS) }.run(open)
 }

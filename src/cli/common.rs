@@ -6,7 +6,7 @@ use ridgewatch::backend::{Device, DeviceChoice};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
-use ridgewatch::run::{EngineError, Setup};
+use ridgewatch::run::{RunError, Setup};
 use ridgewatch::setting::Refused;
 use ridgewatch::source::SourceError;
 use ridgewatch::surrogate::Kind;
@@ -54,7 +54,7 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
         return interrupted.status;
     }
     let configuration = error.chain().any(|cause| {
-        let engine = cause.downcast_ref().is_some_and(|error: &EngineError| error.refused().is_some());
+        let engine = cause.downcast_ref().is_some_and(|error: &RunError| error.refused().is_some());
         let publish = cause.downcast_ref().is_some_and(|error: &PublishError| error.refused().is_some());
         let source = cause.downcast_ref().is_some_and(|error: &SourceError| error.refused().is_some());
         engine || publish || source || cause.is::<ConfigError>() || cause.is::<Usage>()
@@ -106,7 +106,7 @@ where
 /// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
 pub fn open(scene: &SceneFile) -> Result<Setup> {
     let _spinner = opening(scene);
-    Setup::new(scene.settings()).map_err(|error| located(scene, error, EngineError::refused))
+    Setup::new(scene.settings()).map_err(|error| located(scene, error, RunError::refused))
 }
 
 /// Spinner shown while a source is opened.

@@ -7,7 +7,7 @@ use ridgewatch::backend::{Device, TracedOnce};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
-use ridgewatch::run::{EngineError, Plan, Setup, Slide};
+use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -98,7 +98,7 @@ struct Convergence {
 /// Computes, compares and writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
-    let faulty = |error| located(&scene, error, EngineError::refused);
+    let faulty = |error| located(&scene, error, RunError::refused);
     let Setup { plan, mut slides, notes } = open(&scene)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
@@ -113,8 +113,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     let slide = slide.context("the source gave no slide")?;
     let device = device(common, &scene)?;
-    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<EngineError>() {
-        Ok(error) => located(&scene, error, EngineError::refused),
+    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<RunError>() {
+        Ok(error) => located(&scene, error, RunError::refused),
         Err(error) => match error.downcast::<FlowError>() {
             Ok(error) => located(&scene, error, FlowError::refused),
             Err(error) => error,
@@ -151,7 +151,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let seeds = seeds(&plan.domain, grid);
     let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
     let TracedOnce { flow: tracer, traced, seconds, note } =
-        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(EngineError::of)?;
+        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(RunError::of)?;
     note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
     let ftle: Vec<f64> =

@@ -4,7 +4,7 @@ use super::common::{Common, Usage, dimensions, located, opening, print_json, pri
 use super::{messages, signals};
 use anyhow::{Context, Result, bail};
 use ridgewatch::field::{Axis, Geometry, Grid, Snapshot};
-use ridgewatch::run::{EngineError, open_snapshots};
+use ridgewatch::run::{RunError, open_snapshots};
 use ridgewatch::source::SnapshotSource;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Policy, Producer};
 use std::path::PathBuf;
@@ -53,7 +53,7 @@ fn blocks(text: &str) -> Result<[u64; 3], String> {
 pub fn run(common: &Common, options: Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
     let spinner = opening(&scene);
-    let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
+    let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, RunError::refused))?;
     drop(spinner);
     let ring = ring_folder(options.ring.as_deref())?;
     let grid = source.grid().clone();

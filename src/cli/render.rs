@@ -7,7 +7,7 @@ use super::{messages, session};
 use anyhow::{Context, Result, bail};
 use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
 use ridgewatch::render::Method;
-use ridgewatch::run::{self, EngineError, Event, Frame, RunOptions};
+use ridgewatch::run::{self, Event, Frame, RunError, RunOptions};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
@@ -90,7 +90,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             picture = Some(frame);
         }
     };
-    run::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, EngineError::refused))?;
+    run::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, RunError::refused))?;
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {

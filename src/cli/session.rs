@@ -8,7 +8,7 @@ use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
 use ridgewatch::render::Method;
-use ridgewatch::run::{self, EngineError, Event, FrameRecord, RunOptions, RunReport, Setup};
+use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
@@ -172,7 +172,7 @@ fn work(
     let run = || run::run(setup, options, &mut |event| show(event, &mut bar, &mut last, &mut output), stop);
     // A panic must not cost the frames already made.
     let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
-    let result = result.and_then(|result| result.map_err(|error| located(scene, error, EngineError::refused)));
+    let result = result.and_then(|result| result.map_err(|error| located(scene, error, RunError::refused)));
     bar.finish_and_clear();
     let mut run = serde_json::Map::new();
     run.insert("title".into(), scene.title.as_str().into());

@@ -7,7 +7,7 @@ pub const RENAMED: [(&str, &str); 13] = [
     ("time.step", "time.seed_step"),
     ("time.stride", "time.snapshots_per_slide"),
     ("flow.gap", "flow.difference_step"),
-    ("network.scale_levels_by_aspect", "network.scale_levels_by_aspect"),
+    ("network.follow_aspect", "network.scale_levels_by_aspect"),
     ("training.ring", "training.replay_buffer"),
     ("trust.audit_per_cell", "trust.audit_min_per_cell"),
     ("trust.audit_most_per_cell", "trust.audit_max_per_cell"),

@@ -1,18 +1,36 @@
 //! The error of a frame's surrogate on its audit points, and the consequences for trust, size and replay buffer.
 
 use super::cycle::{MAX_RENDER_RESIDUALS, Run};
-use super::frame::Work;
 use super::prepare::every;
 use super::stop::RunEnd;
 use super::transaction::On;
 use super::{FrameRecord, TrustedError};
-use crate::backend::{AuditFindings, Backend, FrameSamples, Interruptible, Tally, audit, residuals, stratified_points, trusted_error};
+use crate::backend::{
+    AuditFindings, Backend, FrameSamples, Interruptible, Rendered, Tally, audit, residuals, stratified_points, trusted_error,
+};
 use crate::flow::Extras;
 use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata};
 use std::sync::atomic::Ordering;
 
-/// The error of a frame's surrogate, before it counts.
+/// A rendered and audited frame whose results have not taken effect.
+pub(super) struct Work<S> {
+    pub(super) rendered: Rendered<S>,
+    pub(super) audit: AuditFindings,
+    pub(super) samples_per_pixel: usize,
+    pub(super) render_seconds: f64,
+    pub(super) audit_seconds: f64,
+}
+
+impl<S> Work<S> {
+    /// Seconds of device time for the picture and its audit; wall-clock time if the CPU rendered.
+    pub(super) fn device_share(&self) -> f64 {
+        let device = self.rendered.stats.device_seconds;
+        self.audit_seconds + if device > 0.0 { device } else { self.render_seconds }
+    }
+}
+
+/// Errors of a frame's surrogate, before they take effect.
 pub(super) struct Assessment {
     trusted: Option<TrustedError>,
     trusted_volume: f64,
@@ -23,7 +41,7 @@ pub(super) struct Assessment {
     rendered: Vec<Residual>,
 }
 
-/// States the error of `frozen` from the audit points, which decided nothing in this frame.
+/// Measures the error of `frozen` on the audit points, which did not influence this frame.
 pub(super) fn assess<S: FrameSamples>(
     run: &Run<'_>,
     frozen: &dyn Predict,
@@ -69,7 +87,7 @@ impl Run<'_> {
         learning.trust.decay();
         learning.trust.observe(Some(audited), &rendered);
         if let Some(sizing) = &mut learning.sizing {
-            // Over the whole domain: where nothing is trusted, the size is to blame.
+            // Over the whole domain, since untrusted regions may need a larger size.
             let everywhere = trusted_error(audited, &Gate::uniform(true));
             learning.resize = everywhere.and_then(|error| sizing.observe(error.optical_rms, self.plan.scene.trust.tolerance));
         }
@@ -77,8 +95,8 @@ impl Run<'_> {
         self.keep_samples(on, &findings.samples);
     }
 
-    /// Error of `frozen` in the trusted region on fresh points, if it was asked for; `None` if a stop cut the measurement short, since it would
-    /// stand on the points that come first.
+    /// Error of `frozen` in the trusted region on new points. `None` if not requested, or if a stop interrupted the measurement, which would then
+    /// cover only a part of the domain.
     pub(super) fn verify(&self, frozen: &dyn Predict, tracer: &dyn Trace, gate: &Gate) -> Result<Option<TrustedError>, RunEnd> {
         if self.options.verify_points == 0 {
             return Ok(None);
@@ -97,8 +115,8 @@ impl Run<'_> {
     }
 }
 
-/// By how much the optical residual of a frame exceeds `tolerance`, or none when it does not. A frame whose tracing budget was spent is
-/// flagged whatever the points say: the surrogate answered where it is not trusted, so that those points speak for it.
+/// Excess of the optical residual of a frame over `tolerance`; `None` if within it. If the tracing budget was spent, the surrogate also answered in
+/// untrusted cells: then the excess is measured on the untrusted points, and always given.
 fn tolerance_excess(tally: &Tally, trusted: Option<TrustedError>, audited: &Audited, gate: &Gate, tolerance: f64) -> Option<f64> {
     if tally.over_budget == 0 {
         return trusted.map(|e| e.optical_rms - tolerance).filter(|over| *over > 0.0);

@@ -1,4 +1,4 @@
-//! Checkpoints of a run, written beside it: at most one at a time, by a thread of its own, while frames go on.
+//! Checkpoints of a run, written by a background thread while frames continue; at most one at a time.
 
 use super::record::CheckpointRecord;
 use crate::backend::{DeviceError, Surrogate};
@@ -9,48 +9,48 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::sync::{Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-/// Longest that the end of a run waits for the disk, for the checkpoint under way and for the last one each: a disk that hangs longer loses.
+/// Maximum time that the end of a run waits for the disk: for the checkpoint in progress, and again for the last one.
 const DISK_LIMIT: Duration = Duration::from_secs(120);
 
-/// What became of a run's checkpoints.
+/// Totals of a run's checkpoints.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct CheckpointTotals {
-    /// Written.
+    /// Number of checkpoints written.
     pub written: u64,
-    /// Not written, for reasons that were told.
+    /// Number of checkpoints that failed; each failure was reported.
     pub failed: u64,
-    /// That fell due while one was being written, and were left for the next time.
+    /// Number of checkpoints that became due while another was being written, and were skipped.
     pub postponed: u64,
-    /// Longest that the loop stood still for one, in seconds; that of the end of the run, where nothing goes on, is not among them.
+    /// Longest pause of the loop for a checkpoint, in seconds, without the checkpoint at the end of the run.
     pub longest_copy_seconds: f64,
-    /// The last one.
+    /// The last checkpoint.
     pub last: Option<CheckpointRecord>,
 }
 
-/// Writes checkpoints behind the cycle's back.
+/// Writes checkpoints in the background.
 pub(super) struct Checkpoints {
     path: PathBuf,
-    /// Seconds between two; none: only at the end.
+    /// Seconds between checkpoints; `None`: only at the end.
     every: Option<f64>,
-    /// When one was last due.
+    /// Time at which a checkpoint was last due.
     due: Instant,
     limit: Duration,
     writing: Option<Writing>,
     totals: CheckpointTotals,
 }
 
-/// One under way.
+/// A checkpoint in progress.
 struct Writing {
     record: CheckpointRecord,
     begun: Instant,
-    /// In a lock alone because threads that render see the cycle.
+    /// The lock only makes the type `Sync`, since rendering threads share the cycle.
     result: Mutex<Receiver<Result<u64, CheckpointError>>>,
 }
 
 impl Drop for Checkpoints {
-    /// Left without [`Checkpoints::finish`], after an error elsewhere: what is under way is completed.
+    /// After an error elsewhere, without [`Checkpoints::finish`], the checkpoint in progress is completed.
     fn drop(&mut self) {
-        // Told by then.
+        // Errors are logged by `wait`.
         let _ = self.wait();
     }
 }
@@ -60,12 +60,12 @@ impl Checkpoints {
         Self { path, every, due: Instant::now(), limit: DISK_LIMIT, writing: None, totals: CheckpointTotals::default() }
     }
 
-    /// What became of all so far.
+    /// Totals so far.
     pub(super) fn totals(&self) -> &CheckpointTotals {
         &self.totals
     }
 
-    /// Begins one after `frame`, where one is due. Seconds that the loop stood still for it, and what should be said of it.
+    /// Starts a checkpoint after `frame`, if one is due. Returns the pause of the loop in seconds, and a warning if frames had to wait.
     ///
     /// # Errors
     /// The device fails.
@@ -80,7 +80,7 @@ impl Checkpoints {
             return Ok((0.0, None));
         }
         let begun = Instant::now();
-        // Otherwise an earlier copy is on its way, and it is due after the next frame.
+        // If an earlier copy is still being downloaded, the checkpoint stays due for the next frame.
         let Some(state) = live.checkpoint_async()? else { return Ok((0.0, None)) };
         self.due = begun;
         let copy_seconds = begun.elapsed().as_secs_f64();
@@ -101,7 +101,7 @@ impl Checkpoints {
         let path = self.path.clone();
         let work = {
             let told = told.clone();
-            // Nobody listens any more once the disk has been given up.
+            // The receiver is gone if the wait for the disk timed out.
             move || drop(told.send(write()))
         };
         if let Err(source) = std::thread::Builder::new().name("ridgewatch-checkpoint".into()).spawn(work) {
@@ -110,7 +110,7 @@ impl Checkpoints {
         self.writing = Some(Writing { record, begun, result: Mutex::new(result) });
     }
 
-    /// The one that was under way since the last frame, for a record: complete, or as far as it is.
+    /// Record of the checkpoint in progress since the last frame, complete or partial; `None` without one.
     pub(super) fn look(&mut self) -> Option<CheckpointRecord> {
         self.hear(Duration::ZERO).map_or_else(|| self.under_way(), |(record, _)| Some(record))
     }
@@ -119,7 +119,7 @@ impl Checkpoints {
         self.writing.as_ref().map(|w| CheckpointRecord { seconds: w.begun.elapsed().as_secs_f64(), ..w.record.clone() })
     }
 
-    /// Hears of the one under way, if it ends within this time.
+    /// Receives the result of the checkpoint in progress, if it completes within this time.
     fn hear(&mut self, within: Duration) -> Option<(CheckpointRecord, Result<(), CheckpointError>)> {
         let result = self.writing.as_mut()?.result.get_mut().unwrap_or_else(PoisonError::into_inner);
         let result = match result.recv_timeout(within) {
@@ -144,7 +144,7 @@ impl Checkpoints {
         Some((record, result))
     }
 
-    /// Waits for the one under way; an error once it takes longer than the limit.
+    /// Waits for the checkpoint in progress. Fails if it takes longer than the limit.
     fn wait(&mut self) -> Result<(), CheckpointError> {
         if self.writing.is_none() {
             return Ok(());
@@ -160,10 +160,10 @@ impl Checkpoints {
         Err(error)
     }
 
-    /// Writes the last one, of a run whose last frame was `frame`, and waits for it.
+    /// Writes the last checkpoint of a run whose last frame was `frame`, and waits for it.
     ///
     /// # Errors
-    /// What keeps it from being written. What became of the one before is told, and counted.
+    /// The last checkpoint cannot be written, or an earlier one hangs. Other errors of the earlier one are logged and counted.
     pub(super) fn finish<S: Surrogate>(&mut self, frame: Option<u64>, live: &S) -> Result<(), CheckpointError> {
         if let Err(hangs @ CheckpointError::Hangs { .. }) = self.wait() {
             return Err(hangs);
@@ -194,7 +194,7 @@ mod tests {
         build(&settings, &NetworkSettings::default(), tracer.domain(), 0, &tracer).unwrap()
     }
 
-    /// One that is due after every frame and writes until told what it came to.
+    /// A writer that is due after every frame and writes until the test sends its result.
     fn slow(folder: &std::path::Path) -> (Checkpoints, Sender<Result<u64, CheckpointError>>) {
         let mut checkpoints = Checkpoints::new(folder.join("weights"), Some(0.0));
         let (end, told) = channel();
@@ -217,7 +217,7 @@ mod tests {
         let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(result.is_ok() && record.bytes == Some(77) && record.postponed == 5, "{record:?}");
         assert_eq!(checkpoints.look(), None, "told once");
-        // The next one.
+        // The next checkpoint succeeds.
         checkpoints.after_frame(6, &mut table).unwrap();
         let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(result.is_ok() && record.frame == Some(6) && record.bytes == Some(folder.path().join("weights").metadata().unwrap().len()));
@@ -238,7 +238,7 @@ mod tests {
         let last = checkpoints.totals.last.clone().unwrap();
         assert!(last.frame == Some(3) && last.bytes.is_some() && folder.path().join("weights").exists());
         assert_eq!((checkpoints.totals.written, checkpoints.totals.failed), (1, 1), "the one before is counted");
-        // What cannot be written is an error at the end, and in a record while frames go on.
+        // A failed write is an error at the end of the run, and an entry of the record while frames continue.
         let mut nowhere = Checkpoints::new(folder.path().join("no/such/weights"), Some(0.0));
         nowhere.after_frame(0, &mut table()).unwrap();
         let (record, _) = nowhere.hear(DISK_LIMIT).unwrap();
@@ -252,13 +252,13 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let (mut checkpoints, end) = slow(folder.path());
         checkpoints.limit = Duration::from_millis(50);
-        // It comes back at all: the writer goes on until it is told to end.
+        // The call returns although the writer still waits for the test.
         assert!(matches!(checkpoints.finish(Some(1), &table()), Err(CheckpointError::Hangs { .. })));
         drop(checkpoints);
         end.send(Ok(1)).unwrap();
 
         let (mut checkpoints, end) = slow(folder.path());
-        // Its thread finds nobody to hear from.
+        // The writer's thread panics, since its channel is closed.
         drop(end);
         let (record, result) = checkpoints.hear(DISK_LIMIT).unwrap();
         assert!(matches!(result, Err(CheckpointError::Writer { .. })) && record.failed.unwrap().contains("panicked"));

@@ -1,18 +1,18 @@
-//! The cycle: slide, render with the weights of the cycle before, test, then train.
+//! The cycle: slide the window, render with the weights of the previous cycle, test, then train.
 //!
-//! While one group of threads renders frame n with frozen weights, another trains the live ones on the samples of the frames before. Where a
-//! GPU trains, it takes turns: picture, then training, for `training.share` of the device's time. Samples traced for frame n are tested against
-//! the frozen weights, which have not seen them, before they go to the replay buffer.
+//! One group of threads renders frame n with frozen weights, while another trains the live weights on the samples of earlier frames. A GPU that
+//! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
+//! with the frozen weights, which were not trained on them, before they go to the replay buffer.
 
 use super::checkpoints::{CheckpointTotals, Checkpoints};
-use super::prepare;
 use super::record::Frame;
+use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
-use super::{EngineError, Settings, TransferRecord};
+use super::{RunError, Settings, TransferRecord};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
@@ -25,33 +25,33 @@ use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
-/// What a run may be told besides its scene.
+/// Options of a run besides its scene.
 #[derive(Debug, Clone, Default)]
 pub struct RunOptions {
-    /// Fresh uniform points on which each frame's stated error is checked afterwards; 0: none.
+    /// Number of new uniform points on which each frame's stated error is checked afterwards; 0 disables the check.
     pub verify_points: usize,
-    /// Wall-clock seconds after which no further frame is begun.
+    /// Wall-clock seconds after which no further frame starts.
     pub seconds: Option<f64>,
-    /// Worker threads; 0: all that the process may use.
+    /// Number of worker threads; 0: as many as the process may use.
     pub threads: usize,
-    /// Where to write the trained surrogate at the end.
+    /// File for the trained surrogate, written at the end.
     pub checkpoint: Option<PathBuf>,
-    /// Writes it also while the run goes on, when so many seconds have passed since the last time: a killed run goes on from there.
+    /// Seconds between checkpoints during the run. A killed run can resume from the latest one.
     pub checkpoint_seconds: Option<f64>,
     /// The device that computes.
     pub device: Device,
 }
 
-/// What a run tells while it goes.
+/// Events of a run in progress.
 pub enum Event {
-    /// Before the first frame: frames to come, where known.
+    /// Before the first frame.
     Begin {
-        /// How many.
+        /// Number of frames; `None` if unknown.
         frames: Option<u64>,
-        /// What should be known.
+        /// Remarks on the settings and the source.
         notes: Vec<String>,
     },
-    /// What was settled after that, before the first frame.
+    /// A remark after [`Event::Begin`] and before the first frame.
     Note(String),
     /// A finished frame.
     Frame(Frame),
@@ -59,50 +59,50 @@ pub enum Event {
     Progress(f32),
 }
 
-/// What a run came to.
+/// Summary of a run.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct RunReport {
-    /// Frames made.
+    /// Number of frames.
     pub frames: u64,
-    /// Slides seen.
+    /// Number of slides.
     pub slides: u64,
-    /// Whether it was stopped from outside.
+    /// True if the caller stopped the run.
     pub interrupted: bool,
     /// Seconds spent waiting for input.
     pub waited: f64,
-    /// Seconds spent on frames and on taking in snapshots that were there.
+    /// Seconds spent on frames and on adding available snapshots to the window.
     pub worked: f64,
     /// Optimizer steps.
     pub train_steps: u64,
-    /// Runge-Kutta steps a path; `None` if each path chooses its own, or before there was a tracer.
+    /// Runge-Kutta steps per path; `None` if each path chooses its own steps, or if there was no tracer yet.
     pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it (see [`crate::flow::StepChoice`]).
+    /// Difference of the log-stretch from that of twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
-    /// The transfer function in force; `None` before there was one.
+    /// Transfer function; `None` if the run ended before it was chosen.
     pub transfer: Option<TransferRecord>,
     /// Size of the surrogate, bytes.
     pub surrogate_bytes: usize,
-    /// Changes of its size with `size = "auto"`, and why; a few dozen at most, since no useless size is tried twice.
+    /// Changes of its size with `size = "auto"`, with reasons; a few dozen at most, since no rejected size is tried twice.
     pub sizes: Vec<String>,
-    /// Whether the snapshots are close enough in time; `None` for closed forms.
+    /// Resolution of the snapshots in time; `None` for closed forms.
     pub time_resolution: Option<TimeResolution>,
     /// Largest size of the window, bytes.
     pub window_bytes: usize,
-    /// What became of the checkpoints; `None` if none was asked for.
+    /// Totals of the checkpoints; `None` if the run writes none.
     pub checkpoints: Option<CheckpointTotals>,
-    /// Warnings since the last frame, whose record has all before.
+    /// Warnings since the last frame; earlier ones are in the records.
     pub warnings: Vec<String>,
 }
 
-/// Change of the FTLE when every second snapshot is dropped, as a share of its root mean square, from which a scene is called coarse.
+/// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
 const COARSE_IN_TIME: f64 = 0.25;
-/// Residuals of rendered samples that go to the trust map each frame at most: beyond it their cells are known well enough.
+/// Maximum number of residuals of rendered samples that go to the trust map each frame. More would not improve the estimates of their cells.
 pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
 
 /// The receiver of a run's events.
 pub(super) type Sink<'a> = dyn FnMut(Event) + Send + 'a;
 
-/// What a run owns on the host, whichever backend computes.
+/// State of a run on the host, independent of the backend.
 pub(super) struct Run<'a> {
     pub(super) plan: &'a Plan,
     pub(super) options: &'a RunOptions,
@@ -114,55 +114,55 @@ pub(super) struct Run<'a> {
     pub(super) transfer: TransferRecord,
     pub(super) learning: Learning,
     pub(super) progress: RunProgress,
-    /// Where checkpoints are asked for.
+    /// `None` if the run writes no checkpoints.
     pub(super) checkpoints: Option<Checkpoints>,
 }
 
-/// What a run has learned, beside the surrogate itself.
+/// State of learning, apart from the surrogate itself.
 pub(super) struct Learning {
     pub(super) trust: TrustMap,
     pub(super) buffer: ReplayBuffer,
-    /// The times that are inputs of the network, and where the window of the buffer's labels begins.
+    /// Times that are inputs of the network, and the start time of the buffer's labels.
     pub(super) times: Times,
     pub(super) start: f64,
-    /// What the surrogate is built from, with the data's own nodes.
+    /// Settings of the surrogate, with the nodes of the data if a table has no others.
     pub(super) settings: SurrogateSettings,
-    /// Finds its size, with `size = "auto"`.
+    /// Search for the size, with `size = "auto"`.
     pub(super) sizing: Option<Sizing>,
-    /// The size that the next frame should have.
+    /// Size for the next frame; `None` to keep the present one.
     pub(super) resize: Option<Resize>,
-    /// Training's share of a device beside a simulation.
+    /// Device time due to training beside a live simulation.
     pub(super) budget: TrainingBudget,
-    /// What was learned after the last frame had gone out, or in a frame that failed; the next record tells it.
+    /// Training after the last frame went out, or in a frame that failed. It goes into the next record.
     pub(super) unreported: Learned,
-    /// Largest log-stretch that audit points of this slide have met.
+    /// Largest log-stretch on the audit points of this slide.
     pub(super) peak: f32,
 }
 
 impl Learning {
-    /// Adds what was learned to the next record.
+    /// Adds training to the next record.
     pub(super) fn report(&mut self, learned: Learned) {
         self.unreported = std::mem::take(&mut self.unreported).and(learned);
     }
 
-    /// What was learned since the last frame; `None` if nothing was trained.
+    /// Training since the last frame; `None` if nothing was trained.
     pub(super) fn unreported_since_last_frame(&mut self) -> Option<Learned> {
         Some(std::mem::take(&mut self.unreported)).filter(|learned| *learned != Learned::default())
     }
 }
 
-/// How far a run is, and what its next record should say.
+/// Progress of a run, and the contents of its next record.
 #[derive(Default)]
 pub(super) struct RunProgress {
     pub(super) frame: u64,
-    /// Frames that were no warm-up.
+    /// Number of frames without the warm-up frames.
     pub(super) pictures: u64,
-    /// Points traced since the last frame to prepare the next.
+    /// Points traced since the last frame to prepare the next one.
     pub(super) preparation_traces: u64,
-    /// Whether it was told that particles do not live.
+    /// True once the warning about short particle lifetimes was given.
     pub(super) has_warned_of_deaths: bool,
     pub(super) warnings: Vec<String>,
-    /// Seconds that the loop stood still since the last frame for a checkpoint.
+    /// Seconds that the loop paused since the last frame for a checkpoint.
     pub(super) checkpoint_pause: f64,
 }
 
@@ -178,28 +178,28 @@ impl Recovering for Run<'_> {
     }
 }
 
-/// A run and where it computes.
+/// A run and the session that computes.
 pub(super) struct Cycle<'a, B: Backend> {
     pub(super) run: Run<'a>,
     pub(super) session: Session<B>,
-    /// The flow map with the number of steps that the first slide settled, so that frames compare.
+    /// Flow map with the number of steps of the first slide, so that frames are comparable.
     pub(super) map: FlowMap,
 }
 
-/// Where a frame stands in its slide.
+/// Place of a frame in its slide.
 #[derive(Clone, Copy)]
 pub(super) struct FramePlace {
     pub(super) is_warmup: bool,
-    /// Seconds that preparing the slide took, for its first frame.
+    /// Seconds of preparing the slide, for its first frame; 0 for the others.
     pub(super) preparing: f64,
 }
 
-/// Runs the whole scene. `sink` gets every event. Setting `stop` ends the run after the current frame; where none is in progress
-/// (while the window fills, tables are traced, or cells are probed) within about a second.
+/// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame. Between frames (while the window
+/// fills, tables are traced, or cells are probed) the run ends within about a second.
 ///
 /// # Errors
-/// What keeps the run from starting or going on.
-pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &AtomicBool) -> Result<RunReport, EngineError> {
+/// A setting, the source, the device or the last checkpoint fails.
+pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &AtomicBool) -> Result<RunReport, RunError> {
     match &options.device {
         Device::Cpu { .. } => run_on(Cpu, setup, options, sink, stop),
         #[cfg(feature = "cuda")]
@@ -207,7 +207,7 @@ pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &Atomi
     }
 }
 
-/// The same on any backend; the options' device is not used.
+/// Runs the whole scene as [`run`] does, on a given backend. The device of the options is not used.
 ///
 /// # Errors
 /// As for [`run`].
@@ -217,12 +217,12 @@ pub fn run_on<B: Backend>(
     options: &RunOptions,
     sink: &mut Sink<'_>,
     stop: &AtomicBool,
-) -> Result<RunReport, EngineError> {
+) -> Result<RunReport, RunError> {
     let mut report = RunReport::default();
     match drive(backend, setup, options, sink, stop, &mut report) {
         Ok(()) | Err(RunEnd::TimeIsUp) => {}
         Err(RunEnd::Stopped) => report.interrupted = true,
-        Err(RunEnd::Device(error)) => return Err(EngineError::Device(Box::new(error))),
+        Err(RunEnd::Device(error)) => return Err(RunError::Device(Box::new(error))),
         Err(RunEnd::Failed(error)) => return Err(error),
     }
     Ok(report)
@@ -247,7 +247,7 @@ fn drive<B: Backend>(
     }
     let first = slides.next_slide(stop)?;
     check_stop(stop)?;
-    let mut slide = first.ok_or(EngineError::EndedEarly)?;
+    let mut slide = first.ok_or(RunError::EndedEarly)?;
     let begun = Instant::now();
     let mut beginning = Beginning { threads: &threads, stop, warnings: Vec::new() };
     let mut session = begin(backend, &plan, &slide, &mut beginning)?;
@@ -259,7 +259,7 @@ fn drive<B: Backend>(
     let settled = loop {
         let settled = with!(&session, on => {
             let tracer = on.tracer();
-            threads.render().install(|| prepare::settled_scene(&plan, tracer, &slide, stop))
+            threads.render().install(|| settled_scene(&plan, tracer, &slide, stop))
         });
         match settled {
             Err(RunEnd::Device(error)) => session.recover(error, &slide, &map, &mut beginning)?,
@@ -267,18 +267,29 @@ fn drive<B: Backend>(
         }
     };
     slide.warnings.append(&mut beginning.warnings);
-    let run = with!(&session, on => Run::new(&plan, options, threads, settled, on.tracer().flow(), &slide, (began, stop), report))?;
+    let from = RunGiven { plan: &plan, options, threads, stop, began, report };
+    let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
     let mut cycle = Cycle { run, session, map };
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
-    // What was learned is kept whether or not the run was stopped.
+    // The checkpoint is written even if the run was stopped.
     match ended {
         Err(RunEnd::Failed(error)) => Err(RunEnd::Failed(error)),
         ended => cycle.finish().map_err(RunEnd::Failed).and(ended),
     }
 }
 
-/// What a recovery needs before there is a run.
+/// What a run is given before its first slide.
+struct RunGiven<'a> {
+    plan: &'a Plan,
+    options: &'a RunOptions,
+    threads: Threads,
+    stop: &'a AtomicBool,
+    began: Instant,
+    report: &'a mut RunReport,
+}
+
+/// State that a recovery needs before [`Run`] exists.
 struct Beginning<'a> {
     threads: &'a Threads,
     stop: &'a AtomicBool,
@@ -297,7 +308,7 @@ impl Recovering for Beginning<'_> {
     }
 }
 
-/// The first slide on the backend, or on the CPU if the device cannot take it and the options allow that.
+/// Prepares the first slide on the backend, or on the CPU if the device fails and the options allow the fallback.
 fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut Beginning<'_>) -> Result<Session<B>, RunEnd> {
     let pool = beginning.threads.render();
     let error = match pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time)) {
@@ -307,7 +318,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
     };
     let goes_on = if error.is_fault() { backend.when_lost() == WhenLost::Cpu } else { backend.may_fall_back() };
     if !goes_on {
-        return Err(EngineError::Device(Box::new(error)).into());
+        return Err(RunError::Device(Box::new(error)).into());
     }
     let mut backend = Cpu;
     let tracer = pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time))?;
@@ -316,16 +327,8 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
 }
 
 impl<'a> Run<'a> {
-    fn new(
-        plan: &'a Plan,
-        options: &'a RunOptions,
-        threads: Threads,
-        settled: Scene,
-        flow: &dyn Tracer,
-        first: &Slide,
-        (began, stop): (Instant, &'a AtomicBool),
-        report: &'a mut RunReport,
-    ) -> Result<Self, RunEnd> {
+    fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
+        let RunGiven { plan, options, threads, stop, began, report } = frame;
         let scene = &plan.scene;
         let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
         let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
@@ -367,13 +370,13 @@ impl<'a> Run<'a> {
 }
 
 impl<B: Backend> Cycle<'_, B> {
-    /// Renders the first slide, whose preparation began at `begun`, and all that follow.
+    /// Renders all slides. The preparation of the first one began at `begun`.
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         self.prepare_first(&mut slide)?;
         loop {
             self.frames(&mut slide, begun, sink)?;
             transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
-            // Both hold the window, here and on the device.
+            // Tracer and slide both hold the window, on the host and on the device.
             with!(&mut self.session, on => on.tracer = None);
             drop(slide);
             let next = slides.next_slide(self.run.stop)?;
@@ -396,7 +399,7 @@ impl<B: Backend> Cycle<'_, B> {
                 _ => Ok(false),
             })?;
             if loaded {
-                // Its table may be that of another window.
+                // The checkpoint's table may be of another window.
                 transaction!(self, slide, run, on => run.slide_surrogate(on));
             }
         }
@@ -418,8 +421,8 @@ impl<B: Backend> Cycle<'_, B> {
         Ok(())
     }
 
-    /// Takes the session to the next window: tables are traced anew, weights carry over, old labels must show that they still hold (unless the network
-    /// has the start time as an input), trust must be earned again.
+    /// Moves the session to the next window: tables are traced again, weights are kept, and trust starts again from nothing. Old labels are tested
+    /// (unless the network has the start time as an input).
     fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
         transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
         self.run.learning.peak = f32::NEG_INFINITY;
@@ -462,7 +465,7 @@ impl<B: Backend> Cycle<'_, B> {
         Ok(())
     }
 
-    fn finish(&mut self) -> Result<(), EngineError> {
+    fn finish(&mut self) -> Result<(), RunError> {
         let run = &mut self.run;
         let learned = std::mem::take(&mut run.learning.unreported);
         run.report.train_steps += learned.steps;
@@ -485,7 +488,7 @@ impl<B: Backend> Cycle<'_, B> {
 }
 
 impl Run<'_> {
-    /// A disk that refuses costs the checkpoint, not the run.
+    /// Starts a checkpoint if one is due. A disk error fails the checkpoint, not the run.
     fn checkpoint_if_due<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         if let (Some(checkpoints), Some(surrogate)) = (&mut self.checkpoints, &mut on.surrogate) {
             let (pause, warning) = checkpoints.after_frame(self.progress.frame - 1, surrogate)?;
@@ -500,14 +503,14 @@ impl Run<'_> {
         let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
         if let Some(chosen) = flow.step_choice().filter(|chosen| chosen.not_finite > 0) {
             warnings.push(format!(
-                "{} of {} paths that steps were chosen on have no finite log-stretch: the integration overflowed there",
+                "{} of {} paths of the step choice have no finite log-stretch: the integration overflowed there",
                 chosen.not_finite,
                 StepChoice::POINTS
             ));
         }
         if let Some(chosen) = flow.step_choice().filter(|chosen| !chosen.within_tolerance) {
             warnings.push(format!(
-                "{} steps a path, the most that are tried, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                "{} steps a path, the maximum, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
                 chosen.steps, chosen.difference
             ));
         }
@@ -515,8 +518,8 @@ impl Run<'_> {
     }
 }
 
-/// Most nodes of a table that follows a simulation: every slide traces it anew while the simulation goes on. Where the CPU traces, one for each
-/// camera path of the slide's frames: with more, answering from the table would cost more than tracing.
+/// Maximum number of table nodes for a live simulation, since every slide traces the table again. On the CPU it is the number of camera paths of
+/// the slide's frames: with more nodes, the table costs more than tracing every query.
 fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
     if device.is_gpu() {
         return usize::MAX;
@@ -525,7 +528,7 @@ fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
     frames.into_iter().fold(1, usize::saturating_mul)
 }
 
-/// Steps a path, unless each path chooses its own.
+/// Steps per path; `None` if each path chooses its own.
 pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
     Some(tracer.steps()).filter(|steps| *steps > 0)
 }

@@ -1,4 +1,4 @@
-//! Why a run could not start or go on.
+//! Errors of a run.
 
 use crate::backend::{BackendError, DeviceError};
 use crate::flow::FlowError;
@@ -8,54 +8,54 @@ use crate::source::SourceError;
 use crate::surrogate::{CheckpointError, SurrogateError};
 use thiserror::Error;
 
-/// Why a run could not start or go on.
+/// Error that prevents a run from starting or continuing.
 #[derive(Debug, Error)]
-pub enum EngineError {
-    /// A setting.
+pub enum RunError {
+    /// A setting is not accepted.
     #[error(transparent)]
     Setting(#[from] Refused),
-    /// The source.
+    /// The source fails.
     #[error(transparent)]
     Source(#[from] SourceError),
-    /// The flow map.
+    /// The flow map cannot be built.
     #[error(transparent)]
     Flow(#[from] FlowError),
-    /// The picture's settings.
+    /// Settings of the picture are not accepted.
     #[error(transparent)]
     Render(#[from] RenderError),
-    /// The surrogate's settings.
+    /// Settings of the surrogate are not accepted.
     #[error(transparent)]
     Surrogate(#[from] SurrogateError),
-    /// A checkpoint.
+    /// A checkpoint cannot be read or written.
     #[error(transparent)]
     Checkpoint(#[from] CheckpointError),
-    /// The device that was asked for, or that was lost.
+    /// The device cannot be used, or was lost.
     #[error(transparent)]
     Device(Box<DeviceError>),
-    /// A synthetic grid.
+    /// The axis of a synthetic grid is not accepted.
     #[error(transparent)]
     Axis(#[from] crate::field::AxisFault),
-    /// The source gave fewer snapshots than its times promised.
+    /// The source has fewer snapshots than listed times.
     #[error("the source ended before its window was full")]
     EndedEarly,
-    /// Every point is land.
+    /// Every probed point lies on missing cells.
     #[error(
         "no velocity anywhere at {when}: all {points} points probed lie on missing cells (fill values or NaN; `ridgewatch inspect` counts \
-         them). Colours are scaled to this slide; with transfer.low and transfer.high in the scene it is shown as missing, and the run goes on"
+         them). Colours cannot be scaled to this slide; if the scene sets transfer.low and transfer.high, it is shown as missing and the run continues"
     )]
     AllMissing {
-        /// Points probed.
+        /// Number of probed points.
         points: usize,
         /// Their date or time.
         when: String,
     },
-    /// The thread pool.
+    /// The thread pool cannot start.
     #[error("cannot start worker threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
 }
 
-impl EngineError {
-    /// The error of a backend that cannot prepare a slide.
+impl RunError {
+    /// Error of a backend that cannot prepare a slide.
     pub fn of(error: BackendError) -> Self {
         match error {
             BackendError::Flow(error) => error.into(),
@@ -64,14 +64,14 @@ impl EngineError {
         }
     }
 
-    /// The setting at fault, where it is one.
+    /// Returns the setting at fault; `None` for other errors.
     pub fn refused(&self) -> Option<Refused> {
         match self {
-            EngineError::Setting(refused) => Some(refused.clone()),
-            EngineError::Source(error) => error.refused(),
-            EngineError::Flow(error) => error.refused(),
-            EngineError::Render(error) => Some(error.clone().into()),
-            EngineError::Surrogate(error) => Some(error.clone().into()),
+            RunError::Setting(refused) => Some(refused.clone()),
+            RunError::Source(error) => error.refused(),
+            RunError::Flow(error) => error.refused(),
+            RunError::Render(error) => Some(error.clone().into()),
+            RunError::Surrogate(error) => Some(error.clone().into()),
             _ => None,
         }
     }

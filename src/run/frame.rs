@@ -1,6 +1,6 @@
-//! One frame: rendered with frozen weights while the live ones train, tested against what it traced, and recorded.
+//! One frame: rendering with frozen weights while the live ones train, comparison with the traced samples, and the record.
 
-use super::assess::assess;
+use super::assess::{Work, assess};
 use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
 use super::record::Frame;
@@ -9,7 +9,7 @@ use super::stop::RunEnd;
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
-use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Rendered, Routing, Surrogate};
+use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Surrogate};
 use crate::flow::VelocitySource;
 use crate::render::Method;
 use crate::surrogate::{Learned, Predict, Trace};
@@ -21,32 +21,15 @@ use std::time::{Duration, Instant};
 /// Mean lifetime share of the particles below which a warning is given.
 const SHORT_LIVED: f64 = 0.75;
 
-/// Number of the first warm-up picture, far beyond all others.
+/// Picture number of the first warm-up frame, larger than all other picture numbers.
 const WARMUP_PICTURES: u64 = 1 << 40;
 
-/// Seconds of training after which the next window is looked for.
+/// Seconds of training between two checks for the next window.
 const TURN: f64 = 0.05;
-/// Between two looks for it while a device rests.
+/// Interval between such checks while the device is idle.
 const GLANCE: Duration = Duration::from_millis(2);
 
-/// A rendered and audited frame whose results do not count yet.
-pub(super) struct Work<S> {
-    pub(super) rendered: Rendered<S>,
-    pub(super) audit: AuditFindings,
-    samples_per_pixel: usize,
-    render_seconds: f64,
-    audit_seconds: f64,
-}
-
-impl<S> Work<S> {
-    /// Seconds that the picture and its audit had the device: by its own clock if it rendered, otherwise by the wall's.
-    fn device_share(&self) -> f64 {
-        let device = self.rendered.stats.device_seconds;
-        self.audit_seconds + if device > 0.0 { device } else { self.render_seconds }
-    }
-}
-
-/// What a frame is rendered and audited with, beside the session.
+/// Inputs of rendering and audit besides the session.
 struct Picture<'a> {
     gate: &'a Gate,
     place: FramePlace,
@@ -54,7 +37,7 @@ struct Picture<'a> {
 }
 
 impl Run<'_> {
-    /// Makes one frame. `start` is when its preparation began. Nothing counts before all of it is computed.
+    /// Makes one frame, whose preparation began at `start`. Its results take effect only when all of it is computed.
     pub(super) fn frame<B: Backend>(
         &mut self,
         on: &mut On<B>,
@@ -70,7 +53,7 @@ impl Run<'_> {
             Method::Reference => Gate::uniform(false),
             Method::Surrogate => Gate::uniform(true),
         };
-        // Frozen weights: what is rendered with has not seen this frame's samples.
+        // The frame is rendered with frozen weights, which were not trained on its samples.
         let frozen = on.surrogate.as_ref().map(Surrogate::freeze).transpose()?;
         let renderer = self.renderer.clone();
         let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
@@ -83,7 +66,7 @@ impl Run<'_> {
             let seconds = assessing.elapsed().as_secs_f64();
             let total = self.progress.checkpoint_pause + start.elapsed().as_secs_f64();
             let verified = match &frozen {
-                // The measurement's time, not the frame's.
+                // Not part of the frame's time.
                 Some(frozen) => self.verify(frozen, on.tracer(), &gate)?,
                 None => None,
             };
@@ -92,12 +75,12 @@ impl Run<'_> {
         let (work, assessment, assess_seconds, total, verified) = match computed {
             Ok(computed) => computed,
             Err(error) => {
-                // The frame is made again with the majorants that it began with.
+                // A repetition of the frame starts with the same majorants.
                 self.renderer = renderer;
                 return Err(error);
             }
         };
-        // Nothing fails from here on.
+        // The steps below cannot fail.
         let mut record = self.record(on, slide, &work);
         record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
         record.verified_error = verified;
@@ -148,8 +131,8 @@ impl Run<'_> {
         Ok(Frame { record: Arc::new(record), film: Arc::new(work.rendered.film), tone_map: scene.render.tone_map })
     }
 
-    /// Renders and audits, while other threads train. Training goes on after the picture for what is left of its seconds, but for a live
-    /// run, whose frame goes out first (see [`Run::train_meanwhile`]).
+    /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame
+    /// goes out first (see [`Run::train_meanwhile`]).
     fn picture<B: Backend>(
         &mut self,
         on: &mut On<B>,
@@ -165,8 +148,7 @@ impl Run<'_> {
         let settings = &scene.training;
         let waits = !picture.is_live || settings.steps_per_frame.is_some();
         let learns = surrogate.as_ref().is_some_and(Surrogate::learns);
-        // Warm-up frames draw other random numbers than all others, so that the first frame after them is the same picture whatever
-        // the warm-up was.
+        // Warm-up frames use separate random numbers, so that the first frame after them does not depend on their number.
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
         let samples_per_pixel = scene.time.warmup_samples.filter(|_| picture.place.is_warmup).unwrap_or(scene.render.samples);
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
@@ -216,7 +198,7 @@ impl Run<'_> {
                     if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
                         return Ok(());
                     }
-                    // The picture is done: its threads are free.
+                    // The picture is complete and its threads are idle.
                     all.install(|| train(&mut learn, settings, Until::Seconds(left), stop, learned))
                 });
                 let work = threads.render().install(&mut render);
@@ -235,15 +217,15 @@ impl Run<'_> {
             }
             (None, _) => (threads.render().install(&mut render), Ok(())),
         };
-        // The weights have changed, whatever becomes of the frame.
+        // Reported even if the frame fails, since the weights have changed.
         self.learning.report(learned);
         trained?;
         work
     }
 
-    /// What is left of a frame's training where a simulation is followed, after the frame has gone out: until the next window is there, but at
-    /// least `training.share` of the `seconds` that the frame took, so that a fast simulation does not end all learning. A device trains for
-    /// `training.share` of the time and no longer, since a solver may be on it.
+    /// Trains in a live run after the frame has gone out, until the next window is complete. The CPU trains for at least `training.share` of the
+    /// `seconds` that the frame took, so that a fast simulation does not prevent training. A device trains for at most `training.share` of the
+    /// time, since a solver may use it too.
     pub(super) fn train_meanwhile<B: Backend>(&mut self, on: &mut On<B>, slides: &dyn Slides, seconds: f64) -> Result<(), RunEnd> {
         let settings = &self.plan.scene.training;
         let (Some(_), None) = (slides.is_awaited(), settings.steps_per_frame) else { return Ok(()) };
@@ -275,7 +257,7 @@ impl Run<'_> {
             let is_idle = learned.steps == 0;
             self.learning.report(learned);
             result?;
-            // One turn may go into the upload of the samples; after two idle ones there is nothing to learn.
+            // A turn may only upload samples; after two turns without a step there is nothing to learn.
             if was_idle && is_idle {
                 break;
             }
@@ -284,7 +266,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// The figures that rendering alone decides.
+    /// Record with the values that follow from rendering.
     fn record<B: Backend>(&mut self, on: &On<B>, slide: &Slide, work: &Work<B::Samples>) -> FrameRecord {
         let (flow, tally, film) = (on.tracer().flow(), &work.rendered.tally, &work.rendered.film);
         let mut warnings = slide.warnings.clone();
@@ -295,7 +277,7 @@ impl Run<'_> {
         let dying = work.audit.points > 0 && work.audit.mean_lifetime_share < SHORT_LIVED;
         if dying && !std::mem::replace(&mut self.progress.has_warned_of_deaths, true) {
             warnings.push(format!(
-                "particles live {:.2} % of tau on average: the others meet land, leave the domain, or are too fast (an unknown fill value, another unit?), and their FTLE is that of the path so far",
+                "particles live {:.2} % of tau on average: they meet land, leave the domain, or are too fast (unknown fill value or wrong unit?), and their FTLE covers only the path until then",
                 100.0 * work.audit.mean_lifetime_share
             ));
         }

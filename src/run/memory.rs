@@ -1,6 +1,6 @@
-//! Whether a window fits into this machine's memory.
+//! Comparison of the window's size with the free memory of the host.
 
-/// Bytes that the system can give without swapping, or that the control group leaves, where either is told.
+/// Free bytes without swapping, or left by the control group, whichever is less; `None` if the system reports neither.
 pub(super) fn available() -> Option<u64> {
     let text = |path: &str| std::fs::read_to_string(path).ok();
     let free = text("/proc/meminfo").and_then(|text| {
@@ -12,12 +12,12 @@ pub(super) fn available() -> Option<u64> {
     free.into_iter().chain(group).min()
 }
 
-/// What should be told of a window of so many bytes.
+/// Warning for a window (in bytes) that exceeds the available memory; `None` otherwise.
 pub(super) fn short(window: u64, available: Option<u64>) -> Option<String> {
     let available = available.filter(|available| window > *available)?;
     let gib = |bytes: u64| bytes as f64 / f64::from(1 << 30);
     Some(format!(
-        "the window will take {:.1} GiB, and {:.1} GiB are free: a shorter tau, a part of the archive (archive.region, archive.level) or fewer nodes take less",
+        "the window needs {:.1} GiB, but only {:.1} GiB are free: reduce tau, read a part of the archive (archive.region, archive.level), or use fewer nodes",
         gib(window),
         gib(available)
     ))

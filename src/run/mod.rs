@@ -1,7 +1,7 @@
-//! The cycle: slides of the window, each frame as one transaction on one backend, learning, assessing, checkpoints and records.
+//! The cycle: slides of the window, frames, training, error estimates, checkpoints and records.
 //!
-//! In: [`Settings`]. Out: frames with their records. Calls `source`, `backend` and what that calls. A frame's results take effect when it is whole; if
-//! the device fails, the frame is discarded and made again on the CPU.
+//! In: [`Settings`]. Out: frames with their records. Calls `source`, `backend` and the rooms below it. Each frame is a transaction on one backend:
+//! its results take effect when it is complete. If the device fails, the frame is discarded and rendered again on the CPU.
 
 mod assess;
 mod checkpoints;
@@ -11,6 +11,7 @@ mod frame;
 mod memory;
 mod prepare;
 mod record;
+mod scene;
 mod settings;
 mod setup;
 mod slides;
@@ -21,7 +22,7 @@ mod transaction;
 pub use crate::trust::TrustedError;
 pub use checkpoints::CheckpointTotals;
 pub use cycle::{Event, RunOptions, RunReport, run, run_on};
-pub use error::EngineError;
+pub use error::RunError;
 pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};

@@ -1,34 +1,32 @@
-//! What comes before a slide's frames: sizes, tables, probes and the pilot.
+//! Preparation of a slide before its frames: surrogate, tables, probes and the pilot picture.
 
+use super::TransferRecord;
 use super::cycle::{MAX_RENDER_RESIDUALS, Run};
-use super::setup::{Plan, assemble};
 use super::slides::Slide;
 use super::stop::{RunEnd, check_stop};
 use super::transaction::{On, present};
-use super::{EngineError, TransferRecord};
 use crate::backend::{
     Backend, FrameJob, FrameSamples, Interruptible, Rendered, Routing, Surrogate, SurrogateRequest, audit, residuals, stratified_points,
 };
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
-use crate::render::{Method, Scene};
+use crate::render::Method;
 use crate::surrogate::network::{Input, Target, uniform};
 use crate::surrogate::{Kind, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata};
 use rayon::prelude::*;
-use std::sync::atomic::AtomicBool;
 
-/// A frame keeps at most one in so many of the replay buffer's places, so that the buffer holds several frames.
+/// Number of frames whose samples the replay buffer can hold at least: a frame keeps at most this part of the capacity.
 const FRAMES_IN_BUFFER: usize = 4;
-/// Random stream of the first probe, apart from those of audit points.
+/// Random stream of the first probe; audit points use other streams.
 const PROBE_STREAM: u64 = 1 << 62;
-/// Random streams of points at which shorter durations are traced.
+/// First random stream of the points at which shorter durations are traced.
 const SHORTER_STREAM: u64 = 1 << 61;
-/// Range of the log-stretch below which colours that are scaled to it show next to nothing: neighbours part by less than five hundredths more
-/// in one place than in another.
+/// Range of the log-stretch below which the FTLE counts as uniform: neighbouring particles separate by factors that differ by at most 5 % over
+/// the domain.
 const UNIFORM: f64 = 0.05;
-/// The same as a share of the FTLE's size.
+/// Range of the FTLE, as a share of its magnitude, below which it counts as uniform.
 const UNIFORM_SHARE: f64 = 0.01;
-/// Number of the pilot's picture.
+/// Picture number of the pilot.
 const PILOT_PICTURE: u64 = 1 << 41;
 
 impl Run<'_> {
@@ -56,7 +54,7 @@ impl Run<'_> {
 
     /// Builds the surrogate at another size. The samples in the replay buffer train it.
     pub(super) fn rebuild_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
-        // Two tables must not need a device's memory together. The old surrogate stays until the new one is built, for a checkpoint after a stop.
+        // The device may have no room for two tables. The old surrogate stays until the new one is built, for a checkpoint after a stop.
         if let Some(surrogate) = &mut on.surrogate {
             surrogate.release()?;
         }
@@ -69,7 +67,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// The size that was due is there.
+    /// Notes that the surrogate has its new size.
     pub(super) fn resized(&mut self) {
         self.learning.resize = None;
     }
@@ -81,7 +79,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Takes the surrogate to the session's window.
+    /// Moves the surrogate to the session's window.
     pub(super) fn slide_surrogate<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let On { tracer, surrogate, .. } = on;
         if let Some(surrogate) = surrogate {
@@ -92,7 +90,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Takes trust and labels to the session's window: old labels are used on if a re-test says that they hold.
+    /// Moves trust and labels to the session's window. Old labels remain in use if a test confirms them.
     pub(super) fn slide_labels<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let flow = on.tracer().flow();
         let holds = self.learning.times.labels_stay_valid(self.learning.start, flow.start());
@@ -110,7 +108,7 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// What colours stand for, in words.
+    /// Describes the colour scale.
     pub(super) fn colours(&self) -> String {
         let TransferRecord { low, high, extinction } = self.transfer;
         let unit = &self.plan.time_unit;
@@ -120,7 +118,7 @@ impl Run<'_> {
         format!("colours from FTLE {low:.3e} to {high:.3e} {per} ({why}), extinction {extinction:.3e}")
     }
 
-    /// What should be told where colours are scaled to an FTLE that hardly varies.
+    /// Warning for colours that are scaled to an FTLE that hardly varies; `None` otherwise.
     pub(super) fn uniform(&self, tracer: &dyn Tracer) -> Option<String> {
         let given = self.plan.scene.transfer.clone().unwrap_or_default();
         if given.low.is_some() && given.high.is_some() {
@@ -132,12 +130,12 @@ impl Run<'_> {
         let size = low.abs().max(high.abs());
         (range <= error.max(UNIFORM) || high - low <= UNIFORM_SHARE * size).then(|| {
             format!(
-                "FTLE is uniform: nothing to scale colours to. The log-stretch varies by {range:.1e} over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
+                "FTLE is uniform: colours have no range to scale to. The log-stretch varies by {range:.1e} over the domain, and its integration error is {error:.1e}; transfer.low and transfer.high set the colours, a longer time.tau may show more"
             )
         })
     }
 
-    /// What should be told of a window's start time.
+    /// Warning for a window that starts outside the range of the network's input; `None` otherwise.
     pub(super) fn beyond_the_range(&self, start: f64) -> Option<String> {
         let [first, last] = self
             .learning
@@ -145,12 +143,12 @@ impl Run<'_> {
             .starts
             .filter(|_| self.plan.scene.render.method != Method::Reference && !self.learning.times.covers_start(start))?;
         Some(format!(
-            "start time {start} lies beyond network.start_range, {first} to {last}: the network takes it for the nearer end, and labels of other windows are not kept"
+            "start time {start} lies beyond network.start_range, {first} to {last}: the network uses the nearer end, and labels of other windows are not kept"
         ))
     }
 
-    /// Traces some points a cell before the first frame of a slide. They tighten the majorants, and tested against the surrogate they earn
-    /// trust without tracing a whole frame. They decide the gate, so they say nothing about the error that is stated; audit points do.
+    /// Traces some points per cell before the first frame of a slide. They tighten the majorants, and their residuals build up trust without
+    /// tracing a whole frame. Since they decide the gate, the stated error does not use them; it uses audit points only.
     pub(super) fn probe<B: Backend>(&mut self, on: &mut On<B>, slide: u64) -> Result<(), RunEnd> {
         let scene = &self.plan.scene;
         let per_cell = scene.trust.min_samples.ceil() as usize;
@@ -161,7 +159,7 @@ impl Run<'_> {
         let probe = self.threads.render().install(|| audit::trace(&interruptible, &unit, extras))?;
         check_stop(self.stop)?;
         let residuals = self.residuals_of(on, &probe.samples)?;
-        // Nothing fails from here on.
+        // The steps below cannot fail.
         let domain = on.tracer().flow().domain();
         let renderer = &mut self.renderer;
         self.threads.render().install(|| {
@@ -176,8 +174,8 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// A picture of one sample a pixel, by RK4 and not shown: a renderer that has seen nothing walks with the largest majorant everywhere and
-    /// makes several times the queries, so that the first frame should not be its first.
+    /// Renders a picture of one sample per pixel, traced and not shown, to tighten the majorants. A new renderer uses the largest majorant
+    /// everywhere, which costs several times as many queries.
     pub(super) fn pilot<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
         let gate = Gate::uniform(false);
         let routing = Routing { gate: &gate, trace_budget: None, keep: self.labels_per_frame(on), extras: self.label_extras() };
@@ -205,8 +203,8 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Traced samples that a frame keeps on the host, at most: as many as training can use, or as many as trust can use if the device trains (it learns
-    /// from all that it traces).
+    /// Maximum number of traced samples that a frame keeps on the host: as many as training can use. If the device trains, it learns from all its
+    /// traces, and the host keeps as many as trust can use.
     pub(super) fn labels_per_frame<B: Backend>(&self, on: &On<B>) -> usize {
         let share = self.plan.scene.training.replay_buffer / FRAMES_IN_BUFFER;
         let trains_here = |surrogate: &B::Surrogate| surrogate.learns() && !surrogate.trains_on_device();
@@ -229,15 +227,15 @@ impl Run<'_> {
         }
     }
 
-    /// What the network learns from beside the log-stretch.
+    /// Labels that the network needs besides the log-stretch.
     pub(super) fn label_extras(&self) -> Extras {
         let network = &self.plan.scene.network;
         let arrival = network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table;
         Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 }
     }
 
-    /// Traces labels of durations below tau, if the duration is an input of the network: one from each of some even parts of (0, tau], drawn anew for every
-    /// frame, at a point of each cell. They come before the frame, so that the first optimizer step, by whose loss later ones are judged, sees some.
+    /// Traces labels of durations below tau, if the duration is an input of the network: stratified durations in (0, tau], drawn again for every
+    /// frame, each at one point per cell. They precede the frame because later losses are judged against that of the first optimizer step.
     pub(super) fn learn_shorter<B: Backend>(&mut self, on: &mut On<B>, slide: &Slide) -> Result<(), RunEnd> {
         const DURATIONS: u64 = 16;
         let learns = on.surrogate.as_ref().is_some_and(Surrogate::learns);
@@ -271,12 +269,12 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Traces some of the labels anew: the share whose ramp is within the tolerance of the label's.
+    /// Traces some labels again. Returns the share whose new value differs by at most the tolerance on the transfer function's ramp.
     fn share_of_labels_that_hold<B: Backend>(&self, on: &On<B>) -> Result<f64, RunEnd> {
         const PROBES: usize = 2048;
         let (labels, flow) = (self.learning.buffer.samples(), on.tracer().flow());
         let mut chosen = self.learning.buffer.probe(PROBES, self.plan.scene.seed, self.progress.frame);
-        // Labels of shorter durations are not what this tracer finds; they hold as long as the others do.
+        // This tracer cannot test labels of shorter durations; they are assumed to hold if the others do.
         chosen.retain(|&i| labels.times_of(i)[1] == 1.0);
         let points: Vec<[f32; 3]> = chosen.iter().map(|&i| flow.domain().from_unit(labels.points[i])).collect();
         let mut traced = Traced::default();
@@ -290,34 +288,11 @@ impl Run<'_> {
     }
 }
 
+/// Every `stride`-th sample, with its log-stretch only.
 pub(super) fn every(samples: &Samples, stride: usize) -> Samples {
     Samples {
         points: samples.points.iter().copied().step_by(stride).collect(),
         log_stretch: samples.log_stretch.iter().copied().step_by(stride).collect(),
         ..Samples::default()
     }
-}
-
-/// The picture's scene. What the scene file leaves open of the transfer function is scaled to the FTLE of the first slide and kept
-/// for the whole run, so that colours compare.
-pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<Scene, RunEnd> {
-    let file = &plan.scene;
-    let mut scene = assemble(file, &plan.domain);
-    if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
-        const PROBES: usize = 64;
-        let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
-        let unit = stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
-        let labels = audit::trace(&Interruptible::new(tracer, stop), &unit, Extras::default())?.samples.log_stretch;
-        check_stop(stop)?;
-        let tau = tracer.flow().tau() as f32;
-        let ftle: Vec<f32> = labels.iter().map(|s| s / tau).filter(|f| f.is_finite()).collect();
-        if ftle.is_empty() {
-            return Err(RunEnd::Failed(EngineError::AllMissing {
-                points: unit.len(),
-                when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
-            }));
-        }
-        scene.transfer = scene.transfer.scaled_to(&ftle);
-    }
-    Ok(scene)
 }

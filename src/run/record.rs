@@ -111,7 +111,7 @@ pub struct CheckpointRecord {
     pub frame: Option<u64>,
     /// Pause of the loop for the copy, in seconds.
     pub copy_seconds: f64,
-    /// Whether frames continued during the readback.
+    /// True if frames continued during the readback.
     pub asynchronous: bool,
     /// Seconds from the start of the copy until the file was written, or until now.
     pub seconds: f64,

@@ -113,7 +113,7 @@ impl TimeSpan {
         number.trim().parse::<f64>().ok().map(|n| n * factor)
     }
 
-    /// Whether the span has a unit.
+    /// True if the span has a unit.
     pub fn has_unit(&self) -> bool {
         matches!(self, TimeSpan::Words(_))
     }

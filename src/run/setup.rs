@@ -1,7 +1,7 @@
-//! From a scene file to everything a run needs, checked before any work is done.
+//! Setup of a run from its settings: opens the source, chooses open settings, and checks everything before work starts.
 
 use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
-use super::{EngineError, Settings, TimeSettings, memory};
+use super::{RunError, Settings, TimeSettings, memory};
 use crate::field::Domain;
 use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
 use crate::render::{Method, Renderer, Scene};
@@ -11,52 +11,61 @@ use crate::source::{DEFAULT_READ_AHEAD, Metric, SnapshotSource, SourceKind, Stea
 use crate::surrogate::Kind;
 use crate::surrogate::network::Input;
 
-/// A scene whose open questions (tau, direction, boundary, domain) are answered.
+/// A scene with all open settings (tau, direction, boundary, domain) chosen.
 #[derive(Debug, Clone)]
 pub struct Plan {
-    /// What was asked for.
+    /// Settings of the scene.
     pub scene: Settings,
-    /// The flow map, but for its start time.
+    /// Settings of the flow map; the start time is that of a slide.
     pub map: FlowMap,
-    /// Where seeds lie.
+    /// Domain of the seeds.
     pub domain: Domain,
-    /// What the velocities are, in words: what is made up says so.
+    /// Description of the velocity; names synthetic data as such.
     pub source: String,
-    /// Unit of times: `s`, `snapshots`, a simulation's own; empty where they have none.
+    /// Unit of times: `s`, `snapshots`, or the simulation's; empty if they have none.
     pub time_unit: String,
 }
 
 /// A plan and its opened source.
 pub struct Setup {
-    /// What is to be done.
+    /// The complete scene.
     pub plan: Plan,
     /// The slides of the window.
     pub slides: Box<dyn Slides>,
-    /// What should be told before work starts.
+    /// Remarks for the user before work starts.
     pub notes: Vec<String>,
 }
 
 impl Setup {
-    /// Opens the source and settles what the scene leaves open.
-    pub fn new(scene: Settings) -> Result<Self, EngineError> {
+    /// Opens the source and chooses the settings that the scene leaves open.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the source cannot be opened.
+    pub fn new(scene: Settings) -> Result<Self, RunError> {
         scene.check()?;
         let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
         Self::settle(scene, snapshots, None)
     }
 
-    /// The same over snapshots of the caller's, which stand for those that the scene describes; none for closed forms.
-    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, EngineError> {
+    /// Sets up a run over the caller's snapshots instead of those that the scene describes; `None` for closed forms.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the snapshots do not span tau.
+    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, RunError> {
         scene.check()?;
         Self::settle(scene, snapshots, None)
     }
 
-    /// The same for a simulation that was found running; its window begins to fill.
-    pub fn live(scene: Settings, live: Live) -> Result<Self, EngineError> {
+    /// Sets up a run on a connected simulation, and starts to fill its window.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the simulation cannot be followed.
+    pub fn live(scene: Settings, live: Live) -> Result<Self, RunError> {
         scene.check()?;
         Self::settle(scene, None, Some(live))
     }
 
-    fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, EngineError> {
+    fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, RunError> {
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
@@ -104,7 +113,7 @@ impl Setup {
             }
             snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
         }
-        // A steady flow says so itself.
+        // After `Steady` is in place, which adds its own note.
         notes.extend(snapshots.iter().flat_map(|source| source.describe().notes));
         let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
             SourceKind::Archive | SourceKind::Live => Boundary::Stop,
@@ -133,14 +142,14 @@ impl Setup {
         if closed.is_some() {
             check_start(&scene.time, tau, direction.sign())?;
         }
-        // What is left open follows from the grid: where that is odd, the message says whose it is.
+        // Open settings follow from the grid, so the message names the source.
         check_picture(&scene, &domain, tau).map_err(|refused| match &snapshots {
             Some(source) => refused.over(&source.name()),
             None => refused,
         })?;
         scene.surrogate.check_nodes(domain.dimensions)?;
         if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
-            notes.push("training.resume is not read: neither method reference nor a table goes on from a checkpoint".to_owned());
+            notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
         let slides = match live {
@@ -156,14 +165,14 @@ impl Setup {
     }
 }
 
-/// Bytes of the window, of what is read ahead, and of the snapshot that is being read.
+/// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.
 fn window_bytes(times: &[f64], tau: f64, nodes: usize) -> u64 {
     let snapshots = (window_snapshots(times, tau) + DEFAULT_READ_AHEAD + 1).min(times.len());
     (snapshots as u64).saturating_mul(nodes as u64).saturating_mul(size_of::<[f32; 4]>() as u64)
 }
 
-/// Settles over which seed times the network's input runs, where it has one and they are left open: those that the source can be asked for. Says
-/// so where there is but one, and the input does nothing.
+/// Chooses the range of the network's start-time input, if it has one and the scene leaves the range open: all seed times that the source covers.
+/// Removes the input and returns a note if there is only one seed time.
 fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, direction: Direction) -> Result<Option<String>, Refused> {
     if !scene.network.inputs.contains(&Input::Start) || scene.network.start_range.is_some() {
         return Ok(None);
@@ -191,31 +200,31 @@ fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, directio
         return Ok(None);
     }
     scene.network.inputs.retain(|input| *input != Input::Start);
-    Ok(Some(format!("network.inputs: \"start\" is left out, since all frames are of one start time, {}", ends[0])))
+    Ok(Some(format!("network.inputs: \"start\" is left out, since all frames have the same start time, {}", ends[0])))
 }
 
-/// Refuses times so far from 0 that adding tau to them is lost in their last place: nothing would move, and the FTLE would be 0.
+/// Rejects start times so large that adding tau is lost to rounding: particles would not move, and the FTLE would be 0.
 fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> {
     let last = time.start + time.seed_step * time.slides.unwrap_or(1).saturating_sub(1) as f64;
     for start in [time.start, last] {
         let moved = ((start + sign * tau) - start).abs();
-        // A millionth of tau is far below what a step resolves.
+        // A millionth of tau is far below the length of a step.
         require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")
             .map_err(|refused| refused.beside(&["time.seed_step", "time.slides", "time.tau"]))?;
     }
     Ok(())
 }
 
-/// Refuses a camera, light or transfer function before anything is read, rendered or written.
+/// Rejects invalid cameras, lights and transfer functions before any data is read.
 fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), Refused> {
     let mut picture = assemble(scene, domain);
-    // What is left open is scaled later, to values that are accepted.
+    // Open values are scaled later, to accepted values.
     picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);
     Renderer::new(picture, domain, tau)?;
     Ok(())
 }
 
-/// The picture's scene, its transfer function as far as the file gives it.
+/// Scene of the picture, with the transfer function as far as the scene file sets it.
 pub(super) fn assemble(scene: &Settings, domain: &Domain) -> Scene {
     Scene::assemble(domain, scene.camera.clone(), scene.light.clone(), scene.transfer.clone(), scene.render.clone(), scene.seed)
 }

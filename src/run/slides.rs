@@ -1,6 +1,6 @@
-//! The slides of the window: one velocity after another, from a closed form, an archive or a running simulation.
+//! Slides of the window: a sequence of velocities, from a closed form, an archive or a running simulation.
 
-use super::{EngineError, Settings};
+use super::{RunError, Settings};
 use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
@@ -14,22 +14,22 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-/// How often a wait for a snapshot looks up for a request to stop.
+/// Interval at which a wait for a snapshot checks for a request to stop.
 const LOOK_UP: Duration = Duration::from_millis(100);
 
-/// One position of the window.
+/// A position of the window in time, with the velocity to integrate.
 pub struct Slide {
-    /// From 0.
+    /// Number of the slide, from 0.
     pub index: u64,
     /// Seed time t0.
     pub time: f64,
-    /// The same as a date, where the source has a calendar.
+    /// `time` as a date; `None` if the source has no calendar.
     pub date: Option<String>,
-    /// Of a simulation that runs now.
+    /// Figures of a running simulation; `None` for other sources.
     pub live: Option<LiveRecord>,
-    /// What is integrated.
+    /// Velocity to integrate.
     pub velocity: VelocitySource,
-    /// What was odd on the way here.
+    /// Warnings since the previous slide.
     pub warnings: Vec<String>,
     /// Seconds spent waiting for snapshots.
     pub waited: f64,
@@ -37,19 +37,19 @@ pub struct Slide {
 
 /// A source of slides.
 pub trait Slides: Send {
-    /// The next slide; `None` when the source has ended, or when `stop` is set, which is checked while snapshots are waited for.
+    /// Returns the next slide; `None` if the source has ended or `stop` is set. A wait for snapshots checks `stop` as well.
     ///
     /// # Errors
     /// The source fails.
-    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError>;
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError>;
 
-    /// `listener` is called with snapshots as they are read: of an archive some slides before they are needed, of a simulation at once.
+    /// Sets a listener that receives each snapshot as it is read. An archive is read some slides ahead; a simulation is read as it publishes.
     fn listen(&self, _listener: Listener) {}
 
-    /// Number of slides in all, if it is known.
+    /// Total number of slides; `None` if unknown.
     fn expected(&self) -> Option<u64>;
 
-    /// Of a running simulation: whether the next window is not there yet. `None` for other sources.
+    /// For a running simulation, true until the next window is complete. `None` for other sources.
     fn is_awaited(&self) -> Option<bool> {
         None
     }
@@ -77,7 +77,7 @@ impl Count {
     }
 }
 
-/// The next item of a source that is read by another thread; `None` when it has ended or `stop` is set.
+/// Returns the next item of a source that another thread reads; `None` if the source has ended or `stop` is set.
 fn wait_for<T>(stop: &AtomicBool, mut next: impl FnMut(Duration) -> Result<Option<T>, StillReading>) -> Option<T> {
     while !stop.load(Ordering::Relaxed) {
         if let Ok(item) = next(LOOK_UP) {
@@ -87,16 +87,16 @@ fn wait_for<T>(stop: &AtomicBool, mut next: impl FnMut(Duration) -> Result<Optio
     None
 }
 
-/// Where seeds of a window start: forward ones at the oldest time, backward ones at the newest.
-fn seed_time(window: &Window, direction: Direction) -> Result<f64, EngineError> {
+/// Seed time of a window: its oldest time for forward integration, its newest for backward integration.
+fn seed_time(window: &Window, direction: Direction) -> Result<f64, RunError> {
     let end = match direction {
         Direction::Forward => window.oldest(),
         Direction::Backward => window.newest(),
     };
-    end.ok_or(EngineError::EndedEarly)
+    end.ok_or(RunError::EndedEarly)
 }
 
-/// A closed form: the seed time moves.
+/// Slides of a closed form: only the seed time changes.
 struct ClosedForm {
     flow: Analytic,
     domain: Domain,
@@ -106,7 +106,7 @@ struct ClosedForm {
 }
 
 impl Slides for ClosedForm {
-    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {
         if self.count.is_over() {
             return Ok(None);
         }
@@ -127,7 +127,7 @@ impl Slides for ClosedForm {
     }
 }
 
-/// An archive: the window moves over its snapshots.
+/// Slides of an archive: the window moves over its snapshots.
 struct ArchiveSlides {
     /// Read ahead by one I/O thread.
     reader: ReadAhead,
@@ -135,7 +135,7 @@ struct ArchiveSlides {
     dates: Vec<(f64, Option<String>)>,
     window: Window,
     direction: Direction,
-    /// Snapshots a slide.
+    /// Snapshots per slide.
     stride: usize,
     count: Count,
     /// Snapshots that moved the window since the last slide.
@@ -143,7 +143,7 @@ struct ArchiveSlides {
 }
 
 impl Slides for ArchiveSlides {
-    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError> {
         if self.count.is_over() {
             return Ok(None);
         }
@@ -183,7 +183,7 @@ impl Slides for ArchiveSlides {
     }
 }
 
-/// A running simulation: its window moves by itself.
+/// Slides of a running simulation, whose window moves by itself.
 struct LiveSlides {
     window: LiveWindow,
     direction: Direction,
@@ -191,7 +191,7 @@ struct LiveSlides {
 }
 
 impl Slides for LiveSlides {
-    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, EngineError> {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError> {
         if self.count.is_over() {
             return Ok(None);
         }
@@ -222,7 +222,7 @@ impl Slides for LiveSlides {
     }
 }
 
-/// The slides of a scene whose |tau| is known.
+/// Opens the slides of a scene whose |tau| is known.
 ///
 /// # Errors
 /// A closed form without a domain, or a source that does not span tau.
@@ -231,7 +231,7 @@ pub(super) fn open_slides(
     snapshots: Option<Box<dyn SnapshotSource>>,
     tau: f64,
     direction: Direction,
-) -> Result<Box<dyn Slides>, EngineError> {
+) -> Result<Box<dyn Slides>, RunError> {
     match (closed_form(&scene.source), snapshots) {
         (Some(flow), _) => {
             let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
@@ -261,7 +261,7 @@ pub(super) fn live_slides(scene: &Settings, window: LiveWindow, direction: Direc
     Box::new(LiveSlides { window, direction, count: Count::new(scene, u64::MAX) })
 }
 
-/// The closed form that `[source]` describes; none for gridded kinds.
+/// Closed form that `[source]` describes; `None` for gridded kinds.
 pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
     let or = |given: Option<f64>, default: f64| given.unwrap_or(default);
     Some(match source.kind {
@@ -283,13 +283,16 @@ pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
     })
 }
 
-/// A gridded source, opened.
-pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, EngineError> {
+/// Opens a gridded source.
+///
+/// # Errors
+/// The source is live or a closed form, or the archive cannot be opened.
+pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, RunError> {
     let source = &scene.source;
     match source.kind {
         SourceKind::Archive => return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?)),
         SourceKind::Live => {
-            let accepted = "with `ridgewatch attach`: this command wants what it can read again";
+            let accepted = "with `ridgewatch attach`: this command needs a source that it can read again";
             return Err(Refused::new("source.kind", "is \"live\"", accepted).into());
         }
         SourceKind::Turbulence => {}
@@ -300,7 +303,7 @@ pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, Engin
     }
     let nodes = source.nodes.unwrap_or([96, 48, 48]);
     let (modes, k_max, amplitude) = (source.modes.unwrap_or(48), source.k_max.unwrap_or(14.0), source.amplitude.unwrap_or(3.0));
-    // The field is the scene's, not the run's: --seed changes the sampling of the picture only.
+    // The field belongs to the scene: --seed changes only the sampling of the picture.
     let turbulence = Turbulence::new(nodes, modes, k_max, amplitude, TURBULENCE_SEED);
     let grid = Turbulence::grid(nodes)?;
     let times = (0..source.snapshots.unwrap_or(12)).map(|t| t as f64).collect();
@@ -309,10 +312,10 @@ pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, Engin
     Ok(Box::new(source.synthetic(Turbulence::described(modes, k_max, amplitude, TURBULENCE_SEED))))
 }
 
-/// A closed form without a box.
-pub(super) fn no_domain() -> EngineError {
+/// Error of a closed form without `[domain]`.
+pub(super) fn no_domain() -> RunError {
     Refused::new("domain", "is missing", "[domain] with min and max, since a closed form has no grid").into()
 }
 
-/// Seed of the standard turbulence (design: 0 for development).
+/// Seed of the standard turbulence.
 const TURBULENCE_SEED: u64 = 0;

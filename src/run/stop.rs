@@ -1,19 +1,19 @@
-//! Why a run ends.
+//! Reasons for the end of a run.
 
-use super::EngineError;
+use super::RunError;
 use crate::backend::{BackendError, DeviceError};
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Why a step of a run did not come to its end.
+/// Reason why a step of a run did not complete.
 pub(super) enum RunEnd {
-    /// The run's own time is over.
+    /// The time limit of the run has passed.
     TimeIsUp,
     /// A stop was requested.
     Stopped,
-    /// The device failed or lacks memory: the step is repeated elsewhere.
+    /// The device failed or is out of memory: the step is repeated, or moved to the CPU.
     Device(DeviceError),
     /// The run failed.
-    Failed(EngineError),
+    Failed(RunError),
 }
 
 impl From<DeviceError> for RunEnd {
@@ -32,14 +32,16 @@ impl From<BackendError> for RunEnd {
     }
 }
 
-impl<E: Into<EngineError>> From<E> for RunEnd {
+impl<E: Into<RunError>> From<E> for RunEnd {
     fn from(error: E) -> Self {
         Self::Failed(error.into())
     }
 }
 
+/// Checks for a request to stop.
+///
 /// # Errors
-/// [`RunEnd::Stopped`] once a stop is requested.
+/// [`RunEnd::Stopped`] if a stop was requested.
 pub(super) fn check_stop(stop: &AtomicBool) -> Result<(), RunEnd> {
     if stop.load(Ordering::Relaxed) { Err(RunEnd::Stopped) } else { Ok(()) }
 }

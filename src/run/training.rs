@@ -1,24 +1,24 @@
-//! Which threads train while the others render, and for how long; where a device trains, for how long after the picture.
+//! Threads and time of training: the split of the CPU threads, and the share of a device's time.
 
-use super::{EngineError, Settings, TrainingSettings};
+use super::{RunError, Settings, TrainingSettings};
 use crate::backend::DeviceError;
 use crate::render::Method;
 use crate::surrogate::{Kind, Learned};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// The pools of a run.
+/// Thread pools of a run.
 pub(super) struct Threads {
     render: rayon::ThreadPool,
-    /// Trains while the frame is rendered, and the pool of all threads that goes on when it is.
+    /// Pool that trains during rendering, and the pool of all threads that trains afterwards. `None`: training does not overlap with rendering.
     train: Option<[rayon::ThreadPool; 2]>,
-    /// Whether a device trains, so that all threads render.
+    /// True if a device trains, so that all threads render.
     pub(super) device_trains: bool,
 }
 
 impl Threads {
-    /// `share` of the threads train, at least one; with a single thread rendering and training take turns.
-    pub(super) fn new(threads: usize, scene: &Settings) -> Result<Self, EngineError> {
+    /// Splits the threads: `training.share` of them train, at least one. A single thread alternates between rendering and training.
+    pub(super) fn new(threads: usize, scene: &Settings) -> Result<Self, RunError> {
         let learns = scene.render.method != Method::Reference && scene.surrogate.kind != Kind::Table;
         let share = scene.training.share;
         let all = if threads > 0 { threads } else { std::thread::available_parallelism().map_or(1, |n| n.get()) };
@@ -33,7 +33,7 @@ impl Threads {
         Ok(Self { render: pool(all - train, "ridgewatch-render")?, train: Some(pools), device_trains: false })
     }
 
-    /// Who renders.
+    /// Pool that renders.
     pub(super) fn render(&self) -> &rayon::ThreadPool {
         match &self.train {
             Some([_, all]) if self.device_trains => all,
@@ -41,63 +41,64 @@ impl Threads {
         }
     }
 
-    /// Who trains while the frame is rendered, and who goes on when it is; none: training waits for its turn.
+    /// Pool that trains during rendering, and pool that trains afterwards. `None` if training does not overlap with rendering.
     pub(super) fn beside(&self) -> Option<[&rayon::ThreadPool; 2]> {
         self.train.as_ref().filter(|_| !self.device_trains).map(|[beside, all]| [beside, all])
     }
 
-    /// All of them.
+    /// Pool of all threads.
     pub(super) fn all(&self) -> &rayon::ThreadPool {
         self.train.as_ref().map_or(&self.render, |[_, all]| all)
     }
 }
 
-/// What training has of a device's time where a simulation is followed: so much of every second is due to it, and what it took is taken off.
+/// Device time for training during a live run: a share of each second is credited, and the time used is subtracted.
 #[derive(Debug)]
 pub(super) struct TrainingBudget {
     share: f64,
-    /// Seconds that are due, and when they were counted.
+    /// Credited seconds, and the time of the latest credit.
     due: f64,
     counted: f64,
 }
 
 impl TrainingBudget {
-    /// Most seconds that may become due: what was missed while nobody trained is not made up for.
+    /// Maximum credit, in seconds. Time missed while training was idle is not made up.
     const MAX_DUE: f64 = 1.0;
-    /// Fewer seconds are not worth a turn.
+    /// Minimum seconds of one turn of training.
     const MIN_TURN: f64 = 0.01;
 
-    /// `share` of the time, from now on.
+    /// A budget of `share` of the time, from now on.
     pub(super) fn new(share: f64) -> Self {
         Self { share, due: 0.0, counted: 0.0 }
     }
 
-    /// Seconds that are due `now` (seconds since the beginning); none where they are not worth a turn yet.
+    /// Returns the credited seconds at time `now` (seconds since the beginning); `None` if they are too few for a turn.
     pub(super) fn due(&mut self, now: f64) -> Option<f64> {
         self.due = (self.due + self.share * (now - self.counted)).min(Self::MAX_DUE);
         self.counted = now;
         (self.due >= Self::MIN_TURN).then_some(self.due)
     }
 
-    /// Training took so many seconds of the device.
+    /// Subtracts the device time that training used, in seconds.
     pub(super) fn took(&mut self, seconds: f64) {
         self.due -= seconds;
     }
 }
 
-/// When a share of a frame's training ends, unless the number of steps is given.
+/// End of a part of a frame's training, unless the number of steps is given.
 #[derive(Clone, Copy)]
 pub(super) enum Until<'a> {
-    /// When the frame is rendered.
+    /// The frame is rendered.
     Rendered(&'a AtomicBool),
-    /// After so many seconds.
+    /// This many seconds have passed.
     Seconds(f64),
 }
 
-/// Trains in slices (`learn` takes seconds and steps, at most) until the end is reached or the run is to stop. Adds to `learned` what the slices did.
+/// Trains in slices until the end is reached or a stop is requested. `learn` takes the maximum seconds and steps of a slice. The results are added to
+/// `learned`.
 ///
 /// # Errors
-/// The device fails; `learned` has the slices before.
+/// The device fails; `learned` contains the slices before the failure.
 pub(super) fn train(
     mut learn: impl FnMut(f64, u64) -> Result<Learned, DeviceError>,
     settings: &TrainingSettings,
@@ -106,7 +107,7 @@ pub(super) fn train(
     learned: &mut Learned,
 ) -> Result<(), DeviceError> {
     const SLICE: f64 = 0.1;
-    /// Steps of a slice where their number is given: wall clock must not decide anything then.
+    /// Steps of a slice if the number of steps is given: the result must then not depend on wall-clock time.
     const SLICE_STEPS: u64 = 32;
     let start = Instant::now();
     let (mut sum, mut result) = (Learned::default(), Ok(()));
@@ -146,7 +147,7 @@ pub(super) fn train(
 #[cfg(test)]
 mod tests {
     use super::*;
-    /// Samples that are left out stay where they are, and every slice finds them; a slice that was rolled back has a loss all the same.
+    /// Every slice counts the same dropped samples again, so they are not summed. A slice that was rolled back has a loss as well.
     #[test]
     fn slices_add_up() {
         let slice = |steps, samples, loss, dropped| Learned { steps, samples, loss, dropped, ..Learned::default() };
@@ -160,7 +161,7 @@ mod tests {
         // (300 * 1 + 500 * 2 + 200 * 6) / 1000.
         assert_eq!(sum.loss, Some(2.5));
         assert!(sum.seconds > 0.0);
-        // A device that fails keeps what it did before.
+        // The results before a device failure are kept.
         let (mut calls, mut sum) = (0, Learned::default());
         let fails = |_, _| {
             calls += 1;
@@ -170,7 +171,7 @@ mod tests {
         assert_eq!((sum.steps, sum.samples), (10, 20));
     }
 
-    /// However long frames take and however late a turn ends, training gets its share of the time.
+    /// Training gets its share of the time for any length of frames and any delay of a turn.
     #[test]
     fn turns_are_a_share_of_the_time() {
         for (share, frame, longer) in [(0.25, 0.007, 1.0), (0.25, 0.2, 1.0), (0.75, 0.03, 1.5), (0.5, 0.4, 0.3)] {

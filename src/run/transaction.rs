@@ -1,10 +1,11 @@
 //! A step of a run as a transaction on one backend.
 //!
-//! A step computes first and takes effect only when nothing can fail any more. If the device lacks memory, the slide is planned anew and the step is
-//! repeated there; if the device is lost, or nothing is left to plan, the step is repeated once by the CPU, from the latest host copy of the weights.
+//! A step first computes, and takes effect only after every fallible operation has succeeded. If the device is out of memory, the slide is
+//! replanned and the step is repeated on the device. If the device is lost, or no smaller plan exists, the CPU repeats the step, from the latest
+//! host copy of the weights.
 
 use super::stop::RunEnd;
-use super::{EngineError, Slide};
+use super::{RunError, Slide};
 use crate::backend::{Backend, Cpu, Surrogate, WhenLost};
 use crate::backend::{DeviceError, Interruptible};
 use crate::flow::FlowMap;
@@ -14,29 +15,30 @@ use std::sync::atomic::AtomicBool;
 /// A backend with the flow map and the surrogate of the present slide.
 pub(super) struct On<B: Backend> {
     pub(super) backend: B,
-    /// `None` between two slides: it holds the window, here and on the device.
+    /// Holds the window, on the host and on the device. `None` between two slides.
     pub(super) tracer: Option<B::Tracer>,
     /// `None` for the method `reference`.
     pub(super) surrogate: Option<B::Surrogate>,
 }
 
-/// The flow map of the slide in progress.
+/// Returns the flow map of the slide in progress.
 pub(super) fn present<T>(tracer: &Option<T>) -> &T {
     tracer.as_ref().unwrap_or_else(|| unreachable!("steps run while a slide is in progress"))
 }
 
 impl<B: Backend> On<B> {
-    /// The flow map of the slide in progress.
+    /// Returns the flow map of the slide in progress.
     pub(super) fn tracer(&self) -> &B::Tracer {
         present(&self.tracer)
     }
 }
 
-/// Where a run computes.
+/// Backend in use.
+#[allow(clippy::large_enum_variant)] // A run has a single one.
 pub(super) enum Session<B: Backend> {
-    /// On the backend that it began with.
+    /// The backend of the options.
     Device(On<B>),
-    /// On the CPU, after the device.
+    /// The CPU, after the device failed.
     Cpu(On<Cpu>),
 }
 
@@ -50,7 +52,7 @@ macro_rules! with {
     };
 }
 
-/// Runs `$work` as a transaction: repeats it after a device failed.
+/// Runs `$work` as a transaction: repeats it after a device failure.
 macro_rules! transaction {
     ($cycle:expr, $slide:expr, $run:ident, $on:ident => $work:expr) => {
         loop {
@@ -70,21 +72,21 @@ pub(super) use {transaction, with};
 pub(super) trait Recovering: Sync {
     /// Adds a warning to the next record.
     fn warn(&mut self, warning: String);
-    /// The threads that trace.
+    /// Threads that trace.
     fn pool(&self) -> &rayon::ThreadPool;
-    /// The request to stop.
+    /// Set to request a stop.
     fn stop(&self) -> &AtomicBool;
 }
 
 impl<B: Backend> Session<B> {
-    /// Makes it possible to repeat a step after `error`.
+    /// Prepares the repetition of a step after `error`.
     ///
     /// # Errors
-    /// The run is to end with the device.
+    /// The settings end the run if the device is lost, or the CPU rejects the flow map.
     pub(super) fn recover(&mut self, error: DeviceError, slide: &Slide, map: &FlowMap, run: &mut impl Recovering) -> Result<(), RunEnd> {
-        let Session::Device(on) = self else { return Err(EngineError::Device(Box::new(error)).into()) };
+        let Session::Device(on) = self else { return Err(RunError::Device(Box::new(error)).into()) };
         let mut error = error;
-        // Without a flow map there is nothing to plan with: the window itself does not fit.
+        // Without a flow map there is no other plan: the window itself does not fit.
         if let (true, Some(tracer)) = (error.is_refusal(), &on.tracer) {
             match run.pool().install(|| on.backend.replan(&error, tracer, &mut on.surrogate)) {
                 Ok(Some(warning)) => {
@@ -98,10 +100,10 @@ impl<B: Backend> Session<B> {
         self.move_to_cpu(error, slide, map, run)
     }
 
-    /// Goes on with the CPU for the rest of the run.
+    /// Moves the rest of the run to the CPU.
     ///
     /// # Errors
-    /// The run is to end with the device; a flow map that the CPU refuses.
+    /// The settings end the run if the device is lost, or the CPU rejects the flow map.
     pub(super) fn move_to_cpu(
         &mut self,
         error: DeviceError,
@@ -111,7 +113,7 @@ impl<B: Backend> Session<B> {
     ) -> Result<(), RunEnd> {
         let Session::Device(on) = self else { return Ok(()) };
         if on.backend.when_lost() == WhenLost::Stop && !error.is_refusal() {
-            return Err(EngineError::Device(Box::new(error)).into());
+            return Err(RunError::Device(Box::new(error)).into());
         }
         let mut backend = Cpu;
         let tracer = run.pool().install(|| backend.tracer(&slide.velocity, map, slide.time))?;

@@ -47,7 +47,7 @@ pub enum SyntheticShape {
     /// Longitude, latitude and pressure levels, packed to 16 bits, CF conventions: one NetCDF file per day. The turbulence is defined on
     /// the grid: its cells are nodes of the archive, for the index metric.
     Ecmwf,
-    /// The same files with a turbulence that is defined on the sphere, smooth over the poles, for the sphere metric.
+    /// Files as for `ecmwf`, with a turbulence defined on the sphere and smooth over the poles, for the sphere metric.
     Globe,
     /// Three components on (z, y, x) with their coordinates: one HDF5 file per snapshot, as from a direct numerical simulation of a flame.
     Flame,

@@ -1,4 +1,4 @@
-//! A checkpoint that is not written yet: a surrogate at one moment. Any thread may write it while the surrogate goes on learning.
+//! State of a surrogate at one moment, before it is written. Any thread may write it while the surrogate continues to train.
 
 use super::checkpoint::Checkpoint;
 use super::trainer::NetworkState;
@@ -6,7 +6,7 @@ use super::{CheckpointError, Table};
 use crate::backend::DeviceError;
 use std::path::Path;
 
-/// Gives a table's values, from the device that holds them.
+/// Downloads a table's values from the device that holds them.
 pub(super) type DownloadTable = Box<dyn FnOnce() -> Result<Table, DeviceError> + Send>;
 
 /// Weights, optimizer state and base table at one moment. Numbers are shared with the surrogate until it changes them; copies on a device are
@@ -28,7 +28,7 @@ impl CheckpointState {
         Self { kind, notes, table, network }
     }
 
-    /// Why the frames had to wait for the copy; `None` if they did not.
+    /// Reason why frames had to wait for the copy; `None` if they did not.
     pub fn wait_reason(&self) -> Option<&str> {
         self.network.as_ref()?.wait_reason()
     }
@@ -40,7 +40,7 @@ impl CheckpointState {
     /// The file system fails, or the device is lost before its copy is downloaded.
     pub fn write(self, path: &Path) -> Result<u64, CheckpointError> {
         let lost = |what| move |source| CheckpointError::Lost { path: path.into(), what, source };
-        // First, since the next slide needs the memory of the table on the device, and the network and the disk take their time.
+        // The table comes first: the next slide needs its memory on the device, and network and disk are slow.
         let table = self.table.map(|download| download()).transpose().map_err(lost("the values of its table"))?;
         let mut checkpoint = Checkpoint::new(self.kind);
         for (key, text) in &self.notes {

@@ -5,46 +5,12 @@
 
 use super::hybrid::FrozenHybrid;
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
+use super::trace::Trace;
 use super::{ReplayBuffer, Table};
 use crate::backend::DeviceError;
-use crate::flow::{Extras, Traced, Tracer};
 use std::sync::Arc;
 
-/// A flow map that some device traces, which may fail.
-pub trait Trace: Send + Sync {
-    /// The flow map as the CPU knows it: domain, start, duration, steps and missing cells.
-    fn flow(&self) -> &dyn Tracer;
-
-    /// Traces seeds, as [`Tracer::trace`] does.
-    ///
-    /// # Errors
-    /// The device fails; `out` is then unspecified.
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError>;
-}
-
-impl<T: Tracer> Trace for T {
-    fn flow(&self) -> &dyn Tracer {
-        self
-    }
-
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
-        Tracer::trace(self, seeds, extras, out);
-        Ok(())
-    }
-}
-
-impl Trace for Box<dyn Tracer> {
-    fn flow(&self) -> &dyn Tracer {
-        &**self
-    }
-
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
-        Tracer::trace(&**self, seeds, extras, out);
-        Ok(())
-    }
-}
-
-/// One device, by what it holds of a surrogate.
+/// One device, with its types for the parts of a surrogate.
 pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     /// Traces the nodes of tables.
     type Tracer<'t>: Trace + ?Sized;
@@ -119,10 +85,11 @@ pub struct HostNetwork {
 pub type Download = Box<dyn FnOnce() -> Result<HostNetwork, DeviceError> + Send>;
 
 /// A copy of a network in training.
+#[allow(clippy::large_enum_variant)] // A run has a single one.
 pub enum NetworkCopy {
     /// On the host. The reason is given if training had to wait for it.
     Ready(HostNetwork, Option<String>),
-    /// On the device; another thread can download it while training goes on.
+    /// On the device; another thread can download it while training continues.
     Downloadable(Download),
 }
 
@@ -131,7 +98,7 @@ pub enum NetworkCopy {
 pub trait Training: Send + Sync + Sized {
     /// The table below the network.
     type Table: DeviceTable;
-    /// A network that does not change.
+    /// An immutable network, for prediction.
     type Network: Send + Sync;
 
     /// The layout of the parameters.
@@ -140,7 +107,7 @@ pub trait Training: Send + Sync + Sized {
     /// Optimizer steps taken so far.
     fn steps_taken(&self) -> usize;
 
-    /// Whether a device other than the CPU takes the steps.
+    /// True if a device other than the CPU takes the steps.
     fn is_on_device(&self) -> bool;
 
     /// Moves the network to where it is trained, if it is not there yet. The scale of `objective` is final.
@@ -152,13 +119,13 @@ pub trait Training: Send + Sync + Sized {
     /// Takes optimizer steps on the synced samples. Returns the loss before each step.
     fn train(&mut self, objective: &Objective, labels: Labels<'_, Self::Table>, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceError>;
 
-    /// Steps that are best taken before the clock is looked at again, with `seconds` left.
+    /// Recommended number of steps before the next reading of the clock, with `seconds` left.
     fn group(&self, seconds: f64) -> u64;
 
     /// Saves parameters, moments and mean as the state to roll back to.
     fn keep(&mut self) -> Result<(), DeviceError>;
 
-    /// Returns to the state that was kept last.
+    /// Returns to the state that [`Training::keep`] saved last.
     fn roll_back(&mut self) -> Result<(), DeviceError>;
 
     /// Sets the running mean to the present parameters.
@@ -193,4 +160,13 @@ pub trait Training: Send + Sync + Sized {
 
     /// Device time of the steps since the last call, seconds; `None` if the CPU took them.
     fn device_seconds(&mut self) -> Option<f64>;
+}
+
+/// Origin of the network with which the CPU continues.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum NetworkFrom {
+    /// The device, if it still works.
+    Device,
+    /// The latest host copy, if the device is lost.
+    HostCopy,
 }

@@ -1,14 +1,15 @@
 //! Surrogates on the CPU.
 
-use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SurrogateDevice, SyncedSamples, Trace, Training};
+use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SurrogateDevice, SyncedSamples, Training};
 use super::hybrid::{FrozenHybrid, Hybrid};
 use super::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Predictor, Step};
+use super::trace::Trace;
 use super::{Kind, NetworkSettings, SurrogateError, SurrogateSettings, Table};
 use crate::backend::DeviceError;
 use crate::field::Domain;
 use std::sync::Arc;
 
-/// The CPU as a surrogate's device. No call of it fails.
+/// The CPU as a surrogate's device. Its calls never fail.
 pub struct Host;
 
 /// A surrogate on the CPU.
@@ -60,7 +61,7 @@ impl DeviceTable for Table {
 /// Settings that are out of range.
 ///
 /// # Panics
-/// When `tracer` fails, which tracers of the CPU do not.
+/// If `tracer` fails, which CPU tracers never do.
 pub fn build(
     settings: &SurrogateSettings,
     network: &NetworkSettings,
@@ -85,7 +86,7 @@ impl HostNetwork {
 pub struct FrozenNetwork {
     /// The layout of the parameters.
     pub shape: Architecture,
-    /// What the outputs mean.
+    /// Interpretation of the outputs.
     pub objective: Objective,
     /// The parameters.
     pub average: Arc<Average>,
@@ -106,14 +107,14 @@ pub struct HostTraining {
     fused: Option<Fused>,
     /// Largest number of samples of a step.
     batch: usize,
-    /// Numbers of the samples that can be trained on; `None` if all can.
+    /// Indices of the samples that can be used for training; `None` if all can.
     among: Option<Vec<u32>>,
-    /// What [`Training::keep`] saved: parameters with moments, mean, steps.
+    /// State saved by [`Training::keep`]: parameters with moments, mean, steps.
     pub(super) kept: Option<([[Vec<f32>; 3]; 2], Average, usize)>,
 }
 
 impl HostTraining {
-    /// Goes on from `network`.
+    /// Continues training from `network`.
     pub fn new(network: HostNetwork) -> Self {
         let predictor = Arc::new(Predictor::new(&network.model.shape, &network.average.layers));
         Self { network, predictor, fused: None, batch: 0, among: None, kept: None }
@@ -160,7 +161,7 @@ impl Training for HostTraining {
         Ok(losses)
     }
 
-    /// One: a step takes longer than looking at the clock.
+    /// One, since a step takes much longer than reading the clock.
     fn group(&self, _: f64) -> u64 {
         1
     }
@@ -168,7 +169,7 @@ impl Training for HostTraining {
     fn keep(&mut self) -> Result<(), DeviceError> {
         let HostNetwork { model, average } = &self.network;
         self.kept = Some(match self.kept.take() {
-            // Reusing the memory saves its page faults at each slide of a window.
+            // Reusing the memory avoids page faults at each slide of a window.
             Some((mut state, mut mean, _)) => {
                 model.copy_state(&mut state);
                 mean.tables.copy_from_slice(&average.tables);

@@ -6,8 +6,9 @@
 
 use super::checkpoint::Checkpoint;
 use super::checkpoint_state::CheckpointState;
-use super::device::{DeviceTable, SurrogateDevice, Trace, Training};
+use super::device::{DeviceTable, NetworkFrom, SurrogateDevice, Training};
 use super::network::{HELD_OUT, Loss, Model, NetworkSettings, Target};
+use super::trace::Trace;
 use super::trainer::Trainer;
 use super::{CheckpointError, HostSurrogate, Kind, Learned, Predict, ReplayBuffer, Samples, SurrogateError, fresh_stamp};
 use crate::backend::DeviceError;
@@ -17,7 +18,7 @@ use std::time::Instant;
 
 /// Largest number of held-out samples that decide the shrinkage.
 const MAX_COMPARED: usize = 8192;
-/// Shrinkage after a slide of the window below which the network starts anew: it does not describe the new table's errors.
+/// Shrinkage after a slide of the window below which the network is reset: it does not describe the new table's errors.
 const USELESS: f32 = 0.05;
 
 /// A surrogate whose numbers are on the device `D`.
@@ -27,11 +28,11 @@ pub struct Hybrid<D: SurrogateDevice> {
     table: Option<D::Table>,
     trainer: Option<Trainer<D::Training>>,
     shrinkage: f32,
-    /// Whether the table has changed since the network last learned.
+    /// True if the table has changed since the last training.
     slid: bool,
 }
 
-/// A surrogate that does not change: frames are rendered with it while training goes on.
+/// An immutable copy of a surrogate. Frames are rendered with it while training continues.
 pub struct FrozenHybrid<D: SurrogateDevice> {
     /// The table, if there is one.
     pub table: Option<D::Table>,
@@ -39,9 +40,9 @@ pub struct FrozenHybrid<D: SurrogateDevice> {
     pub network: Option<Arc<<D::Training as Training>::Network>>,
     /// Factor on the network above a table; 1 without a table.
     pub shrinkage: f32,
-    /// Start time and duration that are predicted for, in unit intervals.
+    /// Start time and duration of predictions, in unit intervals.
     pub times: [f32; 2],
-    /// A number that only this frozen surrogate has in this process.
+    /// Unique number of this frozen surrogate in this process.
     pub stamp: u64,
     kind: Kind,
     bytes: usize,
@@ -76,7 +77,7 @@ impl<D: SurrogateDevice> Predict for Hybrid<D> {
     }
 }
 
-/// Refuses targets and losses for which table and network do not add up.
+/// Rejects targets and losses with which table and network cannot be added.
 pub(super) fn check_residual(network: &NetworkSettings) -> Result<(), SurrogateError> {
     let refuse = |key: &str, found: &str, accepted: &str| {
         let accepted = format!("{accepted} (surrogate.kind = \"residual\")");
@@ -92,10 +93,10 @@ pub(super) fn check_residual(network: &NetworkSettings) -> Result<(), SurrogateE
 }
 
 impl<D: SurrogateDevice> Hybrid<D> {
-    /// Builds a surrogate and traces its table with `nodes` along x, y, z. `training` takes the fresh network over.
+    /// Builds a surrogate and traces its table with `nodes` along x, y, z. `training` moves the new network to its device.
     ///
     /// # Errors
-    /// Settings that are out of range; inside, a failure of the device.
+    /// Outer error: settings out of range. Inner error: the device fails.
     pub fn new(
         kind: Kind,
         nodes: [usize; 3],
@@ -111,7 +112,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
             Kind::Table => None,
             _ => Some(Trainer::new(network, tracer.flow(), seed, kind == Kind::Residual, training)?),
         };
-        // As tables have them.
+        // Two-dimensional tables have one node along z.
         let dimensions = tracer.flow().domain().dimensions.clamp(2, 3);
         let nodes = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
         let mut surrogate = Self { kind, nodes, table: None, trainer, shrinkage: 0.0, slid: false };
@@ -154,17 +155,17 @@ impl<D: SurrogateDevice> Hybrid<D> {
         self.shrinkage
     }
 
-    /// Whether [`Hybrid::learn`] does anything.
+    /// True if the surrogate has a network, so that [`Hybrid::learn`] has an effect.
     pub fn learns(&self) -> bool {
         self.trainer.is_some()
     }
 
-    /// Whether a device other than the CPU takes the optimizer steps.
+    /// True if a device other than the CPU takes the optimizer steps.
     pub fn trains_on_device(&self) -> bool {
         self.trainer.as_ref().is_some_and(|trainer| trainer.training.is_on_device())
     }
 
-    /// The surrogate as it answers now.
+    /// Returns an immutable copy of the surrogate.
     ///
     /// # Errors
     /// The device fails or lacks memory.
@@ -184,7 +185,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
     /// Trains on the buffer's samples for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
     ///
     /// # Errors
-    /// The device fails or lacks memory. What was learned until then is part of the next call's result.
+    /// The device fails or lacks memory. The steps before the failure are part of the next call's result.
     pub fn learn(&mut self, buffer: &ReplayBuffer, seconds: f64, max_steps: u64) -> Result<Learned, DeviceError> {
         let start = Instant::now();
         let samples = buffer.samples();
@@ -205,7 +206,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(Learned { seconds: start.elapsed().as_secs_f64(), ..learned })
     }
 
-    /// Factor that fits the held-out samples best. Training noise is independent of them, so the noise lowers the factor.
+    /// Least-squares factor on the held-out samples. Training noise is independent of them and thus lowers the factor.
     fn fitted_shrinkage(&self, samples: &Samples) -> Result<f32, DeviceError> {
         let stride = HELD_OUT * (samples.len() / HELD_OUT / MAX_COMPARED).max(1);
         let finite = |&i: &usize| samples.log_stretch[i].is_finite() && samples.points[i].iter().all(|x| x.is_finite());
@@ -223,8 +224,8 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(if square > 0.0 { (common / square).clamp(0.0, 1.0) as f32 } else { 0.0 })
     }
 
-    /// Takes the surrogate to a new window: the table is traced anew, weights carry over. A network with the start time as an input goes on
-    /// learning as before, and predicts for the new start.
+    /// Moves the surrogate to a new window: the table is traced again and the weights are kept. A network with the start time as an input keeps its
+    /// training schedule as well, and predicts for the new start.
     ///
     /// # Errors
     /// The device fails or lacks memory.
@@ -237,7 +238,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(())
     }
 
-    /// Everything needed to go on (weights, optimizer state, base table) as it is now. The numbers are waited for.
+    /// Returns the present state (weights, optimizer state, base table) for a checkpoint. Waits for all downloads.
     ///
     /// # Errors
     /// The device fails.
@@ -246,8 +247,8 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(self.state(network))
     }
 
-    /// The same without waiting, to be written by another thread: the numbers come from the device as they are written. `None` while an earlier copy
-    /// is still being downloaded.
+    /// Returns the present state without waiting. The thread that writes it downloads the numbers from the device. `None` while an earlier copy is
+    /// still being downloaded.
     ///
     /// # Errors
     /// The device fails.
@@ -280,10 +281,10 @@ impl<D: SurrogateDevice> Hybrid<D> {
         self.checkpoint().map_err(lost)?.write(path).map(drop)
     }
 
-    /// Restores what was written.
+    /// Loads a checkpoint.
     ///
     /// # Errors
-    /// A file that cannot be read, or a checkpoint of another shape; then nothing changes.
+    /// The file cannot be read, or is a checkpoint of another shape. Then nothing changes.
     pub fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
         let checkpoint = Checkpoint::read(path, self.name())?;
         let lost = |source| CheckpointError::Lost { path: path.into(), what: "the present table", source };
@@ -305,27 +306,18 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(())
     }
 
-    /// The surrogate on the CPU, still without its table. What the network learned counts there from then on.
+    /// Returns the surrogate on the CPU, with its network and without its table, which is traced later.
     ///
     /// # Errors
-    /// The device fails, if the network comes from it.
+    /// The network is downloaded from the device, and the device fails.
     pub fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
-        let trainer = self.trainer.as_mut().map(|trainer| trainer.to_host(from)).transpose()?;
+        let trainer = self.trainer.as_mut().map(|trainer| trainer.on_host(from)).transpose()?;
         Ok(Hybrid { kind: self.kind, nodes: self.nodes, table: None, trainer, shrinkage: self.shrinkage, slid: self.slid })
     }
 }
 
-/// The network that the CPU goes on with.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum NetworkFrom {
-    /// The device, which works.
-    Device,
-    /// The latest host copy, since the device is lost.
-    HostCopy,
-}
-
 impl<D: SurrogateDevice> FrozenHybrid<D> {
-    /// The same surrogate with shrinkage 1, to ask for its parts.
+    /// Returns the surrogate with shrinkage 1, to evaluate its parts.
     fn parts(&self) -> Self {
         let Self { table, network, times, stamp, kind, bytes, .. } = self;
         Self { table: table.clone(), network: network.clone(), shrinkage: 1.0, times: *times, stamp: *stamp, kind: *kind, bytes: *bytes }

@@ -1,80 +1,80 @@
-//! The bounded memory of traced samples: newest wins, and labels of a window that has slid on are set aside until a re-test says that
-//! they still hold.
+//! Bounded buffer of traced samples. New samples replace the oldest. When the window slides, the labels become stale and are not used until
+//! a test of some of them confirms that they still hold.
 
 use super::network::draw;
 use super::{Samples, fresh_stamp};
 use std::ops::Range;
 
-/// Share of re-traced labels that must still hold for the stale ones to be used again. A label error in one sample of twenty, at the
-/// tolerance of the test, adds less to the loss than the tolerance itself.
+/// Minimum share of re-traced labels that must still hold for stale labels to be used again. Errors as large as the test's tolerance in one of
+/// twenty samples add less to the loss than the tolerance itself.
 pub const KEEP_STALE: f64 = 0.95;
 
-/// Where a ring stood when somebody took a copy of it.
+/// State of a buffer at the time of a copy.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BufferMark {
     epoch: u64,
     pushed: u64,
 }
 
-/// Newest samples, at most `capacity`, those set aside included.
+/// Newest samples, at most `capacity`, stale ones included.
 #[derive(Debug)]
 pub struct ReplayBuffer {
     capacity: usize,
     /// Labels of the present window. Circular once full.
     fresh: Samples,
-    /// Where the next fresh sample goes once full.
+    /// Index of the next fresh sample in a full buffer.
     next: usize,
     /// Labels of an earlier window.
     stale: Samples,
     pushed: u64,
-    /// Another number whenever samples were moved, which no other ring has.
+    /// Unique number, replaced whenever samples are moved.
     epoch: u64,
-    /// Times of samples that say nothing of time; none where nobody asks for times.
+    /// Unit times of samples without their own times; `None` if times are not used.
     now: Option<[f32; 2]>,
 }
 
 impl ReplayBuffer {
-    /// An empty ring of at least one sample.
+    /// Creates an empty buffer for at least one sample.
     pub fn new(capacity: usize) -> Self {
         let empty = Samples::default();
         Self { capacity: capacity.max(1), fresh: empty.clone(), next: 0, stale: empty, pushed: 0, epoch: fresh_stamp(), now: None }
     }
 
-    /// A full ring of these samples.
+    /// Creates a full buffer of these samples.
     pub fn holding(samples: &Samples) -> Self {
         let mut ring = Self::new(samples.len());
         ring.push(samples);
         ring
     }
 
-    /// Samples that say nothing of time are of these unit times from now on, and every sample is kept with its own.
+    /// Sets the unit times of samples that are pushed without times. From now on every sample is stored with its times.
     pub fn set_now(&mut self, times: [f32; 2]) {
         self.now = Some(times);
     }
 
-    /// Where the ring stands now.
+    /// Present state of the buffer, for [`ReplayBuffer::written_since`].
     pub fn mark(&self) -> BufferMark {
         BufferMark { epoch: self.epoch, pushed: self.pushed }
     }
 
-    /// Whether samples still lie where they lay at `mark`.
+    /// True if no sample has moved since `mark`.
     pub fn continues(&self, mark: BufferMark) -> bool {
         mark.epoch == self.epoch
     }
 
-    /// Places in [`ReplayBuffer::samples`] that have been written since `mark`: all of them where samples have been moved since, or without a mark.
+    /// Index ranges of [`ReplayBuffer::samples`] written since `mark`; all indices if samples have moved since, or without a mark.
     pub fn written_since(&self, mark: Option<BufferMark>) -> [Range<usize>; 2] {
         let len = self.len();
         let fresh = match mark {
             Some(mark) if self.continues(mark) => usize::try_from(self.pushed - mark.pushed).map_or(len, |fresh| fresh.min(len)),
             _ => len,
         };
-        // The newest sample lies before `end`, and after the last place comes the first one again.
+        // The newest sample is before `end`; the buffer is circular.
         let end = if len < self.capacity { len } else { self.next };
         if fresh <= end { [end - fresh..end, 0..0] } else { [len - (fresh - end)..len, 0..end] }
     }
 
-    /// Most samples held.
+    /// Maximum number of samples.
     pub fn capacity(&self) -> usize {
         self.capacity
     }
@@ -89,23 +89,23 @@ impl ReplayBuffer {
         self.fresh.len()
     }
 
-    /// Whether nothing may be trained on.
+    /// True if there are no samples for training.
     pub fn is_empty(&self) -> bool {
         self.fresh.is_empty()
     }
 
-    /// Samples set aside since the window slid.
+    /// Number of stale samples.
     pub fn stale(&self) -> &Samples {
         &self.stale
     }
 
-    /// Samples ever pushed.
+    /// Number of samples pushed so far.
     pub fn pushed(&self) -> u64 {
         self.pushed
     }
 
-    /// Takes samples in; stale ones make room first, then the oldest fresh ones. Arrivals and Jacobians are kept when every sample has them; a
-    /// push without them, or with them for the first time, starts the ring anew, since half of a flow map cannot be trained on.
+    /// Adds samples. Stale samples are replaced first, then the oldest fresh ones. Arrivals and Jacobians are kept only if every sample has them: a
+    /// push that differs in this from the buffer clears it first.
     pub fn push(&mut self, samples: &Samples) {
         if samples.is_empty() {
             return;
@@ -133,21 +133,21 @@ impl ReplayBuffer {
         self.stale.times.truncate(room);
     }
 
-    /// The window slid: all labels are set aside. What had been set aside before is dropped.
+    /// Marks all labels as stale, since the window has slid. Labels that were stale before are dropped.
     pub fn mark_stale(&mut self) {
         self.stale = std::mem::take(&mut self.fresh);
         self.next = 0;
         self.epoch = fresh_stamp();
     }
 
-    /// Numbers of up to `count` samples to trace anew before they are marked stale, drawn with repetition by seed and counter.
+    /// Indices of up to `count` samples to trace again before they are marked stale, drawn with repetition from seed and counter.
     pub fn probe(&self, count: usize, seed: u64, counter: u64) -> Vec<usize> {
         let len = self.len();
         (0..count.min(len)).map(|i| draw(seed, counter + i as u64, len)).collect()
     }
 
-    /// Tells which share of the probed labels still holds: from [`KEEP_STALE`] on the stale samples may be trained on again (as many as fit),
-    /// below it they are dropped. Returns whether they were kept.
+    /// Decides on the stale labels by the share of probed labels that still hold. From [`KEEP_STALE`] on they are used again (as many as fit), below
+    /// it they are dropped. Returns true if they were kept.
     pub fn revalidate(&mut self, share_holding: f64) -> bool {
         let stale = std::mem::take(&mut self.stale);
         let same = self.fresh.is_empty() || shape(&self.fresh) == shape(&stale);
@@ -230,7 +230,7 @@ mod tests {
             ring.push(&numbered(50..55));
             ring
         };
-        // Room for ten: five fresh ones push three of the eight stale ones out.
+        // Capacity ten: five fresh samples replace three of the eight stale ones.
         let (mut ring, mut dropped) = (half_stale(), half_stale());
         assert_eq!((ring.len(), ring.stale().len()), (5, 5));
         assert_eq!(labels(ring.samples()), (50..55).collect::<Vec<_>>());

@@ -2,8 +2,8 @@
 
 use super::CheckpointError;
 use super::checkpoint::{Checkpoint, Entry};
-use super::device::Trace;
 use super::network::Field;
+use super::trace::Trace;
 use crate::backend::DeviceError;
 use crate::flow::{Extras, Traced};
 use rayon::prelude::*;
@@ -18,7 +18,7 @@ const TRACE_AT_ONCE: usize = 1 << 20;
 pub struct Table {
     nodes: [usize; 3],
     dimensions: usize,
-    /// Values at the nodes, x fastest. Clones share them; a slide writes into memory of its own.
+    /// Values at the nodes, x fastest. Clones share them; a slide allocates new memory if a clone exists.
     values: Arc<Vec<f32>>,
     not_finite: usize,
 }
@@ -36,12 +36,12 @@ impl Table {
         Ok(table)
     }
 
-    /// A table of values that were traced elsewhere, x fastest.
+    /// Creates a table from values that were traced on a device, x fastest.
     pub fn from_values(nodes: [usize; 3], values: Vec<f32>, not_finite: usize) -> Self {
         Self { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: Arc::new(values), not_finite }
     }
 
-    /// Traces every node anew, after the window has slid.
+    /// Traces every node again, after the window has slid.
     ///
     /// # Errors
     /// The tracer's device fails; values are then unspecified.
@@ -49,14 +49,14 @@ impl Table {
         let (nodes, dimensions, domain) = (self.nodes, self.dimensions, tracer.flow().domain());
         let unit = |index: usize| -> [f32; 3] {
             let node = [index % nodes[0], index / nodes[0] % nodes[1], index / (nodes[0] * nodes[1])];
-            // The slab's middle stands for an axis that the flow does not depend on.
+            // Two-dimensional flows are traced in the middle of the slab.
             std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 })
         };
         let mut traced = Traced::default();
         self.not_finite = 0;
         let all = nodes.iter().product();
         if Arc::get_mut(&mut self.values).is_none_or(|values| values.len() != all) {
-            // A frame still renders with the old values, none of which is needed here.
+            // A frame still renders with the old values, so the new ones get their own memory.
             self.values = Arc::new(vec![0.0; all]);
         }
         for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
@@ -64,7 +64,7 @@ impl Table {
             let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
             tracer.trace(&seeds, Extras::default(), &mut traced)?;
             for (value, &traced) in values.iter_mut().zip(&traced.log_stretch) {
-                // A node without a value would spread over all cells around it; no stretch is the value of a particle that never moved.
+                // A NaN would spread to all adjacent cells. Zero stretch is the value of a particle at rest.
                 *value = if traced.is_finite() { traced } else { 0.0 };
                 self.not_finite += usize::from(!traced.is_finite());
             }

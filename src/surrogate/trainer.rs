@@ -1,8 +1,8 @@
-//! The schedule of training: which samples, at which rate, for how long, which weights predict, and what happens when the loss diverges.
+//! The schedule of training: samples, learning rate, duration, averaged weights for prediction, and roll-back after divergence.
 //!
-//! The horizon is unknown (a frame gives the time it has left), so no schedule can count down to it. Instead the rate stays high, and weights for
-//! prediction are a running mean over the last share of the steps (Polyak and Juditsky 1992), which acts like a decaying rate at every moment. The
-//! rate falls only when the loss has stopped falling.
+//! The number of steps is unknown in advance, so the learning rate cannot decay towards a final step. Instead the rate stays high, and the weights
+//! for prediction are a running mean over the last share of the steps (Polyak and Juditsky 1992), which has the effect of a decaying rate at every
+//! step. The rate is lowered only when the loss has stopped falling.
 
 use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SyncedSamples, Training};
 use super::host::HostTraining;
@@ -23,18 +23,18 @@ mod tests;
 
 pub(super) use restart::NetworkState;
 
-/// Steps between two moves of the average: it changes slowly, and every move reads and writes all parameters.
+/// Steps between two updates of the average. It changes slowly, and every update reads and writes all parameters.
 const AVERAGE_EVERY: u64 = 8;
 /// Steps between two copies of the last good weights.
 const KEEP_EVERY: u64 = 512;
-/// Factor on the rate below which more roll-backs make no sense in one call.
+/// Factor on the rate below which a call stops after a roll-back.
 const MIN_CAUTION: f64 = 1e-6;
 
 /// The state to roll back to.
 struct Kept {
     steps: usize,
     progress: Progress,
-    /// Whether the window has slid since, so that it must not be rolled back to. The next copy reuses its memory.
+    /// True if the window has slid since, so that a roll-back to it is not allowed. The next copy reuses its memory.
     is_stale: bool,
 }
 
@@ -46,7 +46,7 @@ pub(super) struct Trainer<T: Training> {
     settings: NetworkSettings,
     rate: f64,
     seed: u64,
-    /// Ranges of the times that are inputs, and the times that are predicted for, in unit intervals.
+    /// Ranges of the times that are inputs, and the times of predictions, in unit intervals.
     times: Times,
     asked: [f32; 2],
     /// Start time of the latest window.
@@ -54,15 +54,16 @@ pub(super) struct Trainer<T: Training> {
     standardised: bool,
     kept: Option<Kept>,
     copies: Copies,
-    /// What calls learned that failed afterwards.
+    /// Results of calls that failed later.
     unreported: Learned,
 }
 
 impl<T: Training> Trainer<T> {
-    /// A trainer of a fresh network for the flow map of `tracer`. `zero_output`: the output layer starts at 0. `training` takes the network over.
+    /// Creates a trainer of a new network for the flow map of `tracer`. `zero_output`: the output layer starts at 0. `training` moves the network to
+    /// its device.
     ///
     /// # Errors
-    /// Settings that are out of range.
+    /// A setting is out of range.
     pub(super) fn new(
         settings: &NetworkSettings,
         tracer: &dyn Tracer,
@@ -74,7 +75,7 @@ impl<T: Training> Trainer<T> {
         let axes: Vec<usize> = (0..domain.dimensions.clamp(1, 3)).collect();
         let shape = Architecture::new(settings, &axes, domain.lengths())?;
         let objective = Objective::new(settings, &shape, domain.extent(), tau);
-        // The published rate of 1e-4 is meant for a day of training; within minutes ten times as much reaches further.
+        // The published rate of 1e-4 is for a day of training; ten times that converges faster within minutes.
         let default = match settings.encoding {
             Encoding::HashGrid => 1e-2,
             Encoding::Frequency => 1e-3,
@@ -98,18 +99,18 @@ impl<T: Training> Trainer<T> {
         })
     }
 
-    /// Start time and duration that are predicted for, in unit intervals.
+    /// Start time and duration of predictions, in unit intervals.
     pub(super) fn asked_times(&self) -> [f32; 2] {
         self.asked
     }
 
-    /// The network as it predicts now.
+    /// Returns the averaged network, for prediction.
     pub(super) fn frozen(&self) -> Result<Arc<T::Network>, DeviceError> {
         self.training.frozen(&self.objective)
     }
 
-    /// Takes the network to a new window: weights carry over, but the average forgets the steps so far, and the rate starts at its first value. If the
-    /// start time is an input, all that was learned stays right, and training goes on as it was.
+    /// Moves the network to a new window: the weights are kept, the average starts again, and the rate returns to its first value. If the start time
+    /// is an input, the network remains valid and training continues unchanged.
     pub(super) fn window_slid(&mut self, tracer: &dyn Tracer) {
         self.asked = self.times.unit(tracer.start(), tracer.tau());
         let before = std::mem::replace(&mut self.start, tracer.start());
@@ -136,7 +137,7 @@ impl<T: Training> Trainer<T> {
     /// Trains on the buffer's samples, or on their differences from `base`.
     ///
     /// # Errors
-    /// The device fails or lacks memory. What was learned until then is part of the next call's result.
+    /// The device fails or lacks memory. The steps before the failure are part of the next call's result.
     pub(super) fn learn(
         &mut self,
         buffer: &ReplayBuffer,
@@ -173,7 +174,7 @@ impl<T: Training> Trainer<T> {
             self.objective.standardise(self.training.shape(), samples, base.as_ref().map(|base| base as &dyn Field));
             self.standardised = true;
         }
-        // The scale of the targets goes to the device with the network, so the network stays until it is known.
+        // The network moves to the device together with the scale of the targets, so the scale must be known first.
         if self.standardised {
             self.training.begin(&self.objective, labels.buffer.capacity(), self.settings.batch)?;
         }
@@ -182,13 +183,13 @@ impl<T: Training> Trainer<T> {
         if usable == 0 {
             return Ok(());
         }
-        // Few samples need no large batch; they would only be drawn many times over.
+        // With few samples, a large batch would only repeat them.
         let count = self.settings.batch.min(usable.max(256));
         let (mut losses, mut counted, mut first_of_call) = (0.0, 0_u64, None::<f64>);
         let began = self.training.steps_taken();
         while learned.steps < max_steps && start.elapsed().as_secs_f64() < seconds {
             let steps = self.training.steps_taken();
-            // The first step of a call is the likeliest to diverge; but a call of a few steps must not cost a copy.
+            // The first step of a call is the most likely to diverge, but short calls should not need a copy.
             let apart = if learned.steps == 0 { KEEP_EVERY / 8 } else { KEEP_EVERY };
             let may_keep = learned.steps == 0 || (steps as u64).is_multiple_of(KEEP_EVERY);
             if may_keep && self.kept.as_ref().is_none_or(|kept| kept.is_stale || steps as u64 >= kept.steps as u64 + apart) {
@@ -213,7 +214,7 @@ impl<T: Training> Trainer<T> {
             learned.loss = (counted > 0).then(|| losses / counted as f64);
             if diverged {
                 learned.rollbacks += 1;
-                // The moments are part of what diverged; so the steps since the last copy are lost.
+                // The moments have diverged too, so the steps since the last copy are lost.
                 let reached = self.training.steps_taken();
                 self.roll_back()?;
                 let kept = self.training.steps_taken();
@@ -233,7 +234,7 @@ impl<T: Training> Trainer<T> {
         if self.training.is_on_device() && self.copies.is_due() { self.update_host_copy(learned) } else { Ok(()) }
     }
 
-    /// The next step, and the number of steps that the average is then a share of.
+    /// Counts the next step. Returns it with the number of steps since the start of the average.
     fn plan(&mut self, count: usize, hold_out: bool) -> (PlannedStep, u64) {
         let progress = &mut self.progress;
         let drawn = Some((self.seed, progress.drawn));
@@ -248,7 +249,7 @@ impl<T: Training> Trainer<T> {
         (PlannedStep { count, drawn, hold_out, rate, average_share, lazy: true }, progress.averaged)
     }
 
-    /// Returns to the last good weights, at half the rate. The generator moves on, so that the same batches are not drawn again.
+    /// Returns to the last good weights, at half the rate. The random counter is not reset, so that other batches are drawn.
     fn roll_back(&mut self) -> Result<(), DeviceError> {
         let (drawn, caution) = (self.progress.drawn, self.progress.caution * 0.5);
         let Some(kept) = self.kept.as_ref().filter(|kept| !kept.is_stale) else { return Ok(()) };
@@ -258,14 +259,14 @@ impl<T: Training> Trainer<T> {
         Ok(())
     }
 
-    /// Starts the download of what the device has learned. If the device has no room for a copy, training waits.
+    /// Starts the download of the network. If the device has no memory for a copy, training waits.
     fn update_host_copy(&mut self, learned: &mut Learned) -> Result<(), DeviceError> {
         let begin = Instant::now();
         let Some(copy) = self.copy()? else { return Ok(()) };
         let wait = match copy {
             NetworkSource::Pending(pending) => {
                 let name = "ridgewatch-download".to_owned();
-                // Without a thread the copy waits for the next one who asks.
+                // If no thread starts, the next reader downloads the copy.
                 self.copies.thread = std::thread::Builder::new().name(name).spawn(move || drop(pending.fetch().cloned())).ok();
                 None
             }
@@ -287,7 +288,7 @@ impl<T: Training> Trainer<T> {
         Ok(())
     }
 
-    /// Copies the network as it is now; `None` while an earlier copy is still being downloaded.
+    /// Copies the present network; `None` while an earlier copy is still being downloaded.
     fn copy(&mut self) -> Result<Option<NetworkSource>, DeviceError> {
         self.take_in();
         if self.copies.pending.is_some() {
@@ -303,10 +304,10 @@ impl<T: Training> Trainer<T> {
         }))
     }
 
-    /// Takes in the copy that was downloaded, if one was.
+    /// Stores a copy whose download is complete, if there is one.
     fn take_in(&mut self) {
         let Some(mut pending) = self.copies.pending.take() else { return };
-        // Asked before the result: a thread that downloads gives its share up afterwards.
+        // Checked before the result, since the downloading thread drops its reference last.
         let is_shared = Arc::get_mut(&mut pending).is_none();
         match pending.ready() {
             Some(_) if std::mem::take(&mut self.copies.is_rolled_back) => {}
@@ -314,7 +315,7 @@ impl<T: Training> Trainer<T> {
                 let stale = self.training.host_copy().clone();
                 self.training.set_host_copy(network.clone());
                 self.copies.progress = pending.progress;
-                // Giving hundreds of megabytes back to the system takes as long as a frame.
+                // Freeing hundreds of megabytes takes as long as a frame.
                 drop(std::thread::Builder::new().spawn(move || drop(stale)));
             }
             Some(Err(_)) => {}
@@ -323,11 +324,11 @@ impl<T: Training> Trainer<T> {
         }
     }
 
-    /// The trainer on the CPU, which goes on with the network as `from` says.
+    /// Returns a trainer on the CPU that continues with the network from `from`.
     ///
     /// # Errors
-    /// The device fails, if the network comes from it.
-    pub(super) fn to_host(&mut self, from: NetworkFrom) -> Result<Trainer<HostTraining>, DeviceError> {
+    /// The network is downloaded from the device, and the device fails.
+    pub(super) fn on_host(&mut self, from: NetworkFrom) -> Result<Trainer<HostTraining>, DeviceError> {
         let reached = self.training.steps_taken();
         let mut progress = self.progress;
         let network = match from {
@@ -360,7 +361,8 @@ impl<T: Training> Trainer<T> {
     }
 }
 
-/// A copy of a network: here (with the reason if training waited for it), or being downloaded.
+/// A copy of a network: on the host (with the reason if training waited for it), or being downloaded.
+#[allow(clippy::large_enum_variant)] // A run has a single one.
 enum NetworkSource {
     Here(HostNetwork, Option<String>),
     Pending(Arc<PendingCopy>),

@@ -418,7 +418,7 @@ fn what_has_no_meaning_is_refused() {
     let clamp = FlowMap { boundary: Boundary::Clamp, ..map(6.0, 6, Precision::F32) };
     let error = refused(&window, clamp.clone(), 0.0);
     assert_eq!(error, FlowError::WindowTooShort { from: 0.0, to: 6.0, needed: 7, present: 5, covered: Some((0.0, 4.0)) });
-    assert_eq!(error.to_string(), "tracing from 0 to 6 needs about 7 snapshots that cover this span; there are 5, from 0 to 4");
+    assert_eq!(error.to_string(), "tracing from 0 to 6 needs about 7 snapshots that cover this span; the window holds 5, from 0 to 4");
     let empty = VelocitySource::Window(Arc::new(Window::new(1.0)));
     assert!(matches!(refused(&empty, clamp, 0.0), FlowError::WindowTooShort { present: 0, .. }));
     let short = map(3.0, 6, Precision::F32);

@@ -6,7 +6,7 @@ use ridgewatch::backend::Device;
 use ridgewatch::backend::cuda::GpuSettings;
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::compare_films;
-use ridgewatch::run::{EngineError, Event, Frame, RunOptions, Setup, run};
+use ridgewatch::run::{Event, Frame, RunError, RunOptions, Setup, run};
 use std::path::Path;
 use std::process::Command;
 use std::sync::atomic::AtomicBool;
@@ -38,7 +38,7 @@ fn scene(when_lost: &str) -> SceneFile {
     SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap()
 }
 
-fn frames(scene: &SceneFile, device: Device, breaks: bool) -> (Vec<Frame>, Option<EngineError>) {
+fn frames(scene: &SceneFile, device: Device, breaks: bool) -> (Vec<Frame>, Option<RunError>) {
     let options = RunOptions { device, ..RunOptions::default() };
     let (mut frames, mut broken) = (Vec::new(), !breaks);
     let mut sink = |event: Event| match event {
@@ -91,7 +91,7 @@ fn in_a_process_of_its_own() {
     match when_lost.as_str() {
         "cpu" => assert!(error.is_none() && found.len() == 4, "{error:?} after {} frames", found.len()),
         _ => {
-            assert!(matches!(&error, Some(EngineError::Device(_))), "{error:?}");
+            assert!(matches!(&error, Some(RunError::Device(_))), "{error:?}");
             assert_eq!(found.len(), 2);
             println!("ended with: {}", error.unwrap());
         }

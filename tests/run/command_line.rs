@@ -31,7 +31,7 @@ fn small_scene(folder: &Path, more: &str) -> String {
 fn bad_usage_is_status_2() {
     refused(&["replay"], 2, &["CONFIG | FILES"]);
     refused(&["dance"], 2, &["dance"]);
-    refused(&["attach", "--exit-at-end"], 2, &["`--exit-at-end` has a new name; accepted: `--exit-at-end`"]);
+    refused(&["attach", "--once"], 2, &["`--once` has a new name; accepted: `--exit-at-end`"]);
     refused(&["replay", &config("saddle.toml"), "--threads", "99999999999"], 2, &["--threads", "0 to 1024"]);
     for rate in ["1e-300", "0", "-1", "nan", "inf"] {
         refused(&["publish", &config("turbulence_easy.toml"), &format!("--rate={rate}")], 2, &["--rate", "from 0.000001"]);

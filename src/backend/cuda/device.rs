@@ -1,4 +1,4 @@
-//! The CUDA backend.
+//! The CUDA implementation of [`Backend`]: plans the placement of a slide, and calls the GPU or the CPU accordingly.
 
 use super::driver::Gpu;
 use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu};
@@ -22,26 +22,26 @@ use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
-/// A GPU as a backend, with the snapshots that it holds.
+/// A GPU as a backend, with the snapshots in its memory.
 pub struct Cuda {
     device: CudaDevice,
     gpu: Arc<Gpu>,
     snapshots: Arc<SnapshotStore>,
     placement: Placement,
-    /// Made when the first frame needs it.
+    /// Renderer, router and audits. `None` before the first frame on the GPU.
     frames: Option<GpuFrames>,
     warnings: Vec<String>,
 }
 
 impl Cuda {
-    /// A backend on an opened device.
+    /// Creates the backend of an opened device.
     pub fn new(device: &CudaDevice) -> Self {
         let (gpu, device) = (device.gpu.clone(), device.clone());
         let snapshots = Arc::new(SnapshotStore::new(&gpu));
         Self { device, gpu, snapshots, placement: Placement::DEVICE, frames: None, warnings: Vec::new() }
     }
 
-    /// The snapshots on the device.
+    /// Returns the snapshots on the device.
     pub fn snapshots(&self) -> &SnapshotStore {
         &self.snapshots
     }
@@ -53,7 +53,7 @@ impl Cuda {
         self.frames.as_mut().ok_or_else(|| DeviceError::Unsupported { what: "rendering without kernels".into() })
     }
 
-    /// Lowers the placement to what the kernels take and the memory holds.
+    /// Lowers the placement to the work that the kernels support and the memory can hold.
     fn plan(&mut self, request: &SurrogateRequest<'_>) -> Result<(), BackendError> {
         let (settings, network, domain) = (request.settings, request.network, request.domain);
         let mut needs = Needs::default();
@@ -65,7 +65,7 @@ impl Cuda {
             let shape = Architecture::new(network, &axes, domain.lengths())?;
             let objective = Objective::new(network, &shape, domain.extent(), 1.0);
             if !DeviceNetwork::takes(&self.gpu, &shape) || objective.derivatives() {
-                // Labels with Jacobians come from the CPU's router alone.
+                // Only the CPU's router provides labels with Jacobians.
                 self.placement = Placement::TRACING_ONLY;
                 self.warnings.push(unsupported(network));
             } else if !DeviceTraining::takes(&self.gpu, &shape, &objective) {
@@ -101,7 +101,7 @@ impl Backend for Cuda {
     }
 
     fn prefetch(&self) -> Option<Listener> {
-        // The I/O thread may outlive the run, and must not keep the device open.
+        // A weak reference: the I/O thread may outlive the run and must not keep the device open.
         let snapshots = Arc::downgrade(&self.snapshots);
         Some(Box::new(move |snapshot| {
             if let Some(snapshots) = snapshots.upgrade() {
@@ -172,7 +172,7 @@ impl Backend for Cuda {
         self.frames = None;
         if let Some(present) = surrogate {
             let mut moved = present.to_host(NetworkFrom::Device)?;
-            // In parts, which need memory for the seeds and results of one part alone.
+            // Traced in parts, so that the device holds the seeds and results of only one part.
             moved.trace_table(tracer)?;
             *present = CudaSurrogate::OnHost(moved);
         }
@@ -193,7 +193,7 @@ impl Backend for Cuda {
 }
 
 impl Cuda {
-    /// A frame that the CPU renders; the GPU traces for it.
+    /// Renders a frame on the CPU; the GPU traces its queries.
     fn render_on_cpu(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
         let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
         let Rendered { film, stats, tally, samples } = render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer)?;
@@ -201,15 +201,16 @@ impl Cuda {
     }
 }
 
-/// A surrogate of the CUDA backend: on the GPU, or on the CPU if the placement says so.
+/// Surrogate of the CUDA backend, on the processor that the placement selects.
+#[allow(clippy::large_enum_variant)] // A run has a single one.
 pub enum CudaSurrogate {
     /// Table and network on the GPU.
     Resident(Hybrid<OnGpu>),
-    /// On the CPU; the GPU traces for it.
+    /// Table and network on the CPU. The GPU traces the table.
     OnHost(HostSurrogate),
 }
 
-/// [`CudaSurrogate`] at one moment.
+/// Immutable copy of a [`CudaSurrogate`] for prediction.
 pub enum CudaFrozen {
     /// On the GPU.
     Resident(FrozenHybrid<OnGpu>),
@@ -217,7 +218,7 @@ pub enum CudaFrozen {
     OnHost(FrozenHybrid<Host>),
 }
 
-/// Calls the same method of either variant.
+/// Evaluates the same expression for either variant.
 macro_rules! either {
     ($type:ident, $value:expr, $inner:ident => $call:expr) => {
         match $value {

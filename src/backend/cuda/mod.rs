@@ -1,7 +1,7 @@
-//! The CUDA backend: device, window ring, sorted tracing, tables and networks on a GPU.
+//! The CUDA backend: velocity window, tracing, tables, networks and rendering on one GPU.
 //!
-//! In: a slide's velocity, a flow map, and seeds or frames. Out: what the CPU backend gives, up to rounding. Kernels are in `kernels/`, compiled at start
-//! for the device found. Everything here returns [`DeviceError`]; nothing panics where libraries or devices are missing.
+//! In: the velocity of a slide, a flow map, and seeds or frames. Out: the results of the CPU backend, up to rounding. NVRTC compiles the kernels in
+//! `kernels/` at start for the architecture of the device. Errors are [`DeviceError`]; a missing library or device is an error and never a panic.
 
 mod device;
 pub mod driver;
@@ -13,8 +13,8 @@ mod rendering;
 mod tracing;
 mod window;
 
-pub use super::device::Storage;
 pub use super::error::DeviceError;
+pub use super::settings::Storage;
 pub use device::{Cuda, CudaFrozen, CudaSurrogate};
 pub use driver::{Budget, Buffer, FoundDevice, Gpu, GpuSettings, compile, launch, nvrtc_version, probe, threads};
 pub use layout::Outputs;

@@ -77,7 +77,7 @@ pub struct AxisReport {
     pub first: f64,
     /// Last coordinate.
     pub last: f64,
-    /// Least distance between neighbours.
+    /// Minimum distance between neighbours.
     pub least_spacing: f64,
     /// Greatest distance between neighbours.
     pub greatest_spacing: f64,

@@ -3,6 +3,7 @@
 //! In: paths and settings. Out: [`SnapshotSource`](super::SnapshotSource)s, and snapshots read ahead by one I/O thread. Calls
 //! `grids` (how to read a file), `cf` and `formats` (requests only).
 
+#[allow(clippy::module_inception)] // The archive itself.
 mod archive;
 mod check;
 mod files;

@@ -9,7 +9,7 @@ pub struct Packing {
     scale: f64,
     offset: f64,
     missing: Vec<f64>,
-    /// Least and greatest valid raw number.
+    /// Minimum and maximum valid raw number.
     valid: (f64, f64),
     /// Added to negative raw numbers (signed storage of unsigned numbers); 0 otherwise.
     wrap: f64,

@@ -38,7 +38,7 @@ pub struct Staggered {
     pub what: String,
 }
 
-/// Least and greatest shift along x and y.
+/// Minimum and maximum shift along x and y.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Reach {
     pub least: Shift,

@@ -61,7 +61,7 @@ impl Conversion {
         made
     }
 
-    /// Drops the snapshots that nobody else holds, and keeps the memory of one.
+    /// Drops the snapshots without other references, and keeps the memory of one for reuse.
     fn reclaim(&mut self) {
         for made in std::mem::take(&mut self.made) {
             match Arc::try_unwrap(made) {

@@ -26,7 +26,7 @@ impl Thinning {
         Self { spacing: tau / intervals as f64, kept: None, skipped: None, error: None, count: 0 }
     }
 
-    /// Least distance in time of two kept steps.
+    /// Minimum distance in time of two kept steps.
     pub fn spacing(&self) -> f64 {
         self.spacing
     }

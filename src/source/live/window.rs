@@ -46,7 +46,7 @@ pub struct LiveRecord {
     pub missed_blocks: u64,
     /// Total number of steps skipped to save memory.
     pub steps_skipped: u64,
-    /// Least distance in time of the kept steps.
+    /// Minimum distance in time of the kept steps.
     pub spacing: f64,
     /// Error of linear interpolation at a skipped step, relative to its velocity (root mean squares); null if none was skipped.
     pub interpolation_error: Option<f64>,

@@ -12,7 +12,7 @@ const MAX_CHUNKS: usize = 16;
 /// Values of the gradients of all chunks together, at most (64 MiB), if there are more than two chunks.
 const MAX_GRADIENT_VALUES: usize = 16 * 1024 * 1024;
 
-/// A fixed share of the batch with a gradient of its own, so that sums do not depend on the number of threads.
+/// A fixed part of the batch with a separate gradient, so that sums do not depend on the number of threads.
 struct Chunk {
     tile: Tile,
     /// The tiles of the chunk, for the gradient of the tables; empty for the frequency encoding.

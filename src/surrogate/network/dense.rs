@@ -190,7 +190,7 @@ impl WithSimd for Product<'_> {
     #[inline(always)]
     fn with_simd<S: Simd>(mut self, simd: S) {
         self.check();
-        // Nobody reads the padding of a gradient for encoded inputs.
+        // The padding of a gradient for encoded inputs is never read.
         let columns = if let Mask::Nothing = self.mask { self.columns } else { padded(self.columns) };
         for column in (0..columns).step_by(2 * S::F32_LANES) {
             // SAFETY: checked above; panels are whole registers, so the last register ends at most at the padded number of columns.

@@ -12,7 +12,7 @@ use super::tile::{Parameters, Tile, Weights};
 use crate::surrogate::Samples;
 use rayon::prelude::*;
 
-/// One sample of this many is held out, if a step asks for it.
+/// Held-out samples are one in this many, if a step holds samples out.
 pub const HELD_OUT: usize = 64;
 
 /// Running mean of the parameters (Polyak and Juditsky 1992). Prediction uses it, since it takes the noise of a high learning rate out of
@@ -25,7 +25,7 @@ pub struct Average {
     pub layers: Vec<f32>,
 }
 
-/// One optimizer step, for whoever holds the samples.
+/// Description of one optimizer step, independent of the device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PlannedStep {
     /// Samples of the batch.
@@ -230,7 +230,7 @@ impl Fused {
 }
 
 /// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`super::Loss::Published`]), and the factor
-/// of exp|output| in its gradient. It needs the mean over the whole batch before any gradient, hence a forward pass of its own.
+/// of exp|output| in its gradient. It needs the mean over the whole batch before any gradient, hence a separate forward pass.
 fn mean_penalty(network: Parameters<'_>, objective: &Objective, samples: &Samples, drawn: &[usize]) -> (f64, f32) {
     let penalty = f64::from(objective.penalty());
     if penalty == 0.0 {

@@ -1,7 +1,7 @@
-//! Host copies of a network that a device trains: how they are downloaded while training goes on.
+//! Host copies of a network on a device, downloaded while training continues.
 //!
-//! burn's module stays on the host. For a checkpoint and every minute or so the device makes a copy, which another thread downloads. When the device
-//! is lost, training goes on from the latest download.
+//! burn's module stays on the host. For a checkpoint, and about once a minute, the device makes a copy, which another thread downloads. After a
+//! device loss, training continues from the latest download.
 
 use super::super::device::{Download, HostNetwork};
 use super::Progress;
@@ -10,16 +10,16 @@ use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Shortest time between two downloads, seconds: a lost device costs at most that much training.
+/// Shortest time between two downloads, seconds: the training lost with a device is not much longer.
 const MIN_INTERVAL: f64 = 60.0;
 /// Time between two downloads as a multiple of the seconds that training waits for one, so that they cost a hundredth of the time.
 const INTERVAL_PER_WAIT: f64 = 100.0;
 /// Longest time that the end of training waits for a download in progress.
 const DOWNLOAD_LIMIT: Duration = Duration::from_secs(5);
 
-/// A copy that a device has made, and its numbers once they are downloaded.
+/// A copy on a device, and its values after the download.
 pub(super) struct PendingCopy {
-    /// How far training was.
+    /// Progress of training at the copy.
     pub(super) progress: Progress,
     download: Mutex<Option<Download>>,
     network: OnceLock<Result<HostNetwork, DeviceError>>,
@@ -30,7 +30,7 @@ impl PendingCopy {
         Arc::new(Self { progress, download: Mutex::new(Some(download)), network: OnceLock::new() })
     }
 
-    /// Downloads the numbers, or waits for the thread that does.
+    /// Downloads the values, or waits for the thread that downloads them.
     pub(super) fn fetch(&self) -> Result<&HostNetwork, DeviceError> {
         let download = || {
             let download = self.download.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -40,7 +40,7 @@ impl PendingCopy {
         self.network.get_or_init(download).as_ref().map_err(Clone::clone)
     }
 
-    /// The numbers, if they are downloaded.
+    /// Returns the values if the download is complete.
     pub(super) fn ready(&self) -> Option<&Result<HostNetwork, DeviceError>> {
         self.network.get()
     }
@@ -49,15 +49,15 @@ impl PendingCopy {
 /// The downloads of one network.
 pub(super) struct Copies {
     pub(super) pending: Option<Arc<PendingCopy>>,
-    /// Whether the pending copy holds weights that were rolled back since.
+    /// True if the weights of the pending copy were rolled back later.
     pub(super) is_rolled_back: bool,
-    /// How far training was at the latest host copy.
+    /// Progress of training at the latest host copy.
     pub(super) progress: Progress,
-    /// When the latest copy was made, and how long training waited for it.
+    /// Time of the latest copy, and the seconds that training waited for it.
     pub(super) made: Instant,
     pub(super) wait_seconds: f64,
     pub(super) thread: Option<JoinHandle<()>>,
-    /// Whether the warning that training waits for downloads was given.
+    /// True once the warning that training waits for downloads was given.
     pub(super) has_warned: bool,
 }
 
@@ -72,14 +72,14 @@ impl Copies {
         MIN_INTERVAL.max(INTERVAL_PER_WAIT * self.wait_seconds)
     }
 
-    /// Whether another download is due.
+    /// True if another download is due.
     pub(super) fn is_due(&self) -> bool {
         self.made.elapsed().as_secs_f64() >= self.interval()
     }
 }
 
 impl Drop for Copies {
-    /// The device must not be closed during a download; one that hangs is not waited for.
+    /// Waits for a download in progress, since the device must not be closed during it. The wait is limited.
     fn drop(&mut self) {
         let begin = Instant::now();
         while self.thread.as_ref().is_some_and(|thread| !thread.is_finished()) && begin.elapsed() < DOWNLOAD_LIMIT {

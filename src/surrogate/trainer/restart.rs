@@ -17,7 +17,7 @@ pub(in crate::surrogate) struct NetworkState {
 }
 
 impl NetworkState {
-    /// Why frames had to wait for the copy; `None` if they did not.
+    /// Reason why frames had to wait for the copy; `None` if they did not.
     pub(in crate::surrogate) fn wait_reason(&self) -> Option<&str> {
         match &self.source {
             NetworkSource::Here(_, why) => why.as_deref(),
@@ -25,7 +25,7 @@ impl NetworkState {
         }
     }
 
-    /// Adds notes and tensors; waits for those that are being downloaded.
+    /// Adds notes and tensors to a checkpoint. Waits for downloads in progress.
     pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceError> {
         for (key, text) in &self.notes {
             checkpoint.note(&format!("network.{key}"), text.clone());
@@ -56,7 +56,7 @@ impl NetworkState {
 }
 
 impl<T: Training> Trainer<T> {
-    /// The network as it is now. The numbers of a device are waited for.
+    /// Returns the present network. Waits for the download from a device.
     ///
     /// # Errors
     /// The device fails.
@@ -64,7 +64,7 @@ impl<T: Training> Trainer<T> {
         Ok(NetworkState { notes: self.notes(), source: NetworkSource::Here(self.training.download()?, None) })
     }
 
-    /// The same without waiting, if the device has room for a copy. `None` while an earlier copy is being downloaded.
+    /// Returns the present network without waiting, if the device has memory for a copy. `None` while an earlier copy is being downloaded.
     ///
     /// # Errors
     /// The device fails.
@@ -75,7 +75,7 @@ impl<T: Training> Trainer<T> {
         Ok(Some(NetworkState { notes: self.notes(), source }))
     }
 
-    /// The notes that a checkpoint states as text.
+    /// Values that a checkpoint stores as text.
     fn notes(&self) -> Vec<(String, String)> {
         let mut notes: Vec<(String, String)> = self.fixed().into_iter().map(|(key, text)| (key.into(), text)).collect();
         notes.push(("inputs".into(), self.training.shape().input_names().join(" ")));
@@ -101,7 +101,7 @@ impl<T: Training> Trainer<T> {
         notes
     }
 
-    /// What must agree to the letter for a checkpoint to fit: the shape and the loss in JSON, the loss without its quotes.
+    /// Notes that must match exactly: the shape and the loss in JSON, the loss without its quotes.
     fn fixed(&self) -> Vec<(&'static str, String)> {
         let shape = serde_json::to_string(self.training.shape()).unwrap_or_default();
         let loss = serde_json::to_string(&self.objective.loss).unwrap_or_default();
@@ -111,13 +111,13 @@ impl<T: Training> Trainer<T> {
         fixed
     }
 
-    /// Reads everything, and only then changes anything.
+    /// Restores the trainer. The whole checkpoint is checked before any state changes.
     pub(in crate::surrogate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
         for (key, text) in self.fixed() {
             checkpoint.expect_note(&format!("network.{key}"), &text)?;
         }
         let tau: f64 = checkpoint.number("network.tau")?;
-        // As the loss has it: starts of windows round.
+        // Compared in f32, as in the loss, since the start times of windows are rounded.
         if tau as f32 != self.objective.tau {
             return Err(checkpoint.mismatch(format!("network.tau {tau}"), format!("network.tau {}", self.times.tau)));
         }

@@ -1,4 +1,4 @@
-//! The warning of a device that has no memory for a copy of the network, and the state to roll back to.
+//! Tests of the warning for a device without memory for a copy, and of the state to roll back to.
 
 use super::*;
 use crate::field::Domain;

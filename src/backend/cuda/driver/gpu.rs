@@ -1,4 +1,7 @@
-//! One GPU: asked for before it is touched, its context, streams, memory and compiled kernels.
+//! One GPU: probing, context, streams, memory and compiled kernels.
+//!
+//! [`probe`] checks that the driver and NVRTC libraries are present before anything else, because cudarc panics if they are not. Each [`Gpu`] has
+//! three streams: one for kernels, one for uploads and one for asynchronous readback.
 
 use crate::backend::cuda::DeviceError;
 use crate::backend::cuda::driver::compile::{self, KernelCache};
@@ -10,24 +13,24 @@ use std::collections::HashMap;
 use std::fmt;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Oldest driver whose calls are used (stream-ordered allocation, lazy loading): CUDA 12.0.
+/// Oldest supported driver, CUDA 12.0: stream-ordered allocation and lazy loading are used.
 const OLDEST_DRIVER: i32 = 12_000;
 
-/// How a GPU is used.
+/// Settings of an opened GPU.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct GpuSettings {
-    /// Most bytes of device memory that ridgewatch takes; none: nine tenths of what is free at start.
+    /// Limit on device memory, bytes. `None`: 90 % of the memory that is free at start.
     pub memory_cap: Option<u64>,
-    /// Where compiled kernels are kept; none: the user's cache folder.
+    /// Folder of the kernel cache. `None`: the user's cache folder.
     pub cache: Option<std::path::PathBuf>,
-    /// Lowest stream priority, for life beside a solver.
+    /// Uses the lowest stream priority, for a GPU that is shared with a solver.
     pub low_priority: bool,
-    /// Fills fresh device memory with bytes that make NaN and far indices, so that a kernel that reads what nothing has written shows. For
-    /// tests.
+    /// For tests: fills new device memory with bytes that are NaN as floats and out of range as indices, so that reads of uninitialised memory
+    /// show.
     pub poison: bool,
 }
 
-/// A device that the driver finds.
+/// A device found by [`probe`].
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct FoundDevice {
     /// N of cuda:N.
@@ -36,7 +39,7 @@ pub struct FoundDevice {
     pub name: String,
 }
 
-/// One opened GPU. Shared by everything that works on it; all calls may come from any thread.
+/// One opened GPU, shared by all its users. All methods may be called from any thread.
 pub struct Gpu {
     ordinal: u32,
     name: String,
@@ -50,7 +53,7 @@ pub struct Gpu {
     behind: AsyncReadback,
     budget: Arc<Budget>,
     cache: KernelCache,
-    /// Or why one does not compile: no frame tries that anew.
+    /// Loaded modules by source and macros. A compile error is stored too, so that no later frame tries again.
     modules: Mutex<HashMap<String, Result<Arc<CudaModule>, DeviceError>>>,
 }
 
@@ -60,9 +63,12 @@ impl fmt::Debug for Gpu {
     }
 }
 
-/// Lists the devices, or says why none can be used. Touches no device, allocates nothing, never panics.
+/// Lists the devices. Opens no device, allocates no device memory and never panics.
+///
+/// # Errors
+/// The driver or NVRTC is missing, does not start or is too old, or no device is present.
 pub fn probe() -> Result<Vec<FoundDevice>, DeviceError> {
-    // SAFETY: only looks the library up; asked first because cudarc panics where it is absent.
+    // SAFETY: this only searches for the library. It comes first because cudarc panics if the library is absent.
     if !unsafe { sys::is_culib_present() } {
         return Err(DeviceError::NoDriver);
     }
@@ -76,7 +82,7 @@ pub fn probe() -> Result<Vec<FoundDevice>, DeviceError> {
     if count <= 0 {
         return Err(DeviceError::NoDevice);
     }
-    // SAFETY: only looks the library up.
+    // SAFETY: this only searches for the library.
     if !unsafe { cudarc::nvrtc::sys::is_culib_present() } {
         return Err(DeviceError::NoNvrtc);
     }
@@ -88,19 +94,19 @@ pub fn probe() -> Result<Vec<FoundDevice>, DeviceError> {
         .collect()
 }
 
-/// 1000 * major + 10 * minor of the CUDA version that the driver supports. The driver must be there.
+/// Returns the CUDA version that the driver supports, 1000 * major + 10 * minor. The library must be present.
 fn driver_version() -> Result<i32, DeviceError> {
     let mut version = 0;
     // SAFETY: `version` outlives the call, and `probe` found the library.
-    unsafe { sys::cuDriverGetVersion(&mut version) }.result().map_err(DeviceError::driver("asking for the driver's version"))?;
+    unsafe { sys::cuDriverGetVersion(&mut version) }.result().map_err(DeviceError::driver("querying the driver version"))?;
     Ok(version)
 }
 
 impl Gpu {
-    /// Opens cuda:`ordinal`: its primary context (burn shares it), a stream for work, one for what comes in and one for what goes back.
+    /// Opens cuda:`ordinal`: its primary context (which burn shares), and streams for kernels, uploads and readback.
     ///
     /// # Errors
-    /// Why it cannot be used.
+    /// [`probe`] fails, the device does not exist or is too old, or a driver call fails.
     pub fn open(ordinal: u32, settings: &GpuSettings) -> Result<Arc<Self>, DeviceError> {
         let devices = probe()?;
         let Some(found) = devices.iter().find(|d| d.ordinal == ordinal) else {
@@ -112,7 +118,7 @@ impl Gpu {
         if capability < (7, 0) {
             return Err(DeviceError::TooOld { device: ordinal, capability });
         }
-        // SAFETY: every use of a buffer on another stream than the one it was made on is ordered by events here (`DeviceSnapshot::ready`,
+        // SAFETY: if a buffer is used on a stream other than its own, this crate orders the use by events (`DeviceSnapshot::ready`,
         // `Buffer::read_by`).
         unsafe { context.disable_event_tracking() };
         let stream = || {
@@ -148,12 +154,12 @@ impl Gpu {
         Ok(Arc::new(gpu))
     }
 
-    /// Freed memory stays in the pool up to the cap: giving it back to the system at each synchronisation costs milliseconds.
+    /// Keeps freed memory in the driver's pool up to the cap, because returning it to the system at each synchronisation costs milliseconds.
     fn keep_freed_memory(&self) -> Result<(), DeviceError> {
         if !self.context.has_async_alloc() {
             return Ok(());
         }
-        let doing = DeviceError::driver("setting the memory pool's threshold");
+        let doing = DeviceError::driver("setting the release threshold of the memory pool");
         let mut threshold: u64 = self.budget.cap();
         // SAFETY: the pool is the device's own, the attribute's type is u64, and `threshold` outlives the call.
         unsafe {
@@ -171,15 +177,15 @@ impl Gpu {
     pub fn name(&self) -> &str {
         &self.name
     }
-    /// Compute capability.
+    /// Compute capability, (major, minor).
     pub fn capability(&self) -> (i32, i32) {
         self.capability
     }
-    /// Multiprocessors.
+    /// Number of multiprocessors.
     pub fn multiprocessors(&self) -> u32 {
         self.multiprocessors
     }
-    /// Bytes of shared memory that a block may ask for.
+    /// Maximum shared memory of a block, bytes (opt-in limit).
     pub fn shared_memory(&self) -> usize {
         self.shared_memory
     }
@@ -191,11 +197,11 @@ impl Gpu {
     pub fn context(&self) -> &Arc<CudaContext> {
         &self.context
     }
-    /// The stream that kernels run on.
+    /// The stream of kernels.
     pub fn work(&self) -> &Arc<CudaStream> {
         &self.work
     }
-    /// The stream that snapshots come in on.
+    /// The stream of snapshot uploads.
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
     }
@@ -205,7 +211,7 @@ impl Gpu {
     pub(in crate::backend::cuda) fn budget(&self) -> &Arc<Budget> {
         &self.budget
     }
-    /// Bytes taken and bytes that may be taken.
+    /// Bytes in use and the limit, bytes.
     pub fn memory(&self) -> (u64, u64) {
         (self.budget.used(), self.budget.cap())
     }
@@ -214,31 +220,37 @@ impl Gpu {
         self.budget.cap().saturating_sub(self.budget.used())
     }
 
-    /// Things that are best worked on together, at so many bytes each: `most`, or as many as a quarter of the memory that is left holds, but at
-    /// least 4096.
+    /// Returns the batch size for items of `bytes` bytes: as many as fit in a quarter of the free memory, at most `most`, and at least 4096 (or
+    /// `most`, if that is smaller).
     pub(in crate::backend::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
         const SHARE: u64 = 4;
         const LEAST: usize = 1 << 12;
         usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(LEAST).min(most)
     }
 
-    /// Memory for `len` values, unset, within the cap. Freed in the order of the work stream.
+    /// Allocates uninitialised memory for `len` values, within the cap. It is freed in the order of the work stream.
     ///
     /// # Errors
-    /// [`DeviceError::OutOfMemory`] with the numbers.
+    /// [`DeviceError::OutOfMemory`], or a driver call fails.
     pub fn alloc<T: DeviceRepr>(&self, what: &str, len: usize) -> Result<Buffer<T>, DeviceError> {
         Buffer::new(&self.work, &self.budget, what, len)
     }
 
-    /// Copies values to new memory.
+    /// Copies values to newly allocated memory.
+    ///
+    /// # Errors
+    /// As for [`Self::alloc`].
     pub fn upload<T: DeviceRepr>(&self, what: &str, values: &[T]) -> Result<Buffer<T>, DeviceError> {
         let mut buffer = self.alloc(what, values.len())?;
         buffer.write(values)?;
         Ok(buffer)
     }
 
-    /// Compiled kernels of one source file (see [`compile::SOURCES`]) with these macros, e.g. `RW_DIMS=3`; compiled once, then from memory,
-    /// and from the cache on disk in later runs.
+    /// Returns the compiled kernels of one source file (see [`compile::SOURCES`]) with these macros, e.g. `RW_DIMS=3`. They are compiled once; later
+    /// calls return the loaded module, and later runs use the cache on disk.
+    ///
+    /// # Errors
+    /// The source does not compile, or the driver cannot load the module.
     pub fn module(&self, source: &str, defines: &[String]) -> Result<Arc<CudaModule>, DeviceError> {
         let key = format!("{source} {}", defines.join(" "));
         let mut modules = self.modules.lock().unwrap_or_else(PoisonError::into_inner);
@@ -250,7 +262,7 @@ impl Gpu {
         let module = match self.cache.find(&request).map(load) {
             Some(Ok(module)) => module,
             Some(Err(error)) if error.is_out_of_memory() => return Err(error),
-            // What the driver does not load is as bad as what is not there.
+            // A cached module that the driver rejects is compiled again.
             Some(Err(_)) | None => {
                 let cubin = match request.compile() {
                     Ok(cubin) => cubin,
@@ -267,33 +279,52 @@ impl Gpu {
         Ok(module)
     }
 
-    /// One kernel of a source file.
+    /// Returns one kernel of a source file.
+    ///
+    /// # Errors
+    /// As for [`Self::module`]; or the module has no kernel of this name.
     pub fn kernel(&self, source: &str, defines: &[String], name: &str) -> Result<CudaFunction, DeviceError> {
         self.module(source, defines)?.load_function(name).map_err(DeviceError::driver("finding a kernel"))
     }
 
-    /// Waits until all work so far is done.
+    /// Waits for all work enqueued on the work stream.
+    ///
+    /// # Errors
+    /// That work, or the driver call, fails.
     pub fn synchronize(&self) -> Result<(), DeviceError> {
         self.work.synchronize().map_err(DeviceError::driver("waiting for the device"))
     }
 
-    /// A point in the work stream's time, for measurements and for ordering other streams behind it.
+    /// Records an event on the work stream, to measure time or to make another stream wait.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub fn mark(&self) -> Result<CudaEvent, DeviceError> {
         self.work.record_event(Some(sys::CUevent_flags::CU_EVENT_DEFAULT)).map_err(DeviceError::driver("recording an event"))
     }
 
-    /// Milliseconds of device time between two marks; waits for the second.
+    /// Returns the device time between two events in milliseconds. Waits for the second event.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub fn milliseconds(&self, from: &CudaEvent, to: &CudaEvent) -> Result<f32, DeviceError> {
         from.elapsed_ms(to).map_err(DeviceError::driver("measuring time"))
     }
 
-    /// Top clock of the multiprocessors.
+    /// Returns the peak clock rate of the multiprocessors, in Hz.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub fn top_clock_hz(&self) -> Result<f64, DeviceError> {
         let kilohertz = self.context.attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_CLOCK_RATE);
-        Ok(f64::from(kilohertz.map_err(DeviceError::driver("asking for the clock"))?) * 1e3)
+        Ok(f64::from(kilohertz.map_err(DeviceError::driver("querying the clock rate"))?) * 1e3)
     }
 
-    /// Bytes a second that a copy of `bytes` on the device moves, read and written: the ceiling of everything that is bound by memory.
+    /// Measures the memory bandwidth of the device with a copy of `bytes` bytes: bytes read plus bytes written, per second. It bounds the speed of
+    /// every memory-bound kernel.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory for two buffers of this size.
     pub fn copy_rate(&self, bytes: usize) -> Result<f64, DeviceError> {
         let doing = DeviceError::driver("copying on the device");
         let (mut from, to) = (self.alloc::<u8>("a copy", bytes)?, self.alloc::<u8>("a copy", bytes)?);

@@ -38,7 +38,7 @@ impl Resident {
     /// # Errors
     /// Error of the driver.
     pub(in crate::backend::cuda) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
-        let doing = DeviceError::driver("asking for shared memory");
+        let doing = DeviceError::driver("requesting shared memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
         function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
         let together = function.occupancy_max_active_blocks_per_multiprocessor(threads, shared, None).map_err(&doing)?;

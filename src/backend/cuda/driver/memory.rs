@@ -1,22 +1,23 @@
-//! Device memory under a cap.
+//! Device memory: buffers in stream order, counted against a limit.
 
 use crate::backend::cuda::DeviceError;
 use cudarc::driver::{CudaSlice, CudaStream, DevicePtr, DevicePtrMut, DeviceRepr, result, sys};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-/// What ridgewatch may take of the device's memory, and what it has taken.
+/// Limit and use of device memory by ridgewatch.
 #[derive(Debug)]
 pub struct Budget {
     cap: u64,
     cap_from: &'static str,
     used: AtomicU64,
-    /// Byte that fresh memory is filled with; none: memory comes as it is.
+    /// Byte that fills new memory. `None`: new memory is uninitialised.
     fill: Option<u8>,
 }
 
 impl Budget {
-    /// `asked`, but not more than there is; without it nine tenths of what is free, since others (burn's pool, the driver) need some.
+    /// Creates a budget of `asked` bytes, at most `total`. Without `asked` it is 90 % of `free`, since other users (burn's pool, the driver) need
+    /// some.
     pub fn new(asked: Option<u64>, free: u64, total: u64) -> Self {
         let (cap, cap_from) = match asked {
             Some(cap) if cap <= total => (cap, "the memory cap"),
@@ -26,17 +27,17 @@ impl Budget {
         Self { cap, cap_from, used: AtomicU64::new(0), fill: None }
     }
 
-    /// The same with fresh memory filled with a byte.
+    /// Fills new memory with a byte.
     pub fn filling(self, fill: Option<u8>) -> Self {
         Self { fill, ..self }
     }
 
-    /// Bytes that may be taken.
+    /// Limit, bytes.
     pub fn cap(&self) -> u64 {
         self.cap
     }
 
-    /// Bytes taken.
+    /// Bytes in use.
     pub fn used(&self) -> u64 {
         self.used.load(Ordering::Relaxed)
     }
@@ -56,34 +57,38 @@ impl Budget {
     }
 }
 
-/// Values on the device. Made, filled and freed in the order of one stream (mostly the work stream).
+/// Values on the device. They are allocated, filled and freed in the order of one stream, usually the work stream.
 #[derive(Debug)]
 pub struct Buffer<T> {
     slice: CudaSlice<T>,
     budget: Arc<Budget>,
     stream: Arc<CudaStream>,
-    /// Another stream that reads it: memory is freed behind its work too.
+    /// Another stream that reads the buffer. The memory is freed after the work of this stream too.
     reader: Option<Arc<CudaStream>>,
     bytes: u64,
 }
 
 impl<T: DeviceRepr> Buffer<T> {
+    /// Allocates uninitialised memory for `len` values in the order of `stream`. `what` names the purpose in errors.
+    ///
+    /// # Errors
+    /// [`DeviceError::OutOfMemory`], or a driver call fails.
     pub(in crate::backend::cuda) fn new(
         stream: &Arc<CudaStream>,
         budget: &Arc<Budget>,
         what: &str,
         len: usize,
     ) -> Result<Self, DeviceError> {
-        // An empty buffer still has an address.
+        // At least one value, so that an empty buffer has an address too.
         let len = len.max(1);
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
         budget.take(what, bytes)?;
-        // SAFETY: the memory is unset; whoever reads it has written it before (each kernel says what it writes; tests fill it with NaN).
+        // SAFETY: the memory is uninitialised. Every reader writes it before (each kernel documents its outputs; tests fill it with NaN).
         let slice = unsafe { stream.alloc(len) }.map_err(|error| {
             budget.give_back(bytes);
             match error.0 {
                 sys::CUresult::CUDA_ERROR_OUT_OF_MEMORY => {
-                    budget.refusal(what, bytes, budget.used(), "but others hold the rest of the device")
+                    budget.refusal(what, bytes, budget.used(), "but other programs use the rest of the device")
                 }
                 _ => DeviceError::driver("allocating device memory")(error),
             }
@@ -95,22 +100,28 @@ impl<T: DeviceRepr> Buffer<T> {
         Ok(buffer)
     }
 
-    /// The same, read by another stream. Whoever reads waits for an event behind the last write.
+    /// Declares another stream that reads the buffer. That stream must wait for an event after the last write.
     pub(in crate::backend::cuda) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
         self.reader = Some(reader.clone());
         self
     }
 
-    /// Copies page-locked values to `at` in the order of the buffer's stream, without waiting.
+    /// Enqueues a copy of pinned values to position `at`, on the stream of the buffer.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// If the values do not fit the buffer.
     ///
     /// # Safety
-    /// `values` is unchanged until the stream has passed this.
+    /// `values` does not change until the stream has executed the copy.
     pub(in crate::backend::cuda) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
         assert!(at + values.len() <= self.len(), "values fit the buffer");
         let doing = DeviceError::driver("copying to the device");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let address = self.address() + (at * size_of::<T>()) as u64;
-        // SAFETY: the destination is within the buffer; the source is the caller's.
+        // SAFETY: the destination is within the buffer; the caller guarantees the source.
         unsafe { result::memcpy_htod_async(address, values, self.stream.cu_stream()) }.map_err(doing)
     }
 
@@ -120,21 +131,27 @@ impl<T: DeviceRepr> Buffer<T> {
         self.slice.len()
     }
 
-    /// Address on the device.
+    /// Device address of the first value.
     pub fn address(&self) -> u64 {
         self.slice.device_ptr(&self.stream).0
     }
 
-    /// Address of value `index`, which must exist.
+    /// Device address of value `index`.
     ///
     /// # Panics
-    /// When it does not.
+    /// If `index` is out of range.
     pub fn address_of(&self, index: usize) -> u64 {
         assert!(index < self.len(), "an index within the buffer");
         self.address() + (index * size_of::<T>()) as u64
     }
 
-    /// Copies `values` to the front, in the order of the work stream. `values` may be reused at once.
+    /// Copies `values` to the front of the buffer, in stream order. `values` may change after the return.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// If the values do not fit the buffer.
     pub fn write(&mut self, values: &[T]) -> Result<(), DeviceError> {
         if values.is_empty() {
             return Ok(());
@@ -143,7 +160,13 @@ impl<T: DeviceRepr> Buffer<T> {
         self.stream.memcpy_htod(values, &mut self.slice).map_err(DeviceError::driver("copying to the device"))
     }
 
-    /// Copies `values` to where value `first` is, in the order of the work stream.
+    /// Copies `values` to position `first`, in stream order.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// If the values do not fit the buffer.
     pub fn write_at(&mut self, first: usize, values: &[T]) -> Result<(), DeviceError> {
         if values.is_empty() {
             return Ok(());
@@ -152,17 +175,29 @@ impl<T: DeviceRepr> Buffer<T> {
         self.stream.memcpy_htod(values, &mut view).map_err(DeviceError::driver("copying to the device"))
     }
 
-    /// Sets the bytes of `count` values from value `first` on to 0, in the order of the work stream.
+    /// Sets the bytes of `count` values from position `first` on to 0, in stream order.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// If the range exceeds the buffer.
     pub fn zero_at(&self, first: usize, count: usize) -> Result<(), DeviceError> {
         assert!(first + count <= self.len(), "the buffer holds as many");
         let doing = DeviceError::driver("filling device memory");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let at = self.address() + (first * size_of::<T>()) as u64;
-        // SAFETY: within the buffer, which is freed behind this on the same stream.
+        // SAFETY: the range is within the buffer, which is freed later on the same stream.
         unsafe { result::memset_d8_async(at, 0, count * size_of::<T>(), self.stream.cu_stream()) }.map_err(doing)
     }
 
-    /// Copies the front of the buffer back; waits for the work before it.
+    /// Copies the front of the buffer to the host. Waits for the work before it.
+    ///
+    /// # Errors
+    /// A driver call or earlier work on the stream fails.
+    ///
+    /// # Panics
+    /// If the buffer holds fewer values than `out`.
     pub fn read(&self, out: &mut [T]) -> Result<(), DeviceError> {
         if out.is_empty() {
             return Ok(());
@@ -174,12 +209,21 @@ impl<T: DeviceRepr> Buffer<T> {
         self.stream.synchronize().map_err(&doing)
     }
 
-    /// Sets every byte, in the order of the work stream.
+    /// Sets every byte of the buffer, in stream order.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub fn fill_bytes(&mut self, byte: u8) -> Result<(), DeviceError> {
         self.set_bytes(byte, self.bytes as usize)
     }
 
-    /// Sets the bytes of the first `count` values to 0, in the order of the work stream.
+    /// Sets the bytes of the first `count` values to 0, in stream order.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Panics
+    /// If the buffer holds fewer values.
     pub fn zero_front(&mut self, count: usize) -> Result<(), DeviceError> {
         assert!(count <= self.len(), "the buffer holds as many");
         self.set_bytes(0, count * size_of::<T>())
@@ -189,14 +233,14 @@ impl<T: DeviceRepr> Buffer<T> {
         let doing = DeviceError::driver("filling device memory");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let (address, _guard) = self.slice.device_ptr_mut(&self.stream);
-        // SAFETY: `address` holds at least `bytes` bytes until `self` is dropped, which is ordered behind this on the same stream.
+        // SAFETY: `address` holds at least `bytes` bytes until `self` is dropped, which comes later on the same stream.
         unsafe { result::memset_d8_async(address, byte, bytes, self.stream.cu_stream()) }.map_err(doing)
     }
 }
 
 impl<T> Drop for Buffer<T> {
     fn drop(&mut self) {
-        // The slice frees itself, in the order of its stream.
+        // The slice frees itself in the order of its stream, which therefore waits for the reader first.
         if let Some(reader) = &self.reader {
             self.stream.context().record_err(self.stream.join(reader));
         }

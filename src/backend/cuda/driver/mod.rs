@@ -1,4 +1,4 @@
-//! The GPU as the driver shows it: context, streams, memory, compiled kernels.
+//! Safe wrappers of the CUDA driver and NVRTC: context, streams, memory, kernel compilation and launches.
 
 pub mod compile;
 mod error;

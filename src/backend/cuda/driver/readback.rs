@@ -1,17 +1,19 @@
-//! What comes back from the device while kernels run: through page-locked pieces, on a stream of its own.
+//! Asynchronous readback: copies device memory to the host on a separate stream, while kernels run on the work stream.
+//!
+//! Two pinned buffers alternate (double buffering): one receives a piece from the device while the CPU copies the other to its destination.
 
 use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use cudarc::driver::CudaStream;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Values of a page-locked piece: 4 MiB.
+/// Values of a pinned buffer: 4 MiB.
 const PIECE: usize = 1 << 20;
 
-/// The way back, for one reader at a time.
+/// Stream and pinned buffers of the readback. The lock admits one reader at a time.
 pub(in crate::backend::cuda) struct AsyncReadback {
     stream: Arc<CudaStream>,
-    /// Two that take turns; taken when they are first needed.
+    /// The two alternating buffers, allocated at the first readback.
     pieces: Mutex<Option<[Pinned<f32>; 2]>>,
 }
 
@@ -22,10 +24,14 @@ impl AsyncReadback {
 }
 
 impl Gpu {
-    /// Values at the front of a buffer as they are after the work so far, while later work goes on. Nobody may change them before this returns.
+    /// Returns the first `len` values of a buffer, after the work that is already enqueued. Later work runs concurrently and must not change them
+    /// before this returns.
     ///
     /// # Errors
-    /// What the device says.
+    /// The device fails or lacks pinned memory.
+    ///
+    /// # Panics
+    /// If `len` exceeds the length of the buffer.
     pub(in crate::backend::cuda) fn read_behind(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
         assert!(len <= from.len(), "the buffer holds as many");
         let mut pieces = self.behind().pieces.lock().unwrap_or_else(PoisonError::into_inner);
@@ -35,24 +41,24 @@ impl Gpu {
         };
         let read = self.read_in(pieces, from, len);
         if read.is_err() {
-            // Neither buffer nor pieces may go under a copy in progress. What it says adds nothing to the error.
+            // Neither the buffer nor the pinned memory may be freed during a copy in progress. A second error adds no information.
             let _ = self.behind().stream.synchronize();
         }
         read
     }
 
     fn read_in(&self, pieces: &mut [Pinned<f32>; 2], from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
-        let doing = DeviceError::driver("bringing values back");
+        let doing = DeviceError::driver("reading values back");
         let stream = &self.behind().stream;
         stream.wait(&self.mark()?).map_err(&doing)?;
         let mut values = vec![0.0; len];
         let mut coming = None;
-        // While a piece is put in its place, the next one is on its way.
+        // While the CPU copies one piece to its destination, the device sends the next one.
         for turn in 0..=len.div_ceil(PIECE) {
             let at = turn * PIECE;
             let sent = if at < len {
                 let count = PIECE.min(len - at);
-                // SAFETY: the buffer holds as many from `at` on, and this piece's last copy was waited for two turns ago.
+                // SAFETY: the buffer holds `count` values from `at` on, and the previous copy to this piece was waited for in the previous turn.
                 unsafe { pieces[turn % 2].copy_on(stream, from.address_of(at), count) }?;
                 Some((at, count, stream.record_event(None).map_err(&doing)?))
             } else {

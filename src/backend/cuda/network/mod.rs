@@ -1,4 +1,4 @@
-//! Networks on the GPU: prediction, training, and the surrogates that live there.
+//! Networks on the GPU: prediction, training, and the surrogates that use them.
 
 mod batched;
 #[cfg(test)]

@@ -1,4 +1,5 @@
-//! The network on the device: its kernels, compiled for one architecture, and prediction.
+//! The network on the device: its kernels, compiled for one architecture, and prediction. The network is a multiresolution hash grid (Mueller et al.
+//! 2022) followed by a multilayer perceptron, fully fused (Mueller et al. 2021) if it is small enough.
 //!
 //! Tables are in half precision, each level padded to a multiple of 64 entries. Layers are in burn's layout; a block rounds them when it reads
 //! them (fused), or a kernel does once per call (batched).

@@ -1,4 +1,6 @@
-//! Surrogates whose table and network are on the GPU.
+//! The GPU as the device of a surrogate ([`SurrogateDevice`]): table, network and labels stay in device memory.
+//!
+//! Training draws from two sets of samples on the device: a copy of the host's replay buffer, and the label pool, which frames fill on the device.
 
 use super::samples::{Filled, SampleWriter, TracedBatch};
 use super::training::NetworkCopy as DeviceCopy;
@@ -17,21 +19,20 @@ use crate::surrogate::{
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
 
-/// Labels that were traced on the device and stay there, as a multiple of the replay buffer's capacity; at most one part in `MEMORY_SHARE` of the memory
-/// that is left.
+/// Capacity of the label pool as a multiple of the replay buffer's. The pool uses at most 1 / `MEMORY_SHARE` of the free device memory.
 const POOL_PER_BUFFER: usize = 4;
 const MEMORY_SHARE: u64 = 8;
-/// A copy of the network for checkpoints takes at most one part in so many of the memory that is left: frames may still need the rest.
+/// A copy of the network for a checkpoint uses at most 1 / `COPY_SHARE` of the free device memory, since frames may need the rest.
 const COPY_SHARE: u64 = 2;
-/// Most steps between two looks at the clock, and steps before it is known how long one takes.
+/// Limit on the optimizer steps between two checks of the clock, and their number before the duration of a step is measured.
 const MAX_GROUP: u64 = 64;
 const FIRST_GROUP: u64 = 8;
-/// Points from the host that are predicted at once, at most: bounds the memory of a call.
+/// Limit on the host points of a prediction batch, to bound the memory of a call.
 const BATCH: usize = 1 << 22;
-/// Bytes of a point and its prediction.
+/// Bytes per point, with its prediction.
 const POINT_BYTES: u64 = 16;
 
-/// A GPU as a surrogate's device.
+/// The GPU as the device of a surrogate.
 pub struct OnGpu;
 
 impl SurrogateDevice for OnGpu {
@@ -40,7 +41,7 @@ impl SurrogateDevice for OnGpu {
     type Training = CudaTraining;
 
     fn trace_table(tracer: &CudaTracer, nodes: [usize; 3], old: Option<CudaTable>) -> Result<CudaTable, DeviceError> {
-        // Old and new must not need memory together.
+        // Freed first, so that old and new table are never allocated together.
         drop(old);
         Ok(CudaTable::new(DeviceTable::trace(tracer.device(), tracer.host().domain(), nodes)?))
     }
@@ -60,17 +61,20 @@ impl SurrogateDevice for OnGpu {
     }
 }
 
-/// The table and the network of a frozen surrogate, on the device.
+/// Returns the table and the network of a frozen surrogate, on the device.
 ///
 /// # Errors
-/// The table has left the device.
+/// The memory of the table on the device is already freed.
 pub(in crate::backend::cuda) fn frozen_parts(
     frozen: &FrozenHybrid<OnGpu>,
 ) -> Result<(Option<&DeviceTable>, Option<&CudaNetwork>), DeviceError> {
     Ok((frozen.table.as_ref().map(CudaTable::device).transpose()?, frozen.network.as_deref()))
 }
 
-/// Predicts at unit points on the host.
+/// Predicts at points on the host, in unit coordinates.
+///
+/// # Errors
+/// The device fails or lacks memory.
 pub(in crate::backend::cuda) fn predict_from_host(
     gpu: &Gpu,
     by: &dyn DevicePredict,
@@ -81,20 +85,20 @@ pub(in crate::backend::cuda) fn predict_from_host(
     for (points, out) in points.chunks(batch).zip(out.chunks_mut(batch)) {
         let unit = gpu.upload("points to predict at", points)?;
         let values = gpu.alloc::<f32>("points to predict at", points.len())?;
-        // SAFETY: both buffers hold as many entries as there are points, and reading waits for the stream.
+        // SAFETY: both buffers hold `points.len()` entries, and the read waits for the stream.
         unsafe { by.predict(unit.address(), points.len(), values.address()) }?;
         values.read(out)?;
     }
     Ok(())
 }
 
-/// A table on the GPU, and on the host after the first download.
+/// A table on the GPU, with a copy on the host after the first download.
 #[derive(Clone)]
 pub struct CudaTable {
-    /// `None` after it has left the device for a table of another size.
+    /// `None` after its device memory is freed for a table of another size.
     device: Option<Arc<DeviceTable>>,
     host: Arc<OnceLock<Table>>,
-    /// A number that tables in this process share only if they share their values.
+    /// Identifies the values: two tables of this process have the same stamp only if they have the same values.
     stamp: u64,
 }
 
@@ -103,15 +107,15 @@ impl CudaTable {
         Self { device: Some(Arc::new(table)), host: Arc::default(), stamp: fresh_stamp() }
     }
 
-    /// The values on the device.
+    /// Returns the table on the device.
     ///
     /// # Errors
-    /// They have left it.
+    /// Its device memory is already freed.
     pub fn device(&self) -> Result<&DeviceTable, DeviceError> {
-        self.device.as_deref().ok_or_else(|| DeviceError::Unsupported { what: "a table that has left the device".into() })
+        self.device.as_deref().ok_or_else(|| DeviceError::Unsupported { what: "a table whose device memory is freed".into() })
     }
 
-    /// Downloads the values and frees the device's memory once no frame uses it.
+    /// Downloads the values. The device memory is freed when no frame uses it any more.
     ///
     /// # Errors
     /// The device fails.
@@ -137,7 +141,8 @@ impl TableOnDevice for CudaTable {
     }
 }
 
-/// Labels of the frames that were traced on the device and stay there, since the last slide that made them wrong. Frames write and training reads, in turns.
+/// Labels that frames trace on the device and that stay on it. A slide that invalidates them clears the pool. The lock serialises writes by frames
+/// and reads by training.
 #[derive(Debug)]
 pub(in crate::backend::cuda) struct LabelPool {
     writer: SampleWriter,
@@ -145,12 +150,12 @@ pub(in crate::backend::cuda) struct LabelPool {
 }
 
 impl LabelPool {
-    /// The present filling, to [return](Self::go_back) to.
+    /// Returns a mark of the present content, for [`Self::go_back`].
     pub(in crate::backend::cuda) fn mark(&self) -> Filled {
         self.samples().filled()
     }
 
-    /// Drops the labels that were added after a mark.
+    /// Removes the labels that were added after a mark.
     pub(in crate::backend::cuda) fn go_back(&self, to: Filled) {
         self.samples().go_back(to);
     }
@@ -160,7 +165,7 @@ impl LabelPool {
     }
 }
 
-/// Adds the labels of one frame to the pool.
+/// Sink that adds the labels of one frame to the pool.
 pub(in crate::backend::cuda) struct LabelSink<'a> {
     pool: &'a LabelPool,
     domain: &'a Domain,
@@ -180,16 +185,16 @@ impl DeviceLearns for LabelSink<'_> {
         }
         let (base, times) = (self.base, Some(self.times));
         let batch = TracedBatch { domain: self.domain, points, labels, count, base, times, held_back: HELD_BACK };
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe { writer.append(&mut samples, batch) }
     }
 }
 
-/// A network on the GPU that does not change.
+/// An immutable network on the GPU, for prediction.
 pub struct CudaNetwork {
     gpu: Arc<Gpu>,
     network: DeviceNetwork,
-    /// The labels of the training that it comes from; `None` if the CPU trains it.
+    /// Label pool of its training. `None` if the CPU trains the network.
     pool: Option<Arc<LabelPool>>,
 }
 
@@ -203,7 +208,7 @@ impl CudaNetwork {
         self.pool.as_ref()
     }
 
-    /// The sink for the labels of a frame at these unit times, as differences from `base`.
+    /// Returns the sink for the labels of a frame at these unit times. Targets are differences from `base`. `None` if the CPU trains the network.
     pub(in crate::backend::cuda) fn label_sink<'a>(
         &'a self,
         domain: &'a Domain,
@@ -214,42 +219,44 @@ impl CudaNetwork {
     }
 }
 
-/// A network in training: on the GPU once its targets' scale is known, on the CPU until then or if the placement says so.
+/// A network in training. It moves to the GPU in `begin`, once the scale of its targets is known, unless the placement assigns training to the CPU.
 pub struct CudaTraining {
     gpu: Arc<Gpu>,
-    /// The network before it moved, and afterwards its latest host copy.
+    /// Training on the CPU. After the move to the GPU, the latest host copy of the network.
     host: HostTraining,
+    /// Training on the GPU. `None` before the move, and with training on the CPU.
     resident: Option<Resident>,
-    /// Whether it may move to the GPU.
+    /// True if training may move to the GPU.
     may_move: bool,
-    /// The network of the CPU that was uploaded last, by its parameters.
+    /// Latest upload of a network that the CPU trains, with the parameters that it was made from.
     uploaded: Mutex<Option<(Arc<Average>, Arc<CudaNetwork>)>>,
 }
 
-/// The part on the GPU.
+/// Training state on the GPU.
 struct Resident {
     training: DeviceTraining,
     samples: DeviceSamples,
-    /// Where the replay buffer stood at the latest sync; `None` before the first.
+    /// Position of the replay buffer at the latest sync. `None` before the first.
     mark: Option<BufferMark>,
-    /// Stamp of the table that the samples' targets are relative to, and that of the pool's; `None` in the latter before the first sync.
+    /// Stamps of the tables to which the targets of `samples` and of the pool are relative. `pool_base` is `None` before the first sync.
     base: Option<u64>,
     pool_base: Option<Option<u64>>,
     usable: usize,
     usable_in_pool: usize,
     pool: Arc<LabelPool>,
-    /// Device seconds of steps that were not asked for yet.
+    /// Device seconds of the steps since the last [`Training::device_seconds`].
     seconds: f64,
-    /// Wall-clock seconds of a step, by the latest steps; 0 before the first.
+    /// Wall-clock seconds per step, measured over the latest steps; 0 before the first.
     step_seconds: f64,
+    /// Copy for prediction of the present parameters. Empty until it is requested.
     frozen: OnceLock<Arc<CudaNetwork>>,
-    /// Memory for copies; taken at the first one, and not here while a copy is downloaded.
+    /// Memory for checkpoint copies. `None` before the first copy and during a download.
     copy_memory: CopyMemory,
 }
 
 type CopyMemory = Arc<Mutex<Option<DeviceCopy>>>;
 
-/// A copy in the memory for copies, to which it returns.
+/// A checkpoint copy. Dropping it returns its memory to `memory`.
 struct HeldCopy {
     copy: Option<DeviceCopy>,
     memory: CopyMemory,
@@ -262,7 +269,7 @@ impl Drop for HeldCopy {
 }
 
 impl CudaTraining {
-    /// Takes a network over. It moves to the GPU with the first steps if `may_move`.
+    /// Creates the training of a network. It moves to the GPU before the first steps if `may_move` is true.
     pub fn new(gpu: &Arc<Gpu>, network: HostNetwork, may_move: bool) -> Self {
         Self { gpu: gpu.clone(), host: HostTraining::new(network), resident: None, may_move, uploaded: Mutex::default() }
     }
@@ -280,11 +287,14 @@ impl CudaTraining {
         Ok(())
     }
 
-    /// Labels that the device holds beyond the replay buffer: capacity for a buffer of `capacity` samples.
+    /// Allocates the label pool that belongs to a replay buffer of `capacity` samples.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     fn pool(gpu: &Gpu, training: &DeviceTraining, capacity: usize) -> Result<Arc<LabelPool>, DeviceError> {
         let writer = training.writer();
         let most = gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
-        // The kernels count samples, those of the replay buffer included, in 32 bits.
+        // The kernels index the samples of pool and replay buffer together with 32 bits.
         let capacity = POOL_PER_BUFFER.saturating_mul(capacity).min(most as usize).clamp(1, 1 << 31);
         Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.ring(capacity)?) }))
     }
@@ -295,7 +305,7 @@ impl Resident {
         let mut training = DeviceTraining::new(gpu, &network.model, objective)?;
         training.set_average(&network.average)?;
         training.reserve(batch)?;
-        // Takes the memory of the state to roll back to.
+        // The first call allocates the memory of the state for a rollback.
         training.keep()?;
         let samples = training.ring(capacity)?;
         let pool = CudaTraining::pool(gpu, &training, capacity)?;
@@ -383,7 +393,7 @@ impl Training for CudaTraining {
         let mark = self.gpu.mark()?;
         let mut losses = resident.training.train_steps(&resident.samples, Some(&pool), steps)?;
         resident.seconds += 1e-3 * f64::from(self.gpu.milliseconds(&mark, &self.gpu.mark()?)?);
-        // Samples without a target are drawn too, and count for nothing in the mean over the batch.
+        // Samples without a target are drawn too and add 0 to the batch mean. This factor corrects the mean for them.
         let drawn = (resident.samples.len() + pool.len()) as f64 / (resident.usable + resident.usable_in_pool) as f64;
         losses.iter_mut().for_each(|loss| *loss *= drawn);
         resident.step_seconds = begin.elapsed().as_secs_f64() / steps.len() as f64;
@@ -448,7 +458,7 @@ impl Training for CudaTraining {
         if let Some((_, network)) = uploaded.as_ref().filter(|(of, _)| Arc::ptr_eq(of, average)) {
             return Ok(network.clone());
         }
-        // Old and new must not need memory together.
+        // Freed first, so that old and new network are never allocated together.
         *uploaded = None;
         let network = DeviceNetwork::upload(&gpu, self.shape(), objective, &average.tables, &average.layers)?;
         let network = Arc::new(CudaNetwork { gpu, network, pool: None });
@@ -469,7 +479,7 @@ impl Training for CudaTraining {
         if taken.is_none() && needed > left / COPY_SHARE {
             let [needed, left] = [needed, left].map(|bytes| bytes.div_ceil(1 << 20));
             return waited(format!(
-                "a copy of the network takes {needed} MiB of the GPU's memory; {left} MiB are left, half of them for frames"
+                "a copy of the network needs {needed} MiB on the GPU; {left} MiB are left, half of which is reserved for frames"
             ));
         }
         match resident.training.copy(taken) {
@@ -485,7 +495,7 @@ impl Training for CudaTraining {
                 });
                 Ok(NetworkCopy::Downloadable(download))
             }
-            // Under the cap, but other programs hold the rest.
+            // The copy is within the cap, but other programs use the rest of the memory.
             Err(error) if error.is_out_of_memory() => waited(error.to_string()),
             Err(error) => Err(error),
         }

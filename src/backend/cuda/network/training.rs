@@ -1,4 +1,5 @@
-//! Training on the device: [`DeviceTraining::train_steps`] takes optimizer steps (batch, gradient, Adam, running mean) with one wait at the end.
+//! Training on the device: [`DeviceTraining::train_steps`] takes optimizer steps with one wait at the end. A step draws a batch, and computes the
+//! gradient, the Adam update (Kingma and Ba 2015) and the running mean of the parameters (Polyak and Juditsky 1992).
 //!
 //! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use
 //! half-precision values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.

@@ -1,5 +1,7 @@
-//! A frame's audit on the device: points drawn, traced, predicted and added up there, so that only sums come back (and each point's optical
-//! residual, for the quantile; and the samples, where somebody learns from them).
+//! Audit of a frame on the device, by the method of [`crate::backend::audit`]: stratified random points, drawn with Philox4x32-10.
+//!
+//! The device draws, traces and predicts the points, and sums the residuals of each cell. The host reads back the sums, the optical residual of each
+//! point (for quantiles), and the samples if they are requested for training.
 
 use crate::backend::audit::{AuditFindings, AuditRequest, draws};
 use crate::backend::cuda::driver::pinned::Pinned;
@@ -13,12 +15,12 @@ use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
 use std::ops::Range;
 use std::sync::Arc;
 
-/// Points that are traced together, at most, unless a single cell has more: bounds the memory.
+/// Limit on the points of a batch, to bound the memory. A batch of a single cell may have more.
 const MOST: usize = 1 << 22;
-/// Threads of a warp, each of which has a cell.
+/// Threads of a warp. Each warp processes one cell.
 const WARP: usize = 32;
 
-/// Makes audits. Keeps its memory from frame to frame.
+/// Audits frames. It reuses its memory between frames.
 pub struct Audits {
     gpu: Arc<Gpu>,
     draw: CudaFunction,
@@ -26,14 +28,14 @@ pub struct Audits {
     memory: Option<Memory>,
 }
 
-/// For points of one batch, and for all cells.
+/// Device memory for the points of one batch and for all cells, with pinned memory for the readback.
 struct Memory {
     unit: Buffer<[f32; 3]>,
     points: Buffer<[f32; 3]>,
     land: Buffer<u8>,
     traced: Buffer<f32>,
     lived: Buffer<f32>,
-    /// None until they are asked for.
+    /// `None` until arrival points are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
     predicted: Buffer<f32>,
     optical: Buffer<f32>,
@@ -67,7 +69,7 @@ impl Memory {
     }
 }
 
-/// Consecutive cells with at most [`MOST`] points each time, `begins` being where each cell's points begin, and their end.
+/// Groups consecutive cells into batches of at most [`MOST`] points. `begins` holds the first point of each cell, followed by the number of points.
 fn batches(begins: &[u32]) -> Vec<Range<usize>> {
     let cells = begins.len() - 1;
     let mut batches = Vec::new();
@@ -82,19 +84,20 @@ fn batches(begins: &[u32]) -> Vec<Range<usize>> {
 }
 
 impl Audits {
-    /// Compiles the kernels, or takes them from the cache.
+    /// Compiles the kernels or loads them from the cache.
     ///
     /// # Errors
-    /// What the compiler or the device says.
+    /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernel = |name| gpu.kernel("audit.cu", &[], name);
         Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// What [`crate::backend::audit::audit`] does, to the last bit where both trace and predict the same; Jacobians do not come back.
+    /// Audits a frame. The result is bitwise that of [`crate::backend::audit::audit`] if traced and predicted values are equal. The samples have no
+    /// Jacobians.
     ///
     /// # Errors
-    /// Memory that is not there, or a device fault.
+    /// The device fails or lacks memory.
     pub fn audit(
         &mut self,
         request: &AuditRequest<'_>,
@@ -111,7 +114,7 @@ impl Audits {
         let in_batch = |batch: &Range<usize>| (begins[batch.end] - begins[batch.start]) as usize;
         let most = batches.iter().map(in_batch).max().unwrap_or(0);
         if !self.memory.as_ref().is_some_and(|memory| memory.holds(most, cells)) {
-            // The old one goes first, so that both never need memory together.
+            // Freed first, so that old and new memory are never allocated together.
             self.memory = None;
             self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MOST.max(most)), cells)?);
         }
@@ -152,7 +155,7 @@ impl Audits {
             let argument = AuditBatchArgument { begins: memory.begins.address(), first: batch.start as u32, count: batch.len() as u32 };
             let warps = threads(batch.len() * WARP, 256);
             let findings = memory.findings.address();
-            // SAFETY: the arguments of the kernels in audit.cu; all arrays hold the batch's points, and `begins` and `findings` every cell.
+            // SAFETY: arguments as declared in audit.cu; all arrays hold the points of the batch, and `begins` and `findings` hold every cell.
             unsafe {
                 launch(stream.launch_builder(&self.draw).arg(&draw).arg(&argument).arg(&points), warps)?;
                 tracer.device().trace(
@@ -172,7 +175,7 @@ impl Audits {
             optical.extend_from_slice(&memory.optical_back.values()[..count]);
         }
         let from = memory.findings.address();
-        // SAFETY: every cell's findings lie there.
+        // SAFETY: `findings` holds one entry for every cell.
         unsafe { memory.findings_back.copy_from(gpu, from, cells) }?;
         gpu.synchronize()?;
         let findings = &memory.findings_back.values()[..cells];
@@ -188,7 +191,8 @@ impl Audits {
     }
 }
 
-/// Brings a batch's points over that do not lie on land; with a domain also where in it they arrive.
+/// Reads back the points of a batch that lie outside missing cells. With `arrivals_in`, also their arrival points in unit coordinates of that
+/// domain.
 fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &mut Samples) -> Result<(), DeviceError> {
     fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
         let mut values = vec![zero; count];

@@ -1,28 +1,27 @@
-//! Frames that are rendered, traced, answered and audited on the GPU alone.
+//! Frames that are rendered and audited entirely on the GPU: connects renderer, query router, predictors and audits.
 
 use super::audit::Audits;
 use super::renderer::GpuRenderer;
 use super::router::{DeviceLearns, DevicePredict, FrameQueries, QueryRouter, TraceAll};
-use crate::backend::cuda::device::Cuda;
 use crate::backend::cuda::driver::Gpu;
 use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
 use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
-use crate::backend::{AuditFindings, AuditRequest, DeviceError, FrameJob, FrameSamples, Rendered, Tally};
+use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Tally};
 use crate::render::{RenderStats, Renderer};
 use crate::surrogate::{FrozenHybrid, Samples};
 use std::sync::Arc;
 
-/// Renders and audits frames. Keeps kernels and memory from frame to frame.
+/// Renders and audits frames. It reuses kernels and memory between frames.
 pub struct GpuFrames {
     renderer: GpuRenderer,
     router: QueryRouter,
     audits: Audits,
 }
 
-/// The surrogate of one frame on the device.
+/// Device-side predictor of one frame.
 pub(in crate::backend::cuda) enum Predictor<'a> {
     Table(&'a DeviceTable),
-    /// And the sink for labels, if the device trains the network.
+    /// The network, above a table if the surrogate has one, and the sink for labels if the device trains the network.
     Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
 }
 
@@ -48,7 +47,7 @@ impl<'a> Predictor<'a> {
 
 impl DevicePredict for Predictor<'_> {
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
-        // SAFETY: the caller's.
+        // SAFETY: guaranteed by the caller.
         unsafe {
             match self {
                 Self::Table(table) => table.predict(points, count, out),
@@ -58,14 +57,14 @@ impl DevicePredict for Predictor<'_> {
     }
 }
 
-/// The labels of a frame: some on the host, and those that stay in the device's pool. Dropped before the commit, the pool forgets them.
+/// Labels of a frame: a part on the host, the rest in the label pool on the device. Dropping them without a commit removes them from the pool.
 pub struct CudaSamples {
     host: Samples,
     uncommitted: Option<(Arc<LabelPool>, Filled)>,
 }
 
 impl CudaSamples {
-    /// Labels on the host alone.
+    /// Creates labels that are on the host only.
     pub(in crate::backend::cuda) fn on_host(host: Samples) -> Self {
         Self { host, uncommitted: None }
     }
@@ -91,21 +90,21 @@ impl Drop for CudaSamples {
 }
 
 impl GpuFrames {
-    /// Compiles the kernels, or takes them from the cache.
+    /// Compiles the kernels or loads them from the cache.
     ///
     /// # Errors
-    /// The compiler or the device fails.
+    /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         Ok(Self { renderer: GpuRenderer::new(gpu)?, router: QueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
     }
 
-    /// Renders a frame.
+    /// Renders a frame. Every query is traced if `surrogate` is `None`.
     ///
     /// # Errors
-    /// The device fails or lacks memory.
-    pub fn render(
+    /// The device fails or lacks memory, or the renderer rejects the number of samples.
+    pub fn render<B: Backend<Tracer = CudaTracer>>(
         &mut self,
-        job: &FrameJob<'_, Cuda>,
+        job: &FrameJob<'_, B>,
         surrogate: Option<&FrozenHybrid<OnGpu>>,
         renderer: &mut Renderer,
     ) -> Result<Rendered<CudaSamples>, DeviceError> {

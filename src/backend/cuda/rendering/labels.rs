@@ -1,7 +1,8 @@
-//! Traced answers that come back to the host, as labels to learn from: a bounded, even sample of all that a frame traced.
+//! Training labels of a frame on the host: a bounded, uniform sample of all traced queries.
 //!
-//! Which ones are kept is a function of their points alone (`keeps_label` of `answer.cuh`): of every 2^shift points one, where the shift
-//! grows as a frame traces more. So the set does not depend on the order in which the device's threads come, nor does its order here.
+//! The sample is selected by a hash of each point (`keeps_label` of `answer.cuh`, adaptive sampling by hash value as in Wegman; Flajolet 1990): one
+//! point in 2^shift is kept, and the shift grows as the frame traces more. So the set does not depend on the order in which GPU threads run. The
+//! host sorts it, so its order does not either.
 
 use crate::backend::cuda::layout::LabelsArgument;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
@@ -11,19 +12,19 @@ use crate::render::rng::philox;
 use crate::surrogate::Samples;
 use rayon::prelude::*;
 
-/// Most labels that one frame keeps (64 MiB).
+/// Limit on the labels of one frame (64 MiB).
 const MOST: usize = 1 << 22;
 
-/// Where a network learns on the device, one label of 2^3 may come back to the host, and is not learned from there: what is held out of
-/// training must be held out on both sides.
+/// With training on the device, one label in 2^3 may go to the host instead of the label pool of the device. The host holds out some of its labels
+/// for validation, so the pool must not contain them.
 pub(in crate::backend::cuda) const HELD_BACK: u32 = 3;
 
-/// A traced point.
+/// A traced query.
 #[derive(Debug, Clone, Copy)]
 struct Label {
     /// Domain coordinates, log-stretch.
     at: [f32; 4],
-    /// Where it arrives, domain coordinates; NaN where that is not asked for.
+    /// Arrival point, domain coordinates; NaN if arrival points are not requested.
     arrival: [f32; 3],
 }
 
@@ -41,7 +42,7 @@ struct Memory {
     arrivals: Option<Buffer<[f32; 3]>>,
 }
 
-/// Whether the label at a point belongs to the kept share of 1 in 2^shift.
+/// Returns true if the label at a point is in the sample of 1 in 2^shift.
 pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
     let [x, y, z] = point.map(f32::to_bits);
     shift == 0 || (shift < 32 && philox([x, y, z, 0], [0, 0])[0] >> (32 - shift) == 0)
@@ -49,19 +50,23 @@ pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
 
 /// The labels of one frame.
 pub struct Labels {
-    /// How many may be kept.
+    /// Upper bound (exclusive) on the labels; 0 keeps none.
     keep: usize,
     shift: u32,
     /// Points traced so far.
     offered: u64,
-    /// Brought back before the memory on the device was full.
+    /// Labels on the host, read back whenever the device's memory was full.
     back: Vec<Label>,
     memory: Option<Memory>,
     arrivals: bool,
 }
 
 impl Labels {
-    /// Keeps fewer than `keep`, of every 2^shift points one at most; none where `keep` is 1 or 0. `arrivals`: with those of each.
+    /// Allocates memory for fewer than `keep` labels, at most one of 2^shift traced points; no labels if `keep` is 0 or 1. `arrivals` adds the
+    /// arrival points.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     pub fn new(gpu: &Gpu, keep: usize, shift: u32, arrivals: bool) -> Result<Self, DeviceError> {
         let keep = if keep > 1 { keep.min(MOST) } else { 0 };
         let room = Self::with_luck(keep);
@@ -72,19 +77,22 @@ impl Labels {
         Ok(Self { keep, shift, offered: 0, back: Vec::new(), memory: (keep > 0).then(memory).transpose()?, arrivals })
     }
 
-    /// Six standard deviations more than a number that is drawn, and a few.
+    /// Returns the capacity for an expected number of labels: a margin of six standard deviations of the binomial count, and 64.
     fn with_luck(expected: usize) -> usize {
         expected + (6.0 * (expected as f64).sqrt()) as usize + 64
     }
 
-    /// What the kernel is told for `traced` further points. `stored` labels are in the device's memory, whose count is at `length`; when
-    /// they leave too little room they come back first, and the count is to be set to 0 (true).
+    /// Returns the kernel argument for `traced` further points. The device holds `stored` labels, with their count at the address `length`. If the
+    /// free space is too small, they are read back first; the second result is then true, and the caller must set the count to 0.
+    ///
+    /// # Errors
+    /// The device fails.
     pub fn offer(&mut self, traced: usize, stored: usize, length: u64) -> Result<(LabelsArgument, bool), DeviceError> {
         let Some(memory) = &self.memory else {
             return Ok((LabelsArgument { at: 0, arrivals: 0, length, capacity: 0, shift: 0 }, false));
         };
         self.offered += traced as u64;
-        // Three quarters, so that what is drawn in excess does not cost half of it.
+        // Three quarters of the limit: a random excess over the limit would halve the sample in `finish`.
         while self.offered >> self.shift > (self.keep - self.keep / 4) as u64 {
             self.shift += 1;
         }
@@ -97,7 +105,10 @@ impl Labels {
         Ok((LabelsArgument { at, arrivals, length, capacity: capacity as u32, shift: self.shift }, full))
     }
 
-    /// Brings `stored` labels back, all that are on the device.
+    /// Reads back the `stored` labels that are on the device.
+    ///
+    /// # Errors
+    /// The device fails.
     pub fn take(&mut self, stored: usize) -> Result<(), DeviceError> {
         let Some(memory) = &self.memory else { return Ok(()) };
         let mut at = vec![[0.0; 4]; stored.min(memory.at.len())];
@@ -116,7 +127,7 @@ impl Labels {
         self.back.retain(|label| keeps_label(label.point(), shift));
     }
 
-    /// All that is kept and was brought back, in unit coordinates of `domain`.
+    /// Returns the labels on the host, sorted, in unit coordinates of `domain`.
     pub fn finish(&mut self, domain: &Domain) -> Samples {
         while self.back.len() >= self.keep.max(1) && self.shift < 32 {
             self.shift += 1;

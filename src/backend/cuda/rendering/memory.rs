@@ -1,35 +1,38 @@
-//! How a frame is cut into bands of pixels and parts of samples, and the device memory that this takes: one block, taken once.
+//! Splits a frame into bands of pixels and parts of samples, and lays out its device memory, which is one allocation.
+//!
+//! A slot holds the state of one flight of a light path (delta tracking from collision to collision). Each band runs `band * parts` slots at once.
 
 use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use crate::render::PixelValue;
 use cudarc::driver::DeviceRepr;
 
-/// Flights that a wave should have, so that sorting pays and the device is full.
+/// Target number of slots: enough to fill the device and to make sorting worthwhile.
 const WANTED_SLOTS: u64 = 1 << 21;
-/// Most flights of a wave; larger pictures are rendered band by band.
+/// Limit on the slots; larger pictures are rendered band by band.
 const MOST_SLOTS: u64 = 1 << 22;
-/// Collisions that a queue holds for every slot that it must hold: room to look ahead.
+/// Minimum length of the collision queue if memory allows: room for speculative queries beyond one collision per slot.
 const LEAST_QUEUE: u64 = 1 << 23;
-/// Fields of a pixel's sums (`PIXEL_SUM_FIELDS` of the kernels).
+/// Number of sums per pixel (`PIXEL_SUM_FIELDS` of the kernels).
 const SUM_FIELDS: u64 = 11;
 
-/// A frame's shape on the device.
+/// Sizes of a frame's arrays on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(in crate::backend::cuda) struct Plan {
     /// Pixels that are tracked together.
     pub(in crate::backend::cuda) band: u32,
-    /// Parts of a pixel's samples that run side by side.
+    /// Parts of a pixel's samples that run concurrently.
     pub(in crate::backend::cuda) parts: u32,
-    /// Collisions that fit the queue.
+    /// Capacity of the collision queue.
     pub(in crate::backend::cuda) queue: u32,
-    /// Majorant cells.
+    /// Number of majorant cells.
     pub(in crate::backend::cuda) cells: u32,
 }
 
 impl Plan {
-    /// The sums, and so the picture's last bits, depend on the parts, therefore these on the picture's size and its samples alone. How
-    /// many pixels are tracked together follows `memory` (bytes that may be used) and changes nothing but the speed.
+    /// Plans a frame that uses at most `memory` bytes, if one pixel per band suffices for that. The number of parts sets the order of the sums, and
+    /// therefore the last bits of the picture. So it depends only on the number of pixels and samples. The size of a band depends on `memory` and
+    /// affects only the speed.
     pub(in crate::backend::cuda) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
         let pixels = pixels.max(1) as u64;
         let parts = (WANTED_SLOTS / pixels).clamp(1, u64::from(samples));
@@ -55,13 +58,13 @@ impl Plan {
         Layout::new(self).end
     }
 
-    /// Whether memory that was taken for `self` does for `other`.
+    /// Returns true if the memory of `self` is large enough for `other`.
     pub(in crate::backend::cuda) fn covers(&self, other: &Self) -> bool {
         self.slots() >= other.slots() && self.band >= other.band && self.queue >= other.queue && self.cells == other.cells
     }
 }
 
-/// Where each array begins, in bytes.
+/// Offset of each array in the allocation, bytes.
 #[derive(Debug, Clone, Copy, Default)]
 pub(in crate::backend::cuda) struct Layout {
     pub(in crate::backend::cuda) place: u64,
@@ -79,7 +82,7 @@ pub(in crate::backend::cuda) struct Layout {
     pub(in crate::backend::cuda) film: u64,
     pub(in crate::backend::cuda) majorants: u64,
     pub(in crate::backend::cuda) may_miss: u64,
-    /// Counts, highest, missing: what is set to 0 at the start of a frame, together with `control`.
+    /// Observations of each majorant cell: counts, highest values, missing values. Set to 0 at the start of a frame, together with `control`.
     pub(in crate::backend::cuda) watch: u64,
     pub(in crate::backend::cuda) control: u64,
     end: u64,
@@ -119,20 +122,20 @@ impl Layout {
     }
 }
 
-/// What the kernels count (`Control` of `kernels/render.cu`).
+/// Counters of the kernels (`Control` of `kernels/render.cu`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(in crate::backend::cuda) struct Control {
     pub(in crate::backend::cuda) live: u32,
     pub(in crate::backend::cuda) length: u32,
-    /// Queries, traced, missing, exceeded, paths, over budget.
+    /// Queries, traced queries, queries in missing cells, exceeded majorants, finished paths, queries over the tracing budget.
     pub(in crate::backend::cuda) totals: [u64; 6],
 }
 
 // SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/render.cu`.
 unsafe impl DeviceRepr for Control {}
 
-/// The memory of a plan.
+/// Device memory of a plan, and pinned memory for its readback.
 pub(in crate::backend::cuda) struct Memory {
     pub(in crate::backend::cuda) plan: Plan,
     pub(in crate::backend::cuda) layout: Layout,
@@ -143,6 +146,10 @@ pub(in crate::backend::cuda) struct Memory {
 }
 
 impl Memory {
+    /// Allocates the memory of a plan.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     pub(in crate::backend::cuda) fn new(gpu: &Gpu, plan: Plan) -> Result<Self, DeviceError> {
         let layout = Layout::new(&plan);
         Ok(Self {
@@ -155,7 +162,10 @@ impl Memory {
         })
     }
 
-    /// Copies values to an offset of the layout that has room for them.
+    /// Copies values to an offset of the layout.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub(in crate::backend::cuda) fn write<T: Copy>(&mut self, offset: u64, values: &[T]) -> Result<(), DeviceError> {
         let bytes = size_of_val(values);
         // SAFETY: numbers and bools, whose bytes are all initialised.
@@ -163,7 +173,10 @@ impl Memory {
         self.block.write_at(offset as usize, bytes)
     }
 
-    /// Sets bytes to 0.
+    /// Sets `bytes` bytes from an offset on to 0.
+    ///
+    /// # Errors
+    /// A driver call fails.
     pub(in crate::backend::cuda) fn zero(&self, offset: u64, bytes: u64) -> Result<(), DeviceError> {
         self.block.zero_at(offset as usize, bytes as usize)
     }

@@ -1,4 +1,4 @@
-//! Frames on the GPU: tracking, query routing, labels and audits.
+//! Frames on the GPU: wavefront path tracing, query routing, labels and audits.
 
 mod audit;
 mod frames;

@@ -1,7 +1,13 @@
-//! Wavefront rendering on the device: from a frame's parameters to its film, nothing leaves the device but a few counters a wave.
+//! Wavefront volume path tracing on the GPU (Laine, Karras, Aila 2013, "Megakernels considered harmful"), with free flights sampled by delta
+//! tracking (Woodcock et al. 1965).
 //!
-//! The picture is that of [`Renderer::render`] with the same answers, up to rounding: same random numbers, same states, same sums in
-//! an order that depends on the picture's size alone. The host derives majorants between frames, from what the device saw.
+//! All paths of a band advance together, in waves. Each wave runs two steps:
+//! 1. `render_start` or `render_advance` moves every flight to its next tentative collisions and appends their points to a queue.
+//! 2. [`DeviceAnswers`] evaluates the log-stretch at the queued points. The next wave uses the values to accept or reject the collisions.
+//!
+//! Only a few counters leave the device after each wave. `render_film` then sums the samples of each pixel. The picture equals that of
+//! [`Renderer::render`] up to rounding if the evaluated values are equal: random numbers and states are the same, and the order of the sums depends
+//! only on the numbers of pixels and samples. Between frames, the host updates the majorants from the observations of the device.
 
 use crate::backend::cuda::rendering::memory::{Control, Memory, Plan};
 use crate::backend::cuda::{DeviceAnswers, DeviceError, Gpu, launch, threads};
@@ -11,36 +17,36 @@ use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-/// Collisions of a flight that are answered at once, at most: on its way from the camera, where the first real collision makes those
-/// behind it worthless, and on its way to the light, where most are used.
+/// Default limit on the collisions of a flight that one wave evaluates. On a camera flight, the first real collision makes the later ones useless. A
+/// shadow flight uses most of its collisions.
 const LOOK_AHEAD: LookAhead = LookAhead { camera: 4, shadow: 8 };
-/// Of the memory that is left when it begins, and of what is left beside its own when a frame wants more, rendering takes at most one part in so
-/// many.
+/// Rendering uses at most 1 / `MEMORY_SHARE` of the device memory that is free when the renderer is created, and, for each frame, at most its own
+/// memory plus that share of the free memory.
 const MEMORY_SHARE: u64 = 2;
 
-/// How many collisions of a flight may be answered at once. The picture does not depend on it.
+/// Limit on the collisions of a flight that one wave evaluates, some of them speculatively. The picture does not depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct LookAhead {
-    /// On the way from the camera.
+    /// Limit for flights from the camera.
     pub camera: u32,
-    /// On the way to the light.
+    /// Limit for shadow flights to the light.
     pub shadow: u32,
 }
 
-/// Device seconds of a frame's stages.
+/// Device time of the stages of a frame, in seconds.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Timeline {
-    /// Starting paths.
+    /// `render_start`: starting the paths.
     pub start: f64,
-    /// Taking answers, flying on, queueing collisions.
+    /// `render_advance`: accepting or rejecting collisions, continuing flights, queueing collisions.
     pub advance: f64,
-    /// Answers: choosing who answers, prediction, sorting and tracing.
+    /// Evaluation of queries: routing, prediction, sorting and tracing.
     pub answer: f64,
-    /// Sums to pixels, and the copy to the host.
+    /// `render_film`: pixel values, and their copy to the host.
     pub film: f64,
-    /// Waves.
+    /// Number of waves.
     pub waves: u64,
-    /// Points that were answered, those that a flight did not live to see included.
+    /// Number of evaluated points, including speculative ones that no flight used.
     pub points: u64,
 }
 
@@ -104,21 +110,21 @@ unsafe impl DeviceRepr for QueueArgument {}
 // SAFETY: `repr(C)`, plain numbers, laid out as `FrameScene` of `kernels/tracking.cuh`, whose size both sides assert.
 unsafe impl DeviceRepr for FrameParameters {}
 
-/// Renders frames on a GPU. Keeps its memory from frame to frame.
+/// Renders frames on a GPU. It reuses its memory between frames.
 pub struct GpuRenderer {
     gpu: Arc<Gpu>,
     start: CudaFunction,
     advance: CudaFunction,
     film: CudaFunction,
     memory: Option<Memory>,
-    /// Bytes of device memory that rendering may take, as far as others leave them.
+    /// Limit on the device memory of rendering, bytes.
     allowed: u64,
     look_ahead: LookAhead,
     timeline: Timeline,
     over_budget: u64,
 }
 
-/// The arguments that all waves of a band share.
+/// Kernel arguments that all waves of a band share.
 struct Wave {
     parameters: FrameParameters,
     grid: GridArgument,
@@ -129,10 +135,10 @@ struct Wave {
 }
 
 impl GpuRenderer {
-    /// Compiles the kernels, or takes them from the cache.
+    /// Compiles the kernels or loads them from the cache.
     ///
     /// # Errors
-    /// What the compiler or the device says.
+    /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernel = |name: &str| gpu.kernel("render.cu", &[], name);
         Ok(Self {
@@ -148,41 +154,41 @@ impl GpuRenderer {
         })
     }
 
-    /// The same with another look-ahead.
+    /// Sets the look-ahead.
     pub fn with_look_ahead(mut self, look_ahead: LookAhead) -> Self {
         self.look_ahead = look_ahead;
         self
     }
 
-    /// The same with at most so many bytes of device memory, as far as a frame can be cut up.
+    /// Sets the limit on device memory, bytes. A band of one pixel may exceed it.
     pub fn with_memory(mut self, bytes: u64) -> Self {
         self.allowed = bytes;
         self
     }
 
-    /// Overwrites the memory between frames with bytes that make NaN and far indices, so that a kernel that reads what it has not written
-    /// shows. For tests.
+    /// For tests: fills the memory between frames with bytes that are NaN as floats and out of range as indices, so that reads of uninitialised
+    /// memory show.
     ///
     /// # Errors
-    /// What the device says.
+    /// A driver call fails.
     pub fn poison(&mut self) -> Result<(), DeviceError> {
         self.memory.as_mut().map_or(Ok(()), |memory| memory.block.fill_bytes(0xFF))
     }
 
-    /// Where the time of the latest frame went.
+    /// Device time of the stages of the latest frame.
     pub fn timeline(&self) -> Timeline {
         self.timeline
     }
 
-    /// Queries of the latest frame that the surrogate answered where it is not trusted, since the tracing budget was spent.
+    /// Number of queries of the latest frame that the surrogate predicted in untrusted cells, because the tracing budget was spent.
     pub fn over_budget(&self) -> u64 {
         self.over_budget
     }
 
-    /// Renders a range of a frame's samples: what [`Renderer::render_samples`] does, with answers on the device.
+    /// Renders a range of a frame's samples as [`Renderer::render_samples`] does, with queries evaluated on the device.
     ///
     /// # Errors
-    /// A range that the renderer refuses, or a device fault; majorants then know nothing of this frame.
+    /// The renderer rejects the range, or the device fails or lacks memory. The majorants are then not updated by this frame.
     pub fn render_samples(
         &mut self,
         renderer: &mut Renderer,
@@ -219,7 +225,7 @@ impl GpuRenderer {
                 progress((done as f64 / paths) as f32);
             }
         };
-        // The film's memory is made ready while the device works on the first band.
+        // The film is allocated while the device works on the first band.
         let mut film = None;
         let tracked = rayon::in_place_scope(|scope| {
             scope.spawn(|_| film = Some(Film::resident(width, height)));
@@ -239,7 +245,7 @@ impl GpuRenderer {
         }
         let seen = self.end_frame(&mut stats)?;
         answers.end()?;
-        // The grid cannot have changed: the renderer was borrowed all the while.
+        // The majorant grid has not changed, since the renderer is borrowed during the frame.
         let known = renderer.absorb(&seen);
         debug_assert!(known);
         let timeline = self.timeline;
@@ -251,7 +257,7 @@ impl GpuRenderer {
         Ok((film, stats))
     }
 
-    /// The memory, taken anew only where the present does not do.
+    /// Returns the memory. Allocates it again only if it is too small for the plan.
     fn reserve(&mut self, plan: Plan) -> Result<&mut Memory, DeviceError> {
         if self.memory.as_ref().is_none_or(|memory| !memory.plan.covers(&plan)) {
             self.memory = None;
@@ -264,7 +270,7 @@ impl GpuRenderer {
         self.memory.as_mut().ok_or(DeviceError::Unsupported { what: "rendering before memory was taken".into() })
     }
 
-    /// Tracks the paths of a band; true when `stop` ended it early.
+    /// Tracks the paths of a band. Returns true if `stop` ended it early.
     fn band(
         &mut self,
         parameters: &FrameParameters,
@@ -294,8 +300,8 @@ impl GpuRenderer {
                 let mut call = stream.launch_builder(&start);
                 call.arg(&wave.parameters).arg(&wave.grid).arg(&wave.watch).arg(&wave.band).arg(&wave.slots).arg(&queue);
                 call.arg(&lists[1]).arg(&camera).arg(&wave.control);
-                // SAFETY: the arguments of `render_start`; the arrays hold `plan.slots()` slots, of which the band has at most as many,
-                // and `plan.queue` collisions, of which each slot queues at most its room.
+                // SAFETY: the arguments of `render_start`; the arrays hold `plan.slots()` slots, which is at least the number of the band's
+                // slots, and `plan.queue` collisions, which bounds what all slots together append.
                 unsafe { launch(&mut call, config) }?;
             } else {
                 let mut call = stream.launch_builder(&advance);
@@ -325,7 +331,7 @@ impl GpuRenderer {
         Ok(false)
     }
 
-    /// Sums to pixels, and these to the host.
+    /// Computes the pixel values of a band from its sums and copies them to the film.
     fn read_film(&mut self, parameters: &FrameParameters, band: BandArgument, film: &mut Film) -> Result<(), DeviceError> {
         let (gpu, kernel) = (self.gpu.clone(), self.film.clone());
         let memory = self.memory()?;
@@ -336,7 +342,7 @@ impl GpuRenderer {
         call.arg(&wave.band).arg(&wave.slots).arg(&out);
         // SAFETY: the arguments of `render_film`; every slot of the band has written its sums.
         unsafe { launch(&mut call, threads(band.pixels as usize, 256)) }?;
-        // SAFETY: the kernel has written as many pixels, and `film` holds a band.
+        // SAFETY: the kernel writes `band.pixels` pixels, and `film` holds a band.
         unsafe { memory.film.copy_from(&gpu, out, band.pixels as usize) }?;
         let ended = gpu.mark()?;
         gpu.synchronize()?;
@@ -345,7 +351,7 @@ impl GpuRenderer {
         Ok(())
     }
 
-    /// What the frame counted and saw.
+    /// Stores the counters of the frame in `stats` and returns the observations of the majorant cells.
     fn end_frame(&mut self, stats: &mut RenderStats) -> Result<CellObservations, DeviceError> {
         let gpu = self.gpu.clone();
         let (seen, control) = self.memory()?.end_frame(&gpu)?;
@@ -366,21 +372,21 @@ impl Timeline {
 }
 
 impl Memory {
-    /// Majorants in force; nothing seen, nothing counted.
+    /// Uploads the majorants and resets the observations and counters.
     fn begin_frame(&mut self, majorants: &[f32], may_miss: &[bool]) -> Result<(), DeviceError> {
         self.write(self.layout.majorants, majorants)?;
         self.write(self.layout.may_miss, may_miss)?;
         self.zero(self.layout.watch, self.layout.control + size_of::<Control>() as u64 - self.layout.watch)
     }
 
-    /// Empties the lists.
+    /// Sets the lengths of the lists to 0.
     fn begin_wave(&self) -> Result<(), DeviceError> {
         self.zero(self.layout.control, std::mem::offset_of!(Control, totals) as u64)
     }
 
     fn end_wave(&mut self, gpu: &Gpu) -> Result<Control, DeviceError> {
         let from = self.at(self.layout.control);
-        // SAFETY: the block holds a `Control` there.
+        // SAFETY: the block holds a `Control` at this offset.
         unsafe { self.control.copy_from(gpu, from, 1) }?;
         gpu.synchronize()?;
         Ok(self.control.values()[0])
@@ -388,7 +394,7 @@ impl Memory {
 
     fn end_frame(&mut self, gpu: &Gpu) -> Result<(CellObservations, Control), DeviceError> {
         let (from, count) = (self.at(self.layout.watch), self.watch.len());
-        // SAFETY: the block holds three values a cell there.
+        // SAFETY: the block holds three values per cell at this offset.
         unsafe { self.watch.copy_from(gpu, from, count) }?;
         let control = self.end_wave(gpu)?;
         let (count, rest) = self.watch.values().split_at(count / 3);
@@ -420,7 +426,7 @@ impl Memory {
         }
     }
 
-    /// The queue of wave `number`: its records beside those of the wave before, whose answers are still to be taken.
+    /// Returns the queue of wave `number`. Its records alternate between two arrays, because the kernel still reads those of the previous wave.
     fn queue(&self, number: usize) -> QueueArgument {
         let l = &self.layout;
         QueueArgument {

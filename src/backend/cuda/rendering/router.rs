@@ -1,4 +1,8 @@
-//! Routes a frame's log-stretch queries on the device, by the rule of [`crate::backend::QueryRouter`], and keeps labels of the traced ones.
+//! Routes the log-stretch queries of a frame on the device by the rule of [`crate::backend::QueryRouter`], and keeps a sample of the traced ones as
+//! training labels.
+//!
+//! Each batch runs four steps: `answer_split` lists the points to predict and the points to trace, the predictor evaluates the first list, the
+//! tracer the second, and `answer_join` writes the values back in the order of the queries.
 
 use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::{ChoiceArgument, ListsArgument, Outputs};
@@ -10,46 +14,54 @@ use crate::trust::Gate;
 use cudarc::driver::{CudaEvent, CudaFunction, PushKernelArg, result};
 use std::sync::Arc;
 
-/// Answers log-stretch queries that lie on the device.
+/// Evaluates log-stretch queries in device memory.
 pub trait DeviceAnswers {
-    /// Enqueues on the work stream: the log-stretch of `count` points (device address `points`, three f32 each, domain coordinates) goes
-    /// to `log_stretch` (f32 each; NaN where there is no value), and who answered to `by` (a byte each: 0 the surrogate, 1 RK4, 2 the
-    /// surrogate where it is not trusted, since the tracing budget was spent).
+    /// Enqueues on the work stream the evaluation of `count` points. All addresses are device addresses.
+    ///
+    /// - `points`: three f32 per point, domain coordinates.
+    /// - `log_stretch`: output, one f32 per point; NaN in missing cells.
+    /// - `by`: output, one byte per point: 0 predicted, 1 traced with RK4, 2 predicted in an untrusted cell because the tracing budget was spent.
     ///
     /// # Errors
-    /// What the device says.
+    /// The device fails or lacks memory.
     fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError>;
 
-    /// Called once all waves of a frame are done, before anything is made of it.
+    /// Called after all waves of a frame, before its results are used.
     ///
     /// # Errors
-    /// What the device says; the frame then counts for nothing.
+    /// The device fails. The caller then discards the frame.
     fn end(&mut self) -> Result<(), DeviceError> {
         Ok(())
     }
 }
 
-/// A surrogate whose memory is on the device.
+/// A predictor on the device: table, network, or both.
 pub trait DevicePredict {
-    /// Enqueues on the work stream: the predicted log-stretch at `count` points (device address `points`, 3 f32 each, unit coordinates;
-    /// those outside the domain are moved to its edge) goes to `out` (f32 each).
+    /// Enqueues on the work stream the prediction of the log-stretch at `count` points. `points` is the device address of the points (three f32 each,
+    /// unit coordinates; points outside the domain are moved to its edge), `out` that of the output (one f32 each).
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     ///
     /// # Safety
-    /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    /// Both addresses are memory of this device with `count` entries, which lives until the work stream has executed the prediction.
     unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError>;
 }
 
-/// A network on the device that learns from what is traced there.
+/// A sink for labels that were traced on the device and stay on it.
 pub trait DeviceLearns {
-    /// Enqueues on the work stream: takes in `count` points (device address `points`, three f32 each, domain coordinates) and what was traced of
-    /// them, but for those that the host may keep.
+    /// Enqueues on the work stream the storage of `count` traced points (device address `points`, three f32 each, domain coordinates). Points that
+    /// the host may keep for validation get no target.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     ///
     /// # Safety
-    /// The memory at all addresses is on this device, holds `count` entries, and lives until the work stream has passed this.
+    /// All addresses are memory of this device with `count` entries, which lives until the work stream has executed this.
     unsafe fn learn_from(&self, points: u64, traced: &Outputs, count: usize) -> Result<(), DeviceError>;
 }
 
-/// Every query traced.
+/// Traces every query.
 pub struct TraceAll<'a>(pub &'a DeviceTracer);
 
 impl DeviceAnswers for TraceAll<'_> {
@@ -57,7 +69,7 @@ impl DeviceAnswers for TraceAll<'_> {
         let gpu = self.0.gpu();
         let doing = DeviceError::driver("filling device memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
-        // SAFETY: the renderer's queue holds `count` entries at each address until the next wave, which is behind this on the stream.
+        // SAFETY: the renderer's queue holds `count` entries at each address until the next wave, which comes later on the stream.
         unsafe {
             result::memset_d8_async(by, 1, count, gpu.work().cu_stream()).map_err(&doing)?;
             self.0.trace(points, count, &Outputs { log_stretch, ..Outputs::default() })
@@ -65,34 +77,34 @@ impl DeviceAnswers for TraceAll<'_> {
     }
 }
 
-/// What answers the queries of one frame.
+/// Tracer, predictor and routing for the queries of one frame.
 pub struct FrameQueries<'a> {
-    /// RK4.
+    /// RK4 tracer.
     pub tracer: &'a DeviceTracer,
-    /// Seeds' domain.
+    /// Domain of the seeds.
     pub domain: &'a Domain,
-    /// Where there is no value; none: nowhere.
+    /// Cells whose queries are NaN. `None` if every cell has data.
     pub missing_cells: Option<&'a DeviceMissingCells>,
-    /// Who answers where the gate trusts it; none: RK4 answers everywhere.
+    /// Predictor for trusted cells. `None`: every query is traced.
     pub surrogate: Option<&'a dyn DevicePredict>,
-    /// Who learns from what is traced, on the device; none: nobody does.
+    /// Sink for labels on the device. `None` if the device does not train.
     pub label_sink: Option<&'a dyn DeviceLearns>,
-    /// Where the surrogate is trusted.
+    /// Cells in which the surrogate is trusted.
     pub gate: &'a Gate,
-    /// Device seconds of tracing from which the surrogate answers everywhere.
+    /// Device seconds of tracing after which the surrogate predicts in untrusted cells too. `None`: no limit.
     pub trace_budget: Option<f64>,
-    /// Traced answers that come back as labels: fewer than so many (4,194,304 at most).
+    /// Upper bound (exclusive) on the labels that are read back to the host, at most 4,194,304.
     pub keep: usize,
-    /// Whether arrivals are labels too.
+    /// True if labels include arrival points.
     pub arrivals: bool,
 }
 
-/// Points that are answered together, at most.
+/// Limit on the points of a batch.
 const CHUNK: usize = 1 << 23;
-/// Bytes of a point in the lists.
+/// Bytes per point in the lists.
 const POINT: u64 = 20;
 
-/// Divides waves between surrogate and RK4. Keeps its memory from frame to frame.
+/// Splits the queries of each wave between surrogate and tracer. It reuses its memory between frames.
 pub struct QueryRouter {
     gpu: Arc<Gpu>,
     split: CudaFunction,
@@ -105,9 +117,9 @@ struct Memory {
     points: Buffer<[f32; 3]>,
     places: Buffer<u32>,
     values: Buffer<f32>,
-    /// Where the tracer's points arrive; none until that is asked for.
+    /// Arrival points of the traced queries. `None` until they are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
-    /// Lengths of the surrogate's list, of the tracer's list, and of the labels.
+    /// Lengths of the list to predict, of the list to trace, and of the labels.
     lengths: Buffer<u32>,
     pinned: Pinned<u32>,
 }
@@ -127,10 +139,10 @@ impl Memory {
         })
     }
 
-    /// The lengths, once the work so far is done.
+    /// Waits for the work so far and returns the lengths.
     fn lengths(&mut self, gpu: &Gpu) -> Result<[usize; 3], DeviceError> {
         let from = self.lengths.address();
-        // SAFETY: three lengths lie there.
+        // SAFETY: `lengths` holds three values.
         unsafe { self.pinned.copy_from(gpu, from, 3) }?;
         gpu.synchronize()?;
         let lengths = self.pinned.values();
@@ -139,19 +151,19 @@ impl Memory {
 }
 
 impl QueryRouter {
-    /// Compiles the kernels, or takes them from the cache.
+    /// Compiles the kernels or loads them from the cache.
     ///
     /// # Errors
-    /// What the compiler or the device says.
+    /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
         let kernel = |name| gpu.kernel("answer.cu", &[], name);
         Ok(Self { split: kernel("answer_split")?, join: kernel("answer_join")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// Overwrites the memory between frames with bytes that make NaN and far indices. For tests.
+    /// For tests: fills the memory between frames with bytes that are NaN as floats and out of range as indices.
     ///
     /// # Errors
-    /// What the device says.
+    /// A driver call fails.
     pub fn poison(&mut self) -> Result<(), DeviceError> {
         let Some(memory) = &mut self.memory else { return Ok(()) };
         memory.points.fill_bytes(0xFF)?;
@@ -159,10 +171,10 @@ impl QueryRouter {
         memory.values.fill_bytes(0xFF)
     }
 
-    /// The answers of one frame.
+    /// Prepares the queries of one frame.
     ///
     /// # Errors
-    /// Memory that is not there, or a device fault.
+    /// The device fails or lacks memory.
     pub fn begin<'a>(&'a mut self, queries: FrameQueries<'a>) -> Result<RoutedQueries<'a>, DeviceError> {
         let gpu = self.gpu.clone();
         let memory = match self.memory.take() {
@@ -202,7 +214,7 @@ impl QueryRouter {
     }
 }
 
-/// The answers of one frame, and what was found out on the way.
+/// Evaluation of the queries of one frame, with its labels and times.
 pub struct RoutedQueries<'a> {
     gpu: Arc<Gpu>,
     split: &'a CudaFunction,
@@ -212,7 +224,8 @@ pub struct RoutedQueries<'a> {
     choice: ChoiceArgument,
     _trusted: Option<Buffer<u8>>,
     labels: Labels,
-    /// Begin and end of dividing, then of predicting, of tracing and of putting together, not yet added up.
+    /// Events of the latest batch, not yet added to the times: start and end of the split, start and end of the prediction, end of the tracing,
+    /// end of the join.
     marks: Option<[CudaEvent; 6]>,
     trace_seconds: f64,
     predict_seconds: f64,
@@ -224,17 +237,17 @@ impl RoutedQueries<'_> {
         self.trace_seconds
     }
 
-    /// Device seconds of everything else: dividing the waves, predicting, putting the answers together.
+    /// Device seconds of split, prediction and join so far.
     pub fn predict_seconds(&self) -> f64 {
         self.predict_seconds
     }
 
-    /// The labels that were kept, in unit coordinates: of queries, and of points traced ahead of flights that ended before them.
+    /// Returns the labels in unit coordinates. They include speculative points that no flight used.
     pub fn labels(&mut self) -> Samples {
         self.labels.finish(self.queries.domain)
     }
 
-    /// Adds the latest chunk's times up, whose work is waited for.
+    /// Adds the times of the latest batch. Waits for its work.
     fn add_up(&mut self) -> Result<(), DeviceError> {
         let Some([begun, divided, asked, predicted, traced, joined]) = self.marks.take() else { return Ok(()) };
         let seconds = |from: &CudaEvent, to: &CudaEvent| self.gpu.milliseconds(from, to).map(|ms| f64::from(ms) * 1e-3);
@@ -245,7 +258,7 @@ impl RoutedQueries<'_> {
         Ok(())
     }
 
-    /// Answers at most as many points as the lists hold.
+    /// Evaluates a batch of points, at most as many as the lists hold.
     fn chunk(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         self.add_up()?;
         let gpu = self.gpu.clone();
@@ -272,14 +285,14 @@ impl RoutedQueries<'_> {
         let [predicted, traced, stored] = self.memory.lengths(&gpu)?;
         let asked = gpu.mark()?;
         if let Some(surrogate) = self.queries.surrogate {
-            // SAFETY: the lists hold as many entries at their front; what uses their memory next is behind this on the stream.
+            // SAFETY: the front of each list holds `predicted` entries; the next use of the memory comes later on the stream.
             unsafe { surrogate.predict(lists.points, predicted, lists.values) }?;
         }
         let answered = gpu.mark()?;
         let back = (capacity - traced) as u64;
         let arrival = if lists.arrivals == 0 { 0 } else { lists.arrivals + 12 * back };
         let out = Outputs { log_stretch: lists.values + 4 * back, arrival, ..Outputs::default() };
-        // SAFETY: as above, at their back.
+        // SAFETY: as above, with `traced` entries at the back of each list.
         unsafe { self.queries.tracer.trace(lists.points + 12 * back, traced, &out) }?;
         let tracing = gpu.mark()?;
         if let Some(label_sink) = self.queries.label_sink {
@@ -293,7 +306,7 @@ impl RoutedQueries<'_> {
         let (predicted, traced) = (predicted as u32, traced as u32);
         let mut call = stream.launch_builder(self.join);
         call.arg(&lists).arg(&predicted).arg(&traced).arg(&log_stretch).arg(&labels);
-        // SAFETY: the arguments of `answer_join`; the lists are as long as it is told, the places within `count`.
+        // SAFETY: the arguments of `answer_join`; the lists have the given lengths, and their places are below `count`.
         unsafe { launch(&mut call, threads((predicted + traced) as usize, 256)) }?;
         self.marks = Some([begun, divided, asked, answered, tracing, gpu.mark()?]);
         Ok(())

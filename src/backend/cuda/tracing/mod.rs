@@ -1,4 +1,4 @@
-//! Seeds on the GPU: sorted by cell, traced in one batch, and tables of traced nodes.
+//! Tracing on the GPU: seeds are sorted by cell and traced in batches. Also the table surrogate, whose nodes are traced seeds.
 
 mod sort;
 mod table;

@@ -1,4 +1,4 @@
-//! Sorts points by cell along a Morton curve, so that neighbouring threads read neighbouring memory.
+//! Sorts points by cell along a Morton curve (Morton 1966) with a counting sort, so that neighbouring threads read neighbouring memory.
 
 use crate::backend::cuda::layout::SortFrame;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
@@ -99,7 +99,7 @@ impl Sorter {
     }
 
     fn scratch(&mut self, count: usize, buckets: usize) -> Result<&mut Scratch, DeviceError> {
-        // A memory that is too small is freed first, so that both never need room together.
+        // Freed first, so that old and new memory are never allocated together.
         let scratch = match self.scratch.take().filter(|s| s.capacity >= count && s.counts.len() >= buckets) {
             Some(scratch) => scratch,
             None => {

@@ -1,4 +1,6 @@
-//! The table surrogate on the device: traced at regular nodes in one sweep, looked up there.
+//! The table surrogate on the device: log-stretch traced at the nodes of a regular grid, with multilinear interpolation in between.
+//!
+//! The seeds are generated brick by brick (8^3 or 8^2 nodes), so that neighbouring threads trace neighbouring seeds.
 
 use crate::backend::cuda::layout::{Outputs, TableArgument, TableFrame};
 use crate::backend::cuda::tracing::sort::Sorter;
@@ -19,25 +21,25 @@ pub struct DeviceTable {
     bricks: CudaFunction,
     mend: CudaFunction,
     lookup: CudaFunction,
-    /// Memory for seeds of one part of the sweep.
+    /// Memory for the seeds of one part of the grid.
     scratch: Sorter,
 }
 
-/// Nodes of a brick's edge in `table_bricks`.
+/// Nodes along the edge of a brick in `table_bricks`.
 const EDGE: usize = 8;
 
 impl DeviceTable {
-    /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
+    /// Traces every node. In two dimensions, the number of nodes along z is ignored. Along the other axes it is at least 2.
     ///
     /// # Errors
-    /// A table that does not fit, or has more nodes than 32 bits can count.
+    /// The table has more nodes than 32 bits can count, or the device fails or lacks memory.
     pub fn trace(tracer: &DeviceTracer, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
         let mut table = Self::empty(tracer.gpu(), domain, nodes)?;
         table.retrace(tracer)?;
         Ok(table)
     }
 
-    /// A copy of a table on the host.
+    /// Uploads a table of the host.
     ///
     /// # Errors
     /// As for [`Self::trace`].
@@ -48,7 +50,7 @@ impl DeviceTable {
         Ok(copy)
     }
 
-    /// A table of the same nodes with these values.
+    /// Creates a table with the same nodes and the values of `table`.
     ///
     /// # Errors
     /// The device fails or lacks memory.
@@ -67,7 +69,7 @@ impl DeviceTable {
         &self.gpu
     }
 
-    /// Its values unset.
+    /// Creates a table whose values are uninitialised.
     fn empty(gpu: &Arc<Gpu>, domain: &Domain, nodes: [usize; 3]) -> Result<Self, DeviceError> {
         let dimensions = domain.dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|k| if k < dimensions { nodes[k].max(2) } else { 1 });
@@ -86,7 +88,10 @@ impl DeviceTable {
         })
     }
 
-    /// Traces every node anew, after the window has slid. Waits for the result.
+    /// Traces every node again, after the window has slid. Waits for the result.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     pub fn retrace(&mut self, tracer: &DeviceTracer) -> Result<(), DeviceError> {
         let nodes = self.frame.nodes.map(|n| n as usize);
         let [bricks_x, bricks_y, bricks_z] = nodes.map(|n| n.div_ceil(EDGE));
@@ -100,7 +105,7 @@ impl DeviceTable {
             let count = (all - first).min(most);
             let seeds = self.scratch.buffer(count)?;
             let (from, n) = (first as u64, count as u32);
-            // SAFETY: arguments as declared in table.cu; `seeds` has room for `count` entries, and `values` for every node.
+            // SAFETY: arguments as declared in table.cu; `seeds` holds `count` entries, and `values` holds every node.
             unsafe {
                 let mut call = stream.launch_builder(&self.bricks);
                 launch(call.arg(&self.frame).arg(&x).arg(&y).arg(&from).arg(&n).arg(&seeds), threads(count, 256))?;
@@ -117,7 +122,7 @@ impl DeviceTable {
         let mut count = [0u32];
         odd.read(&mut count)?;
         self.not_finite = count[0] as usize;
-        // Half as large as the table of a fine grid, and not needed before the next slide.
+        // Freed until the next slide, because for a fine grid it is half as large as the table.
         self.scratch.release();
         Ok(())
     }
@@ -126,15 +131,18 @@ impl DeviceTable {
     pub fn nodes(&self) -> [usize; 3] {
         self.frame.nodes.map(|n| n as usize)
     }
-    /// Nodes whose trace was not finite; they hold 0.
+    /// Number of nodes whose traced value is not finite. They hold 0.
     pub fn not_finite(&self) -> usize {
         self.not_finite
     }
-    /// Address of the values.
+    /// Device address of the values.
     pub fn address(&self) -> u64 {
         self.values.address()
     }
-    /// The values, brought back while other work goes on.
+    /// Reads the values back, while later work continues on the device.
+    ///
+    /// # Errors
+    /// The device fails or lacks pinned memory.
     pub fn values(&self) -> Result<Vec<f32>, DeviceError> {
         self.gpu.read_behind(&self.values, self.values.len())
     }
@@ -150,7 +158,7 @@ impl DevicePredict for DeviceTable {
         let stream = self.gpu.work();
         let mut call = stream.launch_builder(&self.lookup);
         call.arg(&table).arg(&points).arg(&n).arg(&out);
-        // SAFETY: the caller's, and the arguments are as declared in table.cu.
+        // SAFETY: arguments as declared in table.cu; the caller guarantees the addresses.
         unsafe { launch(&mut call, threads(count, 256)) }
     }
 }

@@ -1,4 +1,6 @@
-//! Tracing on the device: seeds and results are at device addresses. Seeds in a window of snapshots are sorted by cell first.
+//! Tracing on the device: RK4 of each path and its variational equation, or central differences (Shadden et al. 2005).
+//!
+//! Seeds and results are at device addresses. In a window of snapshots, seeds are sorted by cell first ([`Sorter`]).
 
 use crate::backend::cuda::layout::{ClosedData, DeviceReal, Outputs, ResultPolicy, Words, words};
 use crate::backend::cuda::tracing::sort::{MAX_POINTS, SortCells, Sorter};
@@ -184,7 +186,7 @@ impl DeviceTracer {
     /// # Errors
     /// Error of the driver.
     pub fn resources(&self) -> Result<(i32, i32), DeviceError> {
-        let doing = DeviceError::driver("asking for a kernel's resources");
+        let doing = DeviceError::driver("querying the resources of a kernel");
         let kernel = if self.cells.is_some() { &self.sorted } else { &self.plain };
         Ok((kernel.num_regs().map_err(&doing)?, kernel.local_size_bytes().map_err(&doing)?))
     }

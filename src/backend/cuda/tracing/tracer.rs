@@ -1,4 +1,4 @@
-//! A slide's flow map on the GPU, for seeds on the host and on the device.
+//! Flow map of a slide on the GPU, for seeds on the host (in batches) and for seeds on the device.
 
 use crate::backend::BackendError;
 use crate::backend::cuda::layout::Outputs;
@@ -8,23 +8,23 @@ use crate::flow::{Extras, FlowMap, MissingCells, Precision, Traced, Tracer, Velo
 use crate::surrogate::Trace;
 use std::sync::{Arc, Mutex, PoisonError};
 
-/// Seeds that go over at once, at most: bounds the memory of a call.
+/// Limit on the seeds of a batch, to bound the memory of a call.
 const BATCH: usize = 1 << 22;
-/// Bytes of one, with all that comes back of it.
+/// Bytes per seed, with all its results.
 const SEED: u64 = 76;
 
 /// A flow map on the GPU.
 pub struct CudaTracer {
     device: DeviceTracer,
-    /// The same flow map on the CPU, which checks the settings and chooses the number of steps.
+    /// The same flow map on the CPU. It validates the settings and selects the number of steps.
     host: Box<dyn Tracer>,
     missing_cells: Option<DeviceMissingCells>,
     double: bool,
-    /// One call at a time.
+    /// Memory of a batch. The lock admits one call at a time.
     room: Mutex<Option<Room>>,
 }
 
-/// Memory for one batch.
+/// Device memory for one batch.
 struct Room {
     capacity: usize,
     extras: Extras,
@@ -37,10 +37,10 @@ struct Room {
 }
 
 impl CudaTracer {
-    /// A tracer of `map` for seeds at `t0`.
+    /// Creates a tracer of `map` for seeds at the start time `t0`. Uploads the snapshots that are not on the device yet.
     ///
     /// # Errors
-    /// A flow map that the CPU's tracer refuses too; a device that fails or lacks memory.
+    /// The flow map is invalid, or the device fails or lacks memory.
     pub fn new(
         store: &SnapshotStore,
         gpu: &Arc<Gpu>,
@@ -68,12 +68,12 @@ impl CudaTracer {
         &*self.host
     }
 
-    /// The flow map on the CPU alone.
+    /// Returns the flow map on the CPU and frees that on the GPU.
     pub fn into_host(self) -> Box<dyn Tracer> {
         self.host
     }
 
-    /// The cells in which no particle can start, on the device; `None` if there are none.
+    /// The cells in which no particle can start, on the device. `None` if every cell has data.
     pub fn missing_cells(&self) -> Option<&DeviceMissingCells> {
         self.missing_cells.as_ref()
     }
@@ -92,7 +92,7 @@ impl Trace for CudaTracer {
         let most = seeds.len().min(batch);
         let fits = |r: &Room| r.capacity >= most && (r.extras.arrival || !extras.arrival) && (r.extras.jacobian || !extras.jacobian);
         if !room.as_ref().is_some_and(fits) {
-            // The old one goes first, so that both never need memory together.
+            // Freed first, so that old and new memory are never allocated together.
             *room = None;
             let capacity = most.next_power_of_two().max(1 << 12);
             let what = "a batch of seeds";
@@ -120,7 +120,7 @@ impl Trace for CudaTracer {
                 arrival: arrival.map_or(0, Buffer::address),
                 jacobian: jacobian.map_or(0, Buffer::address),
             };
-            // SAFETY: every buffer holds `capacity` entries, at least as many as the part, and reading them below waits for the stream.
+            // SAFETY: every buffer holds `capacity` entries, which is at least `part.len()`, and the reads below wait for the stream.
             unsafe { self.device.trace(room.seeds.address(), part.len(), &addresses)? };
             room.log_stretch.read(&mut out.log_stretch[part.clone()])?;
             room.lived.read(&mut out.lived[part.clone()])?;

@@ -1,10 +1,12 @@
-//! The velocity window on the GPU: one upload for each snapshot, held for as long as a window needs it.
+//! The velocity window on the GPU: each snapshot is uploaded once and kept while a window needs it.
 
 pub(super) mod grid;
 mod missing_cells;
 mod prefetch;
+mod snapshot;
 mod store;
 mod uploader;
 
 pub use missing_cells::DeviceMissingCells;
-pub use store::{DeviceSnapshot, DeviceWindow, SnapshotStore};
+pub use snapshot::DeviceSnapshot;
+pub use store::{DeviceWindow, SnapshotStore};

@@ -1,11 +1,10 @@
-//! The queue of snapshots on their way to the device: those that a window needs now come first, then those that later windows will need, in the order in
-//! which they are read.
+//! Upload queue of snapshots. Snapshots that a window needs now come first. Those of later windows follow, in the order in which they are read.
 
 use crate::field::Snapshot;
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 
-/// Snapshots to upload, and what `T` holds of those that are uploaded and not yet taken.
+/// Snapshots to upload, and the device copies `T` of those that are uploaded but not yet taken by a window.
 #[derive(Debug)]
 pub(super) struct PrefetchQueue<T> {
     entries: VecDeque<Entry<T>>,
@@ -13,7 +12,7 @@ pub(super) struct PrefetchQueue<T> {
 
 #[derive(Debug)]
 struct Entry<T> {
-    /// Weak, so that a snapshot that no window wants after all is not kept for it.
+    /// Weak, so that the queue does not keep a snapshot alive that no window needs any more.
     host: Weak<Snapshot>,
     is_needed: bool,
     stage: Stage<T>,
@@ -50,12 +49,13 @@ impl<T> PrefetchQueue<T> {
         }
     }
 
-    /// The next needed snapshot to upload; it counts as uploading from then on.
+    /// Starts the upload of the next needed snapshot. `None` if no needed snapshot waits.
     pub(super) fn next_needed(&mut self) -> Option<Arc<Snapshot>> {
         self.begin(|e| e.is_needed)
     }
 
-    /// The next snapshot to upload early, if fewer than `most` are uploaded or uploading and it fits.
+    /// Starts the upload of the next expected snapshot. `None` if `most` of them are uploaded or uploading, if the next one does not fit, or if no
+    /// snapshot waits.
     pub(super) fn next_early(&mut self, most: usize, fits: impl Fn(&Snapshot) -> bool) -> Option<Arc<Snapshot>> {
         if self.entries.iter().filter(|e| !e.is_needed && !matches!(e.stage, Stage::Waiting)).count() >= most {
             return None;
@@ -72,7 +72,7 @@ impl<T> PrefetchQueue<T> {
         Some(snapshot)
     }
 
-    /// Ends the upload of a snapshot. `None`: it failed, and the snapshot leaves the queue.
+    /// Ends the upload of a snapshot. If `uploaded` is `None`, the upload failed, and the snapshot is removed.
     pub(super) fn end(&mut self, snapshot: &Arc<Snapshot>, uploaded: Option<Arc<T>>) {
         let Some(at) = self.find(snapshot) else { return };
         match uploaded {
@@ -81,12 +81,12 @@ impl<T> PrefetchQueue<T> {
         }
     }
 
-    /// Whether a snapshot is being uploaded.
+    /// Returns true while a snapshot is being uploaded.
     pub(super) fn is_uploading(&self, snapshot: &Arc<Snapshot>) -> bool {
         self.find(snapshot).is_some_and(|at| matches!(self.entries[at].stage, Stage::Uploading))
     }
 
-    /// Takes the uploaded snapshots of a window. Everything that was added before the newest of them is forgotten: the window has passed it.
+    /// Takes the uploaded snapshots of a window. Entries before the newest of them are removed, because the window has passed them.
     pub(super) fn take(&mut self, window: &[&Arc<Snapshot>]) -> Vec<Arc<T>> {
         let wanted = |e: &Entry<T>| window.iter().any(|s| std::ptr::eq(e.host.as_ptr(), Arc::as_ptr(s)));
         let count = self.entries.iter().rposition(wanted).map_or(0, |last| last + 1);
@@ -94,7 +94,7 @@ impl<T> PrefetchQueue<T> {
         taken.filter_map(|e| if let Stage::Uploaded(uploaded) = e.stage { Some(uploaded) } else { None }).collect()
     }
 
-    /// Drops what is uploaded; it is uploaded again in its turn.
+    /// Drops the uploaded copies to free device memory. Their snapshots wait again.
     pub(super) fn release(&mut self) {
         self.entries.iter_mut().filter(|e| matches!(e.stage, Stage::Uploaded(_))).for_each(|e| e.stage = Stage::Waiting);
     }
@@ -132,7 +132,7 @@ mod tests {
         assert_eq!(taken.len(), 1);
         assert_eq!(*taken[0], 0.0);
         assert_eq!(upload(&mut queue), Some(2.0), "there is room again");
-        // A window that wants the fourth has passed the second and the third by, and brings the fourth itself.
+        // A window that needs the fourth has passed the second and the third, and uploads the fourth itself.
         assert!(queue.take(&[&s[0], &s[3]]).is_empty());
         assert_eq!(upload(&mut queue), Some(4.0));
         assert_eq!(queue.take(&[&s[3], &s[4]]).len(), 1);
@@ -150,7 +150,7 @@ mod tests {
         assert_eq!(upload(&mut queue), Some(1.0));
         queue.release();
         assert_eq!(upload(&mut queue), Some(1.0), "let go, it comes again");
-        // Passed by while on its way: what arrives is not kept.
+        // The window passes the first during its upload: the copy is not kept.
         let s = snapshots(2);
         let mut queue = PrefetchQueue::<f64>::default();
         s.iter().for_each(|s| queue.expect(s));

@@ -1,49 +1,35 @@
-//! Snapshots on the device. Every snapshot is uploaded once, through one queue: a thread uploads what later windows will need, while the frames of the
-//! present slide are made, and a window uploads what is still missing. A window that slides keeps what it still needs; a snapshot's memory is free again
-//! once no tracer uses it.
+//! Snapshots on the device. Every snapshot is uploaded once, through one queue. A background thread uploads the snapshots of later windows while the
+//! frames of the present slide are computed. A window uploads the snapshots that are still missing. When the window slides, snapshots that it
+//! shares with the previous one stay on the device. The memory of a snapshot is freed when no tracer uses it any more.
+//!
+//! Half-precision velocities are stored as v / scale, with one power of two as the scale of the whole window.
 
 use crate::backend::cuda::window::grid::{Nodes, storage_define};
 use crate::backend::cuda::window::prefetch::PrefetchQueue;
+use crate::backend::cuda::window::snapshot::DeviceSnapshot;
 use crate::backend::cuda::window::uploader::SnapshotUploader;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
+use crate::backend::cuda::{DeviceError, Gpu, Storage, launch, threads};
 use crate::field::{Snapshot, Window};
-use cudarc::driver::{CudaEvent, PushKernelArg};
+use cudarc::driver::PushKernelArg;
 use rayon::prelude::*;
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock, PoisonError, Weak};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Half-precision velocities of the first window are scaled to below this, which leaves later ones room to grow sevenfold.
+/// Peak of the scaled half-precision velocities when a window is encoded. Later snapshots may have a peak seven times as high.
 const HALF_PEAK: f32 = 4096.0;
-/// Largest half-precision velocity that is used, so that changes fit too; beyond it the window is encoded anew.
+/// Largest scaled half-precision velocity. It leaves room for the difference of two; beyond it the window is encoded again.
 const HALF_MAX: f32 = 30_000.0;
-/// Snapshots that come over before a window wants them, at most.
+/// Limit on the snapshots that are uploaded before a window needs them.
 const MAX_PREFETCHED: usize = 2;
-/// And only where they take at most one part in so many of the memory that is left: others' work must not fail for it.
+/// A snapshot is prefetched only if it takes at most 1 / `PREFETCH_SHARE` of the free device memory, so that other allocations do not fail.
 const PREFETCH_SHARE: u64 = 4;
-/// How often memory that others still hold is asked for again, and how long at most: beyond it they give it back, or use it again.
+/// Interval at which the thread checks whether it holds the last reference to an old snapshot, and the time after which it drops its own reference.
 const RETRY: Duration = Duration::from_millis(20);
 const RETRY_LIMIT: Duration = Duration::from_millis(100);
-/// Threads that copy expected snapshots to page-locked memory, at most: as many as keep the bus busy.
+/// Limit on the threads that copy prefetched snapshots to pinned memory. Four saturate the bus.
 const MAX_COPY_THREADS: usize = 4;
-
-/// One snapshot on the device.
-#[derive(Debug)]
-pub struct DeviceSnapshot {
-    /// Holding it keeps its address from being given to another one.
-    pub(in crate::backend::cuda) host: Arc<Snapshot>,
-    /// [`Storage::bytes`] a node.
-    pub(in crate::backend::cuda) nodes: Buffer<u32>,
-    pub(in crate::backend::cuda) storage: Storage,
-    pub(in crate::backend::cuda) scale: f32,
-    /// Whether some node is missing.
-    pub(in crate::backend::cuda) missing: bool,
-    /// When it is there.
-    pub(in crate::backend::cuda) ready: CudaEvent,
-    /// The one that its pairs lead to, once: earlier windows go on reading them.
-    pub(in crate::backend::cuda) next: OnceLock<Weak<Snapshot>>,
-}
 
 /// The snapshots of one window, oldest first.
 #[derive(Debug, Clone)]
@@ -52,7 +38,7 @@ pub struct DeviceWindow {
 }
 
 impl DeviceWindow {
-    /// What kernels need to know of it.
+    /// Description of the nodes for kernels.
     pub(in crate::backend::cuda) fn nodes(&self) -> Nodes {
         let first = self.snapshots.first();
         Nodes {
@@ -68,11 +54,11 @@ impl DeviceWindow {
     }
 }
 
-/// Brings snapshots over and remembers those that are there.
+/// Uploads snapshots and keeps those of the latest window.
 #[derive(Debug)]
 pub struct SnapshotStore {
     shared: Arc<Shared>,
-    /// Brings expected ones; started with the first.
+    /// Uploads expected snapshots. Started with the first of them.
     thread: Mutex<Option<JoinHandle<()>>>,
 }
 
@@ -80,54 +66,54 @@ pub struct SnapshotStore {
 struct Shared {
     gpu: Arc<Gpu>,
     state: Mutex<State>,
-    /// Told of every change that somebody may wait for.
+    /// Notified of every change of `state`.
     changed: Condvar,
-    /// Locked behind `state`, never before it.
+    /// Lock order: `state` before `uploader`.
     uploader: Mutex<SnapshotUploader>,
 }
 
 #[derive(Debug, Default)]
 struct State {
-    /// Those of the latest window.
+    /// Snapshots of the latest window.
     held: Vec<Arc<DeviceSnapshot>>,
     queue: PrefetchQueue<DeviceSnapshot>,
-    /// How the latest window is held: storage and scale. None before the first.
+    /// Storage and scale of the latest window. `None` before the first window.
     form: Option<(Storage, f32)>,
-    /// Host memory that no window needs: giving it back takes milliseconds, which are the thread's as soon as nobody else holds it.
+    /// Old snapshots on the host. Freeing one takes milliseconds, so the thread does it, once it holds the last reference.
     gone: Vec<(Arc<Snapshot>, Instant)>,
     uploaded: u64,
     prefetched: u64,
-    /// Whether the thread is there.
+    /// True if the thread is running.
     helped: bool,
     ended: bool,
 }
 
 impl SnapshotStore {
-    /// Nothing there yet.
+    /// Creates an empty store.
     pub fn new(gpu: &Arc<Gpu>) -> Self {
         let shared =
             Shared { gpu: gpu.clone(), state: Mutex::default(), changed: Condvar::new(), uploader: Mutex::new(SnapshotUploader::new(gpu)) };
         Self { shared: Arc::new(shared), thread: Mutex::new(None) }
     }
 
-    /// Snapshots uploaded over so far.
+    /// Number of snapshots uploaded so far.
     pub fn uploaded(&self) -> u64 {
         self.shared.state().uploaded
     }
 
-    /// Of them, those that were there before a window wanted them.
+    /// Number of snapshots that were on the device before a window needed them.
     pub fn prefetched(&self) -> u64 {
         self.shared.state().prefetched
     }
 
-    /// A snapshot that windows will want, after those expected before: it comes over beside other work, once there is a window and where
-    /// memory allows.
+    /// Announces a snapshot that a later window will need, after all that are already expected. It is uploaded in the background, after the first
+    /// window and if memory allows.
     pub fn expect(&self, snapshot: &Arc<Snapshot>) {
         let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if thread.is_none() {
             let shared = self.shared.clone();
             let started = std::thread::Builder::new().name("ridgewatch-upload".into()).spawn(move || shared.upload_expected());
-            // Without the thread, windows bring their snapshots themselves.
+            // Without the thread, windows upload their snapshots themselves.
             let Ok(started) = started else { return };
             *thread = Some(started);
         }
@@ -137,11 +123,11 @@ impl SnapshotStore {
         self.shared.changed.notify_all();
     }
 
-    /// The window on the device. Brings over what is not there yet and forgets what the window no longer holds. Kernels launched on the
-    /// work stream afterwards see it.
+    /// Returns the window on the device. Uploads its missing snapshots and drops those of earlier windows. Kernels that are launched on the work
+    /// stream afterwards run after the upload.
     ///
     /// # Errors
-    /// [`DeviceError::WindowTooLarge`] with the numbers and the ways out.
+    /// [`DeviceError::WindowTooLarge`] if the window does not fit; other errors of the device.
     pub fn window(&self, window: &Window, storage: Storage) -> Result<DeviceWindow, DeviceError> {
         let result = self.shared.window(window, storage);
         self.shared.changed.notify_all();
@@ -154,7 +140,7 @@ impl Drop for SnapshotStore {
         self.shared.state().ended = true;
         self.shared.changed.notify_all();
         let thread = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner).take();
-        // It ends after the snapshot in its hands.
+        // The thread ends after the upload in progress.
         let _ = thread.map(JoinHandle::join);
     }
 }
@@ -195,7 +181,7 @@ impl Shared {
         state.held = held;
         let mut gone: Vec<Arc<DeviceSnapshot>> = gone;
         if storage == Storage::F16Pairs {
-            // One that leads elsewhere comes over again.
+            // A snapshot whose changes lead to another successor is uploaded again.
             let leads_here = |s: &Arc<DeviceSnapshot>| {
                 let after = wanted.iter().skip_while(|w| !Arc::ptr_eq(w, &s.host)).nth(1);
                 s.next.get().zip(after).is_none_or(|(next, after)| std::ptr::eq(next.as_ptr(), Arc::as_ptr(after)))
@@ -216,7 +202,7 @@ impl Shared {
         if storage != Storage::F32 {
             let peak = missing.iter().map(|s| peak(s)).fold(0.0, f32::max);
             if state.held.is_empty() || peak / scale > HALF_MAX {
-                // A power of two, so that nothing but range is changed.
+                // The scale is a power of two, so that it changes the range but not the rounding.
                 state.held.clear();
                 state.queue.release();
                 missing = fresh(&state);
@@ -226,7 +212,7 @@ impl Shared {
         }
         let needed = |bytes: u64| missing.iter().map(|s| s.nodes.len() as u64 * bytes).sum::<u64>();
         if needed(storage.bytes()) > self.gpu.memory_left() {
-            // What is here early makes room for what is wanted now.
+            // Prefetched snapshots make room for those needed now.
             state.queue.release();
         }
         let left = self.gpu.memory_left();
@@ -241,7 +227,7 @@ impl Shared {
                 left,
             });
         }
-        // What is uploaded from here on has this form, even if the window fails.
+        // All later uploads have this form, even if this window fails.
         state.form = Some((storage, scale));
         missing.iter().for_each(|snapshot| state.queue.need(snapshot));
         while let Some(snapshot) = state.queue.next_needed() {
@@ -263,8 +249,8 @@ impl Shared {
         Ok(DeviceWindow { snapshots })
     }
 
-    /// Writes changes behind the nodes of those that have none yet, on the work stream. Only tracers of windows that go on past a snapshot
-    /// read its changes, so that those of earlier windows, queued or to come, are not disturbed.
+    /// Writes the changes to the next snapshot, on the work stream, for snapshots that have none yet. Only tracers of windows that extend beyond a
+    /// snapshot read its changes, so tracers of earlier windows are not affected.
     fn pair(&self, snapshots: &[Arc<DeviceSnapshot>], storage: Storage) -> Result<(), DeviceError> {
         for (this, next) in snapshots.iter().zip(snapshots.iter().skip(1)) {
             if this.next.get().is_some() {
@@ -273,15 +259,15 @@ impl Shared {
             let kernel = self.gpu.kernel("window.cu", &[storage_define(storage)], "pair_nodes")?;
             let count = this.host.nodes.len();
             let (nodes, after, n) = (this.nodes.address(), next.nodes.address(), count as u64);
-            // SAFETY: both hold as many nodes, in pairs, and were waited for; this one's changes are read behind this launch alone.
+            // SAFETY: both hold `n` nodes in pairs, and the stream has waited for their uploads. The changes are read only after this launch.
             unsafe { launch(self.gpu.work().launch_builder(&kernel).arg(&nodes).arg(&after).arg(&n), threads(count, 256))? };
-            // Told apart by the snapshot that it is; nobody else sets it, under the lock.
+            // Only set here, under the lock, so it is still unset.
             let _ = this.next.set(Arc::downgrade(&next.host));
         }
         Ok(())
     }
 
-    /// The thread: brings what is expected, and gives back the memory of what is gone.
+    /// Body of the thread: uploads expected snapshots and frees the host memory of old ones.
     fn upload_expected(&self) {
         let copiers = (rayon::current_num_threads() / 4).clamp(1, MAX_COPY_THREADS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(copiers).thread_name(|i| format!("ridgewatch-copy-{i}")).build();
@@ -305,11 +291,11 @@ impl Shared {
             drop(state);
             gone.into_iter().filter_map(|(snapshot, _)| Arc::into_inner(snapshot)).for_each(give_back);
             let bring = |(snapshot, form): &(Arc<Snapshot>, _)| pool.install(|| self.upload_early(snapshot, *form));
-            // A panic must not leave a window waiting for what will never come.
+            // After a panic, a window must not wait forever for this upload.
             let there = next.as_ref().and_then(|next| catch_unwind(AssertUnwindSafe(|| bring(next))).ok().flatten());
             state = self.state();
             if let Some((snapshot, form)) = next {
-                // A window may have been encoded anew meanwhile.
+                // A window may have been encoded again in the meantime.
                 let there = there.filter(|_| state.form == Some(form));
                 state.uploaded += u64::from(there.is_some());
                 state.queue.end(&snapshot, there);
@@ -323,14 +309,13 @@ impl Shared {
         if storage != Storage::F32 && peak(snapshot) / scale > HALF_MAX {
             return None;
         }
-        // A failure shows again when the window brings the snapshot itself.
+        // The error is reported when the window uploads the snapshot itself.
         self.upload(snapshot, storage, scale).ok()
     }
 }
 
-/// Gives a snapshot's memory on the host back. The system is busy with that for some twenty milliseconds, and were it told by unmapping alone,
-/// every thread that maps or unmaps memory meanwhile (the film of the frame before, say) would have to wait. So the pages go first, which a
-/// recent Linux does under a lock of this mapping's own.
+/// Frees the host memory of a snapshot. This takes about 20 ms of system time. `munmap` would block every other thread that maps or unmaps memory
+/// during that time. `madvise(MADV_DONTNEED)` frees the pages first; recent Linux kernels lock only this mapping for it.
 fn give_back(snapshot: Snapshot) {
     let mut nodes = snapshot.nodes;
     #[cfg(target_os = "linux")]
@@ -340,17 +325,17 @@ fn give_back(snapshot: Snapshot) {
         let ahead = bytes.align_offset(PAGE);
         let whole = (nodes.capacity() * size_of::<[f32; 4]>()).saturating_sub(ahead) / PAGE * PAGE;
         if whole > 0 {
-            // SAFETY: whole pages inside the vector's own allocation, which reads as zeros from here on and is not read again. What the call
-            // returns does not matter: the memory goes with the vector in any case.
+            // SAFETY: whole pages inside the vector's allocation. They read as zeros afterwards and are not read again. The result of the call does
+            // not matter, since dropping the vector frees the memory in any case.
             unsafe { libc::madvise(bytes.add(ahead).cast(), whole, libc::MADV_DONTNEED) };
         }
     }
     drop(nodes);
 }
 
-/// Largest velocity component.
+/// Returns the largest absolute velocity component.
 fn peak(snapshot: &Snapshot) -> f32 {
-    // The mark of a missing node is no number, and counts for nothing.
+    // Missing nodes are NaN, which `f32::max` ignores.
     let node = |n: &[f32; 4]| n[0].abs().max(n[1].abs()).max(n[2].abs()).max(n[3].abs());
     snapshot.nodes.par_iter().with_min_len(1 << 14).map(node).reduce(|| 0.0, f32::max)
 }

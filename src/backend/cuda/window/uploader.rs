@@ -1,17 +1,20 @@
-//! One snapshot from host to device: through page-locked pieces on the transfer stream, while kernels run on the work stream.
+//! Upload of a snapshot through pinned memory, on the transfer stream, while kernels run on the work stream.
+//!
+//! Two pinned buffers alternate (double buffering): the CPU fills one while the device copies the other. For half-precision storage, a kernel on the
+//! same stream encodes each piece.
 
 use crate::backend::cuda::window::grid::storage_define;
-use crate::backend::cuda::window::store::DeviceSnapshot;
+use crate::backend::cuda::window::snapshot::DeviceSnapshot;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use crate::field::Snapshot;
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
 use rayon::prelude::*;
 use std::sync::{Arc, OnceLock};
 
-/// Nodes of a page-locked piece: 8 MiB.
+/// Nodes of a pinned buffer: 8 MiB.
 const PIECE: usize = 1 << 19;
 
-/// Brings snapshots over, one after the other.
+/// Uploads snapshots one after the other.
 #[derive(Debug)]
 pub(in crate::backend::cuda) struct SnapshotUploader {
     gpu: Arc<Gpu>,
@@ -19,22 +22,25 @@ pub(in crate::backend::cuda) struct SnapshotUploader {
     encode: Option<(Storage, CudaFunction)>,
 }
 
-/// Two page-locked pieces that take turns, and for other storage than f32 their images on the device.
+/// Two alternating pinned buffers and, for half-precision storage, their unencoded copies on the device.
 #[derive(Debug)]
 struct Pieces {
     pinned: [PinnedHostSlice<u32>; 2],
-    /// When the transfer out of each was done.
+    /// End of the last copy from each buffer.
     free: [Option<CudaEvent>; 2],
     images: Option<[Buffer<u32>; 2]>,
 }
 
 impl SnapshotUploader {
-    /// Memory is taken when it is first needed.
+    /// Creates an uploader. It allocates its memory at the first upload.
     pub(in crate::backend::cuda) fn new(gpu: &Arc<Gpu>) -> Self {
         Self { gpu: gpu.clone(), pieces: None, encode: None }
     }
 
-    /// Enqueues the whole snapshot; [`DeviceSnapshot::ready`] tells when it is there. Velocities are divided by `scale`.
+    /// Enqueues the upload of a snapshot, which ends at the event [`DeviceSnapshot::ready`]. Half-precision velocities are divided by `scale`.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
     pub(in crate::backend::cuda) fn upload(
         &mut self,
         snapshot: &Arc<Snapshot>,
@@ -42,11 +48,11 @@ impl SnapshotUploader {
         scale: f32,
     ) -> Result<DeviceSnapshot, DeviceError> {
         let gpu = self.gpu.clone();
-        let doing = DeviceError::driver("bringing a snapshot over");
+        let doing = DeviceError::driver("uploading a snapshot");
         let words = (storage.bytes() / 4) as usize;
         let mut nodes = Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "a snapshot", snapshot.nodes.len() * words)?.read_by(gpu.work());
         if self.pieces.is_none() {
-            // SAFETY: pieces are written before they are read.
+            // SAFETY: the buffers are written before they are read.
             let pinned = || unsafe { gpu.context().alloc_pinned::<u32>(4 * PIECE) }.map_err(&doing);
             self.pieces = Some(Pieces { pinned: [pinned()?, pinned()?], free: [None, None], images: None });
         }
@@ -55,7 +61,7 @@ impl SnapshotUploader {
             self.encode = Some((storage, gpu.kernel("window.cu", &[storage_define(storage)], "encode_nodes")?));
         }
         let Self { pieces: Some(pieces), encode, .. } = self else {
-            return Err(DeviceError::Unsupported { what: "a transfer without page-locked memory".into() });
+            return Err(DeviceError::Unsupported { what: "a transfer without pinned memory".into() });
         };
         if encoded && pieces.images.is_none() {
             let image = || Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "the encoding of snapshots", 4 * PIECE);
@@ -80,14 +86,14 @@ impl SnapshotUploader {
                 (Some(images), Some((_, kernel))) if encoded => {
                     let (from, to) = (images[side].address(), nodes.address_of(at));
                     let (count, inverse) = (part.len() as u64, 1.0 / scale);
-                    // SAFETY: the piece is not written before its event; the image holds a piece, and `nodes` the part from `at` on.
+                    // SAFETY: the pinned buffer is not written before its event; the device copy holds one piece, and `nodes` the part from `at` on.
                     unsafe {
                         images[side].write_behind(0, piece)?;
                         let mut call = gpu.transfer().launch_builder(kernel);
                         launch(call.arg(&from).arg(&count).arg(&inverse).arg(&to), threads(part.len(), 256))?;
                     }
                 }
-                // SAFETY: the piece is not written before its event.
+                // SAFETY: the pinned buffer is not written before its event.
                 _ => unsafe { nodes.write_behind(at, piece)? },
             }
             pieces.free[side] = Some(gpu.transfer().record_event(None).map_err(&doing)?);
