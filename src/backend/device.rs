@@ -2,7 +2,9 @@
 
 #[cfg(feature = "cuda")]
 use super::cuda::{CudaTracer, Gpu, GpuSettings, SnapshotStore, Tuning};
-use super::settings::{DeviceChoice, DeviceSettings, Storage, WhenLost};
+use super::settings::{DeviceChoice, DeviceSettings};
+#[cfg(feature = "cuda")]
+use super::settings::{Storage, WhenLost};
 use super::{BackendError, DeviceError};
 use crate::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 #[cfg(feature = "cuda")]
@@ -94,7 +96,9 @@ impl Device {
     /// # Errors
     /// The flow map is invalid, or the device fails and the settings do not allow the CPU to take over.
     pub fn trace(&self, velocity: &VelocitySource, map: &FlowMap, t0: f64, seeds: &[[f32; 3]]) -> Result<TracedOnce, BackendError> {
-        let (mut traced, mut note) = (Traced::default(), None);
+        let mut traced = Traced::default();
+        #[cfg_attr(not(feature = "cuda"), allow(unused_mut))] // no other device fails
+        let mut note = None;
         let mut begun = Instant::now();
         match self {
             Self::Cpu { .. } => {}

@@ -141,11 +141,13 @@ impl<D: SurrogateDevice> Hybrid<D> {
     }
 
     /// The table, to be changed in place.
+    #[cfg(feature = "cuda")]
     pub(crate) fn table_mut(&mut self) -> Option<&mut D::Table> {
         self.table.as_mut()
     }
 
     /// The network's training, to be moved elsewhere.
+    #[cfg(feature = "cuda")]
     pub(crate) fn training_mut(&mut self) -> Option<&mut D::Training> {
         self.trainer.as_mut().map(|trainer| &mut trainer.training)
     }

@@ -1,6 +1,5 @@
 //! The page of all keys of a scene file, compared with the keys that are read.
 
-use crate::page;
 use ridgewatch::config::{RENAMED, SceneFile};
 use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
@@ -45,7 +44,7 @@ fn text() -> (String, String) {
 /// Dotted keys of the page's tables with the cell of their default.
 fn documented() -> BTreeMap<String, String> {
     let (mut table, mut found) = (String::new(), BTreeMap::new());
-    for line in page("scene.md").lines() {
+    for line in text().0.lines() {
         if line.starts_with('#') {
             table = back_quoted(line).unwrap_or_default().trim_matches(['[', ']']).to_owned();
         } else if line.starts_with("| `") {

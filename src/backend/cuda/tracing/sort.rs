@@ -129,7 +129,7 @@ impl Sorter {
         self.scratch = None;
     }
 
-    /// Address of memory for at most [`MAX_POINTS`] entries `{x, y, z, index as bits}`, which the caller fills.
+    /// Address of memory for at most `MAX_POINTS` entries `{x, y, z, index as bits}`, which the caller fills.
     ///
     /// # Errors
     /// Out of memory.
