@@ -1,14 +1,13 @@
 //! Fused network against burn's stock operations, in one run on the same cores: inference, training steps, and the parts between.
 //!
-//! `cargo bench --bench network` (under a minute). Ratios are of the fastest of alternating runs: what other processes take
-//! away shows in the slower ones.
+//! `cargo bench --bench network` (under a minute). Ratios compare the fastest of alternating runs, which other processes disturb least.
 #![allow(clippy::print_stdout, clippy::unwrap_used, missing_docs)]
 
 use burn::backend::Flex;
 use burn::tensor::{Tensor, TensorData};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Encoding, Fused, Model, Network, NetworkSettings, Objective, Pick, Step, operation_step, stock_step,
+    Architecture, Average, Encoding, Fused, Model, Network, NetworkSettings, Objective, PlannedStep, Step, operation_step, stock_step,
 };
 use std::sync::Arc;
 use std::time::Instant;
@@ -83,16 +82,15 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
             }),
             Box::new(|| {
                 fused.steps(&mut production, &objective, &mut average, |done, _| {
-                    let pick = Pick::Random { seed: 1, counter: done * training as u64, among: None, hold_out: false };
-                    (done < 4).then_some(Step {
-                        samples: &samples,
-                        pick,
+                    let planned = PlannedStep {
                         count: training,
+                        drawn: Some((1, done * training as u64)),
+                        hold_out: false,
                         rate: 1e-3,
                         average_share: 0.01,
                         lazy: true,
-                        base: None,
-                    })
+                    };
+                    (done < 4).then_some(Step::of(&planned, &samples, None, None))
                 });
             }),
         ],
@@ -109,7 +107,7 @@ fn measure(name: &str, settings: &NetworkSettings, dimensions: usize, inference:
 }
 
 fn main() {
-    // `cargo bench` passes `--bench`; any other word selects the cases whose name contains it.
+    // `cargo bench` passes `--bench`; any other word selects the cases whose names contain it.
     let wanted = std::env::args().skip(1).find(|word| !word.starts_with('-')).unwrap_or_default();
     let default = NetworkSettings::default();
     let published = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, ..default.clone() };

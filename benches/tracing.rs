@@ -18,7 +18,7 @@ use std::time::Instant;
 const ROUNDS: usize = 5;
 
 fn map(tau: f64, steps: usize, precision: Precision, boundary: Boundary) -> FlowMap {
-    FlowMap { precision, gap: 1e-3, boundary, ..FlowMap::tangent(tau, steps) }
+    FlowMap { precision, difference_step: 1e-3, boundary, ..FlowMap::tangent(tau, steps) }
 }
 
 /// Uniform points in no order.

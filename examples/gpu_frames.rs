@@ -1,15 +1,14 @@
-//! Frames of the standard easy turbulence on a GPU, every query traced: frames a second, where the time goes, what a new snapshot costs.
-//! Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+//! Measures frames of the standard easy turbulence on a GPU with every query traced: frame rate, time by stage, cost of a new snapshot.
+//! Prints a table; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` sets another picture or grid.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::engine::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, Traced, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, Gpu, GpuRenderer, GpuSettings, LookAhead, SnapshotStore, Timeline, TraceAll, Tuning};
 use ridgewatch::field::Window;
 use ridgewatch::field::turbulence::Turbulence;
-use ridgewatch::flow::{
-    Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
-};
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
+use ridgewatch::surrogate::Trace;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -24,32 +23,33 @@ fn map(steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
     }
 }
 
-/// The scene that a bare file of this field would get, at this size.
-fn scene(tracer: &dyn Tracer, width: usize, height: usize, seed: u64) -> Scene {
+/// Default scene of a file of this field, at this size.
+fn scene(tracer: &CudaTracer, width: usize, height: usize, seed: u64) -> Scene {
+    let domain = tracer.host().domain();
     let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
     let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
-    let seeds: Vec<[f32; 3]> = unit.map(|u| tracer.domain().from_unit(u)).collect();
+    let seeds: Vec<[f32; 3]> = unit.map(|u| domain.from_unit(u)).collect();
     let mut probes = ridgewatch::flow::Traced::default();
-    tracer.trace(&seeds, Extras::default(), &mut probes);
+    tracer.trace(&seeds, Extras::default(), &mut probes).unwrap();
     let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / TAU as f32).collect();
     let settings = RenderSettings { width, height, ..RenderSettings::default() };
-    let mut scene = Scene::assemble(tracer.domain(), None, None, None, settings, seed);
+    let mut scene = Scene::assemble(domain, None, None, None, settings, seed);
     scene.transfer = TransferSettings::default().scaled_to(&ftle);
     scene
 }
 
 /// A renderer whose majorants have settled.
 fn settled(device: &mut GpuRenderer, tracer: &CudaTracer, scene: Scene) -> Renderer {
-    let mut renderer = Renderer::new(scene, tracer.domain(), TAU).unwrap();
+    let mut renderer = Renderer::new(scene, tracer.host().domain(), TAU).unwrap();
     for frame in 0..6 {
-        device.render_samples(&mut renderer, 1 << 40 | frame, 0..1, &mut Traced(tracer.device()), None, &NEVER).unwrap();
+        device.render_samples(&mut renderer, 1 << 40 | frame, 0..1, &mut TraceAll(tracer.device()), None, &NEVER).unwrap();
     }
     renderer
 }
@@ -95,7 +95,7 @@ fn main() {
         let mut frames: Vec<(f64, Timeline, u64)> = (0..9)
             .map(|frame| {
                 let began = Instant::now();
-                let (_, stats) = device.render_samples(&mut renderer, frame, 0..1, &mut Traced(tracer.device()), None, &NEVER).unwrap();
+                let (_, stats) = device.render_samples(&mut renderer, frame, 0..1, &mut TraceAll(tracer.device()), None, &NEVER).unwrap();
                 (began.elapsed().as_secs_f64(), device.timeline(), stats.queries)
             })
             .collect();
@@ -119,7 +119,7 @@ fn main() {
         }
     }
 
-    // A slide: one more snapshot, brought over and taken into the window, then a frame.
+    // A slide: uploads one more snapshot, adds it to the window, and renders a frame.
     let _ = window.push(next).unwrap();
     let tracer = CudaTracer::new(&store, &gpu, source, &map(22), 0.0, Tuning::default()).unwrap();
     device = device.with_look_ahead(LookAhead { camera: 4, shadow: 8 });
@@ -129,7 +129,7 @@ fn main() {
     let slid = CudaTracer::new(&store, &gpu, VelocitySource::Window(Arc::new(window)), &map(22), 1.0, Tuning::default()).unwrap();
     let seconds = began.elapsed().as_secs_f64();
     renderer.window_slid();
-    device.render_samples(&mut renderer, 1, 0..1, &mut Traced(slid.device()), None, &NEVER).unwrap();
+    device.render_samples(&mut renderer, 1, 0..1, &mut TraceAll(slid.device()), None, &NEVER).unwrap();
     println!(
         "\nA new snapshot, brought on the slide: {:.1} ms until the tracer of the slid window stands, {:.1} ms with the first frame on it (a frame: {:.1} ms); \
          memory {} MiB before, {} MiB after",

@@ -1,25 +1,25 @@
-//! Gated frames of the standard easy turbulence on a GPU, in the loop that `ridgewatch replay` runs: a traced table, or a network that is trained
-//! between the frames, answers where it is trusted, RK4 elsewhere. Frames a second, where the time goes, what is traced, what error is stated;
-//! what 64 accumulated frames are worth against many samples of another seed, beside 64 reference frames; and what a sliding window does to the
-//! traced share, with the device's memory over a thousand frames, and what checkpoints cost their length. Prints; needs a GPU.
-//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [published] [table.key=value]`, where keys are those of a scene.
-//! `published`: frames with the smallest of the published networks.
+//! Measures gated frames of the standard easy turbulence on a GPU, in the loop of `ridgewatch replay`. A traced table, or a network trained between
+//! the frames, answers in trusted cells, and RK4 elsewhere. Prints tables; needs a GPU.
+//!
+//! - Frame rate, time by stage, traced share and stated error.
+//! - PSNR of 64 accumulated frames against many samples of another seed, compared with 64 reference frames.
+//! - Effect of a sliding window on the traced share, device memory over a thousand frames, and cost of checkpoints.
+//!
+//! `-- WIDTH HEIGHT NX NY NZ SAMPLES [tables] [networks] [slides] [published] [table.key=value]`, with the keys of a scene. `published` measures
+//! frames with the smallest of the published networks.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
+use ridgewatch::backend::cuda::{Gpu, GpuSettings};
+use ridgewatch::backend::{CudaDevice, Device, Storage, TracedOnce, WhenLost, stratified_points};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{CudaAccelerator, Gpu, GpuSettings};
-use ridgewatch::engine::{
-    CheckpointRecord, Device, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, Storage, run, stratified_points, trace,
-};
-use ridgewatch::flow::Extras;
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, Method, TransferSettings};
+use ridgewatch::run::{CheckpointRecord, Event, FrameRecord, RunOptions, RunReport, Settings, Setup, run};
 use ridgewatch::surrogate::Kind;
 use ridgewatch::surrogate::network::Encoding;
 use ridgewatch::trust::Strata;
 use std::path::Path;
-use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
@@ -27,18 +27,18 @@ const FRAMES: usize = 64;
 const WARM_UP: usize = 8;
 /// Rows before those of networks.
 const NETWORKS: usize = 3;
-/// In which a network is trained up.
+/// Frames in which a network is trained before the measurement.
 const LEARNING: usize = 240;
-/// The first is where all that is ever taken is; the others have a thousand frames.
+/// Number of slides. All memory is allocated by the end of the first one; the others have a thousand frames.
 const SLIDES: usize = 6;
 const FRAMES_A_SLIDE: usize = 200;
-/// Most that free memory may change by over them, as the driver sees it: two of the chunks in which its pool grows.
+/// Maximum change of free memory over these frames, as the driver reports it: two growth steps of its pool.
 const FLAT: usize = 64 << 20;
 /// Seconds between two checkpoints; a run beside a simulation has 30.
 const CHECKPOINT_SECONDS: f64 = 5.0;
 /// Frames of a slide whose traced share is shown, from 0.
 const SHOWN: [usize; 8] = [0, 1, 2, 4, 9, 24, 99, 199];
-/// A network of 71 MB: few levels, the finest as dense as its table can hold; and batches that keep the device busy.
+/// A network of 71 MB with few levels, the finest as dense as its table allows, and batches that keep the device busy.
 const NETWORK: [&str; 6] = [
     "network.levels=3",
     "network.features=4",
@@ -48,7 +48,7 @@ const NETWORK: [&str; 6] = [
     "network.batch=262144",
 ];
 
-/// `frames` pictures of a scene after its warm-up, added up, and their records.
+/// Sum of `frames` pictures of a scene after its warm-up, and their records.
 fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
     let mut sum = Film::new(settings.render.width, settings.render.height);
     let mut records = Vec::new();
@@ -67,14 +67,14 @@ fn pictures(settings: &Settings, device: &Device) -> (Film, Vec<FrameRecord>) {
     (sum, records)
 }
 
-/// One transfer function for all pictures, scaled to this field as a bare file's would be.
+/// Transfer function for all pictures, scaled to this field as by default.
 fn colours(settings: &Settings, device: &Device) -> TransferSettings {
     let mut setup = Setup::new(settings.clone()).unwrap();
-    let slide = setup.feed.next_slide().unwrap().unwrap();
-    let (tracer, _) = device.tracer(slide.velocity, &setup.plan.map, slide.time).unwrap();
+    let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
     let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
-    let labels = trace(&*tracer, &points, Extras::default()).samples.log_stretch;
-    let ftle: Vec<f32> = labels.iter().map(|s| s / tracer.tau() as f32).collect();
+    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
+    let TracedOnce { flow, traced, .. } = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).unwrap();
+    let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
     TransferSettings::default().scaled_to(&ftle)
 }
 
@@ -89,14 +89,14 @@ fn median_and_most(records: &[FrameRecord], value: impl Fn(&FrameRecord) -> f64 
     format!("{:.1} ({:.1})", median(records, value), records.iter().map(value).fold(f64::NEG_INFINITY, f64::max))
 }
 
-/// Milliseconds of each frame but the first, from record to record: with what happens between frames, without slides and waiting for them.
+/// Milliseconds of each frame except the first, from record to record: includes the work between frames, but no slides and no waiting for them.
 fn lengths(records: &[&FrameRecord]) -> Vec<f64> {
     let between =
         |pair: &[&FrameRecord]| pair[1].seconds.elapsed - pair[0].seconds.elapsed - pair[1].seconds.slide - pair[1].seconds.waiting;
     records.windows(2).map(|pair| 1e3 * between(pair)).collect()
 }
 
-/// What checkpoints cost: the frames during which one was under way beside the others.
+/// Cost of checkpoints: frames during a checkpoint compared with other frames.
 fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
     let lengths = lengths(records);
     let frames = || lengths.iter().zip(&records[1..]);
@@ -107,7 +107,7 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
         format!("{} frames, median {:.1} ms, longest {:.1} ms", some.len(), some[some.len() / 2], some[some.len() - 1])
     };
     let ended: Vec<&CheckpointRecord> = records.iter().filter_map(|r| r.checkpoint.as_ref()).filter(|c| c.bytes.is_some()).collect();
-    let waited_for = ended.iter().filter(|c| !c.behind).count();
+    let waited_for = ended.iter().filter(|c| !c.asynchronous).count();
     let most = |value: fn(&CheckpointRecord) -> f64| ended.iter().map(|c| value(c)).fold(0.0, f64::max);
     format!(
         "{} checkpoints of {:.0} MB, {waited_for} of them waited for, {} postponed: the loop stood still for {:.1} ms at most, written after {:.2} s at most; with one under way: {}; others: {}",
@@ -121,7 +121,7 @@ fn checkpoints(records: &[&FrameRecord], report: &RunReport) -> String {
     )
 }
 
-/// Frames that are traced, and that a network of 8 layers of 256 above frequencies answers, which is trained between them.
+/// Measures traced frames, and frames answered by a network of 8 layers of 256 on a frequency encoding that is trained between them.
 fn published(mut scene: Settings, device: &Device, size: &str) {
     (scene.network.encoding, scene.network.hidden_layers, scene.network.width, scene.network.batch) =
         (Encoding::Frequency, 8, 256, 1 << 16);
@@ -165,7 +165,8 @@ fn main() {
     let value = |i: usize, default: usize| given.get(i).copied().unwrap_or(default);
     let nodes = [value(2, 600), value(3, 192), value(4, 192)];
     let gpu = Gpu::open(0, &GpuSettings::default()).unwrap_or_else(|why| panic!("nothing is measured: {why}"));
-    let device = Device::Gpu { gpu: Arc::new(CudaAccelerator::new(gpu.clone(), Storage::F32)), may_fall_back: false };
+    let device = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
+    let device = Device::Cuda(device);
     let text = include_str!("../configs/turbulence_easy.toml");
     let mut keys = vec!["flow.steps=22".to_owned()];
     keys.extend(NETWORK.map(str::to_owned));
@@ -196,7 +197,7 @@ fn main() {
         truth.seed,
         frame.seconds.total,
         frame.queries,
-        1e-6 * (frame.traced + frame.traced_ahead) as f64 / frame.seconds.trace
+        1e-6 * (frame.traced + frame.speculative_traces) as f64 / frame.seconds.trace
     );
 
     let begin = |block: &str, after: &str| {
@@ -235,8 +236,8 @@ fn main() {
         let (sum, records) = pictures(&scene, &device);
         let psnr = compare_films(&sum, &reference, scene.render.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
         let ms = |of: fn(&FrameRecord) -> f64| 1e3 * median(&records, of);
-        let over = records.iter().filter(|r| r.over_tolerance.is_some()).count();
-        // Adding the pictures up is the measurement's time, not the loop's.
+        let over = records.iter().filter(|r| r.tolerance_excess.is_some()).count();
+        // Adding the pictures is not part of the loop's time.
         let seconds: f64 = records.iter().map(|r| r.seconds.total).sum();
         println!(
             "| {name} | {:.1} | {} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {:.1} | {} | {:.0} | {:.1} % | {:.1} % | {:.4} | {over} frames | {:.1} | {psnr:.1} |",
@@ -252,12 +253,12 @@ fn main() {
             median(&records, |r| r.training.as_ref().map_or(0.0, |learned| learned.steps as f64)),
             median(&records, |r| r.queries as f64),
             100.0 * median(&records, |r| r.traced_share),
-            100.0 * median(&records, |r| r.trusted_share),
-            median(&records, |r| r.trusted.map_or(0.0, |e| e.optical_rms)),
+            100.0 * median(&records, |r| r.trusted_volume),
+            median(&records, |r| r.trusted_error.map_or(0.0, |e| e.optical_rms)),
             median(&records, |r| r.surrogate_psnr.unwrap_or(f64::INFINITY))
         );
         for record in &records {
-            assert!(record.device.starts_with("cuda") && record.traced_ahead > 0, "{:?}", record.warnings);
+            assert!(record.device.starts_with("cuda") && record.speculative_traces > 0, "{:?}", record.warnings);
             assert!(!is_network || record.training.as_ref().is_some_and(|learned| learned.device_seconds.is_some()), "trained there");
         }
     }
@@ -308,7 +309,7 @@ fn main() {
             let shown = SHOWN.map(|n| format!("{:.1} %, {:.0}", 100.0 * frames[n].0.traced_share, 1e3 * frames[n].0.seconds.total));
             println!("| {name} | {} | {} | {:.0} |", slide + 1, shown.join(" | "), 1e3 * frames[0].0.seconds.slide);
         }
-        // From the second slide on, everything that is ever taken has been.
+        // All memory is allocated before the second slide.
         let settled = &seen[FRAMES_A_SLIDE..];
         let taken = || settled.iter().map(|s| s.1 >> 20);
         let free = || settled.iter().map(|s| s.2);

@@ -1,10 +1,10 @@
-//! The network on a GPU: what it predicts and trains in a second, and what it knows after some seconds of tracing and training from
-//! nothing; as blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
+//! Measures the network on a GPU: rates of prediction and training, and its accuracy after some seconds of tracing and training from
+//! a new network. Prints blocks of docs/performance.md. `cargo run --release --example gpu_network [speed] [easy] [hard] [realisations] [double-gyre]
 //! [published-speed] [published] [seconds]`
 //!
-//! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and never leave
-//! it; the clock runs through making the network, tracing (of those labels too that say how large they are) and training: the window is there, kernels
-//! are compiled; it stands still while the error is measured. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
+//! Speed: medians of device time between events, random points. Quality: labels are traced on the device at uniform points and stay there. The
+//! time includes building the network, tracing (also of the labels that determine the scale) and training; it excludes the upload of the window,
+//! the compilation of kernels, and the measurement of the error. PSNR as in docs/accuracy.md: peak is the reference's maximum, 2^20 held-out uniform
 //! points, against f64 with 220 steps (1000 for the double gyre, whose points are x, y and the start time).
 
 #![allow(clippy::print_stdout)] // a measurement, which prints
@@ -44,16 +44,14 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
 
 #[cfg(feature = "cuda")]
 mod bench {
-    use ridgewatch::engine::cuda::{
+    use ridgewatch::backend::cuda::{
         Buffer, CudaTracer, DeviceError, DevicePredict, DeviceSamples, DeviceTable, DeviceTracer, DeviceTraining, Gpu, GpuSettings,
         Outputs, SnapshotStore, Storage, Tuning,
     };
     use ridgewatch::field::Domain;
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
-    use ridgewatch::flow::{
-        Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource,
-    };
+    use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
     use ridgewatch::surrogate::network::{Architecture, Encoding, Input, Model, NetworkSettings, Objective, PlannedStep, Scale, Target};
     use std::error::Error;
     use std::sync::Arc;
@@ -168,14 +166,14 @@ mod bench {
             integrator: Integrator::Tangent,
             precision,
             steps: Steps::Fixed(steps),
-            gap: 0.05,
+            difference_step: 0.05,
             boundary: Boundary::Clamp,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
         }
     }
 
-    /// Points, and room for what is found at them.
+    /// Points, and buffers for their values.
     struct Batch {
         points: Buffer<[f32; 3]>,
         values: Buffer<f32>,
@@ -212,7 +210,7 @@ mod bench {
         20.0 * (peak / square.sqrt()).log10()
     }
 
-    /// Something that draws points.
+    /// Generator of points.
     fn drawer(gpu: &Arc<Gpu>, domain: &Domain) -> Outcome<DeviceTraining> {
         let any = NetworkSettings { log2_table: 4, ..NetworkSettings::default() };
         let shape = Architecture::new(&any, &[0, 1, 2], domain.lengths())?;
@@ -222,7 +220,7 @@ mod bench {
 
     /// Points where a field is known.
     struct KnownPoints {
-        /// In domain coordinates, with what the tracer finds there; and in unit coordinates.
+        /// Points in domain coordinates, their traced values, and the points in unit coordinates.
         seeds: Batch,
         tested: Batch,
         truth: Vec<f32>,
@@ -269,13 +267,13 @@ mod bench {
             };
             let tracer = CudaTracer::new(&store, &gpu, source.clone(), &map(steps, Precision::F32), 0.0, Tuning::default())?;
             let exact = CudaTracer::new(&store, &gpu, source.clone(), &map(220, Precision::F64), 0.0, Tuning::default())?;
-            let domain = tracer.domain().clone();
+            let domain = tracer.host().domain().clone();
             let points = KnownPoints::new(&gpu, &domain, tracer.device(), exact.device())?;
             Ok(Self { gpu, source, store, tracer, domain, steps, points })
         }
     }
 
-    /// What training takes.
+    /// Settings of training.
     #[derive(Clone, Copy)]
     struct Pace {
         batch: usize,
@@ -331,7 +329,7 @@ mod bench {
         Ok(Rates { few, predicted: MANY as f64 / many * 1e3, trained })
     }
 
-    /// What the published networks do in a second; with the operations of their products alone.
+    /// Rates of the published networks; operations are those of their matrix products only.
     pub fn published_speed() -> Outcome<()> {
         let gpu = Gpu::open(0, &GpuSettings::default())?;
         println!("<!-- block network-published-speed -->");
@@ -342,7 +340,7 @@ mod bench {
         for (name, settings) in published_settings() {
             let shape = Architecture::new(&settings, &[0, 1, 2], [1.0; 3])?;
             let products: usize = shape.layers.iter().map(|layer| layer.inputs * layer.outputs).sum();
-            // Training: forward, backward but for the first layer, and the gradients of the weights.
+            // Training: forward pass, backward pass without the first layer, and the gradients of the weights.
             let (forward, all) =
                 (2e-12 * products as f64, 2e-12 * (3 * products - shape.layers[0].inputs * shape.layers[0].outputs) as f64);
             let Rates { few, predicted, trained } = rates(&gpu, &settings, 1e-3, &[FEW, 1 << 16, 1 << 14])?;
@@ -372,7 +370,7 @@ mod bench {
             "| | MB | 2^18 samples, ms | M/s | trained, M/s, batch 2^18 | PSNR, dB, at once or after 1 s | 2 s | 5 s | 10 s | labels, M | trained on, M |"
         );
         println!("|{}", "---|".repeat(11));
-        let six = FlowMap { integrator: Integrator::Differences, gap: 1e-6, ..map(110, Precision::F64) };
+        let six = FlowMap { integrator: Integrator::Differences, difference_step: 1e-6, ..map(110, Precision::F64) };
         let pairs = Tuning { storage: Storage::F16Pairs, ..Tuning::default() };
         // The order that the published way traces in is that of its seeds, whose number then makes no difference.
         let as_they_come = Tuning { sorted: false, keep: false, spread: false, ..Tuning::default() };
@@ -542,7 +540,7 @@ mod bench {
         Ok(())
     }
 
-    /// What a network knew after the seconds of [`MARKS`], and what it took.
+    /// Accuracy of a network after the seconds of [`MARKS`], and its cost.
     struct Learned {
         /// Of what prediction reads.
         megabytes: f64,
@@ -563,6 +561,7 @@ mod bench {
     }
 
     /// Trains for some seconds. `before`: seconds that the clock starts at, where there is a table to be traced.
+    #[allow(clippy::too_many_arguments)] // An experiment has as many parameters.
     fn learn(
         gpu: &Arc<Gpu>,
         domain: &Domain,

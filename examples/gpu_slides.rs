@@ -1,48 +1,87 @@
-//! What a new snapshot costs a running loop: the standard easy turbulence, streamed, every query traced; frames and slides by stage, and
-//! the device's memory over a thousand frames. Prints; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` for another picture or grid.
+//! Measures the cost of a new snapshot in a running loop: the standard easy turbulence, streamed, with every query traced. Times of frames and
+//! slides by stage, and device memory over a thousand frames. Prints a table; needs a GPU. `-- WIDTH HEIGHT NX NY NZ` sets another picture or grid.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
+use ridgewatch::backend::cuda::{Cuda, CudaSamples, CudaSurrogate, CudaTracer, DeviceError, Gpu, GpuSettings};
+use ridgewatch::backend::{
+    AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, FrameJob, FrozenOf, Rendered, Storage, SurrogateRequest, WhenLost,
+};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::{CudaAccelerator, CudaTracerError, DeviceError, Gpu, GpuSettings};
-use ridgewatch::engine::{Accelerator, Device, DeviceRenderer, Event, FrameRecord, Health, RunOptions, Setup, Storage, run};
 use ridgewatch::field::Snapshot;
 use ridgewatch::field::turbulence::Turbulence;
-use ridgewatch::flow::{FlowMap, Tracer, VelocitySource};
-use ridgewatch::source::MemorySource;
+use ridgewatch::flow::{FlowMap, VelocitySource};
+use ridgewatch::render::Renderer;
+use ridgewatch::run::{Event, FrameRecord, RunOptions, Setup, run_on};
+use ridgewatch::source::{Listener, MemorySource};
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, Mutex};
 use std::time::Instant;
 
-/// The GPU, with a clock on what a slide asks of it; told of snapshots ahead or not.
-#[derive(Debug)]
-struct Timed {
-    inner: CudaAccelerator,
-    ahead: bool,
-    tracer_seconds: Mutex<Vec<f64>>,
+/// Timings of the work that slides request from a GPU.
+#[derive(Default)]
+struct Clock {
+    tracer_seconds: Vec<f64>,
+    /// Snapshots uploaded until the latest slide, and how many of them were prefetched.
+    uploaded: u64,
+    ahead: u64,
 }
 
-impl Accelerator for Timed {
+/// The GPU backend with timings, with or without prefetching of snapshots.
+struct Timed {
+    inner: Cuda,
+    ahead: bool,
+    clock: Arc<Mutex<Clock>>,
+}
+
+impl Backend for Timed {
+    type Tracer = CudaTracer;
+    type Surrogate = CudaSurrogate;
+    type Samples = CudaSamples;
+
     fn name(&self) -> String {
         self.inner.name()
     }
-    fn health(&self) -> &Arc<Health> {
-        self.inner.health()
+    fn prefetch(&self) -> Option<Listener> {
+        self.inner.prefetch().filter(|_| self.ahead)
     }
-    fn tracer(&self, source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, CudaTracerError> {
+    fn tracer(&mut self, velocity: &VelocitySource, map: &FlowMap, t0: f64) -> Result<CudaTracer, BackendError> {
         let began = Instant::now();
-        let tracer = self.inner.tracer(source, map, t0);
-        self.tracer_seconds.lock().unwrap().push(began.elapsed().as_secs_f64());
+        let tracer = self.inner.tracer(velocity, map, t0);
+        let mut clock = self.clock.lock().unwrap();
+        clock.tracer_seconds.push(began.elapsed().as_secs_f64());
+        (clock.uploaded, clock.ahead) = (self.inner.snapshots().uploaded(), self.inner.snapshots().prefetched());
         tracer
     }
-    fn renderer(&self) -> Result<Box<dyn DeviceRenderer>, DeviceError> {
-        self.inner.renderer()
+    fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &CudaTracer) -> Result<CudaSurrogate, BackendError> {
+        self.inner.surrogate(request, tracer)
     }
-    fn expect(&self, snapshot: &Arc<Snapshot>) {
-        if self.ahead {
-            self.inner.expect(snapshot);
-        }
+    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let &FrameJob { tracer, surrogate, routing, picture, samples, progress, stop } = job;
+        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, progress, stop }, renderer)
+    }
+    fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        surrogate: Option<&FrozenOf<Self>>,
+    ) -> Result<AuditFindings, DeviceError> {
+        self.inner.audit(request, tracer, surrogate)
+    }
+    fn replan(
+        &mut self,
+        shortage: &DeviceError,
+        tracer: &CudaTracer,
+        surrogate: &mut Option<CudaSurrogate>,
+    ) -> Result<Option<String>, DeviceError> {
+        self.inner.replan(shortage, tracer, surrogate)
+    }
+    fn when_lost(&self) -> WhenLost {
+        self.inner.when_lost()
+    }
+    fn may_fall_back(&self) -> bool {
+        self.inner.may_fall_back()
     }
 }
 
@@ -50,7 +89,7 @@ struct Seen {
     record: Arc<FrameRecord>,
     /// Since the frame before.
     interval: f64,
-    /// Bytes that ridgewatch has taken, and bytes of the device that are free.
+    /// Bytes allocated by ridgewatch, and free bytes of the device.
     taken: u64,
     free: usize,
 }
@@ -78,20 +117,22 @@ fn main() {
          frame to frame with a slide | without |"
     );
     println!("|---|---|---|---|---|---|---|---|---|---|---|");
+    // A measurement must not fall back to the CPU.
+    let chosen = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
     let mut memory = Vec::new();
     for (what, ahead, slides, frames_per_slide) in
         [("brought on the slide", false, 24, 1), ("brought ahead", true, 24, 1), ("brought ahead", true, 40, 25)]
     {
-        let device = Timed { inner: CudaAccelerator::new(gpu.clone(), Storage::F32), ahead, tracer_seconds: Mutex::default() };
-        let device = Arc::new(device);
-        let seen = stream(&gpu, &device, [width, height], shape, slides, frames_per_slide);
+        let clock = Arc::<Mutex<Clock>>::default();
+        let device = Timed { inner: Cuda::new(&chosen), ahead, clock: clock.clone() };
+        let seen = stream(&gpu, device, [width, height], shape, slides, frames_per_slide);
+        let clock = clock.lock().unwrap();
         let of = |with_slide: bool| seen.iter().filter(move |s| s.record.slide > 0 && (s.record.seconds.slide > 0.0) == with_slide);
-        let tracers = device.tracer_seconds.lock().unwrap();
         let from_frame_to_frame = |with_slide: bool| spread(of(with_slide).map(|s| s.interval - s.record.seconds.waiting));
         println!(
             "| {what} | {slides} | {frames_per_slide} | {} | {} | {} | {} | {} | {} | {} | {} |",
             spread(of(true).map(|s| s.record.seconds.slide)),
-            spread(tracers.iter().skip(1).copied()),
+            spread(clock.tracer_seconds.iter().skip(1).copied()),
             spread(of(true).map(|s| s.record.seconds.waiting)),
             spread(of(true).map(|s| s.record.seconds.total)),
             spread(of(false).map(|s| s.record.seconds.total)),
@@ -99,15 +140,15 @@ fn main() {
             from_frame_to_frame(true),
             from_frame_to_frame(false)
         );
-        // From the third slide on, everything that is ever taken has been.
+        // All memory is allocated before the third slide.
         let settled: Vec<&Seen> = seen.iter().filter(|s| s.record.slide >= 2).collect();
         let (least, most) = (settled.iter().map(|s| s.taken).min().unwrap_or(0), settled.iter().map(|s| s.taken).max().unwrap_or(0));
         let (begin, end) = (settled.first().map_or(0, |s| s.free), settled.last().map_or(0, |s| s.free));
         memory.push(format!(
             "{} frames, {} of {} snapshots ahead: {} to {} MiB taken from the third slide on; free at its begin {} MiB, at the end {} MiB.",
             seen.len(),
-            device.inner.snapshots().brought_ahead(),
-            device.inner.snapshots().brought(),
+            clock.ahead,
+            clock.uploaded,
             least >> 20,
             most >> 20,
             begin >> 20,
@@ -118,7 +159,7 @@ fn main() {
 }
 
 /// Runs the cycle over snapshots that are ready in memory, so that reading costs nothing.
-fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 3], slides: usize, frames_per_slide: usize) -> Vec<Seen> {
+fn stream(gpu: &Arc<Gpu>, device: Timed, size: [usize; 2], shape: [usize; 3], slides: usize, frames_per_slide: usize) -> Vec<Seen> {
     let text = format!(
         "[source]\nkind = \"turbulence\"\nnodes = {shape:?}\n[time]\ntau = 11\nframes_per_slide = {frames_per_slide}\n[flow]\nsteps = 22\n\
          [render]\nmethod = \"reference\"\nwidth = {}\nheight = {}\nsamples = 1\n",
@@ -131,7 +172,7 @@ fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 
     let times = (0..ready.len()).map(|t| t as f64).collect();
     let source = MemorySource::new("streamed turbulence", grid, times, move |index, _| ready[index].take().unwrap()).unwrap();
     let setup = Setup::over(scene.settings(), Some(Box::new(source))).unwrap();
-    let options = RunOptions { device: Device::Gpu { gpu: device.clone(), may_fall_back: false }, ..RunOptions::default() };
+    let options = RunOptions::default();
     let (mut seen, mut last) = (Vec::new(), Instant::now());
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event {
@@ -145,7 +186,6 @@ fn stream(gpu: &Arc<Gpu>, device: &Arc<Timed>, size: [usize; 2], shape: [usize; 
             });
         }
     };
-    run(setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
-    assert_eq!(device.health().failure(), None);
+    run_on(device, setup, &options, &mut sink, &AtomicBool::new(false)).unwrap();
     seen
 }

@@ -1,7 +1,7 @@
-//! The network in burn's stock operations on a GPU: rows of the table that `gpu_network speed` prints, for docs/performance.md.
+//! Measures the network with burn's standard operations on a GPU: rows of the table of `gpu_network speed`, for docs/performance.md.
 //! `cargo run --release --features burn-cuda --example gpu_stock_burn`
 //!
-//! The same parameters in both, and predictions that agree, or it stops. Wall clock between synchronisations, medians of nine (of three where
+//! Both use the same parameters; the example stops if their predictions differ. Wall clock between synchronisations, medians of nine (of three where
 //! one takes over half a second, of one where over two); random points, targets 0.5. burn's CUDA backend runs without fusion and autotune, as
 //! ridgewatch builds burn.
 
@@ -13,7 +13,7 @@ use burn::optim::{AdamConfig, GradientsParams, Optimizer};
 use burn::tensor::backend::Backend;
 use burn::tensor::{Tensor, TensorData};
 use burn_cuda::{Cuda, CudaDevice};
-use ridgewatch::engine::cuda::{DevicePredict, DeviceTraining, Gpu, GpuSettings};
+use ridgewatch::backend::cuda::{DevicePredict, DeviceTraining, Gpu, GpuSettings};
 use ridgewatch::field::Domain;
 use ridgewatch::surrogate::network::{Architecture, Encoding, Model, Network, NetworkSettings, Objective};
 use std::error::Error;
@@ -23,11 +23,11 @@ type Outcome<T> = Result<T, Box<dyn Error>>;
 type Stock = Cuda;
 
 const ROUNDS: usize = 9;
-/// Points that are predicted at once.
+/// Number of points per prediction.
 const COUNT: usize = 1 << 20;
 const RATE: f64 = 1e-3;
 
-/// Median seconds of `work`, which ends when the device has done it.
+/// Median seconds of `work`, which waits for the device.
 fn time(mut work: impl FnMut() -> Outcome<()>) -> Outcome<f64> {
     let mut times = Vec::new();
     let wanted = |first: Option<&f64>| match first {
@@ -89,7 +89,7 @@ fn main() -> Outcome<()> {
             drop(outputs);
             Ok(())
         };
-        // The first time compiles and takes memory.
+        // The first call compiles kernels and allocates memory.
         predict()?;
         let predicted = COUNT as f64 / time(predict)?;
         let expected = done(still.forward(&shape, inputs.clone()).into_data().to_vec::<f32>())?;
@@ -103,7 +103,7 @@ fn main() -> Outcome<()> {
 
         let mut adam = AdamConfig::new().with_beta_1(0.9).with_beta_2(0.999).with_epsilon(epsilon).init();
         let mut row = format!("| burn 0.21, {name} | {:.2} | {:.2} ", shape.parameters() as f64 * 1e-6, predicted * 1e-9);
-        // The first batch compiles and takes memory.
+        // The first batch compiles kernels and allocates memory.
         for (number, batch) in [1 << 14, 1 << 20, 1 << 18, 1 << 14].into_iter().enumerate() {
             let inputs = Tensor::<Autodiff<Stock>, 2>::from_data(at(batch), &device);
             let wanted = Tensor::<Autodiff<Stock>, 2>::full([batch, 1], 0.5, &device);

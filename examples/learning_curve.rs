@@ -1,4 +1,4 @@
-//! Prints how a surrogate learns in a run: PSNR over the whole domain against wall-clock seconds, for the network, for base + residual, and
+//! Prints the learning curve of surrogates in a run: PSNR over the whole domain against wall-clock seconds, for the network, for base + residual, and
 //! for the traced table of the same bytes.
 //!
 //! `cargo run --release --example learning_curve -- CONFIG SECONDS [key=value ...]`. Each run is the ordinary cycle on the first slide of the
@@ -7,7 +7,7 @@
 #![allow(clippy::print_stdout)]
 
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::{self, Event, RunOptions, Setup};
+use ridgewatch::run::{self, Event, RunOptions, Setup};
 use ridgewatch::surrogate::Kind;
 use std::error::Error;
 use std::path::Path;
@@ -18,7 +18,7 @@ fn curve(mut scene: SceneFile, kind: Kind, nodes: Option<[usize; 3]>, seconds: f
     scene.surrogate.kind = kind;
     scene.surrogate.table_nodes = nodes;
     (scene.time.slides, scene.time.warmup_frames) = (Some(1), 0);
-    // A table does not learn: a few frames show it.
+    // A table does not learn, so a few frames suffice.
     scene.time.frames_per_slide = if kind == Kind::Table { 3 } else { 100_000 };
     let options = RunOptions { seconds: Some(seconds), ..RunOptions::default() };
     let mut next = 0.0;
@@ -33,7 +33,7 @@ fn curve(mut scene: SceneFile, kind: Kind, nodes: Option<[usize; 3]>, seconds: f
             }
         }
     };
-    let report = engine::run(Setup::new(scene.settings())?, &options, &mut print, &AtomicBool::new(false))?;
+    let report = run::run(Setup::new(scene.settings())?, &options, &mut print, &AtomicBool::new(false))?;
     println!("          {} bytes, {} optimizer steps", report.surrogate_bytes, report.train_steps);
     Ok(report.surrogate_bytes)
 }

@@ -3,7 +3,7 @@
 //! ```text
 //! cargo run --release --example live_window -- /dev/shm/ridgewatch-$USER/run 6 windows
 //! ```
-//! Every step is taken, and it ends with the simulation.
+//! It takes every step, and ends with the simulation.
 #![allow(clippy::print_stdout)]
 
 use anyhow::{Context, bail};
@@ -29,7 +29,7 @@ fn main() -> anyhow::Result<()> {
             match window.next_within(Duration::from_secs(1)) {
                 Ok(Some(taken)) => break taken?,
                 Ok(None) => return Ok(()),
-                // Nothing new within the second.
+                // No new step within the second.
                 Err(_) => {}
             }
         };

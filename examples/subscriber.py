@@ -26,9 +26,9 @@ def main():
         options.save.mkdir(parents=True, exist_ok=True)
 
     socket = zmq.Context().socket(zmq.SUB)
-    # Two waiting messages are enough: an old frame is worth nothing.
+    # Two waiting messages are enough: old frames are useless.
     socket.setsockopt(zmq.RCVHWM, 2)
-    # Reconnecting is libzmq's default (every 100 ms): after a cut-off the frames come again by themselves.
+    # Reconnecting is libzmq's default (every 100 ms): after a disconnect the frames continue.
     socket.connect(options.endpoint)
     socket.subscribe(b"frame")
     if options.records:
@@ -42,7 +42,7 @@ def main():
             print(f"record {record['frame']}: traced {100 * record['traced_share']:.1f} %", flush=True)
             continue
         header, payload = json.loads(parts[0]), parts[1]
-        if header["protocol"] != 2 or len(payload) != header["payload_bytes"]:
+        if header["protocol"] != 3 or len(payload) != header["payload_bytes"]:
             print(f"not understood: protocol {header['protocol']}, {len(payload)} bytes", file=sys.stderr)
             continue
         now, record = time.monotonic(), header["record"]

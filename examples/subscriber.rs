@@ -21,7 +21,7 @@ async fn main() -> anyhow::Result<()> {
     }
 
     let mut socket = SubSocket::new();
-    // Waits for the publisher if it is not there yet, and reconnects by itself after a cut-off.
+    // Waits for the publisher if it is not there yet, and reconnects by itself after a disconnect.
     socket.connect(&endpoint).await.with_context(|| endpoint.clone())?;
     socket.subscribe("frame").await?;
 
@@ -34,7 +34,7 @@ async fn main() -> anyhow::Result<()> {
         let message = match message {
             Ok(message) => message,
             Err(error) => {
-                // A message torn by a cut-off ends up here; the connection comes back in the background.
+                // A message torn by a disconnect is an error; the connection is restored in the background.
                 eprintln!("{error}");
                 tokio::time::sleep(Duration::from_millis(50)).await;
                 continue;
@@ -52,7 +52,7 @@ fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyho
     let (Some(header), Some(payload)) = (message.get(1), message.get(2)) else { bail!("{} parts", message.len()) };
     let header: Value = serde_json::from_slice(header)?;
     let length = header["payload_bytes"].as_u64().context("no payload_bytes")?;
-    if header["protocol"] != 2 || length != payload.len() as u64 {
+    if header["protocol"] != 3 || length != payload.len() as u64 {
         bail!("protocol {}, {} of {length} bytes", header["protocol"], payload.len());
     }
     let number = header["frame"].as_u64().context("no frame number")?;
@@ -67,7 +67,7 @@ fn show(message: &ZmqMessage, gap: f64, save: Option<&std::path::Path>) -> anyho
     }
     let (record, shape) = (&header["record"], &header["shape"]);
     let traced = 100.0 * record["traced_share"].as_f64().unwrap_or(f64::NAN);
-    // Of a simulation that runs now: how long ago its newest step was published, by the clock of one machine.
+    // Live runs: age of the newest step, if both programs share a clock.
     let behind = record["live"]["published"].as_f64().map(|published| {
         let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
         format!(", {:.4} s behind the simulation", now - published)

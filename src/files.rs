@@ -1,18 +1,36 @@
-//! Opening files that a user named.
+//! Files: opened only if regular, written under their names only when whole.
 
-use std::fs::File;
-use std::io;
+use std::fs::{self, File};
+use std::io::{self, ErrorKind};
 use std::path::Path;
 
-/// Opens a regular file for reading. A pipe would wait for a writer without end, and a device gives no length.
+/// Opens a regular file for reading. A pipe could wait for a writer forever, and a device has no length.
 ///
 /// # Errors
-/// Those of the system, and one for what is no regular file.
+/// Errors of the system; `InvalidInput` if the file is not regular.
 pub fn open(path: &Path) -> io::Result<File> {
-    if !std::fs::metadata(path)?.is_file() {
-        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is a folder, a pipe or a device; accepted: a regular file"));
+    if !fs::metadata(path)?.is_file() {
+        return Err(io::Error::new(ErrorKind::InvalidInput, "it is a folder, a pipe or a device; accepted: a regular file"));
     }
     File::open(path)
+}
+
+/// Writes a file beside its place and renames it, so that an unfinished file never has the final name.
+///
+/// # Errors
+/// Errors of the system; then the place is unchanged.
+pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    let name = path.file_name().ok_or_else(|| io::Error::new(ErrorKind::InvalidInput, "no file name"))?;
+    let mut hidden = std::ffi::OsString::from(".");
+    hidden.push(name);
+    hidden.push(".part");
+    let part = path.with_file_name(hidden);
+    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
+    if written.is_err() {
+        // It may not exist; `written` has the error that matters.
+        let _ = fs::remove_file(&part);
+    }
+    written
 }
 
 #[cfg(test)]
@@ -20,11 +38,11 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_folder_and_a_device_are_no_files() {
+    fn only_regular_files_are_opened() {
         for path in ["/", "/dev/null"] {
             assert!(open(Path::new(path)).unwrap_err().to_string().contains("regular file"));
         }
-        assert_eq!(open(Path::new("/nowhere/at/all")).unwrap_err().kind(), io::ErrorKind::NotFound);
+        assert_eq!(open(Path::new("/nowhere/at/all")).unwrap_err().kind(), ErrorKind::NotFound);
         open(&std::env::current_exe().unwrap()).unwrap();
     }
 }

@@ -1,22 +1,23 @@
-//! ridgewatch shows the Lagrangian coherent structures of a flow while it runs.
+//! ridgewatch renders the Lagrangian coherent structures of a flow while its simulation runs.
 //!
-//! The rooms, and the one way of the arrows (a room calls only those to its left):
+//! The rooms; a room calls only those to its left:
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`engine`] ← [`publish`] ← [`config`] ← the command line.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`] ← [`config`] ← the command line.
 //!
-//! Each room defines and checks its own settings, with the words of [`setting`]; [`config`] reads them from one scene file and finds the
-//! line of a fault. [`files`], [`setting`] and [`simd`] lie below all rooms.
+//! Each room defines its settings and checks them with [`setting`]; [`config`] reads them from a scene file and finds the line of a fault.
+//! All rooms may call [`files`], [`setting`] and [`simd`].
 //!
-//! One cycle: take the newest snapshots, slide the window, render with the weights of the previous cycle, test every traced
-//! sample against the surrogate (this feeds the trust map), then train on it.
+//! A cycle takes the newest snapshots, slides the window, renders with the weights of the previous cycle, compares every traced sample with
+//! the surrogate, which updates the trust map, and then trains on it.
 
+pub mod backend;
 pub mod config;
-pub mod engine;
 pub mod field;
 pub mod files;
 pub mod flow;
 pub mod publish;
 pub mod render;
+pub mod run;
 pub mod setting;
 pub mod simd;
 pub mod source;

@@ -2,14 +2,13 @@
 
 mod cli;
 
-use clap::Parser;
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    let arguments = match cli::Arguments::try_parse() {
+    let arguments = match cli::Arguments::read() {
         Ok(arguments) => arguments,
         Err(error) => {
-            // Help and version are no failures; clap knows which stream each belongs to.
+            // Help and version are not failures; clap knows their stream.
             let failed = error.use_stderr();
             return if error.print().is_ok() && !failed { ExitCode::SUCCESS } else { ExitCode::from(2) };
         }

@@ -1,15 +1,15 @@
-//! Damaged NetCDF-4 and HDF5 files of every kind that is read. Their bytes are read by libhdf5, whose C code may crash, hang or ask for any
+//! Damaged NetCDF-4 and HDF5 files of every supported kind. The C code of libhdf5, which reads them, may crash, hang or ask for any amount of
 //! memory: each file goes to a child process with limits, which must end by itself with an answer or one message.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 #![cfg(target_os = "linux")]
 
-mod netcdf_fixture;
+mod kit;
 
 use hdf5_metno::File;
+use kit::grids::{Ocean, Wrf, packed_levels};
+use kit::mutants::{mutant, random, used};
+use kit::netcdf::*;
 use ndarray::{Array4, Array5};
-use netcdf_fixture::grids::{Ocean, Wrf, packed_levels};
-use netcdf_fixture::mutants::{mutant, random, used};
-use netcdf_fixture::*;
 use ridgewatch::source::{SyntheticSettings, SyntheticShape, synthesize};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -18,31 +18,30 @@ use std::time::{Duration, Instant};
 
 /// Address space of a child, kB: the program and its libraries take half of it.
 const MEMORY: u64 = 2_000_000;
-/// Bytes in memory: half as much again as the 30 MB that the largest of 20,000 mutants took, which the program and its libraries need for a
-/// whole file too. 2^20 values that a file claims and does not have would take 16 MB more as f64, the library's copy and ours. (Values that
-/// a file does have by right, up to 2^20 or 1032 / 4 a byte, take 108 bytes each in a window; no mutant came to that.)
+/// Bytes in memory: 1.5 times the 30 MB of the largest of 20,000 mutants, which the program and its libraries also need for a whole file.
+/// 2^20 values that a file only claims to hold would take 16 MB more as f64, in the copies of the library and of the program. (Values that a
+/// file really holds, up to 2^20 or 1032 / 4 a byte, take 108 bytes each in a window; no mutant reached that.)
 const LARGEST: u64 = 45 << 20;
-/// Seconds after which the program gives up the opening of a file. Milliseconds' work; the machine may be slow and busy.
+/// Seconds after which the program gives up opening a file. It takes milliseconds, but the machine may be slow and busy.
 const OPENING_LIMIT: &str = "30";
-/// After so long a child hangs.
+/// Time after which a child counts as hanging.
 const LONGEST: Duration = Duration::from_secs(120);
 
-/// How a child ended.
+/// End of a child.
 #[derive(Debug, PartialEq, Eq, PartialOrd, Ord, Clone, Copy)]
 enum End {
     Answered,
     Refused,
     /// The library crashed, and the file was named.
     Crashed,
-    /// The library looped, and was given up.
+    /// The library did not return within the limit of the program.
     GivenUp,
     /// It did not end by itself.
     Hung,
 }
 
-/// Looks at files or, `traced`, computes an FTLE from them, for which snapshots of all are read. Also returns the bytes that it had in
-/// memory at most.
-#[allow(clippy::zombie_processes)] // `ended` waits for it, and learns what it took.
+/// Inspects files or, if `traced`, computes an FTLE from snapshots of all of them. Also returns the peak memory of the child in bytes.
+#[allow(clippy::zombie_processes)] // `ended` waits for the child, to read its peak memory.
 fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
     let files: Vec<String> = files.iter().map(|f| f.display().to_string()).collect();
     let work = if traced { "ftle" } else { "inspect" };
@@ -51,7 +50,7 @@ fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
     let mut child = Command::new("sh")
         .args(["-c", &command])
         .env("RIDGEWATCH_OPENING_LIMIT", OPENING_LIMIT)
-        // Looking up the names for a backtrace takes 100 MB.
+        // The symbols of a backtrace take 100 MB.
         .env("RUST_BACKTRACE", "0")
         .stdout(Stdio::null())
         .stderr(Stdio::piped())
@@ -73,9 +72,9 @@ fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
     assert!(!said.contains("panicked"), "{command}: {said}");
     let end = match status {
         0 => End::Answered,
-        // 2 where damage makes a file one that the options, or defaults of the scene, do not fit.
+        // 2 if the damage makes the options, or defaults of the scene, invalid for the file.
         1 | 2 => {
-            // The damaged one comes last; a message that names a whole one before it would lead astray.
+            // The damaged file comes last. A message that names a whole one before it would be wrong.
             let damaged = files.last().unwrap();
             assert!(said.contains(damaged), "does not name {damaged}: {command}: {said}");
             match () {
@@ -92,7 +91,7 @@ fn read(files: &[&Path], traced: bool, options: &str) -> (End, u64) {
 /// Exit status (or minus the signal) and peak memory in bytes of a child, once it has ended.
 fn ended(child: u32) -> Option<(i32, u64)> {
     let mut status = 0;
-    // SAFETY: plain numbers, of which zeros are values, filled in by the call.
+    // SAFETY: `usage` consists of plain numbers, for which zeros are valid; the call fills them in.
     let usage = unsafe {
         let mut usage: libc::rusage = std::mem::zeroed();
         let found = libc::wait4(child as libc::pid_t, &raw mut status, libc::WNOHANG, &raw mut usage);
@@ -106,11 +105,11 @@ fn ended(child: u32) -> Option<(i32, u64)> {
     Some((code, usage.ru_maxrss as u64 * 1024))
 }
 
-/// A file to be damaged, and how it is read.
+/// A file to damage, and the options with which it is read.
 struct Case {
     name: &'static str,
     whole: PathBuf,
-    /// A whole file of an earlier time: behind it a damaged one is not read in the same way.
+    /// A whole file of an earlier time: a damaged file after another one is read in another way.
     before: Option<PathBuf>,
     options: &'static str,
 }
@@ -144,35 +143,20 @@ fn grouped(path: &Path) {
 
 /// NetCDF-4.
 fn netcdf4(folder: &Path) -> Vec<Case> {
-    let at = |name: &str| folder.join(name);
     let hours = "hours since 2000-01-01";
     let era = |hour: f64| packed_levels(NETCDF4, &[850.0, 500.0, 700.0], hour);
     let ocean = |hour: f64| Ocean { n: 9, hour, ..Ocean::default() }.fixture();
+    let wrf = |hour: usize| Wrf { hour, ..Wrf::default() }.fixture();
+    let case = |name, before: Fixture, damaged: Fixture, options| {
+        let write = |fixture: Fixture, which: &str| fixture.write(&folder.join(format!("{name}_{which}.nc")));
+        Case { name, whole: write(damaged, "whole"), before: Some(write(before, "before")), options }
+    };
+    let (plane_options, space_options) = ("--set time.tau=3600 --grid 5x5", "--set time.tau=3600 --grid 5x5x5");
     vec![
-        Case {
-            name: "plane",
-            whole: plane(NETCDF4, &[2.0, 3.0, 4.0], hours).write(&at("plane.nc")),
-            before: Some(plane(NETCDF4, &[0.0], hours).write(&at("plane_before.nc"))),
-            options: "--set time.tau=3600 --grid 5x5",
-        },
-        Case {
-            name: "packed levels",
-            whole: era(2.0).write(&at("levels.nc")),
-            before: Some(era(0.0).write(&at("levels_before.nc"))),
-            options: "--set time.tau=3600 --grid 5x5x5",
-        },
-        Case {
-            name: "staggered",
-            whole: Wrf { hour: 18, ..Wrf::default() }.fixture().write(&at("staggered.nc")),
-            before: Some(Wrf::default().fixture().write(&at("staggered_before.nc"))),
-            options: "--set time.tau=3600 --grid 5x5x5",
-        },
-        Case {
-            name: "curvilinear",
-            whole: ocean(2.0).write(&at("curvilinear.nc")),
-            before: Some(ocean(0.0).write(&at("curvilinear_before.nc"))),
-            options: "--set time.tau=3600 --grid 5x5",
-        },
+        case("plane", plane(NETCDF4, &[0.0], hours), plane(NETCDF4, &[2.0, 3.0, 4.0], hours), plane_options),
+        case("packed_levels", era(0.0), era(2.0), space_options),
+        case("staggered", wrf(12), wrf(18), space_options),
+        case("curvilinear", ocean(0.0), ocean(2.0), plane_options),
     ]
 }
 
@@ -222,7 +206,7 @@ fn mutated_files_end_in_an_answer_or_a_message() {
             for _ in 0..share {
                 let _ = std::fs::remove_file(&file);
                 std::fs::write(&file, mutant(&whole, &used, &mut state)).unwrap();
-                // Alone and behind a whole one, headers only and the field.
+                // Alone and after a whole file, headers only and the field.
                 let (behind, traced) = (random(&mut state).is_multiple_of(2), random(&mut state).is_multiple_of(2));
                 let files: Vec<&Path> = before.iter().filter(|_| behind).map(PathBuf::as_path).chain([file.as_path()]).collect();
                 let begin = Instant::now();

@@ -1,14 +1,14 @@
-//! Every kernel compiles for both architectures, in the variants that stand for all. Needs NVRTC, but no GPU: `make test` fetches it and
-//! runs this; a plain `cargo test` shows it as ignored.
+//! Compiles every kernel for two architectures, in representative variants. Needs NVRTC but no GPU: `make test` fetches NVRTC and runs these
+//! tests; a plain `cargo test` reports them as ignored.
 
 #![cfg(feature = "cuda")]
 #![allow(clippy::unwrap_used)]
 
-use ridgewatch::engine::cuda::compile::{Request, SOURCES};
-use ridgewatch::engine::cuda::{Tiling, is_fused, network_defines};
+use ridgewatch::backend::cuda::compile::{Request, SOURCES};
+use ridgewatch::backend::cuda::{Tiling, is_fused, network_defines};
 use ridgewatch::surrogate::network::{Architecture, Encoding, Input, NetworkSettings, Target};
 
-/// Macros in which the gridded kernel is compiled here.
+/// Macros of the gridded kernel: the usual ones with changes.
 fn grid(changes: &[(&str, &str)]) -> Vec<String> {
     let usual = [
         ("REAL", "float"),
@@ -16,7 +16,7 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
         ("SPHERE", "0"),
         ("STORAGE", "0"),
         ("CUBIC", "0"),
-        ("MARKS", "0"),
+        ("MISSING", "0"),
         ("KEEP", "1"),
         ("SCALED", "0"),
         ("EVEN", "7"),
@@ -28,7 +28,7 @@ fn grid(changes: &[(&str, &str)]) -> Vec<String> {
     usual.iter().map(|(name, usual)| format!("RW_{name}={}", value(name, usual))).collect()
 }
 
-/// Encodings, widths and depths: what fills the registers, and what has no second feature or no tables.
+/// Networks of different encodings, widths and depths: some fill the registers, some have a single feature or no tables.
 fn networks() -> Vec<Network> {
     let usual = NetworkSettings { levels: 8, features: 2, ..NetworkSettings::default() };
     let both = vec![Input::Start, Input::Duration];
@@ -51,11 +51,11 @@ fn networks() -> Vec<Network> {
     ];
     let shape = |(settings, axes): &(NetworkSettings, &[usize])| Architecture::new(settings, axes, [1.0; 3]).unwrap();
     let all = settings.iter().map(|settings| Network { shape: shape(settings), penalty: false });
-    // One that a warp holds, and one that goes in batches.
+    // One fused and one batched network.
     all.chain([0, 6].map(|number| Network { shape: shape(&settings[number]), penalty: true })).collect()
 }
 
-/// An architecture, and whether its loss has a penalty on means.
+/// An architecture, with or without a penalty on means in its loss.
 struct Network {
     shape: Architecture,
     penalty: bool,
@@ -76,21 +76,21 @@ fn variants(source: &str) -> Vec<Vec<String>> {
             .collect(),
         "trace_grid.cu" => vec![
             grid(&[]),
-            grid(&[("STORAGE", "1"), ("MARKS", "1"), ("SCALED", "1"), ("EVEN", "5"), ("WRAP", "2"), ("SEAM", "2")]),
-            grid(&[("STORAGE", "2"), ("MARKS", "1")]),
+            grid(&[("STORAGE", "1"), ("MISSING", "1"), ("SCALED", "1"), ("EVEN", "5"), ("WRAP", "2"), ("SEAM", "2")]),
+            grid(&[("STORAGE", "2"), ("MISSING", "1")]),
             grid(&[("STORAGE", "2"), ("REAL", "double"), ("KEEP", "0"), ("DIFFERENCES", "1")]),
             grid(&[("REAL", "double"), ("KEEP", "0")]),
             grid(&[("REAL", "double"), ("DIFFERENCES", "1")]),
-            grid(&[("AXES", "2"), ("MARKS", "1"), ("DIFFERENCES", "1")]),
+            grid(&[("AXES", "2"), ("MISSING", "1"), ("DIFFERENCES", "1")]),
             grid(&[("AXES", "2"), ("CUBIC", "1"), ("EVEN", "3")]),
             grid(&[("CUBIC", "1")]),
             grid(&[("AXES", "2"), ("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1")]),
-            grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MARKS", "1"), ("EVEN", "3")]),
+            grid(&[("SPHERE", "1"), ("SCALED", "1"), ("WRAP", "1"), ("SEAM", "1"), ("MISSING", "1"), ("EVEN", "3")]),
         ],
         "window.cu" => (1..3).map(|storage| vec![format!("RW_STORAGE={storage}")]).collect(),
         "network.cu" => networks().iter().map(Network::defines).collect(),
         "network_fused.cu" => networks().iter().filter(|network| is_fused(&network.shape, usize::MAX)).map(Network::defines).collect(),
-        // All shapes, for no device has room for all of them at once; with the shared memory of H200, A100 and the RTX cards since Ampere.
+        // All tilings, for the shared memory of H200, A100 and the RTX cards since Ampere.
         "network_batched.cu" => networks()
             .iter()
             .flat_map(|network| {
@@ -106,7 +106,7 @@ fn variants(source: &str) -> Vec<Vec<String>> {
 #[test]
 #[ignore = "needs NVRTC (`make test` fetches it)"]
 fn for_both_architectures() {
-    for (source, _) in SOURCES {
+    for source in SOURCES.iter().filter_map(|(path, _)| path.rsplit('/').next()) {
         for defines in variants(source) {
             for capability in [(8, 0), (9, 0)] {
                 let cubin = Request::new(source, capability, &defines).unwrap().compile().unwrap_or_else(|error| panic!("{error}"));

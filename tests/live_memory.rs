@@ -1,15 +1,18 @@
-//! `live.memory_gib` bounds all that following a simulation takes: windows, steps that wait for their blocks, and buffers.
+//! `live.memory_gib` bounds all memory for following a simulation: windows, steps that wait for their blocks, and buffers. The test counts the
+//! heap of its process, which therefore runs nothing else.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
+mod kit;
+
+use kit::ring::{self, Ring, columns};
 use ridgewatch::source::live::{Live, LiveSettings, Taken};
-use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer};
+use ridgewatch_wire::{Policy, Producer};
 use std::alloc::{GlobalAlloc, Layout, System};
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, AtomicIsize, Ordering};
 use std::time::{Duration, Instant};
 
-/// Counts what the process holds on its heap, and its peak.
+/// Counts the bytes on the heap of the process, and their peak.
 struct Counting;
 
 static HELD: AtomicIsize = AtomicIsize::new(0);
@@ -34,52 +37,41 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// After so long a test that hangs fails.
+/// Time after which a test that hangs fails.
 const LONG: Duration = Duration::from_secs(120);
 const NODES: u64 = 256;
-/// Of a snapshot; a step of two components has half of it.
+/// Bytes of a snapshot; a step of two components has half of them.
 const SNAPSHOT: f64 = 16.0 * (NODES * NODES) as f64;
-/// For names, descriptions and words.
+/// Allowance for names, descriptions and messages.
 const SMALL: f64 = 0.5 * SNAPSHOT;
 
 #[test]
 fn windows_waiting_steps_and_buffers_stay_below_the_limit() {
-    let ring = PathBuf::from("/dev/shm").join(format!("rw-live-memory-{}", std::process::id()));
-    let _ = std::fs::remove_dir_all(&ring);
-    let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, NODES);
-    let half = |index: u32| {
-        let mut description = Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
-        let offset = [0, NODES / 2 * u64::from(index), 0];
-        description.block = BlockExtent { index, count: 2, offset, extent: [NODES, NODES / 2, 1] };
-        description
-    };
-    let solvers = [0, 1].map(|block| Producer::open(&ring, half(block), 8, Policy::Wait(Duration::from_millis(20))).unwrap());
+    let ring = Ring::new("live-memory");
+    let blocks = columns(NODES, 2).into_iter();
+    let solvers: Vec<_> = blocks.map(|block| Producer::open(&ring.0, block, 8, Policy::Wait(Duration::from_millis(20))).unwrap()).collect();
     let plane = vec![1.0f32; (NODES * NODES / 2) as usize];
-    let publish = |block: usize, step: u64| {
-        let components = [plane.as_ptr().cast::<u8>(); 2];
-        // SAFETY: a value a node of the block.
-        unsafe { solvers[block].publish(step, step as f64, &Field::packed(&components, Element::F32, [NODES, NODES / 2, 1])).unwrap() };
-    };
+    let publish = |block: usize, step: u64| ring::publish(&solvers[block], step, step as f64, &[&plane[..]; 2]);
     // Eight snapshots, twice.
     let limit = (2.0 * 8.0 + 2.0) * SNAPSHOT + 5.0 * SNAPSHOT / 2.0;
-    let settings = LiveSettings { ring: Some(ring.clone()), memory_gib: limit / f64::from(1 << 30), ..LiveSettings::default() };
+    let settings = LiveSettings { ring: Some(ring.0.clone()), memory_gib: limit / f64::from(1 << 30), ..LiveSettings::default() };
     let before = HELD.load(Ordering::Relaxed);
     PEAK.store(before, Ordering::Relaxed);
     let window = Live::connect(&settings, &AtomicBool::new(false), &mut |_| {}).unwrap().unwrap().follow(6.0, 1).unwrap();
     let (mut frame, mut incomplete) = (None::<Taken>, 0);
     let most = || (PEAK.load(Ordering::Relaxed) - before) as f64;
-    // Until all that takes memory was there; on a slow machine more steps are lost on the way.
+    // Until everything that takes memory has been used; a slow machine loses more steps.
     let (mut step, begin) = (0, Instant::now());
     loop {
         publish(0, step);
-        // Now and then one block is six steps behind the other, more than wait at once.
+        // At times one block is six steps behind the other, more than may wait at once.
         let behind = if step % 60 < 45 { 0 } else { 6 };
         publish(1, step - behind);
-        // A frame takes as long as a window of steps and more; then its window goes.
+        // A frame takes longer than a window of steps; then its window is dropped.
         if step % 12 == 11 {
             frame = None;
             if let Ok(Some(Ok(taken))) = window.next_within(Duration::from_millis(200)) {
-                incomplete = taken.live.incomplete;
+                incomplete = taken.live.steps_incomplete;
                 frame = Some(taken);
             }
         }
@@ -95,6 +87,4 @@ fn windows_waiting_steps_and_buffers_stay_below_the_limit() {
     let most = most();
     println!("{most} bytes at most, {limit} allowed, {} snapshots in the window, {incomplete} steps incomplete", taken.live.snapshots);
     assert!(most <= limit + SMALL, "{most} bytes, {limit} allowed");
-    drop((window, solvers, taken));
-    let _ = std::fs::remove_dir_all(&ring);
 }

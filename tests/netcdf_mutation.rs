@@ -1,15 +1,15 @@
-//! Damaged classic files: whatever the bytes, an answer or an error that names the file, no panic, no hang, no memory for what a file only
-//! claims to hold.
+//! Damaged classic files: each gives snapshots or an error that names the file. No panic, no hang, no memory for data that a file only claims
+//! to hold. The test measures the memory of its process, which therefore runs nothing else.
 //!
-//! NetCDF-4 is elsewhere (archive_mutation.rs): there the bytes are read by libhdf5, whose C code may crash on a damaged file by itself.
+//! NetCDF-4 files are in archive_mutation.rs, since the C code of libhdf5 may crash on a damaged file.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 #![cfg(target_os = "linux")]
 
-mod netcdf_fixture;
+mod kit;
 
-use netcdf_fixture::grids::{Ocean, Wrf, packed_levels};
-use netcdf_fixture::mutants::{mutant, used};
-use netcdf_fixture::*;
+use kit::grids::{Ocean, Wrf, packed_levels};
+use kit::mutants::{mutant, used};
+use kit::netcdf::*;
 use ridgewatch::source::{Archive, ArchiveSettings, SnapshotSource, inspect};
 use std::time::{Duration, Instant};
 
@@ -28,12 +28,10 @@ fn mutated_files_are_answered() {
             .axis("lon", "degrees_east", &[0.0, 90.0, 180.0, 270.0])
             .axis("lat", "degrees_north", &[30.0, 20.0, 10.0])
             .axis("time", "days since 2000-01-01 00:00:00 +01:00", &[0.0, 1.0, 2.0])
-            .variable("u", &["time", "lat", "lon"], Data::I16((0..36).collect()))
+            .fields("m s-1", [("u", Data::I16((0..36).collect()))])
             .with("scale_factor", 0.5)
             .with("valid_range", vec![-5i16, 30])
-            .with("units", "m s-1")
-            .variable("v", &["time", "lat", "lon"], Data::I16((0..36).collect()))
-            .with("units", "m s-1")
+            .fields("m s-1", [("v", Data::I16((0..36).collect()))])
     };
     let cases = [
         ("version 1", records(CLASSIC)),
@@ -43,10 +41,11 @@ fn mutated_files_are_answered() {
         ("staggered", Wrf { format: OFFSET_64, ..Wrf::default() }.fixture()),
         ("curvilinear", Ocean { format: DATA_64, n: 9, ..Ocean::default() }.fixture()),
     ];
+    let settings = ArchiveSettings::default();
     let share = count.div_ceil(cases.len() as u64);
     for (name, fixture) in cases {
         let whole = std::fs::read(fixture.write(&file)).unwrap();
-        assert!(Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()).is_ok());
+        assert!(Archive::open(std::slice::from_ref(&file), &settings).is_ok());
         let used = used(&whole);
         let (mut read, mut refused) = (0, 0);
         for _ in 0..share {
@@ -55,7 +54,7 @@ fn mutated_files_are_answered() {
             std::fs::remove_file(&file).unwrap();
             std::fs::write(&file, &bytes).unwrap();
             let begin = Instant::now();
-            match Archive::open(std::slice::from_ref(&file), &ArchiveSettings::default()) {
+            match Archive::open(std::slice::from_ref(&file), &settings) {
                 Ok(mut archive) => {
                     read += 1;
                     assert!(archive.times().len() <= whole.len(), "bounded by the file: {name}");
@@ -71,7 +70,7 @@ fn mutated_files_are_answered() {
                     assert!(error.to_string().contains("mutant.nc"), "names no file: {name}: {error}");
                 }
             }
-            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &ArchiveSettings::default(), None) {
+            if let Ok(inspection) = inspect(std::slice::from_ref(&file), &settings, None) {
                 assert!(inspection.to_string().contains("mutant.nc"));
             }
             // A millisecond's work; the machine may be slow and busy.
@@ -83,12 +82,12 @@ fn mutated_files_are_answered() {
     }
     let grown = peak() - before;
     println!("{longest:.1?} at most, {} MB more at most than before", grown >> 20);
-    // 7 MB were measured, on 3000 and on 30,000 mutants of files of 7 kB at most: the program's own pages. 2^20 values that a file claims and
-    // does not have would take 8 MB more as f64 alone.
+    // 7 MB were measured, on 3000 and on 30,000 mutants of files of 7 kB at most: pages of the program itself. 2^20 values that a file only
+    // claims to hold would take 8 MB more as f64 alone.
     assert!(grown < 14 << 20, "{grown}");
 }
 
-/// Bytes that this process had in memory at most. What `getrusage` says would begin at the peak of the process that started this one.
+/// Peak memory of this process in bytes. `getrusage` would begin at the peak of the process that started this one.
 fn peak() -> u64 {
     let status = std::fs::read_to_string("/proc/self/status").unwrap();
     let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:")).unwrap();

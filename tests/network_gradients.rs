@@ -1,4 +1,4 @@
-//! The three ways to train, against one another, against finite differences in f64, and Adam against burn's.
+//! The three training paths compared with one another and with finite differences in f64, and Adam compared with burn's.
 
 #![allow(clippy::unwrap_used)]
 
@@ -8,7 +8,7 @@ use network_support::reference::{Kernel, Reference, Rounding, labels, norm};
 use network_support::{Case, cases, uniform_points};
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Model, Objective, Pick, Row, Step, Target, autodiff_gradient, operation_step, row, stock_step,
+    Architecture, Average, Fused, Model, Objective, PlannedStep, Row, Step, Target, autodiff_gradient, operation_step, row, stock_step,
 };
 
 fn prepare(case: &Case) -> (Model, Objective, Samples) {
@@ -32,12 +32,13 @@ fn fused_steps(model: &mut Model, objective: &Objective, samples: &Samples, rate
     fused.steps(model, objective, &mut average, |done, loss| {
         losses.extend(loss);
         let rate = *rates.get(done as usize)?;
-        Some(Step { samples, pick: Pick::InOrder, count: samples.len(), rate, average_share: 1.0, lazy: false, base: None })
+        let planned = PlannedStep { count: samples.len(), drawn: None, hold_out: false, rate, average_share: 1.0, lazy: false };
+        Some(Step::of(&planned, samples, None, None))
     });
     losses
 }
 
-/// Forgets the moments, so that after one step the first moment is the gradient / 10.
+/// The model without moments: after one step, its first moment is the gradient / 10.
 fn fresh(model: &Model) -> Model {
     Model { table_moments: None, layer_moments: None, ..model.clone() }
 }
@@ -62,7 +63,7 @@ fn gradients_equal_finite_differences_in_f64() {
         let (fused, stock) = (gradients(&fused), gradients(&stock));
 
         let mut reference = Reference::new(&model);
-        // What kernels of a device are held to must hold itself.
+        // The gradient by hand is the reference of the device's kernels.
         let known = objective.target == Target::Ftle && objective.mean_penalty == 0.0;
         let by_hand = known.then(|| reference.gradient(&objective, &samples, Kernel::Fused, Rounding::NONE));
         let expected = reference.loss(&objective, &samples);
@@ -134,7 +135,8 @@ fn three_ways_stay_together_over_many_steps() {
         let moved: Vec<f64> = stock.layers().iter().zip(model.layers()).map(|(a, b)| f64::from(a - b)).collect();
         for other in [&operation, &fused] {
             let apart: Vec<f64> = stock.layers().iter().zip(other.layers()).map(|(a, b)| f64::from(a - b)).collect();
-            // Adam divides by tiny second moments, so roundings of vanishing gradients show; they must stay small against the way travelled.
+            // Adam divides by tiny second moments, which amplifies rounding of vanishing gradients; it must stay small beside the way
+            // travelled.
             assert!(norm(&apart) < 2e-2 * norm(&moved), "{}: {} apart after {}", case.name, norm(&apart), norm(&moved));
         }
     }
@@ -151,7 +153,7 @@ fn adam_equals_burns_step_for_step() {
         stock_step(&mut stock, &objective, &samples, 300, 1e-2);
         let moments = |m: &Model| m.layer_moments.as_ref().unwrap().momentum.moment_2.clone().into_data().to_vec::<f32>().unwrap();
         let largest = stock.layers().iter().zip(fused.layers()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-        // A step moves a weight by about the rate, 1e-2; the gradients behind it agree to about 1e-5 of it, the small ones to less.
+        // A step moves a weight by about the rate, 1e-2; large gradients agree to about 1e-5, small ones less well.
         assert!(largest < 2e-4, "step {step}: {largest}");
         for (a, b) in moments(&stock).iter().zip(moments(&fused)) {
             assert!((a - b).abs() <= 1e-4 * a.abs() + 1e-12, "step {step}: second moments {a} and {b}");

@@ -1,4 +1,5 @@
-//! `examples/evaluate_network.py` gives what the program predicts, from the checkpoint alone. Needs Python with NumPy (`make test-reader` has it).
+//! `examples/evaluate_network.py` reproduces the predictions of the program from the checkpoint alone. Needs Python with NumPy
+//! (`make test-reader` has it).
 
 #![allow(clippy::unwrap_used)]
 
@@ -7,12 +8,12 @@ mod network_support;
 use network_support::{DoubleGyre, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target, Times};
-use ridgewatch::surrogate::{Kind, SampleRing, SurrogateSettings, build};
+use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, SurrogateSettings, build};
 use std::io::Write;
 use std::path::Path;
 use std::process::{Command, Stdio};
 
-/// The example's answers at unit points, or what it says instead.
+/// The example's predictions at unit points, or its error message.
 fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<f32>, String> {
     let python = std::env::var("PYTHON").unwrap_or_else(|_| "python3".into());
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/examples/evaluate_network.py");
@@ -24,13 +25,13 @@ fn evaluated(checkpoint: &Path, points: &[[f32; 3]], times: &str) -> Result<Vec<
         .spawn()
         .unwrap();
     let text: String = points.iter().map(|[x, y, z]| format!("{x} {y} {z} {times}\n")).collect();
-    // The script reads everything before it writes anything, or refuses and reads nothing.
-    let fed = child.stdin.take().unwrap().write_all(text.as_bytes());
+    // The script reads everything before it writes anything, or it fails and reads nothing.
+    let written = child.stdin.take().unwrap().write_all(text.as_bytes());
     let output = child.wait_with_output().unwrap();
     if !output.status.success() {
         return Err(String::from_utf8(output.stderr).unwrap());
     }
-    fed.unwrap();
+    written.unwrap();
     Ok(String::from_utf8(output.stdout).unwrap().lines().map(|line| line.parse().unwrap()).collect())
 }
 
@@ -59,25 +60,25 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     ] {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        let mut ring = SampleRing::new(2 * samples.len());
+        let mut ring = ReplayBuffer::new(2 * samples.len());
         for (window, samples) in [(&tracer, &samples), (&later, &other)] {
             ring.set_now(Times::new(network, tracer.tau).unit(window.start, window.tau));
             ring.push(samples);
         }
-        surrogate.learn(&ring, f64::INFINITY, 200);
+        surrogate.learn(&ring, f64::INFINITY, 200).unwrap();
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);
         points.extend([[0.0; 3], [1.0; 3], [1.0, 0.0, 0.5]]);
         if !times.is_empty() {
-            surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30));
+            surrogate.window_slid(&DoubleGyre::new(2.5, if times == "2.5" { 3.0 } else { 1.2 }, 30)).unwrap();
         }
         let mut expected = vec![0.0; points.len()];
-        surrogate.predict(&points, &mut expected);
+        surrogate.predict(&points, &mut expected).unwrap();
         let found = evaluated(&path, &points, times).unwrap();
         assert_eq!(found.len(), expected.len());
         for ((point, found), expected) in points.iter().zip(&found).zip(&expected) {
-            // f64 there, f32 here.
+            // The script computes in f64, the program in f32.
             assert!((found - expected).abs() < 2e-4 * expected.abs().max(1.0), "{name}: {point:?}: {found} for {expected}");
         }
     }
@@ -85,13 +86,13 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
 
 #[test]
 #[ignore = "needs Python with NumPy (`make test-reader` has it)"]
-fn what_the_reader_does_not_take_it_says() {
+fn the_reader_refuses_what_it_cannot_evaluate() {
     let folder = tempfile::tempdir().unwrap();
     let tracer = DoubleGyre::new(0.0, 3.0, 30);
     let hash = NetworkSettings { log2_table: 9, batch: 1024, ..NetworkSettings::default() };
     let start = NetworkSettings { inputs: vec![Input::Start], start_range: Some([-1.0, 4.0]), ..hash.clone() };
     let flow_map = NetworkSettings { target: Target::FlowMap, ..hash.clone() };
-    for (name, network, kind, times, told) in [
+    for (name, network, kind, times, expected) in [
         ("no start", &start, Kind::Network, "", "points have 3 columns; this network takes 4: x y z start"),
         ("a time too many", &hash, Kind::Network, "2.5", "points have 4 columns; this network takes 3: x y z"),
         ("flow map", &flow_map, Kind::Network, "", "its target is not ftle"),
@@ -101,7 +102,7 @@ fn what_the_reader_does_not_take_it_says() {
         let surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
-        let said = evaluated(&path, &uniform_points(8, 5), times).unwrap_err();
-        assert!(said.contains(told) && !said.contains("Traceback"), "{name}: {said}");
+        let message = evaluated(&path, &uniform_points(8, 5), times).unwrap_err();
+        assert!(message.contains(expected) && !message.contains("Traceback"), "{name}: {message}");
     }
 }

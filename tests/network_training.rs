@@ -1,38 +1,29 @@
-//! Surrogates through their trait: learning, divergence, bad samples, checkpoints, the slide of the window.
+//! Surrogates through their trait: learning, divergence, bad samples, checkpoints, slides of the window.
 
 #![allow(clippy::unwrap_used)]
 
 mod network_support;
 
-use network_support::{DoubleGyre, traced, uniform_points};
+use network_support::{DoubleGyre, rms, traced, uniform_points};
 use ridgewatch::flow::Tracer;
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
-use ridgewatch::surrogate::{
-    CheckpointError, Kind, Predict, ResidualNetwork, SampleRing, Samples, Surrogate, SurrogateSettings, Table, build,
-};
+use ridgewatch::surrogate::{CheckpointError, HostSurrogate, Kind, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace, build};
 
 fn small() -> NetworkSettings {
     NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() }
 }
 
-fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Tracer) -> Box<dyn Surrogate> {
+fn surrogate(kind: Kind, network: &NetworkSettings, tracer: &dyn Trace) -> HostSurrogate {
     let settings = SurrogateSettings { kind, table_nodes: Some([33, 17, 1]) };
-    build(&settings, network, tracer.domain(), 5, tracer).unwrap()
+    build(&settings, network, tracer.flow().domain(), 5, tracer).unwrap()
 }
 
-fn rms(surrogate: &dyn Surrogate, samples: &Samples) -> f64 {
-    let mut predicted = vec![0.0; samples.len()];
-    surrogate.predict(&samples.points, &mut predicted);
-    let sum: f64 = predicted.iter().zip(&samples.log_stretch).map(|(p, t)| f64::from(p - t).powi(2)).sum();
-    (sum / samples.len() as f64).sqrt()
-}
-
-fn psnr(surrogate: &dyn Surrogate, samples: &Samples) -> f64 {
+fn psnr(surrogate: &HostSurrogate, samples: &Samples) -> f64 {
     let peak = samples.log_stretch.iter().copied().fold(f32::MIN, f32::max);
     20.0 * (f64::from(peak) / rms(surrogate, samples)).log10()
 }
 
-/// Every kind of network learns the double gyre: the error of a constant is 1 deviation; what is reached by 300 small steps is a fraction of it.
+/// Every kind of network learns the double gyre. The error of a constant is 1 deviation; 300 small steps reach a fraction of it.
 #[test]
 fn every_variant_learns() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
@@ -47,15 +38,15 @@ fn every_variant_learns() {
         ("frequency", frequency, 0.8),
     ] {
         let mut surrogate = surrogate(Kind::Network, &network, &tracer);
-        let learned = surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 300);
+        let learned = surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 300).unwrap();
         assert_eq!((learned.steps, learned.rollbacks, learned.dropped), (300, 0, 0), "{name}");
         assert_eq!(learned.samples, 300 * 2048);
-        let error = rms(&*surrogate, &held_out) / deviation;
+        let error = rms(&surrogate, &held_out) / deviation;
         assert!(error < share, "{name}: {error} of the deviation");
     }
 }
 
-/// The FTLE comes from derivatives of the network, which are worse than its values; but it must have learned something of them.
+/// The FTLE comes from derivatives of the network, which are less accurate than its values, but must improve too.
 #[test]
 fn the_flow_map_learns_arrivals_and_jacobians() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
@@ -65,39 +56,43 @@ fn the_flow_map_learns_arrivals_and_jacobians() {
     for jacobian_weight in [0.0, 0.1] {
         let network = NetworkSettings { target: Target::FlowMap, jacobian_weight, ..small() };
         let mut surrogate = surrogate(Kind::Network, &network, &tracer);
-        let first = surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 20).loss.unwrap();
-        let last = (0..14).map(|_| surrogate.learn(&SampleRing::holding(&samples), f64::INFINITY, 20).loss.unwrap()).last().unwrap();
+        let first = surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap().loss.unwrap();
+        let last =
+            (0..14).map(|_| surrogate.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap().loss.unwrap()).last().unwrap();
         assert!(last < 0.5 * first, "weight {jacobian_weight}: loss {first}, then {last}");
         // A network that has learned nothing maps every point nearly onto itself: hardly any stretch. Derivatives lag behind values, so in
         // 300 steps only a third of the way is asked for.
-        let error = rms(&*surrogate, &held_out);
+        let error = rms(&surrogate, &held_out);
         assert!(error < 0.7 * identity, "weight {jacobian_weight}: {error} of {identity}");
     }
-    // Labels that lack what the target asks for are dropped, not trained on.
+    // Samples without the labels of the target are dropped.
     let network = NetworkSettings { target: Target::FlowMap, ..small() };
-    assert_eq!(surrogate(Kind::Network, &network, &tracer).learn(&SampleRing::holding(&held_out), f64::INFINITY, 20).dropped, 2_000);
+    assert_eq!(
+        surrogate(Kind::Network, &network, &tracer).learn(&ReplayBuffer::holding(&held_out), f64::INFINITY, 20).unwrap().dropped,
+        2_000
+    );
 }
 
 #[test]
 fn a_residual_starts_as_its_table_and_improves_on_it() {
     let tracer = DoubleGyre::new(0.0, 10.0, 40);
     let held_out = traced(&tracer, uniform_points(2, 4_000), false);
-    let table = Table::trace(&tracer, [33, 17, 1]);
-    let mut residual = ResidualNetwork::new(&small(), [33, 17, 1], 5, &tracer).unwrap();
+    let table = surrogate(Kind::Table, &small(), &tracer);
+    let mut residual = surrogate(Kind::Residual, &small(), &tracer);
     let (mut a, mut b) = (vec![0.0; held_out.len()], vec![0.0; held_out.len()]);
-    table.predict(&held_out.points, &mut a);
-    residual.predict(&held_out.points, &mut b);
+    table.predict(&held_out.points, &mut a).unwrap();
+    residual.predict(&held_out.points, &mut b).unwrap();
     assert_eq!(a, b);
     let before = psnr(&residual, &held_out);
-    residual.learn(&SampleRing::holding(&traced(&tracer, uniform_points(1, 40_000), false)), f64::INFINITY, 400);
+    residual.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 40_000), false)), f64::INFINITY, 400).unwrap();
     let after = psnr(&residual, &held_out);
     assert!(after > before + 2.0, "{before} dB, then {after} dB");
-    // Another start time: the table is traced anew; a residual that no longer fits is forgotten at the next samples.
+    // At another start time, the table is traced anew, and the next samples reset a residual that no longer fits.
     let later = DoubleGyre::new(5.0, 10.0, 40);
     let held_out = traced(&later, uniform_points(3, 4_000), false);
-    residual.window_slid(&later);
-    residual.learn(&SampleRing::holding(&traced(&later, uniform_points(4, 40_000), false)), f64::INFINITY, 1);
-    let (slid, table) = (psnr(&residual, &held_out), psnr(&Table::trace(&later, [33, 17, 1]), &held_out));
+    residual.window_slid(&later).unwrap();
+    residual.learn(&ReplayBuffer::holding(&traced(&later, uniform_points(4, 40_000), false)), f64::INFINITY, 1).unwrap();
+    let (slid, table) = (psnr(&residual, &held_out), psnr(&surrogate(Kind::Table, &small(), &later), &held_out));
     // One step at the full rate may cost a little.
     assert!(slid > table - 1.0, "residual {slid} dB on a table of {table} dB");
 }
@@ -106,12 +101,12 @@ fn a_residual_starts_as_its_table_and_improves_on_it() {
 fn a_network_does_not_lose_to_the_constant_after_a_slide() {
     let (early, late) = (DoubleGyre::new(0.0, 10.0, 40), DoubleGyre::new(0.5, 10.0, 40));
     let mut network = surrogate(Kind::Network, &small(), &early);
-    network.learn(&SampleRing::holding(&traced(&early, uniform_points(1, 20_000), false)), f64::INFINITY, 300);
-    network.window_slid(&late);
+    network.learn(&ReplayBuffer::holding(&traced(&early, uniform_points(1, 20_000), false)), f64::INFINITY, 300).unwrap();
+    network.window_slid(&late).unwrap();
     let held_out = traced(&late, uniform_points(2, 4_000), false);
-    let carried = rms(&*network, &held_out);
-    network.learn(&SampleRing::holding(&traced(&late, uniform_points(3, 20_000), false)), f64::INFINITY, 300);
-    assert!(rms(&*network, &held_out) < carried);
+    let carried = rms(&network, &held_out);
+    network.learn(&ReplayBuffer::holding(&traced(&late, uniform_points(3, 20_000), false)), f64::INFINITY, 300).unwrap();
+    assert!(rms(&network, &held_out) < carried);
 }
 
 #[test]
@@ -122,12 +117,12 @@ fn samples_without_a_value_are_dropped_and_counted() {
     samples.log_stretch[77] = f32::INFINITY;
     samples.points[100][1] = f32::NAN;
     let mut network = surrogate(Kind::Network, &small(), &tracer);
-    let learned = network.learn(&SampleRing::holding(&samples), f64::INFINITY, 50);
+    let learned = network.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 50).unwrap();
     assert_eq!((learned.dropped, learned.rollbacks, learned.steps), (3, 0, 50));
     assert!(learned.loss.unwrap().is_finite());
-    assert!(rms(&*network, &traced(&tracer, uniform_points(2, 500), false)).is_finite());
+    assert!(rms(&network, &traced(&tracer, uniform_points(2, 500), false)).is_finite());
     let nothing = Samples { points: vec![[0.5; 3]], log_stretch: vec![f32::NAN], ..Samples::default() };
-    let learned = network.learn(&SampleRing::holding(&nothing), f64::INFINITY, 50);
+    let learned = network.learn(&ReplayBuffer::holding(&nothing), f64::INFINITY, 50).unwrap();
     assert_eq!((learned.dropped, learned.steps, learned.loss), (1, 0, None));
 }
 
@@ -135,27 +130,27 @@ fn samples_without_a_value_are_dropped_and_counted() {
 fn a_diverging_loss_is_rolled_back_and_counted() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
     let samples = traced(&tracer, uniform_points(1, 5_000), false);
-    // A rate at which Adam throws every weight across the whole landscape.
+    // At this rate Adam diverges.
     let network = NetworkSettings { learning_rate: Some(1.0), ..small() };
     let mut wild = surrogate(Kind::Network, &network, &tracer);
-    let learned = wild.learn(&SampleRing::holding(&samples), f64::INFINITY, 300);
+    let learned = wild.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 300).unwrap();
     assert!(learned.rollbacks > 0, "{learned:?}");
     let held_out = traced(&tracer, uniform_points(2, 2_000), false);
-    let error = rms(&*wild, &held_out);
+    let error = rms(&wild, &held_out);
     let scale = held_out.log_stretch.iter().map(|s| f64::from(*s).powi(2)).sum::<f64>().sqrt() / (held_out.len() as f64).sqrt();
     assert!(error.is_finite() && error < 4.0 * scale, "{error} beside labels of {scale}");
-    // A label from hell: finite, but its square is not.
+    // Finite labels whose squares overflow.
     let mut calm = surrogate(Kind::Network, &small(), &tracer);
-    calm.learn(&SampleRing::holding(&samples), f64::INFINITY, 100);
-    let before = rms(&*calm, &held_out);
+    calm.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 100).unwrap();
+    let before = rms(&calm, &held_out);
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples.clone() };
-    let learned = calm.learn(&SampleRing::holding(&poison), f64::INFINITY, 20);
+    let learned = calm.learn(&ReplayBuffer::holding(&poison), f64::INFINITY, 20).unwrap();
     assert!(learned.rollbacks > 0 && learned.steps == 0, "{learned:?}");
     assert_eq!(learned.loss, None, "all of its steps diverged");
-    assert_eq!(rms(&*calm, &held_out), before);
+    assert_eq!(rms(&calm, &held_out), before);
 }
 
-/// A flow that stretches three times as much from window to window: losses grow by 9, but nothing has diverged.
+/// A flow that stretches three times as much from window to window: losses grow by 9 without divergence.
 #[test]
 fn a_flow_that_grows_is_not_taken_for_a_divergence() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
@@ -165,9 +160,9 @@ fn a_flow_that_grows_is_not_taken_for_a_divergence() {
         let mut growth = 0.01;
         for window in 0..8 {
             let log_stretch = calm.log_stretch.iter().map(|s| growth * s).collect();
-            let learned = surrogate.learn(&SampleRing::holding(&Samples { log_stretch, ..calm.clone() }), f64::INFINITY, 40);
+            let learned = surrogate.learn(&ReplayBuffer::holding(&Samples { log_stretch, ..calm.clone() }), f64::INFINITY, 40).unwrap();
             assert_eq!((learned.rollbacks, learned.steps), (0, 40), "{kind:?}, window {window}: {learned:?}");
-            surrogate.window_slid(&tracer);
+            surrogate.window_slid(&tracer).unwrap();
             growth *= 3.0;
         }
     }
@@ -194,25 +189,25 @@ fn a_resumed_run_goes_on_bit_for_bit() {
     {
         let path = folder.path().join(number.to_string());
         let mut first = surrogate(kind, &network, &tracer);
-        first.learn(&SampleRing::holding(&samples), f64::INFINITY, 37);
+        first.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 37).unwrap();
         first.save(&path).unwrap();
-        first.learn(&SampleRing::holding(&samples), f64::INFINITY, 23);
+        first.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 23).unwrap();
         let mut second = surrogate(kind, &network, &tracer);
         second.load(&path).unwrap();
-        second.learn(&SampleRing::holding(&samples), f64::INFINITY, 23);
+        second.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 23).unwrap();
         let (mut a, mut b) = (vec![0.0; 5_000], vec![0.0; 5_000]);
-        first.predict(&samples.points, &mut a);
-        second.predict(&samples.points, &mut b);
+        first.predict(&samples.points, &mut a).unwrap();
+        second.predict(&samples.points, &mut b).unwrap();
         assert!(a.iter().zip(&b).all(|(a, b)| a.to_bits() == b.to_bits()), "{kind:?}");
-        // Saving again gives the same file: weights, both moments, averages and all that is noted.
+        // Saving again gives the same file: weights, both moments, averages and notes.
         let again = [folder.path().join("a"), folder.path().join("b")];
         first.save(&again[0]).unwrap();
         second.save(&again[1]).unwrap();
         assert_eq!(std::fs::read(&again[0]).unwrap(), std::fs::read(&again[1]).unwrap(), "{kind:?}");
     }
-    // Nothing but the checkpoints is left in the folder.
+    // The folder holds only the checkpoints.
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 8);
-    // The range of an input is part of what must fit.
+    // The range of an input must match.
     let other = NetworkSettings { start_range: Some([0.0, 4.0]), ..of_start };
     let fault = surrogate(Kind::Network, &other, &tracer).load(&folder.path().join("4")).unwrap_err().to_string();
     assert!(fault.contains("start_range 0 3") && fault.contains("start_range 0 4"), "{fault}");
@@ -225,10 +220,10 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint");
     let mut network = surrogate(Kind::Network, &small(), &tracer);
-    network.learn(&SampleRing::holding(&samples), f64::INFINITY, 20);
+    network.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 20).unwrap();
     network.save(&path).unwrap();
     let good = std::fs::read(&path).unwrap();
-    let reference = rms(&*network, &samples);
+    let reference = rms(&network, &samples);
 
     let mut damaged: Vec<(String, Vec<u8>)> = vec![
         ("empty".into(), Vec::new()),
@@ -245,18 +240,18 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     for (name, bytes) in damaged {
         std::fs::write(&path, bytes).unwrap();
         assert!(matches!(network.load(&path), Err(CheckpointError::Mismatch { .. })), "{name}");
-        assert_eq!(rms(&*network, &samples), reference, "{name}");
+        assert_eq!(rms(&network, &samples), reference, "{name}");
     }
     assert!(matches!(network.load(&folder.path().join("missing")), Err(CheckpointError::Io { .. })));
 
-    // A sound checkpoint of another shape, kind or scene.
+    // A valid checkpoint of another shape, kind or scene.
     std::fs::write(&path, &good).unwrap();
     let wider = NetworkSettings { width: 48, ..small() };
     assert!(matches!(surrogate(Kind::Network, &wider, &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
     assert!(matches!(surrogate(Kind::Residual, &small(), &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
     assert!(matches!(surrogate(Kind::Table, &small(), &tracer).load(&path), Err(CheckpointError::Mismatch { .. })));
     network.load(&path).unwrap();
-    assert_eq!(rms(&*network, &samples), reference);
+    assert_eq!(rms(&network, &samples), reference);
     // A folder that is not there: an error, and nothing written.
     assert!(matches!(network.save(&folder.path().join("no/such/checkpoint")), Err(CheckpointError::Io { .. })));
 }
@@ -279,9 +274,9 @@ fn time_and_steps_bound_learning() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
     let samples = traced(&tracer, uniform_points(1, 5_000), false);
     let mut network = surrogate(Kind::Network, &small(), &tracer);
-    assert_eq!(network.learn(&SampleRing::holding(&samples), 0.0, 100).steps, 0);
-    assert_eq!(network.learn(&SampleRing::holding(&samples), f64::INFINITY, 0).steps, 0);
-    let learned = network.learn(&SampleRing::holding(&samples), 0.3, u64::MAX);
+    assert_eq!(network.learn(&ReplayBuffer::holding(&samples), 0.0, 100).unwrap().steps, 0);
+    assert_eq!(network.learn(&ReplayBuffer::holding(&samples), f64::INFINITY, 0).unwrap().steps, 0);
+    let learned = network.learn(&ReplayBuffer::holding(&samples), 0.3, u64::MAX).unwrap();
     // One step of 2048 samples takes milliseconds; the rest is for a machine that stands still for a while.
     assert!(learned.steps > 0 && (0.3..30.0).contains(&learned.seconds), "{learned:?}");
 }

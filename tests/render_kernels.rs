@@ -1,8 +1,8 @@
-//! The numerics of the rendering kernels, compiled as host C++, against the Rust code on random inputs: the same text that runs on the
-//! GPU, held to the reference on machines without one. Needs a C++ compiler (`c++`, or what CXX names).
+//! Compares the rendering kernels' numerics, compiled as host C++, with the Rust code on random inputs. The source is the one that runs on the
+//! GPU; the test needs no GPU but a C++ compiler (`c++`, or the one in CXX).
 #![allow(clippy::unwrap_used)] // helpers of tests, which may panic
 
-use ridgewatch::engine::{residuals, stratified_points};
+use ridgewatch::backend::{DeviceError, residuals, stratified_points};
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
@@ -10,7 +10,7 @@ use ridgewatch::flow::{
 };
 use ridgewatch::render::rng::{FrameRandom, philox};
 use ridgewatch::render::{
-    Camera, CameraSettings, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, SeenInCells, Transfer,
+    Camera, CameraSettings, CellObservations, Film, LightSettings, LogStretch, PixelValue, RenderSettings, Renderer, Scene, Transfer,
     TransferSettings,
 };
 use ridgewatch::surrogate::{Predict, Samples, Table};
@@ -23,7 +23,7 @@ use std::sync::{Arc, OnceLock};
 
 static NEVER: AtomicBool = AtomicBool::new(false);
 
-/// The compiled harness. Contraction to fused multiply-add is off, since rustc does not contract either.
+/// Path of the compiled harness. Contraction to fused multiply-add is off, as in rustc.
 fn harness() -> &'static Path {
     static BUILT: OnceLock<PathBuf> = OnceLock::new();
     BUILT.get_or_init(|| {
@@ -54,20 +54,19 @@ fn ask(request: &str, input: &[u8]) -> Vec<u8> {
     output.stdout
 }
 
-fn bytes<T: Copy>(values: &[T]) -> Vec<u8> {
-    // SAFETY: called with numbers and arrays of numbers only, which have no padding.
-    unsafe { std::slice::from_raw_parts(values.as_ptr().cast(), size_of_val(values)) }.to_vec()
+fn bytes<T: bytemuck::NoUninit>(values: &[T]) -> Vec<u8> {
+    bytemuck::cast_slice(values).to_vec()
 }
 
 /// Reads values off the front.
 fn read<T: Copy>(bytes: &mut &[u8], count: usize) -> Vec<T> {
     let (front, rest) = bytes.split_at(count * size_of::<T>());
     *bytes = rest;
-    // SAFETY: called with numbers and structs of numbers, for which every bit pattern is a value.
+    // SAFETY: called with numbers and structs of numbers, for which every bit pattern is valid.
     front.chunks(size_of::<T>()).map(|chunk| unsafe { chunk.as_ptr().cast::<T>().read_unaligned() }).collect()
 }
 
-/// Fresh numbers in [0, 1).
+/// Random numbers in [0, 1).
 fn uniform(stream: u32) -> impl FnMut() -> f32 {
     let mut i = 0;
     move || {
@@ -83,7 +82,7 @@ fn random_words_are_the_same_bits() {
     for i in 0..20_000_u32 {
         let w = philox([i, 0, 0, 0], [1, 2]);
         let (seed, frame) = ((u64::from(w[0]) << 32) | u64::from(w[1]), u64::from(w[2]) << (i % 12));
-        // As `FrameRandom` folds them.
+        // As in `FrameRandom`.
         let key = [seed as u32, ((seed >> 32) as u32).wrapping_add((frame >> 32) as u32)];
         input.extend(bytes(&[key[0], key[1], frame as u32, w[3], i, w[1] >> 20]));
         expected.extend(FrameRandom::new(seed, frame).words(w[3], i, w[1] >> 20));
@@ -114,7 +113,7 @@ fn rays_and_colours_are_the_same_numbers() {
         let camera = Camera::new(&scene.camera, 37.0 / 23.0).unwrap();
         let transfer = Transfer::new(&scene.transfer, 1.0).unwrap();
         let mut renderer = Renderer::new(scene, &domain(), 1.0).unwrap();
-        let mut input = renderer.set_up(0, 0..1).unwrap().parameters.as_bytes().to_vec();
+        let mut input = renderer.frame_setup(0, 0..1).unwrap().parameters.as_bytes().to_vec();
         let n = 5000_u32;
         input.extend(bytes(&[n]));
         let (mut random, mut asked) = (uniform(1), Vec::new());
@@ -136,7 +135,7 @@ fn rays_and_colours_are_the_same_numbers() {
     }
 }
 
-/// Something cheap with structure, some of it missing, some traced.
+/// A cheap test field with structure: some values are missing, some count as traced.
 struct Waves;
 
 impl LogStretch for Waves {
@@ -154,29 +153,29 @@ struct Tracked {
     /// Queries, traced, missing, exceeded, paths, over budget.
     counts: [u64; 6],
     film: Film,
-    seen: SeenInCells,
+    seen: CellObservations,
 }
 
-/// Tracks samples of a frame with the kernels' code. `parts` of a pixel's samples run side by side, `ahead` collisions of a flight.
+/// Tracks samples of a frame with the kernels' code. A pixel's samples are divided into `parts`; a flight queues `ahead` collisions at once.
 fn tracked(renderer: &mut Renderer, frame: u64, samples: std::ops::Range<u32>, parts: u32, ahead: [u32; 2]) -> Tracked {
     tracked_by("frame", &[], renderer, frame, samples, parts, ahead)
 }
 
-/// The same with answers as `request` says, which is told `desk` before.
+/// As [`tracked`], with the answers of `request`, whose own input is `setup`.
 fn tracked_by(
     request: &str,
-    desk: &[u8],
+    answer_setup: &[u8],
     renderer: &mut Renderer,
     frame: u64,
     samples: std::ops::Range<u32>,
     parts: u32,
     ahead: [u32; 2],
 ) -> Tracked {
-    let setup = renderer.set_up(frame, samples.clone()).unwrap();
+    let setup = renderer.frame_setup(frame, samples.clone()).unwrap();
     let (pixels, cells) = (setup.parameters.pixels(), setup.majorants.len());
-    let mut input = [desk, setup.parameters.as_bytes()].concat();
+    let mut input = [answer_setup, setup.parameters.as_bytes()].concat();
     input.extend(bytes(setup.majorants));
-    input.extend(bytes(setup.may_miss));
+    input.extend(bytes(setup.may_be_missing));
     input.extend(bytes(&[0, pixels as u32, parts, samples.start, samples.end - samples.start, 0]));
     input.extend(bytes(&ahead));
     let output = ask(request, &input);
@@ -184,7 +183,7 @@ fn tracked_by(
     let counts = read::<[u32; 6]>(&mut output, 1)[0].map(u64::from);
     let mut film = Film::new(37, 23);
     film.write_pixels(0, &read::<PixelValue>(&mut output, pixels));
-    let seen = SeenInCells { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
+    let seen = CellObservations { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
     assert!(output.is_empty());
     Tracked { counts, film, seen }
 }
@@ -202,7 +201,7 @@ fn whole_frames_are_the_same_bits() {
         let scene = scene(point_light, false, cells);
         let mut reference = Renderer::new(scene.clone(), &domain(), 1.0).unwrap();
         let mut renderer = Renderer::new(scene, &domain(), 1.0).unwrap();
-        // The first frame walks with the largest majorants, later ones with what the frames before have seen.
+        // The first frame uses the largest majorants, later ones those from the values of earlier frames.
         for (frame, samples) in [(0, 0..3), (1, 0..1), (2, 4..9)] {
             let (expected, stats) = reference.render_samples(frame, samples.clone(), &mut Waves, None, &NEVER).unwrap();
             let found = tracked(&mut renderer, frame, samples, 1, [1, 1]);
@@ -214,8 +213,8 @@ fn whole_frames_are_the_same_bits() {
             assert!(bits(&found.film) == bits(&expected), "frame {frame}, cells {cells:?}");
             assert!(renderer.absorb(&found.seen));
         }
-        reference.set_up(3, 0..1).unwrap();
-        renderer.set_up(3, 0..1).unwrap();
+        reference.frame_setup(3, 0..1).unwrap();
+        renderer.frame_setup(3, 0..1).unwrap();
         assert_eq!(renderer.majorants().majorants(), reference.majorants().majorants());
     }
 }
@@ -242,7 +241,7 @@ fn parts_of_a_pixel_merge_to_the_whole() {
         let found = tracked(&mut renderer, 1, 0..13, parts, [1, 1]);
         assert_eq!((found.counts, &found.seen), (whole.counts, &whole.seen), "{parts} parts");
         assert_eq!((&found.film.samples, &found.film.queries), (&whole.film.samples, &whole.film.queries));
-        // Sums in f64 in another order, rounded to f32 once: a unit in the last place.
+        // Sums in f64 in another order, rounded to f32 once, differ by a unit in the last place.
         let near = |a: f32, b: f32| (a.is_nan() && b.is_nan()) || (a - b).abs() <= 2e-7 * (1.0 + b.abs());
         for i in 0..whole.film.samples.len() {
             assert!((0..4).all(|k| near(found.film.rgba[i][k], whole.film.rgba[i][k])), "{parts} parts, pixel {i}");
@@ -266,7 +265,7 @@ fn the_gate_trusts_the_same_points() {
     assert!(ask("gate", &input) == expected);
 }
 
-/// Something to fill a table with.
+/// A tracer of a simple formula, which fills tables.
 struct Plane(Domain);
 
 impl Tracer for Plane {
@@ -294,18 +293,18 @@ fn table_bytes(table: &Table, dimensions: i32) -> Vec<u8> {
 #[test]
 fn tables_are_looked_up_alike() {
     for (domain, dimensions) in [(domain(), 3), (Domain::slab([0.0; 2], [2.0, 1.0], (0.0, 1.0)), 2)] {
-        let table = Table::trace(&Plane(domain), [9, 5, 6]);
+        let table = Table::trace(&Plane(domain), [9, 5, 6]).unwrap();
         let mut random = uniform(5);
         let mut points: Vec<[f32; 3]> = (0..10_000).map(|_| std::array::from_fn(|_| 1.2 * random() - 0.1)).collect();
         points.extend([[0.0; 3], [1.0; 3]]);
         let mut expected = vec![0.0; points.len()];
-        table.predict(&points, &mut expected);
+        table.interpolate(&points, &mut expected);
         let mut input = table_bytes(&table, dimensions);
         input.extend(bytes(&[points.len() as u32]));
         input.extend(bytes(&points));
         let output = ask("table", &input);
         for ((found, expected), point) in read::<f32>(&mut &output[..], points.len()).iter().zip(&expected).zip(&points) {
-            // Where the processor cannot fuse multiply and add, the CPU's lanes round twice: values up to 2 at each of three levels.
+            // A CPU without fused multiply-add rounds twice: values up to 2 at each of three levels.
             assert!((found - expected).abs() <= 1e-6, "{point:?}: {found} and {expected}");
         }
     }
@@ -330,7 +329,7 @@ fn holed(periodic: bool) -> Box<dyn Tracer> {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(2),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -346,8 +345,8 @@ fn axes(periodic: bool) -> [Vec<f64>; 3] {
     [at(if periodic { 1.8 } else { 2.0 }, 11), at(1.0, 6), at(1.0, 7)]
 }
 
-/// Land as the harness reads it: the cells whose middle the tracer calls void.
-fn land_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
+/// Missing cells in the harness's input format: those at whose centre the tracer has no value.
+fn missing_cells_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
     let axes = axes(periodic);
     let mut out = bytes(&[3_i32]);
     let mut middles: Vec<Vec<f64>> = axes.iter().map(|nodes| nodes.windows(2).map(|pair| (pair[0] + pair[1]) / 2.0).collect()).collect();
@@ -361,14 +360,14 @@ fn land_bytes(tracer: &dyn Tracer, periodic: bool) -> Vec<u8> {
     }
     for &z in &middles[2] {
         for &y in &middles[1] {
-            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_void([x as f32, y as f32, z as f32]))));
+            out.extend(middles[0].iter().map(|&x| u8::from(tracer.is_missing([x as f32, y as f32, z as f32]))));
         }
     }
     out
 }
 
-/// Who answers, as the harness reads it. No gate: RK4 everywhere.
-fn desk_bytes(domain: &Domain, spent: bool, gate: Option<&Gate>, land: &[u8], table: &Table) -> Vec<u8> {
+/// Domain, gate, missing cells and table in the harness's input format. Without a gate RK4 answers everywhere.
+fn answer_setup_bytes(domain: &Domain, spent: bool, gate: Option<&Gate>, missing_cells: &[u8], table: &Table) -> Vec<u8> {
     let mut out = bytes(&[domain.min, domain.extent()]);
     out.extend(bytes(&[i32::from(spent)]));
     match gate {
@@ -378,7 +377,7 @@ fn desk_bytes(domain: &Domain, spent: bool, gate: Option<&Gate>, land: &[u8], ta
         }
         None => out.extend(bytes(&[0_i32; 3])),
     }
-    out.extend(land);
+    out.extend(missing_cells);
     out.extend(table_bytes(table, 3));
     out
 }
@@ -402,7 +401,7 @@ fn some_gate() -> Gate {
 #[test]
 fn the_same_one_answers_at_every_point() {
     let (gate, domain) = (some_gate(), domain());
-    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]).unwrap();
     for (periodic, spent) in [(false, false), (true, true)] {
         let tracer = holed(periodic);
         let mut random = uniform(8);
@@ -412,7 +411,7 @@ fn the_same_one_answers_at_every_point() {
         points.extend([[0.0; 3], [2.0, 1.0, 1.0]]);
         let nodes = axes(periodic);
         points.extend((0..77).map(|i| [nodes[0][i % 11] as f32, nodes[1][i % 6] as f32, nodes[2][i % 7] as f32]));
-        let mut input = desk_bytes(&domain, spent, Some(&gate), &land_bytes(&*tracer, periodic), &table);
+        let mut input = answer_setup_bytes(&domain, spent, Some(&gate), &missing_cells_bytes(&*tracer, periodic), &table);
         input.extend(bytes(&[points.len() as u32]));
         input.extend(bytes(&points));
         let output = ask("choices", &input);
@@ -422,7 +421,7 @@ fn the_same_one_answers_at_every_point() {
             let who = read::<i32>(&mut output, 1)[0];
             let values = read::<f32>(&mut output, 4);
             let unit = domain.to_unit(point);
-            let expected = match (tracer.is_void(point), gate.trusts(unit), spent) {
+            let expected = match (tracer.is_missing(point), gate.trusts(unit), spent) {
                 (true, ..) => 0,
                 (_, true, _) => 1,
                 (.., true) => 2,
@@ -432,7 +431,7 @@ fn the_same_one_answers_at_every_point() {
             seen[expected as usize] += 1;
             if expected > 0 {
                 let mut predicted = [0.0];
-                table.predict(&[unit], &mut predicted);
+                table.interpolate(&[unit], &mut predicted);
                 assert_eq!(values[..3], unit, "{point:?}");
                 assert!((values[3] - predicted[0]).abs() <= 1e-6, "{point:?}");
             }
@@ -442,15 +441,16 @@ fn the_same_one_answers_at_every_point() {
     }
 }
 
-/// A surrogate that answers what it was told to.
-struct Told(Vec<f32>);
+/// A surrogate with given predictions.
+struct Given(Vec<f32>);
 
-impl Predict for Told {
+impl Predict for Given {
     fn name(&self) -> &'static str {
-        "told"
+        "given"
     }
-    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) {
+    fn predict(&self, _: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
         out.copy_from_slice(&self.0);
+        Ok(())
     }
     fn bytes(&self) -> usize {
         0
@@ -475,12 +475,12 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
     for &drawn in &strata.drawn {
         input.extend(bytes(&[drawn]));
         for _ in 0..drawn {
-            // Some on land, some without a trace, some predictions that are no number.
-            let (land, lived) = (random() < 0.1, random());
+            // Some points are missing, some traces are NaN, some predictions are not finite.
+            let (missing, lived) = (random() < 0.1, random());
             let traced = if random() < 0.05 { f32::NAN } else { 2.0 * random() - 0.2 };
             let said = if random() < 0.05 { f32::INFINITY } else { traced + 0.2 * random() * random() };
-            input.extend(bytes(&[f32::from(u8::from(land)), lived, said, traced]));
-            if !land {
+            input.extend(bytes(&[f32::from(u8::from(missing)), lived, said, traced]));
+            if !missing {
                 samples.points.push(unit[number]);
                 samples.log_stretch.push(traced);
                 predicted.push(said);
@@ -490,14 +490,14 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
     }
     let output = ask("audit", &input);
     let mut output = &output[..];
-    let expected = Audited::of(&residuals(&Told(predicted), &samples, &transfer, tau), strata.clone());
+    let expected = Audited::of(&residuals(&Given(predicted), &samples, &transfer, tau).unwrap(), strata.clone());
     let (mut number, mut points, mut peak) = (0, 0.0, f64::NEG_INFINITY);
     for (cell, &drawn) in strata.drawn.iter().enumerate() {
         for _ in 0..drawn {
             assert_eq!(read::<[f32; 3]>(&mut output, 1)[0], unit[number], "point {number}");
             number += 1;
         }
-        // What is said of the points themselves stands behind the sums.
+        // Figures of the points themselves follow the sums.
         let found = read::<[f64; 10]>(&mut output, 1)[0];
         let sums = expected.cells()[cell];
         let sums = [sums.count, sums.optical, sums.square, sums.fourth, sums.second, sums.third, sums.log_square];
@@ -518,12 +518,12 @@ fn the_same_labels_are_kept() {
     for shift in [0_u32, 1, 5, 32] {
         let mut input = bytes(&[shift, points.len() as u32]);
         input.extend(bytes(&points));
-        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::engine::cuda::keeps_label(p, shift))).collect();
+        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::backend::cuda::keeps_label(p, shift))).collect();
         assert!(ask("labels", &input) == expected, "1 in 2^{shift}");
     }
 }
 
-/// Answers on the CPU: land, the gate, a table, and the waves where neither answers.
+/// Answers on the CPU: missing cells, then the table inside the gate, and the test field outside.
 struct Gated<'a> {
     tracer: &'a dyn Tracer,
     gate: Option<&'a Gate>,
@@ -537,11 +537,11 @@ impl LogStretch for Gated<'_> {
         for (i, &p) in points.iter().enumerate() {
             let unit = domain().to_unit(p);
             traced[i] = false;
-            if self.tracer.is_void(p) {
+            if self.tracer.is_missing(p) {
                 log_stretch[i] = f32::NAN;
             } else if self.gate.is_some_and(|gate| self.spent || gate.trusts(unit)) {
                 self.over_budget += u64::from(self.gate.is_some_and(|gate| !gate.trusts(unit)));
-                self.table.predict(&[unit], &mut log_stretch[i..=i]);
+                self.table.interpolate(&[unit], &mut log_stretch[i..=i]);
             } else {
                 (log_stretch[i], traced[i]) = ((7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos(), true);
             }
@@ -552,18 +552,18 @@ impl LogStretch for Gated<'_> {
 #[test]
 fn gated_frames_are_the_cpu_s() {
     let (gate, domain) = (some_gate(), domain());
-    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]);
+    let table = Table::trace(&Plane(domain.clone()), [9, 5, 6]).unwrap();
     let tracer = holed(false);
-    let land = land_bytes(&*tracer, false);
+    let missing_cells = missing_cells_bytes(&*tracer, false);
     for (gate, spent) in [(Some(&gate), false), (Some(&gate), true), (None, false)] {
         let scene = scene(false, false, None);
         let mut reference = Renderer::new(scene.clone(), &domain, 1.0).unwrap();
         let mut renderer = Renderer::new(scene, &domain, 1.0).unwrap();
-        let desk = desk_bytes(&domain, spent, gate, &land, &table);
+        let setup = answer_setup_bytes(&domain, spent, gate, &missing_cells, &table);
         for (frame, samples) in [(0, 0..2), (1, 0..5)] {
             let mut answers = Gated { tracer: &*tracer, gate, table: &table, spent, over_budget: 0 };
             let (expected, stats) = reference.render_samples(frame, samples.clone(), &mut answers, None, &NEVER).unwrap();
-            let found = tracked_by("gated", &desk, &mut renderer, frame, samples, 1, [3, 5]);
+            let found = tracked_by("gated", &setup, &mut renderer, frame, samples, 1, [3, 5]);
             let tally = [stats.queries, stats.traced, stats.missing, stats.majorant_exceeded, stats.paths, answers.over_budget];
             assert_eq!(found.counts, tally, "frame {frame}, budget spent: {spent}");
             assert!(bits(&found.film) == bits(&expected), "frame {frame}, budget spent: {spent}");

@@ -1,15 +1,15 @@
-!> Publishes a Fortran solver's velocity to ridgewatch: a module over the C library (ridgewatch.h says what each call does).
+!> Publishes a Fortran solver's velocity to ridgewatch. The module calls the C library, whose header ridgewatch.h documents each call.
 !>
 !>     use ridgewatch
 !>     type(rw_publisher) :: publisher
 !>     call publisher%begin(2)                             ! dimensions
 !>     call publisher%uniform(1, 0d0, 1d0, nx)             ! axis, first node, last node, nodes (and: period)
 !>     call publisher%uniform(2, 0d0, 1d0, ny)
-!>     call publisher%open(status)                         ! where RIDGEWATCH_RING says; rw_off where it is not set
+!>     call publisher%open(status)                         ! in the folder RIDGEWATCH_RING; rw_off if it is not set
 !>     call publisher%publish(step, time, u, v, status)    ! step: int32 or int64; u(nx, ny): real32 or real64, any section of an array
 !>     call publisher%close()
 !>
-!> Errors never stop the solver: a call without `status` passes over them, and rw_message() has the words.
+!> Errors never stop the solver: a call without `status` ignores them, and rw_message() returns the text of the last one.
 module ridgewatch
   use, intrinsic :: iso_c_binding
   use, intrinsic :: iso_fortran_env, only: real32, real64, int32, int64
@@ -23,10 +23,17 @@ module ridgewatch
 
   character(3), parameter :: names = "uvw"
 
-  !> Words of a refusal of this module's own, put together in place: a solver's step takes no memory, not even to be refused.
+  !> Text of an error of this module, of fixed length: publishing allocates nothing, not even for errors.
   type :: words
     character(kind=c_char, len=300) :: text
     integer :: length = 0
+  end type
+
+  !> One component of a step: the address of its first value, and its layout in elements.
+  type :: component
+    type(c_ptr) :: first = c_null_ptr
+    integer :: dimensions = 0, bytes = 4
+    integer(int64) :: extent(3) = 1, strides(3) = 1
   end type
 
   !> A grid while it is described, then an open ring.
@@ -34,7 +41,7 @@ module ridgewatch
     private
     integer :: dimensions = 0
     type(c_ptr) :: description = c_null_ptr, field = c_null_ptr
-    ! Nodes of the axes and of the block as described (0: the whole), and of what was opened, as far as arrays are read.
+    ! Nodes of the described axes, of the described block (0: the whole grid), and of the open ring.
     integer(c_int64_t) :: nodes(3) = 1, block_nodes(3) = 0, extent(3) = 1
   contains
     procedure :: begin => publisher_begin
@@ -49,10 +56,10 @@ module ridgewatch
     procedure :: open => publisher_open
     procedure :: statistics => publisher_statistics
     procedure :: close => publisher_close
-    procedure, private :: publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64
     procedure, private :: publish_2_real32_int32, publish_2_real64_int32, publish_3_real32_int32, publish_3_real64_int32
-    generic :: publish => publish_2_real32, publish_2_real64, publish_3_real32, publish_3_real64, &
-      publish_2_real32_int32, publish_2_real64_int32, publish_3_real32_int32, publish_3_real64_int32
+    procedure, private :: publish_2_real32_int64, publish_2_real64_int64, publish_3_real32_int64, publish_3_real64_int64
+    generic :: publish => publish_2_real32_int32, publish_2_real64_int32, publish_3_real32_int32, publish_3_real64_int32, &
+      publish_2_real32_int64, publish_2_real64_int64, publish_3_real32_int64, publish_3_real64_int64
   end type
 
   interface
@@ -169,7 +176,7 @@ module ridgewatch
 
 contains
 
-  !> Why the last call of this thread failed; empty where there is no memory for it.
+  !> Text of the last error of this thread; empty if there is no memory for it.
   function rw_message() result(message)
     character(:), allocatable :: message
     character(c_char), pointer :: letters(:)
@@ -208,7 +215,7 @@ contains
     character(20) :: digits
     integer(int64) :: rest
     integer :: first
-    ! The remainder has the number's sign, which the most negative one has no opposite of.
+    ! The remainder keeps the number's sign, because the most negative number has no positive counterpart.
     rest = number
     first = len(digits) + 1
     do
@@ -221,7 +228,7 @@ contains
     call add(self, digits(first:))
   end subroutine
 
-  !> Numbers with a sign between them.
+  !> Adds numbers with a separator.
   subroutine add_numbers(self, numbers, between)
     type(words), intent(inout) :: self
     integer(int64), intent(in) :: numbers(:)
@@ -233,7 +240,7 @@ contains
     end do
   end subroutine
 
-  !> Refuses a call before it reaches the library: rw_message() has the words, as if it had been the library.
+  !> Refuses a call before it reaches the library. rw_message() returns the text, as for the library's errors.
   subroutine refuse(found, why, status)
     integer, intent(in) :: found
     type(words), intent(inout) :: why
@@ -243,7 +250,7 @@ contains
     call give(found, status)
   end subroutine
 
-  !> No memory for so many bytes.
+  !> Refuses a call because an allocation failed.
   subroutine refuse_memory(bytes, status)
     integer(int64), intent(in) :: bytes
     integer, intent(out), optional :: status
@@ -254,7 +261,7 @@ contains
     call refuse(rw_system, why, status)
   end subroutine
 
-  !> Whether a grid that is described has the axis; where none is described, the library says so.
+  !> Returns true if the described grid has the axis. Without a description the library refuses the call.
   function has_axis(self, axis, status)
     class(rw_publisher), intent(in) :: self
     integer, intent(in) :: axis
@@ -270,7 +277,7 @@ contains
     call refuse(rw_argument, why, status)
   end function
 
-  !> Begins the description of a grid of 2 or 3 dimensions; an open ring is closed.
+  !> Begins the description of a grid of 2 or 3 dimensions. Closes an open ring.
   subroutine publisher_begin(self, dimensions, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: dimensions
@@ -288,7 +295,7 @@ contains
     call give(merge(rw_ok, rw_argument, c_associated(self%description)), status)
   end subroutine
 
-  !> Axis 1, 2 or 3 of evenly spaced nodes of the global grid. period: length after which it repeats.
+  !> Describes axis 1, 2 or 3 of the global grid with evenly spaced nodes. period: period of the axis, if it has one.
   subroutine publisher_uniform(self, axis, first, last, nodes, period, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: axis, nodes
@@ -305,7 +312,7 @@ contains
     call give(found, status)
   end subroutine
 
-  !> Axis 1, 2 or 3 with its own coordinates, strictly ascending.
+  !> Describes axis 1, 2 or 3 of the global grid by its coordinates, strictly ascending.
   subroutine publisher_rectilinear(self, axis, coordinates, period, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: axis
@@ -329,7 +336,7 @@ contains
     call give(found, status)
   end subroutine
 
-  !> Axes 1 and 2 are longitude and latitude in degrees.
+  !> Makes axes 1 and 2 longitude and latitude in degrees.
   subroutine publisher_sphere(self, radius, status)
     class(rw_publisher), intent(inout) :: self
     real(real64), intent(in) :: radius
@@ -337,7 +344,7 @@ contains
     call give(c_sphere(self%description, radius), status)
   end subroutine
 
-  !> This process has nodes first .. first + extent - 1 (from 1) along each axis; it is block index (from 0) of count.
+  !> Describes this process's block: nodes first .. first + extent - 1 (from 1) along each axis; index (from 0) of count blocks.
   subroutine publisher_block(self, index, count, first, extent, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: index, count, first(:), extent(:)
@@ -350,7 +357,7 @@ contains
       call add_numbers(why, int([size(first), size(extent)], int64), " and ")
       call add(why, " numbers; accepted: ")
       call add_number(why, int(self%dimensions, int64))
-      call add(why, ", one a dimension")
+      call add(why, ", one per dimension")
       call refuse(rw_argument, why, status)
       return
     end if
@@ -363,7 +370,7 @@ contains
     call give(found, status)
   end subroutine
 
-  !> A number that all blocks of this start of the simulation name, and those of its next start do not; 0: none.
+  !> Sets a number that all blocks of this start of the simulation share, and the next start does not; 0: none.
   subroutine publisher_start(self, start, status)
     class(rw_publisher), intent(inout) :: self
     integer(int64), intent(in) :: start
@@ -371,7 +378,7 @@ contains
     call give(c_start(self%description, int(start, c_int64_t)), status)
   end subroutine
 
-  !> Unit of the times, for people; without it "s".
+  !> Sets the unit of the times, for display; default "s".
   subroutine publisher_time_unit(self, unit, status)
     class(rw_publisher), intent(inout) :: self
     character(*), intent(in) :: unit
@@ -379,7 +386,7 @@ contains
     call give(c_time_unit(self%description, trim(unit) // c_null_char), status)
   end subroutine
 
-  !> Steps published, and how many of them overwrote one that nobody had taken; 0 where no ring is open.
+  !> Counts the published steps, and those that overwrote a step that no follower had taken; 0 if no ring is open.
   subroutine publisher_statistics(self, published, overwrote, status)
     class(rw_publisher), intent(in) :: self
     integer(int64), intent(out) :: published, overwrote
@@ -392,7 +399,7 @@ contains
     overwrote = lost
   end subroutine
 
-  !> Steps that the ring holds.
+  !> Sets the number of steps that the ring holds.
   subroutine publisher_slots(self, slots, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: slots
@@ -400,7 +407,7 @@ contains
     call give(c_slots(self%description, int(slots, c_int32_t)), status)
   end subroutine
 
-  !> Waits for ridgewatch so many milliseconds at most; 0: never.
+  !> Sets the longest wait for ridgewatch, in milliseconds; 0: never wait.
   subroutine publisher_wait(self, milliseconds, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(in) :: milliseconds
@@ -408,7 +415,7 @@ contains
     call give(c_wait(self%description, int(milliseconds, c_int32_t)), status)
   end subroutine
 
-  !> Opens the ring in a folder; without one, where RIDGEWATCH_RING says, and rw_off where it is not set. A ring that is open is closed before.
+  !> Opens the ring in a folder, by default the one that RIDGEWATCH_RING names; status rw_off if that is not set. Closes an open ring first.
   subroutine publisher_open(self, status, ring)
     class(rw_publisher), intent(inout) :: self
     integer, intent(out), optional :: status
@@ -437,17 +444,17 @@ contains
     else
       found = c_open(c_null_ptr, self%description, self%field)
     end if
-    ! What is described later is that of the next opening.
+    ! A later description applies to the next opening.
     if (found == rw_ok) self%extent = merge(self%block_nodes, self%nodes, self%block_nodes > 0)
     call give(found, status)
   end subroutine
 
-  !> Ends the ring; harmless where there is none. Where memory is out (rw_system) it stays open and may be closed later.
+  !> Ends the ring; does nothing if none is open. Without memory (rw_system) it stays open and may be closed later.
   subroutine publisher_close(self, status)
     class(rw_publisher), intent(inout) :: self
     integer, intent(out), optional :: status
     integer :: found
-    ! First, so that the words are those of the ring's end.
+    ! First, so that the error text is that of closing the ring.
     call c_free(self%description)
     self%description = c_null_ptr
     found = c_close(self%field)
@@ -455,207 +462,179 @@ contains
     call give(found, status)
   end subroutine
 
-  !> Whether arrays of these shapes, one a component, are those of the open ring.
-  function takes(self, shapes, status)
+  !> Checks the components' shapes against the open ring, and their strides against each other.
+  function are_accepted(self, components, status)
     class(rw_publisher), intent(in) :: self
-    integer(int64), intent(in) :: shapes(:, :)
+    type(component), intent(in) :: components(:)
     integer, intent(out), optional :: status
-    logical :: takes
+    logical :: are_accepted
     type(words) :: why
-    integer :: c, dimensions
-    takes = .false.
+    integer :: c, n
+    are_accepted = .false.
     if (.not. c_associated(self%field)) then
       call refuse(rw_off, why, status)
       return
     end if
-    dimensions = size(shapes, 1)
-    if (dimensions /= self%dimensions) then
+    n = components(1)%dimensions
+    if (n /= self%dimensions) then
       call add(why, "components have ")
-      call add_number(why, int(dimensions, int64))
+      call add_number(why, int(n, int64))
       call add(why, " dimensions; accepted: ")
       call add_number(why, int(self%dimensions, int64))
       call refuse(rw_argument, why, status)
       return
     end if
-    do c = 1, size(shapes, 2)
-      if (any(shapes(:, c) /= self%extent(:dimensions))) then
-        call add(why, "`")
-        call add(why, names(c:c))
-        call add(why, "` has ")
-        call add_numbers(why, shapes(:, c), " x ")
-        call add(why, " nodes; accepted: ")
-        call add_numbers(why, self%extent(:dimensions), " x ")
-        call add(why, ", as the ring was opened")
-        call refuse(rw_argument, why, status)
-        return
-      end if
+    do c = 1, n
+      if (all(components(c)%extent == self%extent)) cycle
+      call add(why, "`" // names(c:c) // "` has ")
+      call add_numbers(why, components(c)%extent(:n), " x ")
+      call add(why, " nodes; accepted: ")
+      call add_numbers(why, self%extent(:n), " x ")
+      call add(why, ", as the ring was opened")
+      call refuse(rw_argument, why, status)
+      return
     end do
-    takes = .true.
-  end function
-
-  !> Whether the components' strides are the same.
-  function agree(strides, status)
-    integer(c_int64_t), intent(in) :: strides(:, :)
-    integer, intent(out), optional :: status
-    logical :: agree
-    type(words) :: why
-    integer :: c
-    agree = .true.
-    do c = 2, size(strides, 2)
-      if (all(strides(:, c) == strides(:, 1))) cycle
-      agree = .false.
-      call add(why, "`")
-      call add(why, names(c:c))
-      call add(why, "` has strides ")
-      call add_numbers(why, strides(:, c), ", ")
+    do c = 2, n
+      if (all(components(c)%strides == components(1)%strides)) cycle
+      call add(why, "`" // names(c:c) // "` has strides ")
+      call add_numbers(why, components(c)%strides(:n), ", ")
       call add(why, "; accepted: ")
-      call add_numbers(why, strides(:, 1), ", ")
+      call add_numbers(why, components(1)%strides(:n), ", ")
       call add(why, ", as `u`")
       call refuse(rw_argument, why, status)
       return
     end do
+    are_accepted = .true.
   end function
 
-  ! Strides of an array section are the distances of its elements' addresses: no copy is made of it. An extent of 1 has no distance.
+  !> Describes an array or a section of one. A stride is the distance between the addresses of two neighbours, so that a section is not copied.
+  function component_of(array) result(found)
+    class(*), intent(in), target :: array(..)
+    type(component) :: found
+    integer(int64) :: n(3), origin, neighbours(3)
+    found%dimensions = rank(array)
+    found%bytes = storage_size(array) / 8
+    found%extent(:found%dimensions) = shape(array, kind=int64)
+    ! Of an empty array no element may be referenced.
+    if (any(found%extent < 1)) return
+    n = min(2_int64, found%extent)
+    neighbours = 0
+    select rank (array)
+    rank (2)
+      found%first = first_of(array(1, 1))
+      neighbours(:2) = [address(first_of(array(n(1), 1))), address(first_of(array(1, n(2))))]
+    rank (3)
+      found%first = first_of(array(1, 1, 1))
+      neighbours = [address(first_of(array(n(1), 1, 1))), address(first_of(array(1, n(2), 1))), &
+                    address(first_of(array(1, 1, n(3))))]
+    end select
+    origin = address(found%first)
+    ! An axis with one node has no neighbour.
+    found%strides = merge((neighbours - origin) / found%bytes, 1_int64, found%extent > 1)
+  end function
 
-  subroutine publish_2_real32(self, step, time, u, v, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int64), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real32), intent(in), target :: u(:,:), v(:,:)
-    integer, intent(out), optional :: status
-    integer(int64) :: shapes(2, 2)
-    integer(c_int64_t) :: strides(2, 2)
-    shapes(:, 1) = shape(u, kind=int64)
-    shapes(:, 2) = shape(v, kind=int64)
-    if (.not. takes(self, shapes, status)) return
-    strides = 1
-    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 4
-    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 4
-    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 4
-    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 4
-    if (.not. agree(strides, status)) return
-    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, &
-                            strides(:, 1)), status)
-  end subroutine
-
-  subroutine publish_2_real64(self, step, time, u, v, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int64), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real64), intent(in), target :: u(:,:), v(:,:)
-    integer, intent(out), optional :: status
-    integer(int64) :: shapes(2, 2)
-    integer(c_int64_t) :: strides(2, 2)
-    shapes(:, 1) = shape(u, kind=int64)
-    shapes(:, 2) = shape(v, kind=int64)
-    if (.not. takes(self, shapes, status)) return
-    strides = 1
-    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1))) - address(c_loc(u(1, 1)))) / 8
-    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2))) - address(c_loc(u(1, 1)))) / 8
-    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1))) - address(c_loc(v(1, 1)))) / 8
-    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2))) - address(c_loc(v(1, 1)))) / 8
-    if (.not. agree(strides, status)) return
-    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1)), c_loc(v(1, 1)), c_null_ptr, &
-                            strides(:, 1)), status)
-  end subroutine
-
-  subroutine publish_3_real32(self, step, time, u, v, w, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int64), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
-    integer, intent(out), optional :: status
-    integer(int64) :: shapes(3, 3)
-    integer(c_int64_t) :: strides(3, 3)
-    shapes(:, 1) = shape(u, kind=int64)
-    shapes(:, 2) = shape(v, kind=int64)
-    shapes(:, 3) = shape(w, kind=int64)
-    if (.not. takes(self, shapes, status)) return
-    strides = 1
-    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(u, 3) > 1) strides(3, 1) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 4
-    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 4
-    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 4
-    if (size(v, 3) > 1) strides(3, 2) = (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 4
-    if (size(w, 1) > 1) strides(1, 3) = (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 4
-    if (size(w, 2) > 1) strides(2, 3) = (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 4
-    if (size(w, 3) > 1) strides(3, 3) = (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 4
-    if (.not. agree(strides, status)) return
-    call give(c_strided_f32(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, 1)), &
-                            strides(:, 1)), status)
-  end subroutine
-
-  subroutine publish_3_real64(self, step, time, u, v, w, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int64), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
-    integer, intent(out), optional :: status
-    integer(int64) :: shapes(3, 3)
-    integer(c_int64_t) :: strides(3, 3)
-    shapes(:, 1) = shape(u, kind=int64)
-    shapes(:, 2) = shape(v, kind=int64)
-    shapes(:, 3) = shape(w, kind=int64)
-    if (.not. takes(self, shapes, status)) return
-    strides = 1
-    if (size(u, 1) > 1) strides(1, 1) = (address(c_loc(u(2, 1, 1))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(u, 2) > 1) strides(2, 1) = (address(c_loc(u(1, 2, 1))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(u, 3) > 1) strides(3, 1) = (address(c_loc(u(1, 1, 2))) - address(c_loc(u(1, 1, 1)))) / 8
-    if (size(v, 1) > 1) strides(1, 2) = (address(c_loc(v(2, 1, 1))) - address(c_loc(v(1, 1, 1)))) / 8
-    if (size(v, 2) > 1) strides(2, 2) = (address(c_loc(v(1, 2, 1))) - address(c_loc(v(1, 1, 1)))) / 8
-    if (size(v, 3) > 1) strides(3, 2) = (address(c_loc(v(1, 1, 2))) - address(c_loc(v(1, 1, 1)))) / 8
-    if (size(w, 1) > 1) strides(1, 3) = (address(c_loc(w(2, 1, 1))) - address(c_loc(w(1, 1, 1)))) / 8
-    if (size(w, 2) > 1) strides(2, 3) = (address(c_loc(w(1, 2, 1))) - address(c_loc(w(1, 1, 1)))) / 8
-    if (size(w, 3) > 1) strides(3, 3) = (address(c_loc(w(1, 1, 2))) - address(c_loc(w(1, 1, 1)))) / 8
-    if (.not. agree(strides, status)) return
-    call give(c_strided_f64(self%field, step, time, c_loc(u(1, 1, 1)), c_loc(v(1, 1, 1)), c_loc(w(1, 1, 1)), &
-                            strides(:, 1)), status)
-  end subroutine
-
-  ! Steps that are counted in 32 bits.
-
-  subroutine publish_2_real32_int32(self, step, time, u, v, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int32), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real32), intent(in), target :: u(:,:), v(:,:)
-    integer, intent(out), optional :: status
-    call publish_2_real32(self, int(step, int64), time, u, v, status)
-  end subroutine
-
-  subroutine publish_2_real64_int32(self, step, time, u, v, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int32), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real64), intent(in), target :: u(:,:), v(:,:)
-    integer, intent(out), optional :: status
-    call publish_2_real64(self, int(step, int64), time, u, v, status)
-  end subroutine
-
-  subroutine publish_3_real32_int32(self, step, time, u, v, w, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int32), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real32), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
-    integer, intent(out), optional :: status
-    call publish_3_real32(self, int(step, int64), time, u, v, w, status)
-  end subroutine
-
-  subroutine publish_3_real64_int32(self, step, time, u, v, w, status)
-    class(rw_publisher), intent(in) :: self
-    integer(int32), intent(in) :: step
-    real(real64), intent(in) :: time
-    real(real64), intent(in), target :: u(:,:,:), v(:,:,:), w(:,:,:)
-    integer, intent(out), optional :: status
-    call publish_3_real64(self, int(step, int64), time, u, v, w, status)
-  end subroutine
+  function first_of(element)
+    type(*), intent(in), target :: element
+    type(c_ptr) :: first_of
+    first_of = c_loc(element)
+  end function
 
   pure function address(pointer)
     type(c_ptr), intent(in) :: pointer
     integer(c_int64_t) :: address
     address = transfer(pointer, address)
   end function
+
+  !> Publishes components of either kind and rank.
+  subroutine publish(self, step, time, components, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: step
+    real(real64), intent(in) :: time
+    type(component), intent(in) :: components(:)
+    integer, intent(out), optional :: status
+    type(c_ptr) :: first(3)
+    if (.not. are_accepted(self, components, status)) return
+    first = c_null_ptr
+    first(:size(components)) = components%first
+    if (components(1)%bytes == 4) then
+      call give(c_strided_f32(self%field, step, time, first(1), first(2), first(3), components(1)%strides), status)
+    else
+      call give(c_strided_f64(self%field, step, time, first(1), first(2), first(3), components(1)%strides), status)
+    end if
+  end subroutine
+
+  ! The specific procedures of `publish` declare the accepted types and ranks.
+
+  subroutine publish_2_real32_int64(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:, :), v(:, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v)], status)
+  end subroutine
+
+  subroutine publish_2_real64_int64(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:, :), v(:, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v)], status)
+  end subroutine
+
+  subroutine publish_3_real32_int64(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:, :, :), v(:, :, :), w(:, :, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v), component_of(w)], status)
+  end subroutine
+
+  subroutine publish_3_real64_int64(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int64), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:, :, :), v(:, :, :), w(:, :, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v), component_of(w)], status)
+  end subroutine
+
+  subroutine publish_2_real32_int32(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:, :), v(:, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v)], status)
+  end subroutine
+
+  subroutine publish_2_real64_int32(self, step, time, u, v, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:, :), v(:, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v)], status)
+  end subroutine
+
+  subroutine publish_3_real32_int32(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real32), intent(in), target :: u(:, :, :), v(:, :, :), w(:, :, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v), component_of(w)], status)
+  end subroutine
+
+  subroutine publish_3_real64_int32(self, step, time, u, v, w, status)
+    class(rw_publisher), intent(in) :: self
+    integer(int32), intent(in) :: step
+    real(real64), intent(in) :: time
+    real(real64), intent(in), target :: u(:, :, :), v(:, :, :), w(:, :, :)
+    integer, intent(out), optional :: status
+    call publish(self, int(step, int64), time, [component_of(u), component_of(v), component_of(w)], status)
+  end subroutine
 
 end module

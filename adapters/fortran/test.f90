@@ -1,4 +1,4 @@
-!> Each kind of call once, with values that the test behind it knows: u = i + 10 j + 100 k, v = 2 u, w = 3 u.
+!> Makes each kind of call once, with values that fortran_module.rs checks: u = i + 10 j + 100 k, v = 2 u, w = 3 u.
 program test
   use, intrinsic :: iso_fortran_env, only: real32, real64, int64
   use ridgewatch
@@ -24,7 +24,7 @@ program test
     do j = 1, 3
       do i = 1, 4
         u32(i, j, k) = i + 10 * j + 100 * k
-        ! Every second row, ghost cells beside.
+        ! Every second row, with ghost cells.
         u64(i, 2 * j, k) = u32(i, j, k)
       end do
     end do
@@ -37,7 +37,7 @@ program test
   call want(status == rw_ok, 2)
   call publisher%publish(2_int64, 1.5d0, u64(1:4, 2:6:2, :), v64(1:4, 2:6:2, :), w64(1:4, 2:6:2, :), status)
   call want(status == rw_ok, 3)
-  ! Wrong shapes, wrong rank, different strides: refused, and nothing is read.
+  ! Wrong shapes, a wrong rank and different strides are refused, and nothing is read.
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
   call want(status == rw_argument, 4)
   call says("`u` has 3 x 3 x 2 nodes; accepted: 4 x 3 x 2, as the ring was opened", 40)
@@ -54,20 +54,20 @@ program test
   call publisher%publish(3, 2d0, u64(4:1:-1, 2:6:2, :), v64(1:4, 2:6:2, :), w64(4:1:-1, 2:6:2, :), status)
   call want(status == rw_argument, 45)
   call says("`v` has strides 1, 12, 48; accepted: -1, 12, 48, as `u`", 46)
-  ! What is described now is that of the next opening: smaller arrays are too small still.
+  ! A new description applies to the next opening: smaller arrays are still refused.
   call publisher%uniform(1, 0d0, 2d0, 3)
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
   call want(status == rw_argument, 90)
   call publisher%block(0, 1, [1, 1, 1], [3, 3, 2])
   call publisher%publish(3, 2d0, u32(1:3, :, :), v32(1:3, :, :), w32(1:3, :, :), status)
   call want(status == rw_argument, 91)
-  ! No grid has five dimensions; whoever passes over that reads and writes nothing of five.
+  ! A grid of five dimensions is refused, and later calls read and write nothing of it.
   call second%begin(5, status)
   call want(status == rw_argument, 35)
   call says("`dimensions` is 5; accepted: 2 or 3", 47)
   call second%block(0, 1, [1, 1, 1, 1, 1], [2, 2, 2, 2, 2], status)
   call want(status == rw_argument, 36)
-  call says("`description` is null; accepted: what rw_describe returned", 48)
+  call says("`description` is null; accepted: a result of rw_describe", 48)
   call second%begin(2)
   call second%uniform(3, 0d0, 1d0, 4, status=status)
   call want(status == rw_argument, 49)
@@ -77,7 +77,7 @@ program test
   call says("`axis` is -2; accepted: 1 to 2", 52)
   call second%block(0, 1, [1, 1], [2], status)
   call want(status == rw_argument, 53)
-  call says("`first` and `extent` have 2 and 1 numbers; accepted: 2, one a dimension", 54)
+  call says("`first` and `extent` have 2 and 1 numbers; accepted: 2, one per dimension", 54)
   call second%uniform(1, 0d0, 1d0, 4)
   call second%uniform(2, 0d0, 1d0, 4)
   call second%open(status)
@@ -89,7 +89,7 @@ program test
   call second%close()
   call publisher%close(status)
   call want(status == rw_ok, 9)
-  ! Longitude and latitude, in a ring of its own that is named.
+  ! Longitude and latitude, in a separate ring whose folder is named.
   call get_environment_variable("RIDGEWATCH_RING", ring)
   call publisher%begin(2)
   call publisher%sphere(6.371d6)
@@ -97,7 +97,7 @@ program test
   call publisher%rectilinear(2, [-60d0, 0d0, 60d0])
   call publisher%open(status, trim(ring) // "/globe")
   call want(status == rw_ok, 10)
-  ! Open again: the first ring ends, its name is free.
+  ! Opening again ends the first ring and frees its name.
   call publisher%open(status, trim(ring) // "/globe")
   call want(status == rw_ok, 34)
   east = reshape([(real(i, real32), i=1, 12)], [4, 3])
@@ -121,7 +121,7 @@ program test
   call want(status == rw_ok, 16)
   call second%publish(1, 1d0, east(3:4, :), west(3:4, :), status)
   call want(status == rw_ok, 17)
-  ! Two steps fit. The third is waited for: a follower is to come. The fourth is not, since that was in vain.
+  ! Two steps fit. The third waits for a follower to come; the fourth does not, because that wait timed out.
   call publisher%publish(2, 2d0, east(1:2, :), east(1:2, :), status)
   call system_clock(before, rate)
   call publisher%publish(3, 3d0, east(1:2, :), east(1:2, :), status)
@@ -141,7 +141,7 @@ program test
 
 contains
 
-  !> The words of the last refusal, whoever refused.
+  !> Compares the text of the last error.
   subroutine says(expected, line)
     character(*), intent(in) :: expected
     integer, intent(in) :: line

@@ -1,44 +1,46 @@
-//! The points that a frame's waves ask about.
+//! Collision points that a frame's waves query.
 
 use cudarc::driver::result;
-use ridgewatch::engine::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, Traced};
-use ridgewatch::flow::{Extras, Tracer};
+use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, TraceAll};
+use ridgewatch::flow::Extras;
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
+use ridgewatch::surrogate::Trace;
 use std::error::Error;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
-/// Larger than a screen, so that there are enough.
+/// Picture size. Larger than a screen, to have enough points.
 const PICTURE: [usize; 2] = [3840, 2160];
 
 /// The first collision points of a reference frame, in the order in which its waves queue them.
 pub struct Collisions {
     pub points: Buffer<[f32; 3]>,
     pub first_wave: usize,
-    /// Waves that they are from.
+    /// Number of waves of these points.
     pub waves: usize,
     pub picture: [usize; 2],
 }
 
 impl Collisions {
-    /// At most `most` points of the scene that a bare file of this field would get, its majorants settled.
+    /// At most `most` points of the default scene of a file of this field, after its majorants have settled.
     pub fn new(gpu: &Arc<Gpu>, tracer: &CudaTracer, most: usize) -> Result<Self, Box<dyn Error>> {
+        let (domain, tau) = (tracer.host().domain(), tracer.host().tau());
         let at = |i: usize, n: usize| (i as f32 + 0.5) / n as f32;
         let unit = (0..64 * 64 * 16).map(|i| [at(i % 64, 64), at(i / 64 % 64, 64), at(i / 4096, 16)]);
-        let seeds: Vec<[f32; 3]> = unit.map(|u| tracer.domain().from_unit(u)).collect();
+        let seeds: Vec<[f32; 3]> = unit.map(|u| domain.from_unit(u)).collect();
         let mut probes = ridgewatch::flow::Traced::default();
-        tracer.trace(&seeds, Extras::default(), &mut probes);
-        let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / tracer.tau() as f32).collect();
+        tracer.trace(&seeds, Extras::default(), &mut probes)?;
+        let ftle: Vec<f32> = probes.log_stretch.iter().map(|s| s / tau as f32).collect();
         let settings = RenderSettings { width: PICTURE[0], height: PICTURE[1], ..RenderSettings::default() };
         let transfer = TransferSettings::default().scaled_to(&ftle);
-        let scene = Scene::assemble(tracer.domain(), None, None, Some(transfer), settings, 0);
-        let mut renderer = Renderer::new(scene, tracer.domain(), tracer.tau())?;
+        let scene = Scene::assemble(domain, None, None, Some(transfer), settings, 0);
+        let mut renderer = Renderer::new(scene, domain, tau)?;
         let mut device = GpuRenderer::new(gpu)?;
         for frame in 0..4 {
-            device.render_samples(&mut renderer, frame, 0..1, &mut Traced(tracer.device()), None, &NEVER)?;
+            device.render_samples(&mut renderer, frame, 0..1, &mut TraceAll(tracer.device()), None, &NEVER)?;
         }
-        let mut heard = Listening { inner: Traced(tracer.device()), points: gpu.alloc("points", most)?, waves: Vec::new() };
+        let mut heard = Listening { inner: TraceAll(tracer.device()), points: gpu.alloc("points", most)?, waves: Vec::new() };
         device.render_samples(&mut renderer, 4, 0..1, &mut heard, None, &NEVER)?;
         let mut points = heard.points;
         let found: usize = heard.waves.iter().sum();
@@ -53,9 +55,9 @@ impl Collisions {
     }
 }
 
-/// Traces every query and copies what is asked, until there is no more room.
+/// Traces every query and copies its points until the buffer is full.
 struct Listening<'a> {
-    inner: Traced<'a>,
+    inner: TraceAll<'a>,
     points: Buffer<[f32; 3]>,
     /// Points copied of each wave.
     waves: Vec<usize>,

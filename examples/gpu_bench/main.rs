@@ -1,8 +1,8 @@
-//! What the GPU traces in a second, and what bounds it: blocks of docs/performance.md. Times are medians of device time between events;
-//! seeds and results stay on the device; every batch is sorted anew, and the sort counts.
+//! Measures the tracing rate of a GPU and its bounds, as blocks of docs/performance.md. Times are medians of device time between events. Seeds and
+//! results stay on the device. Every batch is sorted, and the time includes the sort.
 //! `cargo run --release --example gpu_bench [quick|collisions|profile]`; `profile` launches each kernel once, for a profiler.
 
-// It talks to its user on standard output.
+// Prints its results to standard output.
 #![allow(clippy::print_stdout)]
 
 #[cfg(not(feature = "cuda"))]
@@ -27,22 +27,23 @@ mod collisions;
 #[cfg(feature = "cuda")]
 mod bench {
     use super::collisions::Collisions;
-    use ridgewatch::engine::Storage;
-    use ridgewatch::engine::cuda::{
+    use ridgewatch::backend::Storage;
+    use ridgewatch::backend::cuda::{
         Buffer, CudaTracer, DeviceError, DevicePredict, DeviceTable, DeviceTracer, Gpu, GpuSettings, Outputs, SnapshotStore, Tuning,
     };
     use ridgewatch::field::analytic::Analytic;
     use ridgewatch::field::turbulence::Turbulence;
     use ridgewatch::field::{Axis, Domain, Geometry, Grid, Window};
     use ridgewatch::flow::{
-        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, Tracer, VelocitySource,
+        Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource,
     };
+    use ridgewatch::surrogate::Trace;
     use std::error::Error;
     use std::f64::consts::TAU;
     use std::sync::Arc;
     use std::time::Instant;
 
-    /// What is measured.
+    /// Selection of the measurements.
     #[derive(Clone, Copy, PartialEq)]
     pub enum Rows {
         All,
@@ -66,7 +67,7 @@ mod bench {
             integrator,
             precision,
             steps: Steps::Fixed(steps),
-            gap,
+            difference_step: gap,
             boundary,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -77,7 +78,7 @@ mod bench {
         map(SNAPSHOTS as f64 - 1.0, steps, Integrator::Tangent, Precision::F32, 0.05, Boundary::Clamp)
     }
 
-    /// Uniform points in no order.
+    /// Uniform points in random order.
     fn scattered(domain: &Domain, count: usize, seed: u64) -> Vec<[f32; 3]> {
         let mut state = 0x2545_f491_4f6c_dd1du64 ^ (seed << 17);
         let mut uniform = || {
@@ -195,7 +196,7 @@ mod bench {
             let fine = CudaTracer::new(&self.store, &self.gpu, source.clone(), &fine, 0.0, Tuning::default())?;
             let points = scattered(domain, 1 << 18, 77);
             let mut truth = Traced::default();
-            fine.trace(&points, Extras::default(), &mut truth);
+            fine.trace(&points, Extras::default(), &mut truth)?;
             let peak = truth.log_stretch_f64.iter().copied().fold(0.0, f64::max);
             Ok(Truth { batch: Batch::new(&self.gpu, &points)?, points, log_stretch: truth.log_stretch_f64, peak })
         }
@@ -301,8 +302,8 @@ mod bench {
             Ok(())
         }
 
-        /// Least milliseconds of a trace: the arithmetic of its stages at the device's rate of issue, or the window and the seeds read once at
-        /// the rate of a copy, whichever takes longer.
+        /// Lower bound of the milliseconds of a trace: the arithmetic of its stages at the device's rate of issue, or one read of the window and the
+        /// seeds at the rate of a copy, whichever takes longer.
         fn floor(&self, steps: usize, storage: Storage, count: usize) -> f64 {
             let operations = 4.0 * steps as f64 * STAGE_OPERATIONS * count as f64 / self.issue;
             let node = storage.bytes() as f64;
@@ -372,9 +373,9 @@ mod bench {
                 let tangent = batch.time(&tracer, count)?;
                 let (rate, psnr) = (count as f64 / tangent / 1e3, truth.psnr_of(&tracer)?);
                 println!("| tangent | f32 | - | {} | {rate:.0} | 1 | {psnr:.1} |", storage.name());
-                // In pairs only the best of them.
+                // For storage in pairs only the best rivals.
                 for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
-                    let changed = FlowMap { integrator, precision, gap, ..turbulent(22) };
+                    let changed = FlowMap { integrator, precision, difference_step: gap, ..turbulent(22) };
                     let tracer = self.tracer(&source, &changed, Tuning { keep, spread, ..held })?;
                     let ms = batch.time(&tracer, count)?;
                     let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
@@ -396,7 +397,8 @@ mod bench {
                 }
             }
             let random = KERNELS[2].1;
-            let published = FlowMap { integrator: Integrator::Differences, precision: Precision::F64, gap: 1e-6, ..turbulent(110) };
+            let published =
+                FlowMap { integrator: Integrator::Differences, precision: Precision::F64, difference_step: 1e-6, ..turbulent(110) };
             let count = 1 << 18;
             let published = self.tracer(&source, &published, random)?;
             let slow = batch.time(&published, count)? / count as f64;
@@ -461,7 +463,7 @@ mod bench {
                 let ms = batch.time(&tracer, batch.count)?;
                 println!("| {integrator:?} | {precision:?} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
             }
-            // The same flow on a grid, interpolated by cubics.
+            // The same flow on a grid, with cubic interpolation.
             let axis = |name: &str, length: f64, nodes: usize| Axis::uniform(name, "", 0.0, length, nodes);
             let grid =
                 Arc::new(Grid { axes: vec![axis("x", 2.0, 401)?, axis("y", 1.0, 201)?], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
@@ -502,7 +504,7 @@ mod bench {
         ]
     };
 
-    /// What follows, up to the next such line, is a block of docs/performance.md (see scripts/gpu-check-write).
+    /// Starts a block of docs/performance.md, which ends at the next such line (see scripts/gpu-check-write).
     fn block(name: &str) {
         println!("<!-- block {} -->", name.to_lowercase());
     }

@@ -1,6 +1,6 @@
 //! `ridgewatch compare`.
 
-use super::{Common, Usage, print_json, print_text};
+use super::common::{Common, Usage, print_json, print_text};
 use anyhow::Result;
 use std::path::PathBuf;
 
@@ -11,7 +11,7 @@ pub struct Options {
     a: PathBuf,
     /// Reference picture.
     b: PathBuf,
-    /// Tone map in front of PSNR and SSIM: contrast, brightness, gamma.
+    /// Tone map applied before PSNR and SSIM: contrast, brightness, gamma.
     #[arg(long, num_args = 3, value_names = ["CONTRAST", "BRIGHTNESS", "GAMMA"], default_values_t = [1.85, 0.75, 1.4])]
     tone_map: Vec<f64>,
 }

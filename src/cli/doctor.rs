@@ -1,6 +1,6 @@
 //! `ridgewatch doctor`.
 
-use super::{Common, print_json, print_text};
+use super::common::{Common, print_json, print_text};
 use anyhow::Result;
 use serde::Serialize;
 
@@ -28,7 +28,7 @@ struct Gpu {
     why_not: Option<String>,
 }
 
-/// Looks and tells.
+/// Prints what is found.
 pub fn run(common: &Common) -> Result<()> {
     let gpu = gpu();
     let diagnosis = Diagnosis {
@@ -72,7 +72,7 @@ fn cpu() -> Cpu {
 
 #[cfg(feature = "cuda")]
 fn gpu() -> Gpu {
-    use ridgewatch::engine::cuda::{Gpu as Opened, GpuSettings, nvrtc_version, probe};
+    use ridgewatch::backend::cuda::{Gpu as Opened, GpuSettings, nvrtc_version, probe};
     let found = match probe() {
         Ok(found) => found,
         Err(why) => return Gpu { usable: false, found: Vec::new(), why_not: Some(why.to_string()) },
@@ -88,7 +88,7 @@ fn gpu() -> Gpu {
                 gpu.driver(),
                 cap >> 20
             );
-            // An NVRTC may know nothing of an old card, and an old driver nothing of what a new NVRTC made.
+            // NVRTC may not support an old card, and an old driver may refuse the code of a new NVRTC.
             let why_not = gpu.module("sort.cu", &[]).err().map(|why| why.to_string());
             Gpu { usable: why_not.is_none(), found: [names, vec![more]].concat(), why_not }
         }

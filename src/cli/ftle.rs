@@ -1,13 +1,17 @@
-//! `ridgewatch ftle`: the field on a grid, and how right it is.
+//! `ridgewatch ftle`: the FTLE field on a grid, and its error.
 
-use super::{Common, Usage, located, messages, print_json, print_text, scene};
+use super::common::{Common, Usage, check_folder, chosen_steps, device, dimensions, located, open, print_json, print_text, scene};
+use super::messages;
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{Device, EngineError, Plan, Setup, Slide};
+use ridgewatch::backend::{Device, TracedOnce};
+use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Extras, FlowError, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch::run::{Plan, RunError, Setup, Slide};
 use ridgewatch::setting::word;
 use serde::Serialize;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// Options of `ftle`.
 #[derive(Debug, clap::Args)]
@@ -15,43 +19,34 @@ pub struct Options {
     /// A scene file (.toml), or data files and globs.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions. Without NZ these get as many along z as the
-    /// source has levels, closed forms as many as the spacing along x asks for.
+    /// Grid of seeds, from edge to edge of the domain: NXxNY, or NXxNYxNZ in three dimensions. Default of NZ: the number of levels of the
+    /// source, or the spacing along x for closed forms.
     #[arg(long, default_value = "201x101", value_parser = grid)]
-    grid: Grid,
-    /// Which slide of the window, from 0.
+    grid: [usize; 3],
+    /// Slide of the window, from 0.
     #[arg(long, default_value_t = 0, value_name = "N")]
     slide: u64,
-    /// Holds the field against its closed form where there is one, else against Dormand-Prince integration in f64 of the same field.
+    /// Compare the field with its closed form if it has one, else with Dormand-Prince integration in f64.
     #[arg(long)]
     check: bool,
-    /// Prints the error against the same truth for 5, 10, 20 ... 160 steps (in f64), and the order that it shows.
+    /// Print the error for 5, 10, 20 ... 160 steps (in f64) against the same truth, and the order of convergence.
     #[arg(long)]
     convergence: bool,
-    /// NetCDF file; without it nothing is written.
+    /// NetCDF file; by default nothing is written.
     #[arg(long, short)]
     out: Option<PathBuf>,
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Grid([usize; 3]);
-
-fn grid(text: &str) -> Result<Grid, String> {
-    const ACCEPTED: &str = "accepted: NXxNY or NXxNYxNZ with numbers from 2 to 16384";
-    let numbers: Vec<usize> =
-        text.split(['x', 'X']).map(|n| n.trim().parse().map_err(|_| ACCEPTED.to_owned())).collect::<Result<_, _>>()?;
-    if !numbers.iter().all(|n| (2..=16_384).contains(n)) {
-        return Err(ACCEPTED.into());
-    }
-    match numbers[..] {
-        [x, y] => Ok(Grid([x, y, 1])),
-        [x, y, z] => Ok(Grid([x, y, z])),
-        _ => Err(ACCEPTED.into()),
+fn grid(text: &str) -> Result<[usize; 3], String> {
+    match dimensions(text).filter(|numbers| numbers.iter().all(|n| (2..=16_384).contains(n))).as_deref() {
+        Some(&[x, y]) => Ok([x, y, 1]),
+        Some(&[x, y, z]) => Ok([x, y, z]),
+        _ => Err("accepted: NXxNY or NXxNYxNZ with numbers from 2 to 16384".into()),
     }
 }
 
-/// Most seeds of a field: some 8 GiB of memory.
-const MOST_SEEDS: usize = 1 << 27;
+/// Maximum number of seeds, which take some 8 GiB of memory.
+const MAX_SEEDS: usize = 1 << 27;
 
 #[derive(Serialize)]
 struct Report {
@@ -62,9 +57,9 @@ struct Report {
     integrator: Integrator,
     precision: Precision,
     steps: usize,
-    /// Difference of the log-stretch from twice as many steps, where the steps were chosen by it.
+    /// Difference of the log-stretch from twice as many steps. `None` if the steps were given.
     integration_difference: Option<f64>,
-    /// Unit of `time` and `tau`; empty where they have none.
+    /// Unit of `time` and `tau`; empty if they have none.
     time_unit: String,
     source: String,
     minimum: f64,
@@ -100,26 +95,26 @@ struct Convergence {
     order: Vec<f64>,
 }
 
-/// Computes, checks and writes.
+/// Computes, compares and writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
-    let faulty = |error| located(&scene, error, EngineError::refused);
-    let Setup { plan, mut feed, notes, .. } = super::open(&scene)?;
+    let faulty = |error| located(&scene, error, RunError::refused);
+    let Setup { plan, mut slides, notes } = open(&scene)?;
     notes.iter().for_each(messages::note);
     if let Some(out) = &options.out {
-        super::check_folder(out)?;
+        check_folder(out)?;
     }
     let mut slide = None;
     for _ in 0..=options.slide {
-        slide = feed.next_slide().map_err(faulty)?;
+        slide = slides.next_slide(&AtomicBool::new(false)).map_err(faulty)?;
         if slide.is_none() {
             bail!(Usage(format!("--slide {}: the source has fewer slides", options.slide)));
         }
     }
     let slide = slide.context("the source gave no slide")?;
-    let device = super::device(common, &scene)?;
-    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<EngineError>() {
-        Ok(error) => located(&scene, error, EngineError::refused),
+    let device = device(common, &scene)?;
+    let report = compute(&plan, &slide, options, &device).map_err(|error| match error.downcast::<RunError>() {
+        Ok(error) => located(&scene, error, RunError::refused),
         Err(error) => match error.downcast::<FlowError>() {
             Ok(error) => located(&scene, error, FlowError::refused),
             Err(error) => error,
@@ -133,9 +128,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
 }
 
 fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Result<Report> {
-    let (tracer, told) = device.tracer(slide.velocity.clone(), &plan.map, slide.time)?;
-    told.iter().for_each(messages::note);
-    let mut grid = options.grid.0;
+    let mut grid = options.grid;
     match (plan.domain.dimensions, grid[2]) {
         (2, 1) => {}
         (2, n) => bail!(Usage(format!("--grid has {n} seeds along z, but the flow does not vary along z; accepted: NXxNY"))),
@@ -151,26 +144,20 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         }
         _ => {}
     }
-    if grid.iter().product::<usize>() > MOST_SEEDS {
+    if grid.iter().product::<usize>() > MAX_SEEDS {
         let [x, y, z] = grid;
         bail!(Usage(format!("--grid {x}x{y}x{z}: accepted: at most 2^27 seeds in all")));
     }
-    let seeds = seeds(&*tracer, grid);
-    let begun = std::time::Instant::now();
-    let mut traced = Traced::default();
+    let seeds = seeds(&plan.domain, grid);
     let spinner = messages::spinner(format!("tracing {} seeds", seeds.len()));
-    tracer.trace(&seeds, Extras::default(), &mut traced);
-    device.check()?;
-    if let Some(failure) = device.failure() {
-        messages::note(format!("work on the GPU has ended, the CPU went on: {failure}"));
-    }
-    device.shortages().into_iter().for_each(messages::note);
-    let seconds = begun.elapsed().as_secs_f64();
+    let TracedOnce { flow: tracer, traced, seconds, note } =
+        device.trace(&slide.velocity, &plan.map, slide.time, &seeds).map_err(RunError::of)?;
+    note.into_iter().for_each(messages::note);
     let tau = tracer.tau();
     let ftle: Vec<f64> =
-        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_void(seed) { f64::NAN } else { s / tau }).collect();
+        unrounded(&traced).iter().zip(&seeds).map(|(s, &seed)| if tracer.is_missing(seed) { f64::NAN } else { s / tau }).collect();
     let known: Vec<f64> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
-    let missing = seeds.iter().filter(|seed| tracer.is_void(**seed)).count();
+    let missing = seeds.iter().filter(|seed| tracer.is_missing(**seed)).count();
     if options.check || options.convergence {
         spinner.set_message(format!("integrating {} seeds for comparison", seeds.len()));
     }
@@ -206,17 +193,17 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     })
 }
 
-/// Difference of the log-stretch from twice as many steps, where the steps were chosen by it.
+/// Difference of the log-stretch from twice as many steps. `None` if the steps were given.
 fn difference_of_steps(tracer: &dyn Tracer) -> Option<f64> {
-    tracer.chosen().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
+    tracer.step_choice().map(|chosen| chosen.difference).filter(|difference| difference.is_finite())
 }
 
-fn seeds(tracer: &dyn Tracer, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
+fn seeds(domain: &Domain, [nx, ny, nz]: [usize; 3]) -> Vec<[f32; 3]> {
     let at = |i: usize, n: usize| if n > 1 { i as f32 / (n - 1) as f32 } else { 0.5 };
-    (0..nx * ny * nz).map(|i| tracer.domain().from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
+    (0..nx * ny * nz).map(|i| domain.from_unit([at(i % nx, nx), at(i / nx % ny, ny), at(i / (nx * ny), nz)])).collect()
 }
 
-/// FTLE of a closed form that is the same everywhere; none where there is no such form.
+/// FTLE of a flow whose FTLE is uniform and known. `None` for other flows.
 fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
     let tau = plan.map.tau;
     match velocity {
@@ -233,7 +220,7 @@ fn closed_form(plan: &Plan, velocity: &VelocitySource) -> Option<f64> {
     }
 }
 
-/// Log-stretch as precise as it was integrated.
+/// Log-stretch in the precision of its integration.
 fn unrounded(traced: &Traced) -> Vec<f64> {
     if traced.log_stretch_f64.is_empty() {
         traced.log_stretch.iter().map(|s| f64::from(*s)).collect()
@@ -242,7 +229,7 @@ fn unrounded(traced: &Traced) -> Vec<f64> {
     }
 }
 
-/// FTLE at the seeds that is taken for the truth.
+/// FTLE at the seeds that counts as the truth, with its name.
 fn truth(plan: &Plan, slide: &Slide, seeds: &[[f32; 3]]) -> Result<(&'static str, Vec<f64>)> {
     if let Some(value) = closed_form(plan, &slide.velocity) {
         return Ok(("closed form", vec![value; seeds.len()]));
@@ -274,10 +261,10 @@ fn check(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3]], ft
     })
 }
 
-/// Both values at every seed that has a velocity. A value that is not finite there is a failure, nothing to be left out.
+/// Both values at every seed with a velocity. A value there that is not finite is an error.
 fn comparable(tracer: &dyn Tracer, seeds: &[[f32; 3]], a: &[f64], b: &[f64]) -> Result<Vec<(f64, f64)>> {
     let pairs = a.iter().copied().zip(b.iter().copied());
-    let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_void(**seed)).map(|(pair, _)| pair).collect();
+    let pairs: Vec<(f64, f64)> = pairs.zip(seeds).filter(|(_, seed)| !tracer.is_missing(**seed)).map(|(pair, _)| pair).collect();
     let failed = pairs.iter().filter(|(a, b)| !a.is_finite() || !b.is_finite()).count();
     match (pairs.len(), failed) {
         (0, _) => bail!("no seed has a velocity: there is nothing to compare"),
@@ -304,10 +291,10 @@ fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3
     Ok(Convergence { truth: name, steps, rms, order })
 }
 
-/// Writes under a temporary name first: nothing half-written is left under the final one.
+/// Writes the field under a temporary name and renames it, so that an unfinished file never has the final name.
 fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usize; 3], ftle: &[f64], lived: &[f32]) -> Result<()> {
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
-    // A file like any other, by the umask; temporary ones are for their owner alone otherwise.
+    // Mode by the umask; by default temporary files are private.
     let mode = std::os::unix::fs::PermissionsExt::from_mode(0o666);
     let temporary = tempfile::Builder::new().prefix(".ridgewatch-").suffix(".nc").permissions(mode).tempfile_in(folder)?.into_temp_path();
     {
@@ -358,7 +345,7 @@ fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usi
     Ok(())
 }
 
-/// Name and unit of an axis, as its source has them.
+/// Name and unit of an axis in its source.
 fn axis_words(velocity: &VelocitySource, axis: usize) -> (&str, &str) {
     let known = match velocity {
         VelocitySource::Window(window) => window.grid().and_then(|g| g.axes.get(axis)).map(|a| (a.name(), a.units())),
@@ -381,7 +368,7 @@ fn print_report(report: &Report) {
         report.samples_per_second
     ));
     if let Some(difference) = report.integration_difference {
-        messages::note(super::steps_told(report.steps as u64, difference));
+        messages::note(chosen_steps(report.steps as u64, difference));
     }
     print_text(format_args!("FTLE from {:.6e} to {:.6e}, mean {:.6e}", report.minimum, report.maximum, report.mean));
     if report.missing_seeds > 0 || report.stopped_early_share > 0.0 {

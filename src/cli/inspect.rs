@@ -1,9 +1,9 @@
 //! `ridgewatch inspect`.
 
-use super::{Common, Usage, located, print_json, print_text};
+use super::common::{Common, Usage, is_config, located, print_json, print_text};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::TimeSpan;
+use ridgewatch::run::TimeSpan;
 use ridgewatch::setting::word;
 use ridgewatch::source::{SourceError, SourceKind};
 use std::path::PathBuf;
@@ -14,20 +14,20 @@ pub struct Options {
     /// Data files or globs, or a scene file (.toml) of kind archive.
     #[arg(required = true)]
     files: Vec<PathBuf>,
-    /// Integration time that the window's memory is stated for, in seconds or with a unit, e.g. "30 days"; default: the scene's `time.tau`, else half of
-    /// the span.
+    /// Integration time for which the memory of the window is stated, in seconds or with a unit, e.g. "30 days"; default: the scene's
+    /// `time.tau`, else half of the span.
     #[arg(long)]
     tau: Option<String>,
 }
 
-/// Inspects. What cannot be read is a failure, after the report.
+/// Inspects. Fails after the report if the files cannot be read.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = match &options.files[..] {
-        [one] if one.extension().is_some_and(|e| e == "toml") => SceneFile::read(one, &common.overrides)?,
+        [one] if is_config(one) => SceneFile::read(one, &common.overrides)?,
         files => SceneFile::for_archive(files.to_vec(), &common.overrides)?,
     };
     if scene.source.kind != SourceKind::Archive {
-        return Err(Usage(format!("the scene's source is {}; inspect looks at archives", word(scene.source.kind))).into());
+        return Err(Usage(format!("the scene's source is {}; inspect accepts archives", word(scene.source.kind))).into());
     }
     let tau = match &options.tau {
         None => scene.time.tau.as_ref().and_then(TimeSpan::value),
@@ -46,7 +46,7 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     }
     match (&inspection.refused, &inspection.problem) {
         (Some(refused), _) => Err(scene.locate(refused.clone()).into()),
-        // What follows the first line is in the report.
+        // The report has the further lines.
         (None, Some(problem)) => bail!("cannot be read as an archive: {}", problem.lines().next().unwrap_or_default()),
         (None, None) => Ok(()),
     }

@@ -1,4 +1,4 @@
-//! What is said on standard error.
+//! Messages on standard error.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressFinish, ProgressStyle};
 use std::io::{IsTerminal, Write, stderr};
@@ -19,11 +19,11 @@ pub fn start(verbose: u8) {
         .without_time()
         .with_target(false)
         .compact();
-    // It would say so on standard error, which panics where nothing can be written there.
+    // Such an error would be printed on standard error, which panics if standard error cannot be written.
     lines.log_internal_errors(false).init();
 }
 
-/// The one line that says why a command failed.
+/// Prints why a command failed, in one line.
 pub fn fail(error: &anyhow::Error) {
     let mut message = error.to_string();
     for cause in error.chain().skip(1) {
@@ -36,13 +36,12 @@ pub fn fail(error: &anyhow::Error) {
     note(message);
 }
 
-/// A line of information.
+/// Prints a line of information. Ignores a full disk and a closed pipe.
 pub fn note(text: impl std::fmt::Display) {
-    // A full disk or a reader that has gone away ends no run.
     let _ = writeln!(stderr(), "ridgewatch: {text}");
 }
 
-/// A progress bar over `length` steps (a spinner where unknown), drawn only when standard error is a terminal.
+/// A progress bar over `length` steps (a spinner if unknown), drawn only when standard error is a terminal.
 pub fn progress(length: Option<u64>) -> ProgressBar {
     let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };
     let (bar, style) = match length {
@@ -51,14 +50,14 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     };
     bar.set_draw_target(target);
     bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
-    // Its clock goes on while nothing is told.
+    // Keeps its clock running.
     bar.enable_steady_tick(std::time::Duration::from_millis(200));
     bar
 }
 
-/// A turning sign with the time that has passed, for work whose share is not known; drawn only when standard error is a terminal.
+/// A spinner with the elapsed time, for work of unknown length; drawn only when standard error is a terminal.
 pub fn spinner(text: String) -> ProgressBar {
-    // Cleared however the work ends.
+    // Clears itself when dropped.
     let bar = progress(None).with_finish(ProgressFinish::AndClear);
     bar.set_style(ProgressStyle::with_template("{spinner} {elapsed_precise} {msg}").unwrap_or_else(|_| ProgressStyle::default_spinner()));
     bar.set_message(text);

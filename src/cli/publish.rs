@@ -1,13 +1,13 @@
-//! `ridgewatch publish`: an archive plays the simulation.
+//! `ridgewatch publish`: publishes an archive as a simulation does.
 
-use super::{Common, Usage, located, messages, print_json, print_text, scene};
+use super::common::{Common, Usage, dimensions, located, opening, print_json, print_text, ring_folder, scene};
+use super::{messages, signals};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{EngineError, open_snapshots};
 use ridgewatch::field::{Axis, Geometry, Grid, Snapshot};
+use ridgewatch::run::{RunError, open_snapshots};
 use ridgewatch::source::SnapshotSource;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Policy, Producer};
 use std::path::PathBuf;
-use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -17,56 +17,52 @@ pub struct Options {
     /// A scene file (.toml) with an archive or the turbulence, or data files.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// The ring's folder; without it that of the environment variable RIDGEWATCH_RING.
+    /// The ring folder; by default the environment variable RIDGEWATCH_RING names it.
     #[arg(long, value_name = "FOLDER")]
     ring: Option<PathBuf>,
-    /// Steps a second; without it as fast as they can be read.
+    /// Steps a second; by default as fast as they can be read.
     #[arg(long, value_name = "STEPS", value_parser = rate)]
     rate: Option<f64>,
-    /// Ends after so many steps; an archive that is shorter begins again, its times going on.
+    /// End after N steps. A shorter archive is repeated with increasing times.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     steps: Option<u64>,
-    /// Publishes in so many blocks along x, y and z, as a decomposed simulation does.
+    /// Number of blocks along x, y and z, as of a decomposed simulation.
     #[arg(long, default_value = "1x1x1", value_name = "AxBxC", value_parser = blocks)]
     blocks: [u64; 3],
-    /// Steps that a ring holds.
+    /// Number of steps that a ring holds.
     #[arg(long, default_value_t = 4, value_name = "N")]
     slots: u32,
-    /// Waits for ridgewatch to take a step, so many milliseconds at most; 0: never.
+    /// Maximum wait for ridgewatch to take a step, in milliseconds; 0: never wait.
     #[arg(long, default_value_t = 0, value_name = "MILLISECONDS")]
     wait: u64,
 }
 
-/// Steps a second, of which each comes within a time that clocks can count to.
+/// Parses the steps a second. The minimum keeps the time of a step within the range of clocks.
 fn rate(word: &str) -> Result<f64, String> {
     word.parse().ok().filter(|rate: &f64| rate.is_finite() && *rate >= 1e-6).ok_or_else(|| "accepted: a number from 0.000001".to_owned())
 }
 
 fn blocks(text: &str) -> Result<[u64; 3], String> {
-    let numbers: Result<Vec<u64>, _> = text.split(['x', 'X']).map(|n| n.trim().parse()).collect();
-    match numbers.ok().as_deref() {
+    match dimensions::<u64>(text).as_deref() {
         Some(&[x, y, z]) if x > 0 && y > 0 && z > 0 && x.saturating_mul(y).saturating_mul(z) <= 4096 => Ok([x, y, z]),
         _ => Err("accepted: AxBxC, at most 4096 blocks".into()),
     }
 }
 
 /// Publishes.
-pub fn run(common: &Common, options: &Options) -> Result<()> {
+pub fn run(common: &Common, options: Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
-    let spinner = super::opening(&scene);
-    let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, EngineError::refused))?;
+    let spinner = opening(&scene);
+    let mut source = open_snapshots(&scene.settings()).map_err(|error| located(&scene, error, RunError::refused))?;
     drop(spinner);
-    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
-    let Some(ring) = options.ring.clone().or_else(named) else {
-        bail!(Usage(format!("no ring: --ring names its folder, or the environment variable {}", ridgewatch_wire::RING_VARIABLE)));
-    };
+    let ring = ring_folder(options.ring.as_deref())?;
     let grid = source.grid().clone();
     let shape = grid.shape().map(|n| n as u64);
     if (0..3).any(|k| options.blocks[k] > shape[k]) {
         bail!(Usage(format!("--blocks {:?}: the grid has {shape:?} nodes", options.blocks)));
     }
     let policy = if options.wait == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(options.wait)) };
-    // Of this start: another one may come with other blocks.
+    // Identifies this start; another one may have other blocks.
     let start = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as u64);
     let whole = Description { start, ..description(&grid, &source.describe().time_unit) };
     let producers: Result<Vec<Producer>, _> = parts(shape, options.blocks)
@@ -75,20 +71,9 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         .collect();
     let producers = producers.context("cannot publish")?;
     messages::note(format_args!("publishing {} steps of {shape:?} nodes into {}", source.times().len(), ring.display()));
-    let stop = Arc::new(AtomicBool::new(false));
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
     source.describe().notes.iter().for_each(messages::note);
-    let (flag, rate, steps) = (stop.clone(), options.rate, options.steps.unwrap_or(source.times().len() as u64));
-    let played = runtime.block_on(async move {
-        let signals = super::replay::watch_signals(stop, Arc::default()).map(tokio::spawn);
-        let played = tokio::task::spawn_blocking(move || play(&mut *source, &producers, rate, steps, &flag)).await;
-        if let Some(signals) = signals {
-            signals.abort();
-        }
-        played
-    });
-    let (steps, overwrote, seconds) = played.context("publishing stopped unexpectedly")??;
+    let (rate, steps) = (options.rate, options.steps.unwrap_or(source.times().len() as u64));
+    let (steps, overwrote, seconds) = signals::until_stopped(move |stop| play(&mut *source, &producers, rate, steps, stop))?;
     if common.json {
         return print_json(&serde_json::json!({ "steps": steps, "overwrote": overwrote, "seconds": seconds }));
     }
@@ -96,10 +81,10 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
     Ok(())
 }
 
-/// Bytes of an archive up to which it is read before the first step, so that the rate is not the disk's.
-const HELD: usize = 4 << 30;
+/// Maximum size of an archive that is read before the first step, so that the disk does not limit the rate.
+const MAX_HELD_BYTES: usize = 4 << 30;
 
-/// Plays `steps` steps; returns how many, how many blocks overwrote one that nobody had taken, and the seconds.
+/// Publishes `steps` steps. Returns their number, the number of blocks overwritten before they were read, and the seconds.
 fn play(
     source: &mut dyn SnapshotSource,
     producers: &[Producer],
@@ -108,11 +93,11 @@ fn play(
     stop: &AtomicBool,
 ) -> Result<(u64, u64, f64)> {
     let times = source.times().to_vec();
-    // From the last time of a round to the first of the next: the interval before the last.
+    // Time of one pass; the interval between two passes is the last one of the archive.
     let round = times[times.len() - 1] - times[0] + if times.len() > 1 { times[times.len() - 1] - times[times.len() - 2] } else { 1.0 };
     let wanted = times.len().min(usize::try_from(steps).unwrap_or(usize::MAX));
     let mut held = Vec::new();
-    if wanted.saturating_mul(source.grid().nodes()).saturating_mul(12) <= HELD {
+    if wanted.saturating_mul(source.grid().nodes()).saturating_mul(12) <= MAX_HELD_BYTES {
         for index in 0..wanted {
             if stop.load(Ordering::Relaxed) {
                 return Ok((0, 0, 0.0));
@@ -147,14 +132,14 @@ fn play(
             let first = (ox + nx * (oy + ny * oz)) as usize;
             let components: Vec<*const u8> = planes[..whole.components()].iter().map(|plane| plane[first..].as_ptr().cast()).collect();
             let field = Field { components: &components, element: Element::F32, strides: [1, nx as isize, (nx * ny) as isize] };
-            // SAFETY: each plane has a value a node of the grid, of which the block is a part.
+            // SAFETY: each plane has one value for each node of the grid, which contains the block.
             overwrote += u64::from(unsafe { producer.publish(step, time, &field) }?.overwrote);
         }
     }
     Ok((steps, overwrote, begin.elapsed().as_secs_f64()))
 }
 
-/// u, v and w as a simulation has them; NaN where the velocity is missing.
+/// Components u, v and w as of a simulation; NaN at missing cells.
 fn planes(snapshot: &Snapshot) -> [Vec<f32>; 3] {
     let grid = &snapshot.grid;
     let [nx, ny, _] = grid.shape();
@@ -165,7 +150,7 @@ fn planes(snapshot: &Snapshot) -> [Vec<f32>; 3] {
         } else {
             match grid.geometry {
                 Geometry::Cartesian => [node[0], node[1], node[2]],
-                // Back from geocentric components to eastward and northward; the third axis's velocity is in the fourth place.
+                // From geocentric components to eastward and northward; node[3] is the velocity along the third axis.
                 Geometry::Sphere { .. } => {
                     let (sin_lon, cos_lon) = grid.axes[0].coordinates()[i % nx].to_radians().sin_cos();
                     let (sin_lat, cos_lat) = grid.axes[1].coordinates()[i / nx % ny].to_radians().sin_cos();
@@ -181,9 +166,9 @@ fn planes(snapshot: &Snapshot) -> [Vec<f32>; 3] {
     planes
 }
 
-/// The grid as a simulation describes it.
+/// Describes the grid as a simulation does.
 fn description(grid: &Grid, time_unit: &str) -> Description {
-    // What is longer than the wire takes is cut: names are for people.
+    // The wire limits the length of names, which are for people.
     let short = |text: &str| text.chars().filter(|c| !c.is_control()).take(16).collect::<String>();
     let axis = |axis: &Axis| AxisDescription {
         name: short(axis.name()),
@@ -198,7 +183,7 @@ fn description(grid: &Grid, time_unit: &str) -> Description {
     Description::whole(geometry, grid.axes.iter().map(axis).collect(), &short(time_unit))
 }
 
-/// The blocks, x fastest, as even as they come.
+/// Blocks of about equal size, x fastest.
 fn parts(shape: [u64; 3], blocks: [u64; 3]) -> Vec<BlockExtent> {
     let count = blocks.iter().product::<u64>() as u32;
     let begin = |k: usize, b: u64| shape[k] * b / blocks[k];
@@ -216,6 +201,7 @@ fn parts(shape: [u64; 3], blocks: [u64; 3]) -> Vec<BlockExtent> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::sync::Arc;
 
     #[test]
     fn blocks_cover_the_grid() {

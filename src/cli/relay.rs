@@ -1,33 +1,34 @@
 //! `ridgewatch relay`.
 
-use super::nice::Nice;
-use super::{Common, Usage, messages, print_json};
+use super::common::{Common, Usage, check_folder, print_json, ring_folder};
+use super::process::Nice;
+use super::{messages, signals};
 use anyhow::{Context, Result, bail};
 use ridgewatch_wire::message::{ConnectionFile, Key};
 use ridgewatch_wire::relay::{RelayCounts, serve};
 use std::net::{IpAddr, TcpListener};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::Ordering;
 
 /// Options of `relay`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// The ring's folder; without it that of the environment variable RIDGEWATCH_RING.
+    /// The ring folder; by default the environment variable RIDGEWATCH_RING names it.
     #[arg(value_name = "RING")]
     ring: Option<PathBuf>,
-    /// Where to listen: HOST:PORT; port 0: any free one. Another node needs this node's name or address here.
+    /// Address to listen at, HOST:PORT; port 0: any free one. Other nodes need the name or address of this node here.
     #[arg(long, default_value = "127.0.0.1:0", value_name = "HOST:PORT")]
     listen: String,
-    /// Writes the address and the key here (mode 0600), for `ridgewatch attach` on the other node.
+    /// File for the address and the key (mode 0600), for `ridgewatch attach` on the other node.
     #[arg(long, value_name = "FILE")]
     connection: PathBuf,
     #[command(flatten)]
     nice: Nice,
 }
 
-/// What is odd about a listener that was asked for by `host` and got this address: a name that other nodes know may stand for this machine's own
-/// loopback here (127.0.1.1 in Debian's /etc/hosts).
+/// Warning for a listener that other nodes do not reach: `host` may stand for the loopback on this machine, as 127.0.1.1 in Debian's
+/// /etc/hosts.
 fn out_of_reach(host: &str, address: IpAddr) -> Option<String> {
     let meant = host == "localhost" || host.trim_matches(['[', ']']).parse::<IpAddr>().is_ok();
     (address.is_loopback() && !meant).then(|| {
@@ -35,49 +36,37 @@ fn out_of_reach(host: &str, address: IpAddr) -> Option<String> {
     })
 }
 
-/// Relays until it is told to stop.
-pub fn run(common: &Common, options: &Options) -> Result<()> {
+/// Relays until a signal.
+pub fn run(common: &Common, options: Options) -> Result<()> {
     if !common.overrides.is_empty() {
-        bail!(Usage("--set: relay takes no scene; accepted: RING, --listen, --connection, --nice".into()));
+        bail!(Usage("--set: relay has no scene; accepted: RING, --listen, --connection, --nice".into()));
     }
-    let named = || std::env::var_os(ridgewatch_wire::RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
-    let Some(ring) = options.ring.clone().or_else(named) else {
-        bail!(Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE)));
-    };
+    let ring = ring_folder(options.ring.as_deref())?;
     let listener = TcpListener::bind(&options.listen).with_context(|| format!("cannot listen at {}", options.listen))?;
     let (address, port) = (listener.local_addr()?.ip(), listener.local_addr()?.port());
     let host = options.listen.rsplit_once(':').map_or("127.0.0.1", |(host, _)| host);
     if let Some(warning) = out_of_reach(host, address) {
         messages::note(warning);
     }
-    options.nice.step_back();
-    super::open_files::allow_many();
+    options.nice.apply();
     let key = Key::random()?;
-    super::check_folder(&options.connection)?;
-    let (stop, counts) = (Arc::new(AtomicBool::new(false)), Arc::new(RelayCounts::default()));
-    let runtime =
-        tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build().context("cannot start the I/O thread")?;
+    check_folder(&options.connection)?;
+    let (counts, path) = (Arc::new(RelayCounts::default()), options.connection);
     let connection = ConnectionFile { address: format!("{host}:{port}"), key: key.clone() };
-    let served = runtime.block_on(async {
-        // Before the file is there, so that no signal leaves it behind.
-        let signals = super::replay::watch_signals(stop.clone(), Arc::default()).map(tokio::spawn);
-        connection.write(&options.connection)?;
+    let relayed = counts.clone();
+    signals::until_stopped(move |stop| {
+        connection.write(&path)?;
         messages::note(format_args!(
-            "relaying {} at {host}:{port}; on the other node: ridgewatch attach {}",
+            "relaying {} at {}; on the other node: ridgewatch attach {}",
             ring.display(),
-            options.connection.display()
+            connection.address,
+            path.display()
         ));
-        let (flag, counts) = (stop.clone(), counts.clone());
-        let work = move || serve(&ring, &listener, &key, &counts, &flag, Arc::new(messages::note));
-        let served = tokio::task::spawn_blocking(work).await;
-        if let Some(signals) = signals {
-            signals.abort();
-        }
-        anyhow::Ok(served)
+        let served = serve(&ring, &listener, &key, &relayed, stop, Arc::new(messages::note));
+        // So that nobody waits for a relay that has ended.
+        connection.remove(&path);
+        Ok(served?)
     })?;
-    // Whoever reads it later would wait for nobody.
-    connection.remove(&options.connection);
-    served.context("the relay stopped unexpectedly")??;
     if common.json {
         let count = |c: &std::sync::atomic::AtomicU64| c.load(Ordering::Relaxed);
         print_json(&serde_json::json!({

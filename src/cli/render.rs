@@ -1,10 +1,13 @@
 //! `ridgewatch render`.
 
-use super::{Common, Usage, check_folder, check_learns, located, messages, print_json, print_text, scene};
+use super::common::{
+    Common, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene,
+};
+use super::{messages, session};
 use anyhow::{Context, Result, bail};
-use ridgewatch::engine::{self, EngineError, Event, Frame, RunOptions};
 use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
 use ridgewatch::render::Method;
+use ridgewatch::run::{self, Event, Frame, RunError, RunOptions};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
 
@@ -15,19 +18,19 @@ pub struct Options {
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
     /// reference, surrogate (neural) or gated; overrides the scene's.
-    #[arg(long, value_parser = super::method)]
+    #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Samples a pixel; overrides the scene's `render.samples`.
     #[arg(long, value_name = "N")]
     spp: Option<usize>,
-    /// Frames rendered and thrown away first, with the scene's samples: they train the surrogate and tighten the majorants.
-    /// Without it: the scene's time.warmup_frames.
+    /// Number of frames rendered and discarded first, with the scene's samples; they train the surrogate and tighten the majorants.
+    /// Default: the scene's time.warmup_frames.
     #[arg(long, value_name = "N")]
     warmup: Option<usize>,
-    /// Checks the stated error on N fresh points.
+    /// Check the stated error on N new points.
     #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
     verify: u64,
-    /// Starts from a surrogate written by `replay --checkpoint`.
+    /// Start from a surrogate written by `replay --checkpoint`.
     #[arg(long, value_name = "FILE")]
     resume: Option<PathBuf>,
     /// Picture: .exr (all layers, linear) or .png (tone-mapped). An .exr gets a .png beside it, and both a .scene.toml,
@@ -65,11 +68,11 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let run_options = RunOptions {
         verify_points: options.verify as usize,
         threads: common.threads,
-        device: super::device(common, &scene)?,
+        device: device(common, &scene)?,
         ..RunOptions::default()
     };
     let scene_text = scene.to_toml()?;
-    let setup = super::open(&scene)?;
+    let setup = open(&scene)?;
     let bar = messages::progress(Some(100));
     let mut picture: Option<Frame> = None;
     let (mut whole, mut warnings) = (0, Vec::new());
@@ -82,12 +85,12 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         Event::Progress(share) => bar.set_position(100 * whole + (share * 100.0) as u64),
         Event::Frame(frame) => {
             whole += 1;
-            // Those of warm-up frames too: some are told once a run.
+            // Including warm-up frames, since some warnings appear once a run.
             warnings.extend(frame.record.warnings.iter().cloned());
             picture = Some(frame);
         }
     };
-    engine::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, EngineError::refused))?;
+    run::run(setup, &run_options, sink, &AtomicBool::new(false)).map_err(|error| located(&scene, error, RunError::refused))?;
     bar.finish_and_clear();
     let frame = picture.context("no frame was made")?;
     if extension == "exr" {
@@ -102,8 +105,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         messages::note(warning);
     }
     if let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference) {
-        messages::note(super::steps_told(steps, difference));
+        messages::note(chosen_steps(steps, difference));
     }
-    print_text(format_args!("{}: {}", options.out.display(), super::replay::line(&frame.record)));
+    print_text(format_args!("{}: {}", options.out.display(), session::line(&frame.record)));
     Ok(())
 }

@@ -1,6 +1,7 @@
 //! `ridgewatch synthesize`: archives of the standard turbulence.
 
-use super::{Common, Usage, messages, print_json, print_text};
+use super::common::{Common, Usage, dimensions, print_json, print_text, word};
+use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::source::{SyntheticSettings, SyntheticShape};
 use std::path::PathBuf;
@@ -8,17 +9,17 @@ use std::path::PathBuf;
 /// Options of `synthesize`.
 #[derive(Debug, clap::Args)]
 pub struct Options {
-    /// ecmwf (packed NetCDF, longitude-latitude-level, turbulence on the grid), globe (the same, turbulence on the sphere) or flame
+    /// ecmwf (packed NetCDF, longitude-latitude-level, turbulence on the grid), globe (as ecmwf, turbulence on the sphere) or flame
     /// (HDF5, x-y-z).
     #[arg(value_parser = shape)]
     shape: SyntheticShape,
-    /// Folder; made where it is not there.
+    /// Folder; created if it does not exist.
     #[arg(long, short)]
     out: PathBuf,
     /// Nodes: NXxNYxNZ. Published: 360x181x37 (ecmwf), 600x192x192 (flame).
     #[arg(long, default_value = "96x48x24", value_parser = nodes)]
-    nodes: Nodes,
-    /// Snapshots.
+    nodes: [usize; 3],
+    /// Number of snapshots.
     #[arg(long, default_value_t = 12)]
     snapshots: usize,
     /// The hard turbulence (wave numbers to 30, 8 cells a snapshot) instead of the easy one (14, 3).
@@ -26,33 +27,21 @@ pub struct Options {
     hard: bool,
 }
 
-#[derive(Debug, Clone, Copy)]
-struct Nodes([usize; 3]);
-
-fn nodes(text: &str) -> Result<Nodes, String> {
-    let numbers: Result<Vec<usize>, _> = text.split(['x', 'X']).map(|n| n.trim().parse()).collect();
-    match numbers.ok().as_deref() {
-        Some(&[x, y, z]) => Ok(Nodes([x, y, z])),
-        _ => Err("accepted: NXxNYxNZ".into()),
-    }
+fn nodes(text: &str) -> Result<[usize; 3], String> {
+    dimensions(text).and_then(|numbers| numbers.try_into().ok()).ok_or_else(|| "accepted: NXxNYxNZ".into())
 }
 
-fn shape(word: &str) -> Result<SyntheticShape, String> {
-    match word {
-        "ecmwf" => Ok(SyntheticShape::Ecmwf),
-        "globe" => Ok(SyntheticShape::Globe),
-        "flame" => Ok(SyntheticShape::Flame),
-        _ => Err("accepted: ecmwf, globe, flame".into()),
-    }
+fn shape(text: &str) -> Result<SyntheticShape, String> {
+    word(text, "ecmwf, globe, flame")
 }
 
 /// Writes.
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     if !common.overrides.is_empty() {
-        bail!(Usage("--set: synthesize takes no scene; accepted: --nodes, --snapshots, --hard, --seed".into()));
+        bail!(Usage("--set: synthesize has no scene; accepted: --nodes, --snapshots, --hard, --seed".into()));
     }
     let mut settings = SyntheticSettings::new(options.shape);
-    settings.nodes = options.nodes.0;
+    settings.nodes = options.nodes;
     settings.snapshots = options.snapshots;
     settings.seed = common.seed.unwrap_or(0);
     if options.hard {

@@ -1,7 +1,8 @@
-//! Errors that point at the line.
+//! Why a scene is refused, in the words of a scene file.
 
-use crate::setting::Refused;
-use std::path::{Path, PathBuf};
+use super::renamed::renamed;
+use serde::{Deserialize, Deserializer};
+use std::path::PathBuf;
 use thiserror::Error;
 
 /// Why a scene is refused.
@@ -12,47 +13,23 @@ pub enum ConfigError {
     Unreadable {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the system.
         message: String,
     },
-    /// The file is no TOML, has an unknown key, or a value of the wrong type.
-    #[error("{path}:{line}: {message}\n  {line:>4} | {excerpt}")]
-    Syntax {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// That line.
-        excerpt: String,
-        /// What is wrong with it.
-        message: String,
-    },
-    /// A value is outside its range, or does not go with another one.
-    #[error("{place}: `{key}` {found}; accepted: {accepted}{}", excerpt(.line))]
-    Value {
-        /// File and line, or `--set`.
+    /// The text is not TOML, a key is unknown, or a value is not accepted.
+    #[error("{place}: {message}{}", excerpt(.line))]
+    Fault {
+        /// File and line, or option of the command line.
         place: String,
-        /// Dotted key.
-        key: String,
-        /// What was found, as in `is -1`.
-        found: String,
-        /// What is accepted.
-        accepted: String,
-        /// Line number and line, where the file has it.
+        /// The key, the value found, and the accepted values.
+        message: String,
+        /// Line number (from 1) and text of the line, if the file has it.
         line: Option<(usize, String)>,
     },
-    /// A `--set` that cannot be applied.
-    #[error("--set {given}: {message}")]
-    Override {
-        /// As given.
-        given: String,
-        /// What is wrong with it.
-        message: String,
-    },
-    /// The scene of a run cannot be written beside what it makes.
+    /// The scene of a run cannot be written as a file.
     #[error("the scene cannot be written as a file: {message}")]
     Unwritable {
-        /// What is wrong with it.
+        /// Key and reason.
         message: String,
     },
 }
@@ -61,60 +38,50 @@ fn excerpt(line: &Option<(usize, String)>) -> String {
     line.as_ref().map_or_else(String::new, |(number, text)| format!("\n  {number:>4} | {text}"))
 }
 
-impl ConfigError {
-    /// Finds the line of `text` that set the key, unless it was set at another place.
-    pub(super) fn locate(refused: Refused, path: &Path, text: &str, elsewhere: Option<String>) -> Self {
-        let Refused { key, found, accepted, .. } = refused;
-        let line = if elsewhere.is_none() { span_of(text, &key).map(|at| line_at(text, at)) } else { None };
-        let place = match (elsewhere, &line) {
-            (Some(place), _) => place,
-            (None, Some((number, _))) => format!("{}:{number}", path.display()),
-            (None, None) => path.display().to_string(),
+/// A key or value that does not fit the settings.
+#[derive(Debug)]
+pub(super) struct KeyFault {
+    /// Byte offset in the text. `None` if the value comes from an option.
+    pub(super) at: Option<usize>,
+    /// The key, the value found, and the accepted values.
+    pub(super) message: String,
+}
+
+/// Deserialises TOML.
+///
+/// # Errors
+/// The first fault, with its dotted key.
+pub(super) fn read<'de, T: Deserialize<'de>>(toml: impl Deserializer<'de, Error = toml::de::Error>) -> Result<T, KeyFault> {
+    serde_path_to_error::deserialize(toml).map_err(|error| KeyFault {
+        at: error.inner().span().map(|span| span.start),
+        message: in_plain_words(&error.path().to_string(), error.inner().message()),
+    })
+}
+
+/// Translates serde's message on the key at `path` (`.` is the file) into the words of a scene file, with the nearest accepted name if one is
+/// unknown.
+fn in_plain_words(path: &str, message: &str) -> String {
+    if let Some(field) = message.strip_prefix("missing field `") {
+        let table = if path == "." { String::new() } else { format!("{path}.") };
+        return format!("`{table}{field} is missing");
+    }
+    if let Some(rest) = message.strip_prefix("unknown field `") {
+        return match renamed(path) {
+            Some(new) => format!("`{path}` has a new name; accepted: `{new}`"),
+            None => format!("`{path}` is unknown; {}", accepted_names(rest)),
         };
-        Self::Value { place, key, found, accepted, line }
     }
-
-    /// From a TOML error, with its line and, for an unknown key, the nearest known one.
-    pub(super) fn from_toml(path: &Path, text: &str, error: &toml::de::Error) -> Self {
-        let (line, excerpt) = line_at(text, error.span().map_or(0, |s| s.start));
-        Self::Syntax { path: path.to_path_buf(), line, excerpt, message: in_plain_words(error.message()) }
+    if let Some(rest) = message.strip_prefix("unknown variant `") {
+        return format!("`{path}` is \"{}\"; {}", rest.split('`').next().unwrap_or_default(), accepted_names(rest));
     }
-}
-
-/// Byte offset of the value at a dotted key, or of the nearest table above it.
-fn span_of(text: &str, key: &str) -> Option<usize> {
-    let document = toml_edit::Document::parse(text).ok()?;
-    let mut item = document.as_item();
-    let mut best = None;
-    for part in key.split('.') {
-        let Some(next) = item.get(part) else { break };
-        item = next;
-        best = item.span().map(|s| s.start).or(best);
-    }
-    best
-}
-
-/// Line number (from 1) and text of the line that holds byte `at`.
-fn line_at(text: &str, at: usize) -> (usize, String) {
-    let at = at.min(text.len());
-    let before = text.get(..at).unwrap_or("");
-    let number = before.matches('\n').count();
-    (number + 1, text.lines().nth(number).unwrap_or("").to_owned())
-}
-
-/// serde's message in the words of a scene file, with the nearest accepted name where one is unknown.
-pub(super) fn in_plain_words(message: &str) -> String {
     let wrong = ["invalid type: ", "invalid value: ", "invalid length "].into_iter().find_map(|start| message.strip_prefix(start));
     match wrong.and_then(|rest| rest.split_once(", expected ")) {
-        Some((found, expected)) => format!("is {}; accepted: {}", found_in_words(found), expected_in_words(expected)),
-        None => match message.strip_prefix("missing field ") {
-            Some(field) => format!("{field} is missing"),
-            None => with_suggestion(message),
-        },
+        Some((found, expected)) => format!("`{path}` is {}; accepted: {}", found_in_words(found), expected_in_words(expected)),
+        None => format!("`{path}`: {message}"),
     }
 }
 
-/// ``integer `5` `` as `5`.
+/// Writes ``integer `5` `` as `5`.
 fn found_in_words(found: &str) -> String {
     let value = found.split_once('`').and_then(|(_, rest)| rest.rsplit_once('`')).map(|(value, _)| value);
     match (found, value, found.strip_prefix("string ")) {
@@ -127,7 +94,7 @@ fn found_in_words(found: &str) -> String {
     }
 }
 
-/// `usize` as `a whole number, 0 or above`.
+/// Writes `usize` as `a whole number, 0 or above`.
 fn expected_in_words(expected: &str) -> String {
     match expected {
         "usize" | "u64" | "u32" | "u16" | "u8" => "a whole number, 0 or above".to_owned(),
@@ -144,19 +111,19 @@ fn expected_in_words(expected: &str) -> String {
     }
 }
 
-/// Adds the nearest accepted name to serde's message on an unknown field or variant.
-fn with_suggestion(message: &str) -> String {
-    let mut quoted = message.split('`').skip(1).step_by(2);
-    let Some(unknown) = quoted.next().filter(|_| message.starts_with("unknown")) else { return message.to_owned() };
-    // A name that holds the other, as `tol` and `tolerance`, is nearer than its length says.
+/// Rewrites ``found`, expected one of `known`, `other``` with the accepted name that is nearest to the one found.
+fn accepted_names(message: &str) -> String {
+    // The name found, then words and accepted names in turn.
+    let mut pieces = message.split('`').step_by(2);
+    let unknown = pieces.next().unwrap_or_default();
+    let expected = message.split_once(", expected ").map_or("none", |(_, expected)| expected.strip_prefix("one of ").unwrap_or(expected));
+    // A name that contains the other, as `tolerance` contains `tol`, is nearer than its length says.
     let contained = |known: &str| unknown.len().min(known.len()) >= 3 && (known.contains(unknown) || unknown.contains(known));
-    let nearest = quoted
+    let nearest = pieces
         .map(|known| (strsim::damerau_levenshtein(unknown, known), known))
         .min_by_key(|&(distance, known)| (distance > 2 && !contained(known), distance));
-    match nearest {
-        Some((distance, known)) if distance <= unknown.len().max(3) / 2 || contained(known) => {
-            format!("{message}. Did you mean `{known}`?")
-        }
-        _ => message.to_owned(),
+    match nearest.filter(|&(distance, known)| distance <= unknown.len().max(3) / 2 || contained(known)) {
+        Some((_, known)) => format!("accepted: {expected}. Did you mean `{known}`?"),
+        None => format!("accepted: {expected}"),
     }
 }

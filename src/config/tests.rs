@@ -66,7 +66,7 @@ fn a_fault_in_any_section_points_at_its_line() {
     for (section, fault, key, found, accepted) in [
         ("source", "epsilon = nan", "source.epsilon", "nan", "a finite number"),
         ("time", "frames_per_slide = 0", "time.frames_per_slide", "0", "from 1 to"),
-        ("flow", "gap = 0.0", "flow.gap", "0", "above 0"),
+        ("flow", "difference_step = 0.0", "flow.difference_step", "0", "above 0"),
         ("surrogate", "table_nodes = [1, 8, 8]", "surrogate.table_nodes", "[1, 8, 8]", "at least 2"),
         ("network", "features = 3", "network.features", "3", "1, 2, 4 or 8"),
         ("network", "growth = 0.5", "network.growth", "0.5", "1 to 4"),
@@ -92,12 +92,12 @@ fn a_fault_in_any_section_points_at_its_line() {
 
 #[test]
 fn a_fault_found_later_is_located_and_options_are_blamed_for_theirs() {
-    let text = format!("{GYRE}[flow]\ngap = 1e-12\nintegrator = \"differences\"\n");
+    let text = format!("{GYRE}[flow]\ndifference_step = 1e-12\nintegrator = \"differences\"\n");
     let mut scene = SceneFile::parse(Path::new("scene.toml"), &text, &[]).unwrap();
-    let late = crate::flow::FlowError::OutOfRange { key: "gap", found: 1e-12, accepted: "more" }.refused().unwrap();
-    assert!(scene.locate(late.clone()).to_string().starts_with("scene.toml:9: `flow.gap` is 0.000000000001; accepted: more"));
-    scene.set_by("flow.gap", "--gap 1e-12");
-    assert!(scene.locate(late).to_string().starts_with("--gap 1e-12: `flow.gap`"));
+    let late = crate::flow::FlowError::OutOfRange { key: "difference_step", found: 1e-12, accepted: "more" }.refused().unwrap();
+    assert!(scene.locate(late.clone()).to_string().starts_with("scene.toml:9: `flow.difference_step` is 0.000000000001; accepted: more"));
+    scene.set_by("flow.difference_step", "--difference-step 1e-12");
+    assert!(scene.locate(late).to_string().starts_with("--difference-step 1e-12: `flow.difference_step`"));
 }
 
 #[test]
@@ -115,7 +115,7 @@ fn paths_in_a_scene_are_relative_to_it_and_those_of_the_command_line_are_not() {
     assert_eq!((scene.archive.files[0].to_str(), scene.training.resume.unwrap().to_str()), (Some("b.nc"), Some("v.safetensors")));
 }
 
-/// A range has two ends: the one that was just set is to be blamed, whichever is reported.
+/// Of the two ends of a range, the error names the one just set.
 #[test]
 fn of_two_keys_at_fault_together_the_one_on_the_command_line_is_named() {
     let said = error(GYRE, &["domain.min=[3, 0, 0]"]);
@@ -136,7 +136,24 @@ fn values_are_shown_as_a_scene_file_writes_them() {
     assert!(error(GYRE, &["render.majorant_cells=[0, 1, 1]"]).contains("is [0, 1, 1];"));
 }
 
-/// What a key of the wrong type is told.
+#[test]
+fn an_old_key_is_refused_with_its_new_name() {
+    for (old, new) in RENAMED.into_iter().filter(|(old, _)| !old.starts_with("--")) {
+        assert_eq!(renamed(new), None, "{new} is the name of today");
+        let (table, key) = old.split_once('.').unwrap();
+        let (text, line) = with_fault(table, &format!("{key} = 1"));
+        let words = format!("`{old}` has a new name; accepted: `{new}`");
+        assert_eq!(error(&text, &[]), format!("scene.toml:{line}: {words}\n  {line:>4} | {key} = 1"));
+        for set in [format!("{old}=1"), format!("{table}={{ {key} = 1 }}")] {
+            let said = error(GYRE, &[&set]);
+            assert!(said.starts_with("--set ") && said.ends_with(&words), "{said}");
+        }
+        // The new name is accepted; only this value is wrong.
+        let said = error(&with_fault(table, &format!("{} = {{ a = 1 }}", new.split_once('.').unwrap().1)).0, &[]);
+        assert!(said.contains(&format!("`{new}` is ")) && said.contains("; accepted: "), "{said}");
+    }
+}
+
 #[test]
 fn types_are_said_in_plain_words() {
     for (set, words) in [
@@ -155,19 +172,19 @@ fn types_are_said_in_plain_words() {
         assert!(said.starts_with(&format!("--set {set}: ")) && said.contains(words), "{set}: {said}");
     }
     let said = error(&format!("{GYRE}[render]\nwidth = \"wide\"\n"), &[]);
-    assert_eq!(said, "scene.toml:9: is \"wide\"; accepted: a whole number, 0 or above\n     9 | width = \"wide\"");
-    assert!(error("[source]\nomega = 1\n", &[]).contains("`kind` is missing"));
+    assert_eq!(said, "scene.toml:9: `render.width` is \"wide\"; accepted: a whole number, 0 or above\n     9 | width = \"wide\"");
+    assert!(error("[source]\nomega = 1\n", &[]).contains("`source.kind` is missing"));
 }
 
-/// A key that is read and does nothing is a mistake that nobody would notice.
+/// Otherwise nobody would notice the mistake.
 #[test]
 fn keys_that_do_nothing_are_refused_where_they_stand() {
     for (section, line, key) in [
         ("archive", "w = \"none\"", "archive.w"),
         ("archive.synthetic", "shape = \"flame\"", "archive.synthetic.shape"),
         ("live", "at_end = \"stop\"", "live.at_end"),
-        ("time", "stride = 2", "time.stride"),
-        ("flow", "gap = 1e-3", "flow.gap"),
+        ("time", "snapshots_per_slide = 2", "time.snapshots_per_slide"),
+        ("flow", "difference_step = 1e-3", "flow.difference_step"),
         ("flow", "tolerance = 0.1\nsteps = 9", "flow.tolerance"),
         ("flow", "steps = 9\nintegrator = \"dormand_prince\"\nprecision = \"f64\"", "flow.steps"),
         ("flow", "interpolation = \"cubic\"", "flow.interpolation"),
@@ -185,20 +202,23 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
         assert!(said.starts_with(&format!("scene.toml:{at}: `{key}` does nothing here; accepted: ")), "{said}");
     }
     let archive = "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[time]\n";
-    for line in ["start = 1.0", "step = 2.0"] {
+    for line in ["start = 1.0", "seed_step = 2.0"] {
         let said = error(&format!("{archive}{line}\n"), &[]);
-        assert!(said.starts_with("scene.toml:6: `time.st") && said.contains("only with closed forms"), "{said}");
+        assert!(said.starts_with("scene.toml:6: `time.s") && said.contains("only with closed forms"), "{said}");
     }
-    assert!(error(GYRE, &["flow.gap=1e-3"]).starts_with("--set flow.gap=1e-3: `flow.gap` does nothing here"));
-    assert!(error(GYRE, &["time.step=0", "time.slides=2"]).starts_with("--set time.slides=2: `time.step` is 0"));
-    // An option that makes a part of the file idle is no fault of the file.
+    assert!(
+        error(GYRE, &["flow.difference_step=1e-3"])
+            .starts_with("--set flow.difference_step=1e-3: `flow.difference_step` does nothing here")
+    );
+    assert!(error(GYRE, &["time.seed_step=0", "time.slides=2"]).starts_with("--set time.slides=2: `time.seed_step` is 0"));
+    // An option that leaves a part of the file without effect is no fault of the file.
     let text = format!("{GYRE}[surrogate]\ntable_nodes = [8, 8, 8]\n");
     let parsed = |text: &str, set: &str| SceneFile::parse(Path::new("s"), text, &[set.to_owned()]);
     assert!(parsed(&text, "surrogate.kind=network").is_ok());
-    // One that gives a part of it work mends it.
+    // One that gives a part effect mends it.
     let text = format!("{GYRE}[surrogate]\nkind = \"table\"\n[training]\nsteps_per_frame = 9\n");
     assert!(parsed(&text, "surrogate.kind=residual").is_ok() && parsed(&text, "surrogate.table_nodes=[8, 8, 8]").is_err());
-    // The method is changed by an option.
+    // Options change the method.
     assert!(parsed(&format!("{GYRE}[network]\nwidth = 32\n"), "render.method=reference").is_ok());
     let files = "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[archive.synthetic]\nshape = \"flame\"\n";
     let said = error(files, &[]);
@@ -213,16 +233,16 @@ fn a_name_cut_short_is_recognised() {
 }
 
 #[test]
-fn a_live_run_neither_waits_for_the_disk_nor_fills_it_unless_told() {
-    use crate::publish::WhenFull::{Drop, Wait};
+fn a_live_run_neither_waits_for_the_disk_nor_fills_it_by_default() {
+    use crate::publish::WhenDiskSlow::{Drop, Wait};
     let told = |overrides: &[&str]| {
         let overrides: Vec<String> = overrides.iter().chain(&["time.tau=1"]).map(|s| (*s).to_owned()).collect();
         let publish = SceneFile::for_live(&overrides).unwrap().publish_settings();
-        (publish.keep, publish.keep_bytes, publish.records_bytes, publish.when_full)
+        (publish.keep, publish.keep_bytes, publish.records_bytes, publish.when_disk_slow)
     };
     let gib = Some(1 << 30);
     assert_eq!(told(&[]), (Some(100), None, gib, Some(Drop)));
-    assert_eq!(told(&["publish.keep=7", "publish.when_full=wait"]), (Some(7), None, gib, Some(Wait)));
+    assert_eq!(told(&["publish.keep=7", "publish.when_disk_slow=wait"]), (Some(7), None, gib, Some(Wait)));
     assert_eq!(told(&["publish.keep_bytes=1000000"]), (None, Some(1_000_000), gib, Some(Drop)));
     assert_eq!(told(&["publish.records_bytes=2000000"]), (Some(100), None, Some(2_000_000), Some(Drop)));
     let replayed = SceneFile::parse(Path::new("scene.toml"), GYRE, &[]).unwrap();

@@ -19,7 +19,7 @@ pub enum Analytic {
         /// omega, radians per time unit.
         omega: f64,
     },
-    /// Arnold-Beltrami-Childress: u = A' sin z + C cos y, v = B sin x + A' cos z, w = C sin y + B cos x with
+    /// Arnold-Beltrami-Childress flow: u = A' sin z + C cos y, v = B sin x + A' cos z, w = C sin y + B cos x with
     /// A' = A + growth * sin(pi t) * t in the unsteady form (Haller 2001: growth 0.5).
     Abc {
         /// A.
@@ -31,7 +31,7 @@ pub enum Analytic {
         /// Growth of A; 0 is the steady flow.
         growth: f64,
     },
-    /// u = rate x, v = -rate y (about the origin): FTLE = rate, both ways.
+    /// u = rate x, v = -rate y: FTLE = rate, forward and backward.
     Saddle {
         /// rate.
         rate: f64,
@@ -49,7 +49,7 @@ pub enum Analytic {
 }
 
 impl Analytic {
-    /// Axes along which the flow varies: 2 or 3.
+    /// Number of axes along which the flow varies: 2 or 3.
     pub fn dimensions(&self) -> usize {
         match self {
             Analytic::Abc { .. } => 3,
@@ -61,7 +61,7 @@ impl Analytic {
 /// The constants of a closed form at one time, computed once for all samples.
 pub type Constants<R> = [R; 4];
 
-/// A closed form that a kernel is compiled for. `D` is the number of axes.
+/// A closed form as a type, for which kernels are compiled. `D` is the number of axes.
 pub trait ClosedForm<const D: usize>: Copy + Send + Sync + 'static {
     /// Constants at a time.
     fn constants(&self, time: f64) -> Constants<f64>;
@@ -80,14 +80,14 @@ pub struct DoubleGyre {
 }
 
 impl DoubleGyre {
-    /// Radians of phase a unit of time: the flow depends on time by its phase alone.
+    /// Phase in radians per unit of time. The flow depends on time through its phase alone.
     #[cfg(feature = "cuda")]
     pub(crate) fn rate(&self) -> f64 {
         self.omega
     }
 
-    /// What the constants at `time` after a start are made of, with the sine and cosine of the phase at the start
-    /// (sin(a + b) = sin a cos b + cos a sin b): the first two, and epsilon times sine and cosine of the phase since.
+    /// The first two constants, and epsilon times sine and cosine of the phase `time` after a start. With sine and cosine of the phase at the
+    /// start they give the constants at that time (sin(a + b) = sin a cos b + cos a sin b).
     #[cfg(feature = "cuda")]
     pub(crate) fn constants_since(&self, time: f64) -> Constants<f64> {
         let [scale, scale_pi, ..] = self.constants(time);
@@ -175,7 +175,7 @@ impl ClosedForm<2> for Linear {
     }
     #[inline(always)]
     fn velocity<L: Lanes>(constants: &Constants<L::Real>, x: &[L; 2]) -> [L; 2] {
-        // A coordinate that overflowed must not meet a coefficient of zero.
+        // A coordinate that overflowed times a coefficient of 0 would be NaN.
         let term = |row: usize, column: usize| {
             let g = constants[2 * row + column];
             if g == L::Real::from_f64(0.0) { L::zero() } else { L::splat(g) * x[column] }
@@ -190,7 +190,7 @@ impl ClosedForm<2> for Linear {
     }
 }
 
-/// An [`Analytic`] as the type that its kernel is compiled for.
+/// An [`Analytic`] as the type for which its kernel is compiled.
 #[derive(Debug, Clone, Copy)]
 pub enum Form {
     /// Double gyre.
@@ -202,7 +202,7 @@ pub enum Form {
 }
 
 impl Analytic {
-    /// The form to compile for.
+    /// The type of the closed form.
     pub fn form(&self) -> Form {
         let linear = |gradient| Form::Linear(Linear { gradient });
         match *self {
@@ -214,7 +214,7 @@ impl Analytic {
         }
     }
 
-    /// Velocity at a point and time.
+    /// Velocity at a point and time, in coordinate units per time unit.
     pub fn velocity(&self, point: [f64; 3], time: f64) -> [f64; 3] {
         let plane = [point[0], point[1]];
         let flat = |v: [f64; 2]| [v[0], v[1], 0.0];

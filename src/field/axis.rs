@@ -3,22 +3,22 @@
 use std::cmp::Ordering;
 use thiserror::Error;
 
-/// A strictly ascending coordinate axis. Readers flip descending axes (latitude, pressure) before they come here.
+/// A strictly ascending coordinate axis. Readers flip descending axes (latitude, pressure) before they make an [`Axis`].
 #[derive(Debug, Clone, PartialEq)]
 pub struct Axis {
     name: String,
     units: String,
     coordinates: Vec<f64>,
-    /// Spacing, when all intervals are equal to within 1e-5 of their mean.
+    /// Spacing if all intervals are equal to within 1e-5 of their mean.
     uniform_step: Option<f64>,
     /// The length after which the axis repeats, e.g. 360 for global longitudes.
     period: Option<f64>,
 }
 
-/// Why a list of numbers is no axis.
+/// Error of making an axis from coordinates.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum AxisFault {
-    /// No cell fits between fewer than two nodes.
+    /// Fewer than two nodes.
     #[error("axis `{name}` has {found} node(s); at least 2 are needed")]
     TooShort {
         /// Axis name.
@@ -26,7 +26,7 @@ pub enum AxisFault {
         /// Nodes found.
         found: usize,
     },
-    /// The coordinates turn back, repeat or are not numbers.
+    /// The coordinates descend, repeat or are not finite.
     #[error("axis `{name}` is not strictly ascending: node {index} is {here}, the one before it is {before}")]
     NotAscending {
         /// Axis name.
@@ -41,7 +41,10 @@ pub enum AxisFault {
 }
 
 impl Axis {
-    /// An axis through `coordinates`, which must ascend strictly.
+    /// An axis with the given coordinates.
+    ///
+    /// # Errors
+    /// Fewer than two coordinates, or coordinates that do not ascend strictly.
     pub fn new(name: impl Into<String>, units: impl Into<String>, coordinates: Vec<f64>) -> Result<Self, AxisFault> {
         let name = name.into();
         if coordinates.len() < 2 {
@@ -59,7 +62,10 @@ impl Axis {
         Ok(Self { name, units: units.into(), coordinates, uniform_step: even.then_some(step), period: None })
     }
 
-    /// `nodes` evenly spaced nodes from `first` to `last`.
+    /// An axis of `nodes` evenly spaced nodes from `first` to `last`.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
     pub fn uniform(name: impl Into<String>, units: impl Into<String>, first: f64, last: f64, nodes: usize) -> Result<Self, AxisFault> {
         let name = name.into();
         if nodes < 2 {
@@ -69,7 +75,7 @@ impl Axis {
         Self::new(name, units, (0..nodes).map(|i| first + step * i as f64).collect())
     }
 
-    /// The same axis, repeating after `period`. The interval between the last node and the first one's image is a cell too.
+    /// Makes the axis periodic. The interval between the last node and the image of the first is a cell too.
     pub fn with_period(mut self, period: f64) -> Self {
         self.period = Some(period);
         self
@@ -101,22 +107,22 @@ impl Axis {
         self.coordinates[0]
     }
 
-    /// Last coordinate, or the first one's image where the axis is periodic.
+    /// Last coordinate, or the image of the first if the axis is periodic.
     pub fn last(&self) -> f64 {
         self.period.map_or(self.coordinates[self.coordinates.len() - 1], |p| self.first() + p)
     }
 
-    /// Spacing, when the axis is uniform.
+    /// Spacing; `None` unless the axis is uniform.
     pub fn uniform_step(&self) -> Option<f64> {
         self.uniform_step
     }
 
-    /// Length after which the axis repeats.
+    /// Length after which the axis repeats; `None` unless it is periodic.
     pub fn period(&self) -> Option<f64> {
         self.period
     }
 
-    /// Number of cells along the axis: one fewer than nodes, or as many where it is periodic.
+    /// Number of cells: that of the nodes if the axis is periodic, otherwise one less.
     pub fn cells(&self) -> usize {
         if self.period.is_some() { self.len() } else { self.len() - 1 }
     }

@@ -1,18 +1,17 @@
-//! The box in which seeds are placed.
+//! The box that seeds and pictures cover.
 
-/// An axis-aligned box in the coordinates of the data (degrees on the sphere). `[f32; 3]` points everywhere in the program
-/// are in these coordinates. Two-dimensional flows are extruded: their third extent is a slab thickness that no velocity
-/// depends on.
+/// An axis-aligned box in the coordinates of the data (degrees on the sphere). Two-dimensional flows are extruded: no velocity depends on the
+/// third axis, whose extent is the thickness of a slab.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Domain {
     /// Lower corner.
     pub min: [f64; 3],
     /// Upper corner.
     pub max: [f64; 3],
-    /// Number of axes along which the flow varies: 2 or 3. Axes at and beyond it are extruded.
+    /// Number of axes along which the flow varies: 2 or 3.
     pub dimensions: usize,
-    /// Lengths per coordinate unit along each axis, in one unit for all: with it edges compare. 1 where the axes share a unit; see
-    /// [`super::Grid::domain`] for those that do not.
+    /// Length per coordinate unit along each axis, in one unit for all axes, so that edges compare. 1 if the axes have the same unit; see
+    /// `Grid::domain` for other axes.
     pub scale: [f64; 3],
 }
 
@@ -27,30 +26,30 @@ impl Domain {
         Self { min, max, dimensions: 3, scale: [1.0; 3] }
     }
 
-    /// Upper less lower corner, in coordinates; edges of different units do not compare (see [`Self::lengths`]).
+    /// Upper minus lower corner, in coordinates. Edges in different units do not compare (see [`Self::lengths`]).
     pub fn extent(&self) -> [f64; 3] {
         std::array::from_fn(|k| self.max[k] - self.min[k])
     }
 
-    /// Edge lengths in one unit: what decides how many cells, nodes or seeds an axis gets beside the others.
+    /// Edge lengths in one unit, by which cells, nodes or seeds are distributed over the axes.
     pub fn lengths(&self) -> [f64; 3] {
         let extent = self.extent();
         std::array::from_fn(|k| extent[k] * self.scale[k])
     }
 
-    /// Point of the domain at `unit` coordinates in [0, 1].
+    /// Converts unit coordinates in [0, 1] to domain coordinates.
     pub fn from_unit(&self, unit: [f32; 3]) -> [f32; 3] {
         let extent = self.extent();
         std::array::from_fn(|k| (self.min[k] + extent[k] * f64::from(unit[k])) as f32)
     }
 
-    /// Unit coordinates of a point, clamped into [0, 1].
+    /// Converts domain coordinates to unit coordinates, clamped to [0, 1].
     pub fn to_unit(&self, point: [f32; 3]) -> [f32; 3] {
         let extent = self.extent();
         std::array::from_fn(|k| (((f64::from(point[k]) - self.min[k]) / extent[k]) as f32).clamp(0.0, 1.0))
     }
 
-    /// Whether the point lies in the closed box.
+    /// True if the point lies in the closed box.
     pub fn contains(&self, point: [f32; 3]) -> bool {
         (0..3).all(|k| f64::from(point[k]) >= self.min[k] && f64::from(point[k]) <= self.max[k])
     }

@@ -2,28 +2,27 @@
 
 use super::{Axis, Domain};
 
-/// How coordinates become lengths.
+/// Metric of a grid: relation of coordinates to lengths.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Geometry {
     /// Coordinates are lengths; node velocities are (u, v, w) in coordinate units per time unit.
     Cartesian,
-    /// Axes 0 and 1 are longitude and latitude in degrees; particles move on a sphere of this radius (in the velocity's unit of
-    /// length). Node velocities are horizontal vectors in geocentric Cartesian components (x to 0°E 0°N, z to the north pole),
-    /// so that a pole is no singularity. Axis 2, where there is one, is a height in the unit of the radius; a horizontal length is one on
-    /// the radius at every height.
+    /// Axes 0 and 1 are longitude and latitude in degrees. Particles move on a sphere. Node velocities are horizontal vectors in geocentric
+    /// Cartesian components (x to 0°E 0°N, z to the north pole), so that a pole is no singularity. An optional axis 2 is a height in the
+    /// unit of the radius; horizontal lengths are those on the radius at every height.
     Sphere {
-        /// Radius.
+        /// Radius, in the unit of length of the velocity.
         radius: f64,
     },
 }
 
-/// Edge of a third axis without a length, as a share of the longest other edge.
+/// Default edge of a third axis that has another unit than the others, as a share of the longest other edge.
 pub const VERTICAL_EDGE: f64 = 0.25;
 
-/// Degrees from a pole within which a row of a grid is the pole.
+/// Largest distance of a row of a grid from a pole, in degrees, at which it counts as the pole.
 const ROW_AT_POLE: f64 = 1e-6;
 
-/// Whether a latitude in degrees is that of a pole.
+/// True if a latitude in degrees is that of a pole.
 pub fn is_pole(latitude: f64) -> bool {
     90.0 - latitude.abs() < ROW_AT_POLE
 }
@@ -35,7 +34,7 @@ pub struct Grid {
     pub axes: Vec<Axis>,
     /// Metric.
     pub geometry: Geometry,
-    /// Slab that a two-dimensional grid is extruded over (ignored in three dimensions).
+    /// Lower and upper end of the slab over which a two-dimensional grid is extruded (ignored in three dimensions).
     pub slab: (f64, f64),
 }
 
@@ -45,7 +44,7 @@ impl Grid {
         self.axes.len()
     }
 
-    /// Nodes along x, y and z (1 where there is no z).
+    /// Number of nodes along x, y and z (1 along z in two dimensions).
     pub fn shape(&self) -> [usize; 3] {
         std::array::from_fn(|k| self.axes.get(k).map_or(1, Axis::len))
     }
@@ -55,8 +54,8 @@ impl Grid {
         self.shape().iter().product()
     }
 
-    /// The box that the grid covers. A third axis in another unit than the first (heights in metres over degrees) has no length beside the
-    /// others: its edge counts as a quarter of the longest, as pictures show it.
+    /// The box that the grid covers. If the third axis has another unit than the first (heights in metres over degrees), its length does not
+    /// compare with the others; its edge is set to [`VERTICAL_EDGE`] of the longest.
     pub fn domain(&self) -> Domain {
         let corner = |k: usize, slab: f64, end: fn(&Axis) -> f64| self.axes.get(k).map_or(slab, end);
         let mut domain = Domain {
@@ -66,7 +65,7 @@ impl Grid {
             scale: [1.0; 3],
         };
         if let [x, _, z] = &self.axes[..]
-            && (matches!(self.geometry, Geometry::Sphere { .. }) || differ(x.units(), z.units()))
+            && (matches!(self.geometry, Geometry::Sphere { .. }) || units_differ(x.units(), z.units()))
         {
             let extent = domain.extent();
             domain.scale[2] = VERTICAL_EDGE * extent[0].max(extent[1]) / extent[2];
@@ -75,10 +74,10 @@ impl Grid {
     }
 }
 
-/// Whether two axes are known to count different things. One that says nothing of its unit counts as the other does.
-fn differ(one: &str, other: &str) -> bool {
+/// True if two units are known to be different. An empty unit is that of the other axis.
+fn units_differ(one: &str, other: &str) -> bool {
     let unit = |text: &str| {
-        // Metres that count several times ("m x 20") are metres.
+        // Stretched metres ("m x 20") are metres.
         let text = text.split(" x ").next().unwrap_or_default().trim().to_lowercase();
         match text.as_str() {
             "metre" | "metres" | "meter" | "meters" => "m".to_owned(),
@@ -100,10 +99,10 @@ mod tests {
         let grid = |z: Axis, geometry| Grid { axes: vec![axis("degrees", 360.0), axis("degrees", 180.0), z], geometry, slab: (0.0, 1.0) };
         let globe = grid(axis("m", 32_000.0), Geometry::Sphere { radius: super::super::EARTH_RADIUS }).domain();
         assert_eq!(globe.lengths(), [360.0, 180.0, 90.0]);
-        assert_eq!(globe.extent(), [360.0, 180.0, 32_000.0], "coordinates stay what they are");
+        assert_eq!(globe.extent(), [360.0, 180.0, 32_000.0], "coordinates are unchanged");
         assert_eq!(grid(axis("m", 32_000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 90.0]);
         assert_eq!(grid(axis("degrees", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "one unit: as it is");
-        assert_eq!(grid(axis("", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "none is said: as it is");
-        assert!(!differ("m", "Metres") && !differ("m x 20", "meter") && differ("km", "m"));
+        assert_eq!(grid(axis("", 1000.0), Geometry::Cartesian).domain().lengths(), [360.0, 180.0, 1000.0], "unknown unit: as it is");
+        assert!(!units_differ("m", "Metres") && !units_differ("m x 20", "meter") && units_differ("km", "m"));
     }
 }

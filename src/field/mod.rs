@@ -1,6 +1,6 @@
 //! Velocity data: axes and grids, snapshots, missing cells, the sliding window, closed-form flows.
 //!
-//! In: numbers from `source`. Out: what `flow` integrates. This room calls no other room.
+//! In: velocities from `source`. Out: the fields that `flow` integrates. Calls only `simd`.
 
 mod axis;
 mod domain;

@@ -4,8 +4,8 @@ use super::{Geometry, Grid, is_pole};
 use rayon::prelude::*;
 use std::sync::Arc;
 
-/// Nodes that a thread makes at once.
-const PIECE: usize = 1 << 14;
+/// Nodes per task of a thread.
+const NODES_PER_TASK: usize = 1 << 14;
 
 /// The velocity on a grid at one time.
 #[derive(Debug, Clone)]
@@ -14,57 +14,57 @@ pub struct Snapshot {
     pub time: f64,
     /// The grid.
     pub grid: Arc<Grid>,
-    /// One node each: `[u, v, w, mark]`, x fastest, then y, then z. `mark` is 0 where the velocity is known and NaN where it is
-    /// missing (land, fill value, NaN), so that a missing corner shows in every interpolation that touches it. Velocities
-    /// of missing nodes are 0. On the sphere `u, v, w` are geocentric Cartesian components of the horizontal velocity (see
-    /// [`Geometry::Sphere`]); with levels the mark of a known node is its vertical velocity, in units of the third axis per time.
+    /// One entry `[u, v, w, mark]` per node, x fastest, then y, then z. `mark` is 0 if the velocity is known and NaN if it is missing (land,
+    /// fill value, NaN), so that a missing node makes every interpolation that reads it NaN. Velocities of missing nodes are 0. On the sphere
+    /// `u, v, w` are geocentric Cartesian components of the horizontal velocity (see [`Geometry::Sphere`]). With levels the mark of a known
+    /// node is its vertical velocity, in units of the third axis per time.
     pub nodes: Vec<[f32; 4]>,
-    /// Nodes without a velocity, counted once by whoever reads: a window that slides asks several times.
-    missing: usize,
+    /// Number of nodes without a velocity.
+    missing_nodes: usize,
 }
 
-/// Where a velocity is unknown.
+/// Node without a velocity.
 pub const MISSING: [f32; 4] = [0.0, 0.0, 0.0, f32::NAN];
 
 impl Snapshot {
-    /// A snapshot of finished nodes, one for each of the grid, as [`Self::nodes`] describes them.
+    /// A snapshot of finished nodes, in the layout of [`Self::nodes`].
     pub fn new(time: f64, grid: Arc<Grid>, nodes: Vec<[f32; 4]>) -> Self {
-        let missing = count_missing(&nodes);
-        Self { time, grid, nodes, missing }
+        let missing_nodes = count_missing(&nodes);
+        Self { time, grid, nodes, missing_nodes }
     }
 
-    /// Builds the node array from separate components (`w` empty in two dimensions); any non-finite component makes the node
-    /// missing. On the sphere `u` is eastward, `v` northward and `w` along the third axis; a row at a pole, where longitudes go round,
-    /// becomes one vector, the mean of its known nodes.
+    /// Builds the nodes from separate components (`w` empty in two dimensions). A component that is not finite makes its node missing. On the
+    /// sphere `u` is eastward, `v` northward and `w` along the third axis. On periodic longitudes a row at a pole becomes one vector, the mean
+    /// of its known nodes.
     ///
     /// # Panics
-    /// When a component has not one value a node: readers check shapes before.
+    /// If a component does not have one value per node; readers check shapes before.
     pub fn from_components(time: f64, grid: Arc<Grid>, u: &[f32], v: &[f32], w: &[f32]) -> Self {
         let components = Components::new(&grid, u, v, w);
         let mut nodes: Vec<[f32; 4]> = (0..grid.nodes()).map(|i| components.node(i)).collect();
-        components.join_poles(&mut nodes);
+        components.average_poles(&mut nodes);
         Self::new(time, grid, nodes)
     }
 
-    /// [`Self::from_components`] by all threads of the rayon pool that it is called in, into the memory of `nodes`: memory that is new to the
-    /// process costs more than what is written there.
+    /// [`Self::from_components`] in parallel on the current rayon pool, into the memory of `nodes`. Reusing memory is faster than the page faults
+    /// of a new allocation.
     ///
     /// # Panics
-    /// Those of [`Self::from_components`].
+    /// As [`Self::from_components`].
     pub fn from_components_into(mut nodes: Vec<[f32; 4]>, time: f64, grid: Arc<Grid>, u: &[f32], v: &[f32], w: &[f32]) -> Self {
         let components = Components::new(&grid, u, v, w);
         nodes.resize(grid.nodes(), MISSING);
-        nodes.par_chunks_mut(PIECE).enumerate().for_each(|(piece, nodes)| {
-            nodes.iter_mut().enumerate().for_each(|(i, node)| *node = components.node(piece * PIECE + i));
+        nodes.par_chunks_mut(NODES_PER_TASK).enumerate().for_each(|(task, nodes)| {
+            nodes.iter_mut().enumerate().for_each(|(i, node)| *node = components.node(task * NODES_PER_TASK + i));
         });
-        components.join_poles(&mut nodes);
-        let missing = nodes.par_chunks(PIECE).map(count_missing).sum();
-        Self { time, grid, nodes, missing }
+        components.average_poles(&mut nodes);
+        let missing_nodes = nodes.par_chunks(NODES_PER_TASK).map(count_missing).sum();
+        Self { time, grid, nodes, missing_nodes }
     }
 
     /// Number of nodes whose velocity is missing.
-    pub fn missing(&self) -> usize {
-        self.missing
+    pub fn missing_nodes(&self) -> usize {
+        self.missing_nodes
     }
 
     /// Memory of the nodes, in bytes.
@@ -77,7 +77,7 @@ fn count_missing(nodes: &[[f32; 4]]) -> usize {
     nodes.iter().filter(|n| n[3].is_nan()).count()
 }
 
-/// The components that a snapshot's nodes are made from.
+/// The components from which the nodes of a snapshot are built.
 struct Components<'a> {
     grid: &'a Grid,
     u: &'a [f32],
@@ -92,15 +92,15 @@ struct Components<'a> {
 impl<'a> Components<'a> {
     fn new(grid: &'a Grid, u: &'a [f32], v: &'a [f32], w: &'a [f32]) -> Self {
         let count = grid.nodes();
-        assert!(u.len() == count && v.len() == count && (w.is_empty() || w.len() == count), "one value a node");
-        let turns = |axis: usize| -> Vec<(f64, f64)> {
+        assert!(u.len() == count && v.len() == count && (w.is_empty() || w.len() == count), "one value per node");
+        let sin_cos = |axis: usize| -> Vec<(f64, f64)> {
             if grid.geometry == Geometry::Cartesian {
                 Vec::new()
             } else {
                 grid.axes[axis].coordinates().iter().map(|c| c.to_radians().sin_cos()).collect()
             }
         };
-        Self { grid, u, v, w, shape: grid.shape(), longitudes: turns(0), latitudes: turns(1) }
+        Self { grid, u, v, w, shape: grid.shape(), longitudes: sin_cos(0), latitudes: sin_cos(1) }
     }
 
     /// Node `i`, x fastest.
@@ -126,22 +126,22 @@ impl<'a> Components<'a> {
         }
     }
 
-    /// Makes a row at a pole one vector.
-    fn join_poles(&self, nodes: &mut [[f32; 4]]) {
+    /// Averages the rows at poles, if longitudes are periodic.
+    fn average_poles(&self, nodes: &mut [[f32; 4]]) {
         let axes = &self.grid.axes;
         if self.grid.geometry == Geometry::Cartesian || axes[0].period().is_none() {
             return;
         }
         let [nx, ny, _] = self.shape;
         for (y, _) in axes[1].coordinates().iter().enumerate().filter(|(_, latitude)| is_pole(**latitude)) {
-            nodes.chunks_exact_mut(nx * ny).for_each(|level| make_one(&mut level[y * nx..(y + 1) * nx]));
+            nodes.chunks_exact_mut(nx * ny).for_each(|level| average_known(&mut level[y * nx..(y + 1) * nx]));
         }
     }
 }
 
-/// Gives all known nodes of a row their mean. What longitudes beside a pole differ by is divided by the width of a cell there, so that even
-/// rounding would show.
-fn make_one(row: &mut [[f32; 4]]) {
+/// Replaces all known nodes of a row by their mean. Differences along a row at a pole are divided by the tiny width of a cell there, which would
+/// amplify even rounding errors.
+fn average_known(row: &mut [[f32; 4]]) {
     let known = || |node: &&mut [f32; 4]| !node[3].is_nan();
     let (mut sum, mut count) = ([0.0; 4], 0.0);
     for node in row.iter_mut().filter(known()) {
@@ -162,16 +162,16 @@ mod tests {
         let latitude = Axis::uniform("lat", "degrees_north", 0.0, 90.0, 3).unwrap();
         let grid =
             Arc::new(Grid { axes: vec![longitude, latitude], geometry: Geometry::Sphere { radius: EARTH_RADIUS }, slab: (0.0, 1.0) });
-        // At the north pole along 0 degrees east, but for one node that says something else and one that is missing.
+        // The same vector at the north pole from all longitudes, except for one different node and one missing node.
         let mut u = vec![1.0f32; 12];
         let mut v = vec![2.0f32; 12];
         u[8..].copy_from_slice(&[0.0, 3.0, 0.5, f32::NAN]);
         v[8..].copy_from_slice(&[-3.0, 0.0, 3.0, 0.0]);
         let snapshot = Snapshot::from_components(0.0, grid.clone(), &u, &v, &[]);
-        // The same in memory that holds something else, too long at that.
+        // The same in reused memory that is too long.
         let again = Snapshot::from_components_into(vec![[7.0; 4]; 20], 0.0, grid, &u, &v, &[]);
         let bits = |s: &Snapshot| s.nodes.iter().flatten().map(|v| v.to_bits()).collect::<Vec<_>>();
-        assert_eq!((bits(&again), again.missing()), (bits(&snapshot), 1));
+        assert_eq!((bits(&again), again.missing_nodes()), (bits(&snapshot), 1));
         let pole = &snapshot.nodes[8..];
         // (3, 0), (-3, 0) and (3, 0.5): the mean is (1, -0.5 / 3).
         assert!((pole[0][0] - 1.0).abs() < 1e-6 && (pole[0][1] + 0.5 / 3.0).abs() < 1e-6, "{pole:?}");

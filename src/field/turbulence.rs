@@ -1,4 +1,4 @@
-//! The standard synthetic turbulence: a sum of travelling shear waves, the same for everybody who reports figures.
+//! Synthetic turbulence for benchmarks: a sum of travelling shear waves (random Fourier modes, Kraichnan 1970).
 //!
 //! Unit length = the short side of the grid (192 cells in the published 600x192x192). Each mode has a wave vector uniform on the
 //! sphere with k cycles per unit, k log-uniform from 2 to k_max; a polarisation perpendicular to it, uniform in angle; amplitude
@@ -17,7 +17,7 @@ const PUBLISHED_SHORT_SIDE: f64 = 192.0;
 /// Time interval between snapshots.
 const SNAPSHOT_INTERVAL: f64 = 1.0;
 
-/// SplitMix64 (Steele, Lea, Flood 2014): small, seedable, the same on every machine.
+/// SplitMix64 (Steele, Lea, Flood 2014): a small, portable, seedable generator.
 struct SplitMix64(u64);
 
 impl SplitMix64 {
@@ -32,7 +32,7 @@ impl SplitMix64 {
     fn uniform(&mut self) -> f64 {
         ((self.next() >> 11) as f64 + 0.5) / (1u64 << 53) as f64
     }
-    /// Normal with variance 1 (Box and Muller).
+    /// Normal with variance 1 (Box and Muller 1958).
     fn normal(&mut self) -> f64 {
         let radius = (-2.0 * self.uniform().ln()).sqrt();
         radius * (TAU * self.uniform()).cos()
@@ -90,7 +90,7 @@ impl Turbulence {
         Self { modes }
     }
 
-    /// What it is, in words, for whoever may take it for a measurement.
+    /// Description in words, which marks the data as synthetic.
     pub fn described(modes: usize, k_max: f64, amplitude: f64, seed: u64) -> String {
         format!("synthetic turbulence, seed {seed}, {modes} modes up to {k_max} cycles, {amplitude} cells a snapshot")
     }
@@ -132,7 +132,7 @@ impl Turbulence {
         let step = (along_x[nx - 1] - along_x[0]) / (nx - 1) as f64;
         let at = |axis: usize, index: usize| grid.axes.get(axis).map_or(0.0, |a| a.coordinates()[index]);
         let mut nodes = vec![[0.0f32; 4]; grid.nodes()];
-        // Four nodes side by side; each mode's phase is turned by four steps at a time.
+        // Four nodes at once; a rotation advances the phase of each mode by four nodes.
         nodes.par_chunks_mut(nx).enumerate().for_each_init(
             || vec![[f64x4::ZERO; 3]; nx.div_ceil(4)],
             |sums, (row, nodes)| {

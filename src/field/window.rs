@@ -1,4 +1,4 @@
-//! The sliding window: the snapshots that [t0, t0 + tau] needs, and no more.
+//! The sliding window: exactly the snapshots that an integration over [t0, t0 + tau] needs.
 
 use super::{Grid, Snapshot};
 use std::collections::VecDeque;
@@ -12,34 +12,34 @@ pub struct Window {
     span: f64,
 }
 
-/// What became of a snapshot that was accepted.
+/// Result of adding a snapshot.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Pushed {
-    /// Snapshots that the window let go.
+    /// Number of old snapshots dropped.
     pub dropped: usize,
-    /// What was odd about it.
+    /// Irregularity of the snapshot; `None` if it is regular.
     pub warning: Option<WindowWarning>,
 }
 
-/// Odd, but with a defined result.
+/// Irregularity of a snapshot that was accepted.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum WindowWarning {
-    /// The newer one replaced the older one.
+    /// The snapshot replaced an older one of the same time.
     #[error("snapshot repeats time {time}: the newer one replaces the older")]
     Duplicate {
         /// Its time.
         time: f64,
     },
-    /// Put where it belongs.
-    #[error("snapshot at time {time} came after {newest}: it was put in its place")]
+    /// The snapshot was inserted before newer ones.
+    #[error("snapshot at time {time} came after {newest}: it was inserted in order of time")]
     OutOfOrder {
         /// Its time.
         time: f64,
-        /// The newest time before it came.
+        /// Newest time in the window.
         newest: f64,
     },
-    /// Many values are not numbers.
-    #[error("{missing} of {nodes} velocities at time {time} are missing; the snapshots before had {before}")]
+    /// Many more velocities are missing than before.
+    #[error("{missing} of {nodes} velocities at time {time} are missing; the previous snapshot had {before}")]
     MissingBurst {
         /// Its time.
         time: f64,
@@ -47,36 +47,36 @@ pub enum WindowWarning {
         missing: usize,
         /// All nodes.
         nodes: usize,
-        /// Missing nodes of the snapshot before.
+        /// Missing nodes of the previous snapshot.
         before: usize,
     },
 }
 
-/// Why a snapshot was refused; the window is as before.
+/// Error of adding a snapshot; the window is unchanged.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum WindowFault {
-    /// Older than everything that the window still needs.
+    /// The snapshot is older than the window.
     #[error("snapshot at time {time} is late: the window already starts at {oldest}")]
     Late {
         /// Its time.
         time: f64,
-        /// Oldest time held.
+        /// Oldest time in the window.
         oldest: f64,
     },
-    /// Another grid than the window's.
+    /// The grid differs from that of the window.
     #[error("snapshot at time {time} has another grid ({found:?} nodes) than the window ({expected:?} nodes)")]
     GridChanged {
         /// Its time.
         time: f64,
-        /// Its shape.
+        /// Shape of its grid.
         found: [usize; 3],
-        /// The window's shape.
+        /// Shape of the window's grid.
         expected: [usize; 3],
     },
-    /// Time is not a number.
+    /// The time is not finite.
     #[error("snapshot has no finite time ({time})")]
     NoTime {
-        /// What it says.
+        /// Its time.
         time: f64,
     },
 }
@@ -87,7 +87,10 @@ impl Window {
         Self { snapshots: VecDeque::new(), span }
     }
 
-    /// Takes a snapshot in, and lets go of those that an integration over `span` ending at the newest time no longer needs.
+    /// Adds a snapshot, and drops those that an integration over `span` ending at the newest time no longer needs.
+    ///
+    /// # Errors
+    /// The snapshot is late, has no finite time, or has another grid. The window is unchanged then.
     pub fn push(&mut self, snapshot: Arc<Snapshot>) -> Result<Pushed, WindowFault> {
         let time = snapshot.time;
         if !time.is_finite() {
@@ -110,21 +113,21 @@ impl Window {
         if place < self.snapshots.len() {
             warning = Some(WindowWarning::OutOfOrder { time, newest: self.newest().unwrap_or(time) });
         } else if let Some(last) = self.snapshots.back() {
-            let (missing, before, nodes) = (snapshot.missing(), last.missing(), snapshot.nodes.len());
+            let (missing, before, nodes) = (snapshot.missing_nodes(), last.missing_nodes(), snapshot.nodes.len());
             if missing > before + nodes / 20 {
                 warning = Some(WindowWarning::MissingBurst { time, missing, nodes, before });
             }
         }
         self.snapshots.insert(place, snapshot);
-        Ok(Pushed { dropped: self.release(), warning })
+        Ok(Pushed { dropped: self.drop_expired(), warning })
     }
 
-    /// Whether a snapshot of this time would be refused as late: a full window never moves back in time.
+    /// True if [`Self::push`] would refuse a snapshot of this time as late: a full window never moves back in time.
     pub fn is_late(&self, time: f64) -> bool {
         self.oldest().is_some_and(|oldest| time < oldest) && self.is_full()
     }
 
-    /// Time between a snapshot that would be put in and the nearest one held; none where there is none, or where it would take the place of one.
+    /// Time between a new snapshot and the nearest one in the window; `None` if the window is empty or the new snapshot would replace one.
     pub fn distance(&self, time: f64) -> Option<f64> {
         let place = self.snapshots.partition_point(|s| s.time < time);
         let before = place.checked_sub(1).map(|before| time - self.snapshots[before].time);
@@ -132,8 +135,8 @@ impl Window {
         if behind == Some(0.0) { None } else { before.into_iter().chain(behind).reduce(f64::min) }
     }
 
-    /// Drops what lies wholly before `newest - span`.
-    fn release(&mut self) -> usize {
+    /// Drops snapshots before `newest - span`, except for the last one before it.
+    fn drop_expired(&mut self) -> usize {
         let Some(newest) = self.newest() else { return 0 };
         let start = newest - self.span;
         let slack = self.span * 1e-9;
@@ -145,7 +148,7 @@ impl Window {
         dropped
     }
 
-    /// Whether the snapshots cover an integration over the whole span.
+    /// True if the snapshots cover an integration over the whole span.
     pub fn is_full(&self) -> bool {
         match (self.oldest(), self.newest()) {
             (Some(oldest), Some(newest)) => self.snapshots.len() >= 2 && newest - oldest >= self.span * (1.0 - 1e-9),
@@ -153,17 +156,17 @@ impl Window {
         }
     }
 
-    /// Integration span |tau| that the window is kept for.
+    /// Integration span |tau| that the window serves.
     pub fn span(&self) -> f64 {
         self.span
     }
 
-    /// Time of the oldest snapshot.
+    /// Time of the oldest snapshot; `None` if the window is empty.
     pub fn oldest(&self) -> Option<f64> {
         self.snapshots.front().map(|s| s.time)
     }
 
-    /// Time of the newest snapshot.
+    /// Time of the newest snapshot; `None` if the window is empty.
     pub fn newest(&self) -> Option<f64> {
         self.snapshots.back().map(|s| s.time)
     }
@@ -173,7 +176,7 @@ impl Window {
         self.snapshots.iter()
     }
 
-    /// Grid, once a snapshot is there.
+    /// Grid of the snapshots; `None` if the window is empty.
     pub fn grid(&self) -> Option<&Arc<Grid>> {
         self.snapshots.front().map(|s| &s.grid)
     }

@@ -1,40 +1,45 @@
-//! From a description of a flow map to the kernel that is compiled for it.
+//! Makes the tracer of a flow map: picks the kernel that is compiled for its flow, integrator and precision.
 
+use super::displacement::cells_crossed;
 use super::grid_flow::GridFlow;
-use super::resolution::cells_crossed;
+use super::missing_cells::MissingCells;
 use super::sphere::SphereFlow;
 use super::sphere_levels::LayeredSphereFlow;
-use super::steps::Chosen;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
-use super::velocity::{Chart, Closed, Velocity};
-use super::voids::Voids;
-use super::{Boundary, FlowError, FlowMap, Integrator, Precision, Steps, Tracer, VelocitySource, dormand_prince, steps};
+use super::velocity::{ClosedFormFlow, Coordinates, Velocity};
+use super::{Boundary, FlowError, FlowMap, Integrator, Precision, StepChoice, Steps, Tracer, VelocitySource, dormand_prince, steps};
 use crate::field::analytic::{ClosedForm, Form};
 use crate::field::{Domain, Geometry, Window};
-use crate::simd::{Gather, Lanes, Two};
+use crate::simd::{Gather, LanePair, Lanes};
 use std::marker::PhantomData;
 use wide::{f32x8, f64x4};
 
-/// Makes the CPU's tracer for seeds at time `t0`.
+/// Makes the tracer of the CPU for seeds at time `t0`.
 ///
 /// # Errors
-/// A number out of range, a window that does not cover the integration, or a combination that has no meaning; see [`FlowError`].
+/// A parameter out of range, a window that does not cover the integration, or a combination without meaning; see [`FlowError`].
 pub fn cpu_tracer(source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, FlowError> {
     tracer_in_order(source, map, t0, Order::Auto)
 }
 
-/// [`cpu_tracer`] with a choice of order, for measurements.
+/// [`cpu_tracer`] with a choice of order, for benchmarks.
+///
+/// # Errors
+/// As [`cpu_tracer`].
 pub fn tracer_in_order(source: VelocitySource, map: &FlowMap, t0: f64, order: Order) -> Result<Box<dyn Tracer>, FlowError> {
-    Assembly::new(source, map, t0, order)?.build::<f32x8, f64x4, Two<f32x8>>()
+    TracerBuilder::new(source, map, t0, order)?.build::<f32x8, f64x4, LanePair<f32x8>>()
 }
 
-/// [`cpu_tracer`] without vectors, one sample at a time, for measurements.
+/// [`cpu_tracer`] without vectors, one sample at a time, for benchmarks.
+///
+/// # Errors
+/// As [`cpu_tracer`].
 pub fn scalar_tracer(source: VelocitySource, map: &FlowMap, t0: f64) -> Result<Box<dyn Tracer>, FlowError> {
-    Assembly::new(source, map, t0, Order::Auto)?.build::<f32, f64, f32>()
+    TracerBuilder::new(source, map, t0, Order::Auto)?.build::<f32, f64, f32>()
 }
 
-/// What all kinds of tracer are made from.
-struct Assembly<'a> {
+/// The parts that all kinds of tracer share.
+struct TracerBuilder<'a> {
     source: VelocitySource,
     domain: Domain,
     map: &'a FlowMap,
@@ -51,7 +56,7 @@ fn positive(key: &'static str, value: f64) -> Result<(), FlowError> {
     }
 }
 
-impl<'a> Assembly<'a> {
+impl<'a> TracerBuilder<'a> {
     fn new(source: VelocitySource, map: &'a FlowMap, t0: f64, order: Order) -> Result<Self, FlowError> {
         positive("tau", map.tau)?;
         match map.steps {
@@ -65,24 +70,29 @@ impl<'a> Assembly<'a> {
         let to = t0 + map.direction.sign() * map.tau;
         let domain = match &source {
             VelocitySource::Analytic(_, domain) => domain.clone(),
-            VelocitySource::Window(window) => covering(window, t0.min(to), t0.max(to))?,
+            VelocitySource::Window(window) => covered_domain(window, t0.min(to), t0.max(to))?,
         };
         if map.integrator == Integrator::Differences {
-            positive("gap", map.gap)?;
+            positive("difference_step", map.difference_step)?;
             if map.precision == Precision::F32 {
                 let used = 0..domain.dimensions;
                 let coordinate = used.flat_map(|k| [domain.min[k].abs(), domain.max[k].abs()]).fold(0.0, f64::max);
-                let least = coordinate * f64::from(f32::EPSILON);
-                if map.gap < least {
-                    return Err(FlowError::GapVanishes { gap: map.gap, precision: map.precision, coordinate, least });
+                let min_step = coordinate * f64::from(f32::EPSILON);
+                if map.difference_step < min_step {
+                    return Err(FlowError::DifferenceStepVanishes {
+                        step: map.difference_step,
+                        precision: map.precision,
+                        coordinate,
+                        min_step,
+                    });
                 }
             }
         }
         Ok(Self { source, domain, map, from: t0, to, order })
     }
 
-    /// `S` and `D` are the single- and double-precision lanes. `P` are the single-precision lanes for closed forms in the plane, whose
-    /// state is so small that two chains of instructions fit into the registers (a quarter faster; elsewhere slower).
+    /// `S` and `D` are the single- and double-precision lanes. `P` are the single-precision lanes for closed forms in the plane: their state
+    /// is so small that two chains of instructions fit into the registers, which is a quarter faster (and slower for other flows).
     fn build<S, D, P>(self) -> Result<Box<dyn Tracer>, FlowError>
     where
         S: Gather<Real = f32>,
@@ -102,29 +112,29 @@ impl<'a> Assembly<'a> {
             }
             VelocitySource::Window(window) => {
                 let window = window.clone();
-                let grid = window.grid().ok_or_else(|| too_short(&window, self.from, self.to))?.clone();
-                let (policy, interpolation) = (self.map.boundary, self.map.interpolation);
+                let grid = window.grid().ok_or_else(|| window_too_short(&window, self.from, self.to))?.clone();
+                let (boundary, interpolation) = (self.map.boundary, self.map.interpolation);
                 match (grid.geometry, grid.dimensions()) {
                     (Geometry::Cartesian, 2) => self.kernel::<_, _, S, D, 2, 2>(
-                        || GridFlow::<f32, 2>::new(&window, &grid, policy, interpolation),
-                        || GridFlow::<f64, 2>::new(&window, &grid, policy, interpolation),
+                        || GridFlow::<f32, 2>::new(&window, &grid, boundary, interpolation),
+                        || GridFlow::<f64, 2>::new(&window, &grid, boundary, interpolation),
                     ),
                     (Geometry::Cartesian, _) => self.kernel::<_, _, S, D, 3, 3>(
-                        || GridFlow::<f32, 3>::new(&window, &grid, policy, interpolation),
-                        || GridFlow::<f64, 3>::new(&window, &grid, policy, interpolation),
+                        || GridFlow::<f32, 3>::new(&window, &grid, boundary, interpolation),
+                        || GridFlow::<f64, 3>::new(&window, &grid, boundary, interpolation),
                     ),
                     (Geometry::Sphere { radius }, 2) => {
                         positive("radius", radius)?;
                         self.kernel::<_, _, S, D, 3, 2>(
-                            || SphereFlow::<f32>::new(&window, &grid, radius, policy, interpolation),
-                            || SphereFlow::<f64>::new(&window, &grid, radius, policy, interpolation),
+                            || SphereFlow::<f32>::new(&window, &grid, radius, boundary, interpolation),
+                            || SphereFlow::<f64>::new(&window, &grid, radius, boundary, interpolation),
                         )
                     }
                     (Geometry::Sphere { radius }, 3) => {
                         positive("radius", radius)?;
                         self.kernel::<_, _, S, D, 4, 3>(
-                            || LayeredSphereFlow::<f32>::new(&window, &grid, radius, policy, interpolation),
-                            || LayeredSphereFlow::<f64>::new(&window, &grid, radius, policy, interpolation),
+                            || LayeredSphereFlow::<f32>::new(&window, &grid, radius, boundary, interpolation),
+                            || LayeredSphereFlow::<f64>::new(&window, &grid, radius, boundary, interpolation),
                         )
                     }
                     (Geometry::Sphere { .. }, axes) => Err(FlowError::SphereAxes { axes }),
@@ -138,12 +148,12 @@ impl<'a> Assembly<'a> {
         form: F,
     ) -> Result<Box<dyn Tracer>, FlowError> {
         self.kernel::<_, _, S, D, N, N>(
-            || Ok(Closed::<F, f32, N>::new(form, &self.domain, self.map.boundary)),
-            || Ok(Closed::<F, f64, N>::new(form, &self.domain, self.map.boundary)),
+            || Ok(ClosedFormFlow::<F, f32, N>::new(form, &self.domain, self.map.boundary)),
+            || Ok(ClosedFormFlow::<F, f64, N>::new(form, &self.domain, self.map.boundary)),
         )
     }
 
-    /// Picks precision and integrator.
+    /// Makes a tracer with the integrator, precision and number of steps of the map.
     fn kernel<V32, V64, S, D, const N: usize, const C: usize>(
         &self,
         single: impl FnOnce() -> Result<V32, FlowError>,
@@ -163,19 +173,24 @@ impl<'a> Assembly<'a> {
         let (count, chosen) = match self.map.steps {
             Steps::Fixed(steps) => (steps, None),
             Steps::Auto { tolerance } => {
-                // Rounding must not decide, so steps are chosen in double precision.
+                // Steps are chosen in double precision, so that rounding does not affect the choice.
                 let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
-                let intervals = intervals(Chart::breaks(&tracer.field), from, to);
-                // A path that stops is cut to whole steps.
-                let a_cell = if matches!(self.map.boundary, Boundary::Stop | Boundary::Zero) { 2.0 } else { 1.0 };
+                let intervals = intervals(Coordinates::break_times(&tracer.field), from, to);
+                // Paths that stop are cut to whole steps, so that they need shorter ones.
+                let steps_per_cell = if matches!(self.map.boundary, Boundary::Stop | Boundary::Zero) { 2.0 } else { 1.0 };
                 let cells = match &self.source {
-                    VelocitySource::Window(window) => a_cell * cells_crossed(window, from, to),
+                    VelocitySource::Window(window) => steps_per_cell * cells_crossed(window, from, to),
                     VelocitySource::Analytic(..) => 0.0,
                 };
-                let chosen = steps::choose(tolerance, steps::Gridded { intervals, least: cells }, &self.domain, |steps, points, out| {
-                    tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
-                    tracer.trace(points, super::Extras::default(), out);
-                })?;
+                let chosen = steps::choose_steps(
+                    tolerance,
+                    steps::GridConstraints { intervals, min_steps: cells },
+                    &self.domain,
+                    |steps, points, out| {
+                        tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));
+                        tracer.trace(points, super::Extras::default(), out);
+                    },
+                )?;
                 (chosen.steps, Some(chosen))
             }
         };
@@ -185,14 +200,14 @@ impl<'a> Assembly<'a> {
         }
     }
 
-    fn fixed<V, L, const N: usize, const C: usize>(&self, field: V, steps: usize, chosen: Option<Chosen>) -> Box<dyn Tracer>
+    fn fixed<V, L, const N: usize, const C: usize>(&self, field: V, steps: usize, chosen: Option<StepChoice>) -> Box<dyn Tracer>
     where
         L: Lanes,
         V: Velocity<L, N, C> + 'static,
     {
         let stages = Stages::new::<V, L, N, C>(&field, self.from, self.to, steps);
         if self.map.integrator == Integrator::Differences {
-            Box::new(CpuTracer { chosen, ..self.tracer::<_, _, L, N, C>(field, DifferencesKernel(stages, self.map.gap)) })
+            Box::new(CpuTracer { chosen, ..self.tracer::<_, _, L, N, C>(field, DifferencesKernel(stages, self.map.difference_step)) })
         } else {
             Box::new(CpuTracer { chosen, ..self.tracer::<_, _, L, N, C>(field, TangentKernel(stages)) })
         }
@@ -213,16 +228,16 @@ impl<'a> Assembly<'a> {
             normalisation: self.map.normalisation,
             order: self.order,
             chosen: None,
-            voids: match &self.source {
-                VelocitySource::Analytic(..) => Voids::none(),
-                VelocitySource::Window(window) => Voids::at(window, self.from, self.map.interpolation),
+            missing_cells: match &self.source {
+                VelocitySource::Analytic(..) => MissingCells::none(),
+                VelocitySource::Window(window) => MissingCells::at(window, self.from, self.map.interpolation),
             },
             lanes: PhantomData,
         }
     }
 }
 
-fn too_short(window: &Window, from: f64, to: f64) -> FlowError {
+fn window_too_short(window: &Window, from: f64, to: f64) -> FlowError {
     let present = window.snapshots().len();
     let covered = window.oldest().zip(window.newest());
     let (from, to) = (from.min(to), from.max(to));
@@ -233,18 +248,21 @@ fn too_short(window: &Window, from: f64, to: f64) -> FlowError {
     FlowError::WindowTooShort { from, to, needed, present, covered }
 }
 
-/// The grid's domain, when the snapshots reach from `from` to `to`.
-fn covering(window: &Window, from: f64, to: f64) -> Result<Domain, FlowError> {
+/// The domain of the grid.
+///
+/// # Errors
+/// [`FlowError::WindowTooShort`] unless the snapshots cover the time from `from` to `to`.
+fn covered_domain(window: &Window, from: f64, to: f64) -> Result<Domain, FlowError> {
     let slack = (to - from) * 1e-9;
     match (window.grid(), window.oldest(), window.newest()) {
         (Some(grid), Some(first), Some(last)) if window.snapshots().len() > 1 && first <= from + slack && last >= to - slack => {
             Ok(grid.domain())
         }
-        _ => Err(too_short(window, from, to)),
+        _ => Err(window_too_short(window, from, to)),
     }
 }
 
-/// Snapshot intervals that the integration touches; 0 for closed forms.
+/// Number of snapshot intervals that the integration touches; 0 for closed forms.
 fn intervals(times: &[f64], from: f64, to: f64) -> usize {
     let (from, to) = (from.min(to), from.max(to));
     let slack = (to - from) * 1e-9;

@@ -1,13 +1,13 @@
-//! From state coordinates to cells, for one axis.
+//! Converts state coordinates to cells along one axis.
 //!
-//! A state coordinate is the distance from the axis' first node in mean spacings. On a uniform axis cell and fraction are its integer
-//! and fractional part; on another one they are found in a table.
+//! A state coordinate is the distance from the first node of the axis in mean spacings. On a uniform axis, cell and fraction are its
+//! integer and fractional part. On other axes they come from a lookup table.
 
 use super::Boundary;
 use crate::field::Axis;
 use crate::simd::{Gather, Mask, Real};
 
-/// One axis, prepared.
+/// One axis, prepared for lookups.
 #[derive(Debug, Clone)]
 pub struct AxisMap<R> {
     /// Coordinate of the first node.
@@ -18,64 +18,52 @@ pub struct AxisMap<R> {
     pub nodes: u32,
     /// Index of the last cell.
     pub last_cell: u32,
-    /// Whether the last cell lies between the last node and the first one's image.
+    /// True if the last cell lies between the last node and the image of the first.
     pub seam: bool,
-    /// State coordinate of the last node (or image).
+    /// State coordinate of the last node, or of the image of the first.
     pub high: R,
-    /// After which length states repeat.
-    wrap: Option<R>,
-    table: Option<Table<R>>,
+    /// Period of the state coordinate; `None` if it does not repeat.
+    pub wrap: Option<R>,
+    /// Lookup table; `None` if the axis is even.
+    pub table: Option<Table<R>>,
 }
 
-/// Unevenly spaced nodes.
+/// Lookup table of unevenly spaced nodes.
 #[derive(Debug, Clone)]
-struct Table<R> {
-    /// Node positions, with the image of the first one where the axis is periodic.
-    positions: Vec<R>,
+pub struct Table<R> {
+    /// Positions of the nodes and, on a periodic axis, of the image of the first.
+    pub positions: Vec<R>,
     /// 1 / length of each cell.
-    inverse: Vec<R>,
-    /// The cell in which each of evenly spaced intervals begins.
-    begins: Vec<u32>,
-    /// Intervals in a unit of length.
-    density: R,
-}
-
-/// The table of an uneven axis, for other devices.
-#[cfg_attr(not(feature = "cuda"), allow(dead_code))]
-pub(crate) struct TableView<'a, R> {
-    /// Node positions, with the image of the first one where the axis is periodic.
-    pub positions: &'a [R],
-    /// 1 / length of each cell.
-    pub inverse: &'a [R],
-    /// The cell in which each of evenly spaced intervals begins.
-    pub begins: &'a [u32],
-    /// Intervals in a unit of length.
+    pub inverse: Vec<R>,
+    /// The cell in which each interval of even length begins.
+    pub begins: Vec<u32>,
+    /// Intervals per unit of length.
     pub density: R,
 }
 
-/// Intervals a cell in [`Table::begins`]: more make the scan shorter.
+/// Intervals per cell in [`Table::begins`]; more intervals make the scan shorter.
 const INTERVALS: usize = 4;
 
-/// Where lanes are along one axis.
+/// Cell and fraction of all lanes along one axis.
 #[derive(Clone, Copy)]
-pub struct Place<L: Gather> {
+pub struct GridLocation<L: Gather> {
     /// Cell.
     pub cell: L::Cells,
-    /// Position in it, 0 to 1.
+    /// Position in the cell, 0 to 1.
     pub fraction: L,
-    /// d fraction / d state; 0 where the state is held at an end of the axis.
+    /// d fraction / d state; 0 if the state is clamped to an end of the axis.
     pub slope: L,
-    /// Whether some slope is not 1.
-    pub sloped: bool,
+    /// True if some slope may differ from 1.
+    pub scaled: bool,
 }
 
 impl<R: Real> AxisMap<R> {
-    /// Prepares an axis for particles with this edge policy.
-    pub fn new(axis: &Axis, policy: Boundary) -> Self {
+    /// Prepares an axis for particles with a boundary policy.
+    pub fn new(axis: &Axis, boundary: Boundary) -> Self {
         let (first, cells) = (axis.first(), axis.cells());
         let spacing = (axis.last() - first) / cells as f64;
-        let wrap = (axis.period().is_some() || policy == Boundary::Periodic).then(|| R::from_f64(cells as f64));
-        // A periodic axis is even only when its seam is as wide as the other cells.
+        let wrap = (axis.period().is_some() || boundary == Boundary::Periodic).then(|| R::from_f64(cells as f64));
+        // A periodic axis is even only if its seam is as wide as the other cells.
         let even = axis.uniform_step().is_some_and(|step| (step / spacing - 1.0).abs() < 1e-5);
         Self {
             first,
@@ -89,23 +77,6 @@ impl<R: Real> AxisMap<R> {
         }
     }
 
-    /// After which length states repeat.
-    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
-    pub(crate) fn wrap_length(&self) -> Option<R> {
-        self.wrap
-    }
-
-    /// The table of an uneven axis.
-    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
-    pub(crate) fn table(&self) -> Option<TableView<'_, R>> {
-        match &self.table {
-            Some(table) => {
-                Some(TableView { positions: &table.positions, inverse: &table.inverse, begins: &table.begins, density: table.density })
-            }
-            None => None,
-        }
-    }
-
     /// State coordinate of a domain coordinate.
     pub fn state(&self, coordinate: f64) -> f64 {
         (coordinate - self.first) / self.spacing
@@ -116,13 +87,13 @@ impl<R: Real> AxisMap<R> {
         self.first + state * self.spacing
     }
 
-    /// Ends within which a particle may go on.
+    /// State coordinates between which a particle continues.
     pub fn ends(&self) -> [f64; 2] {
         if self.wrap.is_some() { [f64::NEG_INFINITY, f64::INFINITY] } else { [0.0, self.high.to_f64()] }
     }
 
-    /// Distances from the cell's first node to the nodes around it in cell lengths: the node before (negative), the node after next.
-    /// None where there is no such node.
+    /// Distances, in cell lengths, from the first node of the cell to the previous node (negative) and to the node after the second. `None`
+    /// if that node does not exist.
     pub fn reach(&self, cell: u32) -> [Option<f64>; 2] {
         let cells = self.last_cell as usize + 1;
         let i = cell as usize;
@@ -133,10 +104,10 @@ impl<R: Real> AxisMap<R> {
         [before.map(|b| -length(b) / here), after.map(|a| 1.0 + length(a) / here)]
     }
 
-    /// Finds each lane's cell. Cells are in range whatever the state is.
+    /// Finds the cell of each lane. Cells are in range for every state, including NaN.
     #[inline(always)]
-    pub fn locate<L: Gather<Real = R>>(&self, state: L) -> Place<L> {
-        let (mut held, mut slope, mut sloped) = (state, L::one(), false);
+    pub fn locate<L: Gather<Real = R>>(&self, state: L) -> GridLocation<L> {
+        let (mut held, mut slope, mut scaled) = (state, L::one(), false);
         if let Some(wrap) = self.wrap {
             let wrap = L::splat(wrap);
             held = state - wrap * (state / wrap).floor();
@@ -145,19 +116,19 @@ impl<R: Real> AxisMap<R> {
             let same = held.equal(state);
             if !same.all() {
                 slope = L::select(same, slope, L::zero());
-                sloped = true;
+                scaled = true;
             }
         }
         match &self.table {
             None => {
                 let (cell, base) = held.truncate(self.last_cell);
-                Place { cell, fraction: held - base, slope, sloped }
+                GridLocation { cell, fraction: held - base, slope, scaled }
             }
             Some(table) => {
                 let found = L::cells_from_fn(|lane| table.find(held.lane(lane), self.last_cell));
                 let at = |values: &[R]| L::from_fn(|lane| values[L::cell(&found, lane) as usize]);
                 let inverse = at(&table.inverse);
-                Place { cell: found, fraction: (held - at(&table.positions)) * inverse, slope: slope * inverse, sloped: true }
+                GridLocation { cell: found, fraction: (held - at(&table.positions)) * inverse, slope: slope * inverse, scaled: true }
             }
         }
     }
@@ -203,10 +174,10 @@ mod tests {
         let axis = Axis::new("z", "m", vec![0.0, 1.0, 1.1, 5.0, 40.0]).unwrap();
         let map = AxisMap::<f64>::new(&axis, Boundary::Stop);
         for (coordinate, cell, fraction) in [(0.0, 0, 0.0), (0.5, 0, 0.5), (1.05, 1, 0.5), (4.999, 2, 3.899 / 3.9), (40.0, 3, 1.0)] {
-            let place = map.locate(map.state(coordinate));
-            assert_eq!(place.cell, cell);
+            let location = map.locate(map.state(coordinate));
+            assert_eq!(location.cell, cell);
             // Rounding only.
-            assert!((place.fraction - fraction).abs() < 1e-13, "{coordinate}");
+            assert!((location.fraction - fraction).abs() < 1e-13, "{coordinate}");
         }
         assert_eq!(map.locate(-3.0).slope, 0.0);
         assert!(map.locate(f64::NAN).cell <= 3);
@@ -216,11 +187,11 @@ mod tests {
     fn a_periodic_axis_has_a_seam() {
         let axis = Axis::uniform("lon", "degrees", 0.0, 270.0, 4).unwrap().with_period(360.0);
         let map = AxisMap::<f64>::new(&axis, Boundary::Stop);
-        let place = map.locate(map.state(-45.0));
-        assert_eq!((place.cell, place.fraction, place.slope), (3, 0.5, 1.0));
+        let location = map.locate(map.state(-45.0));
+        assert_eq!((location.cell, location.fraction, location.slope), (3, 0.5, 1.0));
         let uneven = AxisMap::<f64>::new(&Axis::uniform("lon", "", 0.0, 200.0, 5).unwrap().with_period(360.0), Boundary::Stop);
-        let place = uneven.locate(uneven.state(280.0));
-        assert_eq!(place.cell, 4);
-        assert!((place.fraction - 0.5).abs() < 1e-14, "rounding only");
+        let location = uneven.locate(uneven.state(280.0));
+        assert_eq!(location.cell, 4);
+        assert!((location.fraction - 0.5).abs() < 1e-14, "rounding only");
     }
 }

@@ -1,12 +1,13 @@
-//! The reference: path and tangent by the embedded pair 5(4) of Dormand and Prince (1980) in double precision, step by step of its
-//! own size. Steps end at the snapshots' times, where the velocity has kinks.
+//! The reference: path and variational equation by the embedded Runge-Kutta pair 5(4) of Dormand and Prince (1980) in double precision, with
+//! adaptive steps. Steps end at the times of the snapshots, where the time derivative of the velocity jumps.
 
-use super::rk4::Paths;
-use super::stretch::{largest, log_stretch, rescale};
+use super::rk4::TracedBatch;
+use super::stretch::{log_stretch, max_abs, rescale};
 use super::velocity::Velocity;
 
-/// Nodes, weights and error weights of the pair.
+/// Nodes of the pair.
 const C: [f64; 7] = [0.0, 0.2, 0.3, 0.8, 8.0 / 9.0, 1.0, 1.0];
+/// Coefficients of the stages; those of the last stage are the weights of order 5.
 const A: [[f64; 6]; 7] = [
     [0.0; 6],
     [0.2, 0.0, 0.0, 0.0, 0.0, 0.0],
@@ -16,17 +17,17 @@ const A: [[f64; 6]; 7] = [
     [9017.0 / 3168.0, -355.0 / 33.0, 46732.0 / 5247.0, 49.0 / 176.0, -5103.0 / 18656.0, 0.0],
     [35.0 / 384.0, 0.0, 500.0 / 1113.0, 125.0 / 192.0, -2187.0 / 6784.0, 11.0 / 84.0],
 ];
-/// Fifth order less fourth.
+/// Weights of order 5 minus weights of order 4.
 const E: [f64; 7] = [71.0 / 57600.0, 0.0, -71.0 / 16695.0, 71.0 / 1920.0, -17253.0 / 339200.0, 22.0 / 525.0, -1.0 / 40.0];
 
-/// Local error allowed, relative to the size of position (at least 1) and tangent.
+/// Local error tolerance, relative to the size of position (at least 1) and tangent.
 pub const TOLERANCE: f64 = 1e-10;
-/// Steps, taken or not, after which a path is given up: its log-stretch is NaN.
-const MOST_STEPS: usize = 1_000_000;
-/// Shares of |tau|: a step this short is taken whatever its error (a kink lies in it); a particle whose step of this length still
-/// leaves the domain has arrived at the edge.
-const SHORTEST: f64 = 1e-12;
-const EDGE: f64 = 1e-9;
+/// Accepted and rejected steps after which a path is abandoned; its log-stretch is NaN.
+const MAX_STEPS: usize = 1_000_000;
+/// Share of |tau| below which a step is accepted regardless of its error, because the velocity has a kink in it.
+const MIN_STEP_SHARE: f64 = 1e-12;
+/// Share of |tau| of the step that locates the edge of the domain.
+const EDGE_STEP_SHARE: f64 = 1e-9;
 
 /// Position and tangent, or their time derivative.
 type State<const D: usize, const N: usize> = ([f64; D], [[f64; N]; D]);
@@ -47,23 +48,27 @@ fn combine<const D: usize, const N: usize>(from: &State<D, N>, h: f64, weights: 
     to
 }
 
-/// Integrates one particle from `from` to `to`.
+/// Integrates one particle from time `from` to time `to`.
 pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
     field: &V,
     from: f64,
     to: f64,
     tolerance: f64,
     points: &[[f32; 3]],
-) -> Paths<f64, D, N> {
+) -> TracedBatch<f64, D, N> {
     let seed = points[0].map(f64::from);
     let span = to - from;
-    let mut state: State<D, N> = (field.start(seed), field.first_tangent(seed));
+    let mut state: State<D, N> = (field.seed_state(seed), field.initial_tangent(seed));
     let mut exponent = 0.0;
-    let (mut alive, mut left) = (field.inside(&state.0), false);
-    left |= !alive;
-    // Ends of smooth stretches of time, in the direction of travel.
-    let mut ends: Vec<f64> =
-        field.breaks().iter().copied().filter(|b| (b - from) / span > SHORTEST && (b - from) / span < 1.0 - SHORTEST).collect();
+    let (mut alive, mut left_domain) = (field.inside(&state.0), false);
+    left_domain |= !alive;
+    // Ends of the intervals in which the velocity is smooth in time, in the direction of travel.
+    let mut ends: Vec<f64> = field
+        .break_times()
+        .iter()
+        .copied()
+        .filter(|b| (b - from) / span > MIN_STEP_SHARE && (b - from) / span < 1.0 - MIN_STEP_SHARE)
+        .collect();
     if span < 0.0 {
         ends.reverse();
     }
@@ -71,18 +76,18 @@ pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
 
     let (mut time, mut step, mut tried) = (from, span * 1e-3, 0);
     let mut gave_up = false;
-    'stretches: for end in ends {
+    'intervals: for end in ends {
         let mut k = [([0.0; D], [[0.0; N]; D]); 7];
         let mut mark = derivative(field, time, &state, &mut k[0]);
-        while alive && (end - time) / span > SHORTEST {
+        while alive && (end - time) / span > MIN_STEP_SHARE {
             if !mark.is_finite() {
                 alive = false;
-                break 'stretches;
+                break 'intervals;
             }
             tried += 1;
-            if tried > MOST_STEPS {
+            if tried > MAX_STEPS {
                 gave_up = true;
-                break 'stretches;
+                break 'intervals;
             }
             let last = (step / (end - time)) >= 1.0;
             let h = if last { end - time } else { step };
@@ -91,46 +96,46 @@ pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
                 next = combine(&state, h, &A[s][..s], &k[..s]);
                 mark += derivative(field, time + C[s] * h, &next, &mut k[s]);
             }
-            let slip = combine(&([0.0; D], [[0.0; N]; D]), h, &E, &k);
-            let mut error = largest(&slip.1) / (tolerance * largest(&next.1).max(largest(&state.1)));
+            let error_estimate = combine(&([0.0; D], [[0.0; N]; D]), h, &E, &k);
+            let mut error = max_abs(&error_estimate.1) / (tolerance * max_abs(&next.1).max(max_abs(&state.1)));
             for i in 0..D {
-                error = error.max(slip.0[i].abs() / (tolerance * state.0[i].abs().max(1.0)));
+                error = error.max(error_estimate.0[i].abs() / (tolerance * state.0[i].abs().max(1.0)));
             }
             let share = (h / span).abs();
             if !(mark.is_finite() && field.inside(&next.0)) {
-                // Come as near to the edge as wanted, then stop.
-                if share < EDGE {
-                    (alive, left) = (false, mark.is_finite());
-                    break 'stretches;
+                // Approach the edge by shorter steps, then stop.
+                if share < EDGE_STEP_SHARE {
+                    (alive, left_domain) = (false, mark.is_finite());
+                    break 'intervals;
                 }
                 step = h * 0.25;
                 mark = 0.0;
                 continue;
             }
             let factor = if error > 0.0 { (0.9 * error.powf(-0.2)).clamp(0.2, 5.0) } else { 5.0 };
-            if error <= 1.0 || share < SHORTEST {
+            if error <= 1.0 || share < MIN_STEP_SHARE {
                 (time, state) = (if last { end } else { time + h }, next);
                 let before = exponent;
-                field.settle_tangent(&mut state.0, &mut state.1);
+                field.renormalise_with_tangent(&mut state.0, &mut state.1);
                 rescale(&mut state.1, &mut exponent);
                 if exponent == before {
-                    // The last stage is the next step's first one.
+                    // The last stage is the first stage of the next step.
                     k[0] = k[6];
                 } else {
                     derivative(field, time, &state, &mut k[0]);
                 }
             }
             mark = 0.0;
-            // A step cut short by a break says nothing about the next one's length.
+            // The length of a step that a snapshot time cuts short is no estimate for the next step.
             if !last || factor < 1.0 {
                 step = h * factor;
             }
         }
     }
-    let metric = field.metric(&state.0, &state.1);
-    let stretch = if gave_up { f64::NAN } else { exponent.mul_add(std::f64::consts::LN_2, log_stretch(&metric)) };
+    let gradient = field.gradient(&state.0, &state.1);
+    let stretch = if gave_up { f64::NAN } else { exponent.mul_add(std::f64::consts::LN_2, log_stretch(&gradient)) };
     let lived = if alive { 1.0 } else { (time - from) / span };
-    Paths { log_stretch: stretch, lived, left, state: state.0, metric, exponent }
+    TracedBatch { log_stretch: stretch, lived, left_domain, state: state.0, gradient, exponent }
 }
 
 fn derivative<V: Velocity<f64, D, N>, const D: usize, const N: usize>(field: &V, time: f64, at: &State<D, N>, k: &mut State<D, N>) -> f64 {

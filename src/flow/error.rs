@@ -1,25 +1,25 @@
-//! Why a flow map cannot be traced.
+//! Errors of making a tracer.
 
 use super::{Boundary, Precision};
 use crate::setting::{Refused, shown, word};
 use thiserror::Error;
 
-/// Why no tracer was made.
+/// Error of making a tracer.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum FlowError {
-    /// A number of the flow map is out of range.
+    /// A parameter of the flow map is out of range.
     #[error("`{key}` is {found}; accepted: {accepted}")]
     OutOfRange {
-        /// Its name.
+        /// Name of the parameter.
         key: &'static str,
-        /// What it is.
+        /// Its value.
         found: f64,
-        /// What is accepted.
+        /// Accepted values.
         accepted: &'static str,
     },
-    /// The snapshots do not reach far enough.
+    /// The snapshots do not cover the integration.
     #[error(
-        "tracing from {from} to {to} needs about {needed} snapshots that cover this span; there are {present}{}",
+        "tracing from {from} to {to} needs about {needed} snapshots that cover this span; the window holds {present}{}",
         covered.map_or(String::new(), |(first, last)| format!(", from {first} to {last}"))
     )]
     WindowTooShort {
@@ -27,32 +27,32 @@ pub enum FlowError {
         from: f64,
         /// Later end of the integration.
         to: f64,
-        /// Snapshots needed at the spacing of those present (2 where that is unknown).
+        /// Snapshots needed at the spacing of those present; 2 if the spacing is unknown.
         needed: usize,
         /// Snapshots present.
         present: usize,
         /// First and last time present.
         covered: Option<(f64, f64)>,
     },
-    /// Snapshots end where the grid ends.
+    /// Gridded velocity ends at its grid.
     #[error("boundary `{}` is for closed-form flows; gridded velocity accepts stop, clamp, periodic or zero", word(.boundary))]
     NotOnGrids {
-        /// What was asked for.
+        /// Boundary requested.
         boundary: Boundary,
     },
-    /// Neighbouring particles would fall on the same number.
-    #[error("`gap` {gap} vanishes in {} beside coordinates of {coordinate}; at least {least} or f64 is needed", word(.precision))]
-    GapVanishes {
-        /// What was asked for.
-        gap: f64,
+    /// Neighbouring particles would round to the same position.
+    #[error("`difference_step` {step} vanishes in {} beside coordinates of {coordinate}; at least {min_step} or f64 is needed", word(.precision))]
+    DifferenceStepVanishes {
+        /// Step requested.
+        step: f64,
         /// Floating-point type.
         precision: Precision,
         /// Largest coordinate of the domain.
         coordinate: f64,
-        /// Smallest gap that survives.
-        least: f64,
+        /// Smallest step that changes every coordinate.
+        min_step: f64,
     },
-    /// The closed form and the box disagree.
+    /// Flow and domain have different numbers of axes.
     #[error("the flow varies along {flow} axes, its domain along {domain}")]
     Dimensions {
         /// Axes of the flow.
@@ -60,7 +60,7 @@ pub enum FlowError {
         /// Axes of the domain.
         domain: usize,
     },
-    /// A number of axes that the sphere does not have.
+    /// The grid has a number of axes that the sphere does not support.
     #[error("sphere metric is for two or three axes (longitude, latitude, height); the grid has {axes}")]
     SphereAxes {
         /// Axes found.
@@ -72,7 +72,7 @@ pub enum FlowError {
         /// Nodes found.
         nodes: usize,
     },
-    /// A snapshot does not fit its grid.
+    /// The number of velocities of a snapshot differs from that of its grid's nodes.
     #[error("snapshot at time {time} has {found} velocities; its grid has {expected} nodes")]
     SnapshotShape {
         /// Its time.
@@ -82,22 +82,22 @@ pub enum FlowError {
         /// Nodes of the grid.
         expected: usize,
     },
-    /// No number of steps was enough.
+    /// No number of steps meets the tolerance.
     #[error(
         "{steps} steps still differ from twice as many by {reached:.2e} (root mean square of the log-stretch); tolerance {tolerance:.2e}"
     )]
     StepsNotFound {
-        /// Most steps tried.
+        /// Largest number of steps tried.
         steps: usize,
         /// Difference reached.
         reached: f64,
-        /// Difference asked for.
+        /// Difference requested.
         tolerance: f64,
     },
 }
 
 impl FlowError {
-    /// The setting at fault, where it is one.
+    /// The setting at fault; `None` if no setting is.
     pub fn refused(&self) -> Option<Refused> {
         Some(match self {
             FlowError::OutOfRange { key, found, accepted } => {
@@ -112,10 +112,10 @@ impl FlowError {
             FlowError::NotOnGrids { boundary } => {
                 Refused::new("flow.boundary", format_args!("is {}", shown(boundary)), "stop, clamp, periodic or zero on gridded velocity")
             }
-            FlowError::GapVanishes { gap, precision, coordinate, least } => Refused::new(
-                "flow.gap",
-                format_args!("is {gap}, which vanishes in {} beside coordinates of {coordinate}", word(precision)),
-                format!("at least {least}, or flow.precision = \"f64\""),
+            FlowError::DifferenceStepVanishes { step, precision, coordinate, min_step } => Refused::new(
+                "flow.difference_step",
+                format_args!("is {step}, which vanishes in {} beside coordinates of {coordinate}", word(precision)),
+                format!("at least {min_step}, or flow.precision = \"f64\""),
             )
             .beside(&["flow.precision"]),
             FlowError::SphereAxes { axes } => Refused::new(

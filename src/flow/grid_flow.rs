@@ -1,7 +1,7 @@
-//! Gridded flow in Cartesian coordinates. States are in mean grid spacings from the first node.
+//! Gridded flow in Cartesian coordinates. A state is the distance from the first node in mean grid spacings.
 
 use super::sampler::{GridStage, Sampler};
-use super::velocity::{Chart, Velocity, bounds, identity, within};
+use super::velocity::{Coordinates, Velocity, bounds, identity, within};
 use super::{Boundary, FlowError, Interpolation};
 use crate::field::{Grid, Window};
 use crate::simd::{Gather, Real, array};
@@ -13,14 +13,14 @@ pub struct GridFlow<R, const D: usize> {
     bounds: [[R; D]; 2],
     /// Mean spacings.
     spacing: [f64; D],
-    /// spacing[i] / spacing[j]; none where all spacings are equal.
+    /// spacing[i] / spacing[j]; `None` if all spacings are equal.
     ratios: Option<[[R; D]; D]>,
 }
 
 impl<R: Real, const D: usize> GridFlow<R, D> {
     /// Prepares a window.
-    pub fn new(window: &Window, grid: &Grid, policy: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
-        let sampler = Sampler::new(window, grid, policy, interpolation, |axes| {
+    pub fn new(window: &Window, grid: &Grid, boundary: Boundary, interpolation: Interpolation) -> Result<Self, FlowError> {
+        let sampler = Sampler::new(window, grid, boundary, interpolation, |axes| {
             array(|c| if c == 3 { 1.0 } else { axes.get(c).map_or(0.0, |axis| 1.0 / axis.spacing) })
         })?;
         let spacing = array(|k| sampler.axes[k].spacing);
@@ -28,37 +28,37 @@ impl<R: Real, const D: usize> GridFlow<R, D> {
         let end = |i: usize| array(|k| R::from_f64(ends[k][i]));
         let equal = spacing.iter().all(|&s| s == spacing[0]);
         let ratios = array(|i| array(|j| R::from_f64(spacing[i] / spacing[j])));
-        Ok(Self { bounds: bounds(policy, end(0), end(1)), spacing, ratios: (!equal).then_some(ratios), sampler })
+        Ok(Self { bounds: bounds(boundary, end(0), end(1)), spacing, ratios: (!equal).then_some(ratios), sampler })
     }
 }
 
-impl<R: Real, const D: usize> Chart<D, D> for GridFlow<R, D> {
+impl<R: Real, const D: usize> Coordinates<D, D> for GridFlow<R, D> {
     fn sort_key(&self, point: [f32; 3]) -> Option<u32> {
-        Some(self.sampler.sort_key(&self.start(point.map(f64::from))))
+        Some(self.sampler.sort_key(&self.seed_state(point.map(f64::from))))
     }
-    fn start(&self, point: [f64; 3]) -> [f64; D] {
+    fn seed_state(&self, point: [f64; 3]) -> [f64; D] {
         array(|k| self.sampler.axes[k].state(point[k]))
     }
-    fn first_tangent(&self, _: [f64; 3]) -> [[f64; D]; D] {
+    fn initial_tangent(&self, _: [f64; 3]) -> [[f64; D]; D] {
         identity()
     }
-    fn separation(&self, _: [f64; 3], axis: usize, gap: f64) -> f64 {
-        2.0 * gap / self.spacing[axis]
+    fn separation(&self, _: [f64; 3], axis: usize, step: f64) -> f64 {
+        2.0 * step / self.spacing[axis]
     }
-    fn arrival(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
+    fn arrival_point(&self, state: &[f64; D], seed: [f32; 3]) -> [f32; 3] {
         array(|k| state.get(k).map_or(seed[k], |&x| self.sampler.axes[k].coordinate(x) as f32))
     }
-    fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], metric: [[f64; D]; D]) -> [[f64; D]; D] {
-        metric
+    fn coordinate_jacobian(&self, _: [f64; 3], _: &[f64; D], gradient: [[f64; D]; D]) -> [[f64; D]; D] {
+        gradient
     }
-    fn breaks(&self) -> &[f64] {
+    fn break_times(&self) -> &[f64] {
         self.sampler.times()
     }
 }
 
 impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
     type Stage = GridStage<L::Real>;
-    const MARKS: bool = true;
+    const HAS_MISSING: bool = true;
 
     fn stage(&self, time: f64) -> Self::Stage {
         self.sampler.stage(time)
@@ -87,7 +87,7 @@ impl<L: Gather, const D: usize> Velocity<L, D, D> for GridFlow<L::Real, D> {
         within(&self.bounds, x)
     }
     #[inline(always)]
-    fn metric(&self, _: &[L; D], m: &[[L; D]; D]) -> [[L; D]; D] {
+    fn gradient(&self, _: &[L; D], m: &[[L; D]; D]) -> [[L; D]; D] {
         match &self.ratios {
             None => *m,
             Some(ratios) => array(|i| array(|j| m[i][j] * L::splat(ratios[i][j]))),

@@ -1,7 +1,10 @@
 //! Ground truth: integrators, tangent flow map, Cauchy-Green, log-stretch and FTLE.
 //!
 //! In: a velocity (closed form or window) and seeds. Out: the log-stretch s = ln sigma_max(J) = |tau| FTLE at each seed. This room
-//! calls only `field`; it knows nothing of networks, images or sockets.
+//! calls only `field`, `simd` and `setting`.
+//!
+//! FTLE(x, t, tau) = 1/|tau| ln sqrt(lambda_max(J^T J)) with J = d phi / d x, the gradient of the flow map phi (Haller 2001; Shadden, Lekien
+//! and Marsden 2005). J is the solution of the variational equation dJ/dt = (grad v) J, integrated together with the path (`rk4`).
 
 use crate::field::{Domain, Window, analytic::Analytic};
 use serde::{Deserialize, Serialize};
@@ -9,9 +12,11 @@ use std::sync::Arc;
 
 mod assemble;
 mod axis_map;
+mod displacement;
 mod dormand_prince;
 mod error;
 mod grid_flow;
+mod missing_cells;
 mod resolution;
 mod rk4;
 mod sampler;
@@ -23,25 +28,23 @@ mod steps;
 mod stretch;
 mod tracer;
 mod velocity;
-mod voids;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
 #[cfg(feature = "cuda")]
 pub(crate) use axis_map::AxisMap;
 pub use error::FlowError;
+#[cfg(feature = "cuda")]
+pub(crate) use missing_cells::MissingCells;
 pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};
 #[cfg(feature = "cuda")]
 pub(crate) use sphere::poles;
-pub use steps::Chosen;
 pub(crate) use stretch::log_stretch;
 pub use tracer::Order;
 #[cfg(feature = "cuda")]
 pub(crate) use velocity::{angle_slack, bounds};
-#[cfg(feature = "cuda")]
-pub(crate) use voids::Voids;
 
-/// Which way particles travel from the seed.
+/// Direction of time in which particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Direction {
@@ -69,15 +72,15 @@ impl Direction {
     }
 }
 
-/// How the flow map's gradient is found.
+/// Method that finds the gradient of the flow map.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Integrator {
     /// dJ/dt = (grad v) J along one path, Runge-Kutta of order 4.
     Tangent,
-    /// Central differences of 2 particles an axis, `gap` apart from the seed, Runge-Kutta of order 4 (the published way).
+    /// Central differences of two particles per axis, `difference_step` away from the seed, Runge-Kutta of order 4 (the published method).
     Differences,
-    /// Tangent flow by the adaptive pair of Dormand and Prince in f64: the reference.
+    /// Tangent flow by the adaptive pair of Dormand and Prince (1980) in f64: the reference.
     #[serde(rename = "dormand_prince", alias = "dormandprince")]
     DormandPrince,
 }
@@ -92,29 +95,29 @@ pub enum Precision {
     F64,
 }
 
-/// What happens to a particle at the edge of the domain.
+/// Policy for particles that reach the edge of the domain.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Boundary {
-    /// It stops and keeps the stretch it had; it is counted.
+    /// The particle stops, keeps the stretch that it had, and is counted.
     Stop,
-    /// Velocity outside is the velocity at the nearest point of the edge.
+    /// The velocity outside is that at the nearest point of the edge.
     Clamp,
     /// The domain repeats along every axis.
     Periodic,
-    /// Closed-form flows go on outside the box.
+    /// The flow continues outside the box (closed forms only).
     Unbounded,
-    /// It stops and its FTLE is 0 (the published small renderer).
+    /// The particle stops and its FTLE is 0 (the published small renderer).
     Zero,
 }
 
-/// What the log-stretch of a particle that stopped early is divided by.
+/// Divisor of the log-stretch of a particle that stopped early.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Normalisation {
     /// |tau|: a particle stopped at a coast shows no ridge there.
     Tau,
-    /// The time it lived (tends to the local strain rate).
+    /// The time until it stopped; the quotient tends to the local strain rate.
     Lived,
 }
 
@@ -128,34 +131,34 @@ pub enum Interpolation {
     Cubic,
 }
 
-/// How many Runge-Kutta steps a path gets.
+/// Number of Runge-Kutta steps per path.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Steps {
-    /// The fewest whose log-stretch differs from twice as many by at most this root mean square, on a few thousand points; on grids at least
-    /// two a snapshot interval and one a cell that is crossed (two where paths stop at edges and land).
+    /// The smallest number whose log-stretch differs from that of twice as many steps by at most the tolerance, on a few thousand points.
+    /// On grids at least two per snapshot interval and one per cell crossed (two if paths stop at edges and missing cells).
     Auto {
-        /// Root mean square of the log-stretch.
+        /// Root mean square difference of the log-stretch, no unit.
         tolerance: f64,
     },
-    /// This many.
+    /// A given number.
     Fixed(usize),
 }
 
-/// Everything that defines one flow map, but for its start time.
+/// Definition of a flow map, except for its start time.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlowMap {
     /// |tau|, in time units.
     pub tau: f64,
     /// Forward or backward.
     pub direction: Direction,
-    /// How J is found.
+    /// Method that finds J.
     pub integrator: Integrator,
     /// Floating-point type.
     pub precision: Precision,
     /// Number of steps.
     pub steps: Steps,
-    /// Distance of the difference particles from the seed, in coordinate units.
-    pub gap: f64,
+    /// Distance of the particles of [`Integrator::Differences`] from the seed, in coordinate units.
+    pub difference_step: f64,
     /// Edge policy.
     pub boundary: Boundary,
     /// Divisor for particles that stopped early.
@@ -165,7 +168,7 @@ pub struct FlowMap {
 }
 
 impl FlowMap {
-    /// The production path with so many steps over `tau`: forward, tangent flow in single precision, unbounded, linear interpolation.
+    /// The production settings with `steps` steps over `tau`: forward, tangent flow in single precision, unbounded, linear interpolation.
     pub fn tangent(tau: f64, steps: usize) -> Self {
         Self {
             tau,
@@ -173,7 +176,7 @@ impl FlowMap {
             integrator: Integrator::Tangent,
             precision: Precision::F32,
             steps: Steps::Fixed(steps),
-            gap: 1e-4,
+            difference_step: 1e-4,
             boundary: Boundary::Unbounded,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -184,13 +187,13 @@ impl FlowMap {
 /// The velocity that is integrated.
 #[derive(Debug, Clone)]
 pub enum VelocitySource {
-    /// A closed form, anywhere and at any time, over this domain.
+    /// A closed form over a domain, defined everywhere and at any time.
     Analytic(Analytic, Domain),
     /// Snapshots; the window covers [t0, t0 + tau].
     Window(Arc<Window>),
 }
 
-/// What a trace should return besides the log-stretch.
+/// Results that a trace returns besides the log-stretch.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Extras {
     /// Arrival positions phi(x), in domain coordinates.
@@ -199,23 +202,23 @@ pub struct Extras {
     pub jacobian: bool,
 }
 
-/// One entry a seed, in the order of the seeds.
+/// Results of a trace: one entry per seed, in the order of the seeds.
 #[derive(Debug, Clone, Default)]
 pub struct Traced {
-    /// Log-stretch s = ln sigma_max(J), no unit; FTLE = s / |tau| (see [`Normalisation`], which is already applied).
+    /// Log-stretch s = ln sigma_max(J), no unit; FTLE = s / |tau|. The [`Normalisation`] is already applied.
     pub log_stretch: Vec<f32>,
-    /// The same unrounded; filled when the integration is in double precision, otherwise empty.
+    /// The log-stretch in double precision; empty unless the integration is in double precision.
     pub log_stretch_f64: Vec<f64>,
-    /// Share of |tau| that the particle lived, in [0, 1].
+    /// Share of |tau| until the particle stopped, in [0, 1]; 1 if it never stopped.
     pub lived: Vec<f32>,
-    /// Arrival positions; empty unless asked for.
+    /// Arrival positions; empty unless requested.
     pub arrival: Vec<[f32; 3]>,
-    /// Jacobians; empty unless asked for.
+    /// Jacobians; empty unless requested.
     pub jacobian: Vec<[f32; 9]>,
 }
 
 impl Traced {
-    /// Room for so many seeds; entries that are new are unknown (NaN, lived 0). `double`: with unrounded log-stretches.
+    /// Resizes all arrays to `count` seeds; new entries are NaN, with a lifetime of 0. `double`: also those in double precision.
     pub(crate) fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
         let wanted = |yes: bool| if yes { count } else { 0 };
         self.log_stretch.resize(count, f32::NAN);
@@ -226,46 +229,42 @@ impl Traced {
     }
 }
 
-/// Traces seeds in large batches; shared by all threads. [`cpu_tracer`] makes the CPU's.
+/// How the number of steps was chosen.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepChoice {
+    /// Steps per path.
+    pub steps: usize,
+    /// Root mean square difference of the log-stretch from twice as many steps; on grids without the 2 % of the points that differ most.
+    pub difference: f64,
+    /// True if the difference is within the tolerance.
+    pub within_tolerance: bool,
+    /// Points, of [`Self::POINTS`], whose log-stretch is not finite.
+    pub not_finite: usize,
+}
+
+impl StepChoice {
+    /// Points on which the error of a number of steps is measured.
+    pub const POINTS: usize = 2048;
+}
+
+/// Traces seeds in large batches; shared by all threads. [`cpu_tracer`] makes the tracer of the CPU.
 pub trait Tracer: Send + Sync {
-    /// Where seeds may lie.
+    /// Box in which seeds may lie.
     fn domain(&self) -> &Domain;
     /// Seed time.
     fn start(&self) -> f64;
     /// |tau|.
     fn tau(&self) -> f64;
-    /// Runge-Kutta steps a path gets.
+    /// Runge-Kutta steps per path; 0 if the step size is adaptive.
     fn steps(&self) -> usize;
-    /// How the number of steps was chosen; none where it was given.
-    fn chosen(&self) -> Option<Chosen> {
+    /// How the number of steps was chosen; `None` if it was given.
+    fn step_choice(&self) -> Option<StepChoice> {
         None
     }
-    /// Whether a seed lies where the velocity is missing at its start time (land): it has no FTLE. Closed forms
-    /// have velocity everywhere.
-    fn is_void(&self, _seed: [f32; 3]) -> bool {
+    /// True if a seed lies in a missing cell at the start time: it has no FTLE. Closed forms have no missing cells.
+    fn is_missing(&self, _seed: [f32; 3]) -> bool {
         false
     }
-    /// The tracer itself, for an engine that knows its own ones again; none for others.
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        None
-    }
-    /// Traces all seeds; sorts them by cell when that pays and parallelises over rayon's current pool. Replaces what `out` held.
+    /// Traces all seeds in parallel on the current rayon pool, sorted by cell if that is faster. Replaces the contents of `out`.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
-    /// Traces the nodes of a regular grid over the unit domain on a device that keeps what it traced; none: nobody does, and the nodes are
-    /// seeds like others. Node i of n along an axis lies at i / (n - 1); one node along z in two dimensions.
-    fn trace_nodes(&self, _nodes: [usize; 3]) -> Option<std::sync::Arc<dyn TracedNodes>> {
-        None
-    }
-}
-
-/// The log-stretch at the nodes of a regular grid, held by the device that traced it.
-pub trait TracedNodes: std::fmt::Debug + Send + Sync {
-    /// Nodes whose trace was not finite; they hold 0.
-    fn not_finite(&self) -> usize;
-    /// All of them, x fastest, brought to the host; NaN where the device is lost, and nobody is left to trace them anew.
-    fn values(&self) -> Vec<f32>;
-    /// Interpolates multilinearly at unit points; false where the device cannot, and `out` then holds anything.
-    fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) -> bool;
-    /// What the device made, for an engine that knows its own.
-    fn as_any(&self) -> &dyn std::any::Any;
 }

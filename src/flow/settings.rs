@@ -8,9 +8,9 @@ use serde::{Deserialize, Deserializer, Serialize};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 #[serde(untagged)]
 pub enum StepsSetting {
-    /// This many.
+    /// A given number.
     Fixed(usize),
-    /// By error.
+    /// Chosen by error.
     #[serde(serialize_with = "auto_word")]
     Auto,
 }
@@ -49,23 +49,22 @@ impl<'de> Deserialize<'de> for StepsSetting {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct FlowSettings {
-    /// How J is found.
+    /// Method that finds J.
     pub integrator: Integrator,
     /// Floating-point type.
     pub precision: Precision,
-    /// Runge-Kutta steps a path.
+    /// Runge-Kutta steps per path.
     pub steps: StepsSetting,
-    /// With `steps = "auto"`: root mean square of the log-stretch that a doubling of the steps may change; none: 0.01 for closed forms
-    /// and the synthetic turbulence, 0.1 for archives, whose interpolated gradient
-    /// converges slowly. What was reached is in the summary.
+    /// With `steps = "auto"`: root mean square by which the log-stretch may change if the steps are doubled. `None`: 0.01 for closed forms and
+    /// the synthetic turbulence, 0.1 for archives, whose interpolated gradient converges slowly. The summary contains the value reached.
     pub tolerance: Option<f64>,
-    /// Distance of difference particles, in coordinate units.
-    pub gap: f64,
-    /// Edge policy; none: `unbounded` for closed forms, `stop` for archives, `clamp` for the synthetic turbulence.
+    /// Distance of the particles of `differences` from the seed, in coordinate units.
+    pub difference_step: f64,
+    /// Boundary policy; `None`: `unbounded` for closed forms, `stop` for archives, `clamp` for the synthetic turbulence.
     pub boundary: Option<Boundary>,
     /// Divisor for particles that stopped early.
     pub normalisation: Normalisation,
-    /// Interpolation in space; none: cubic for two-dimensional archives, linear otherwise.
+    /// Interpolation in space; `None`: cubic for two-dimensional archives, linear otherwise.
     pub interpolation: Option<Interpolation>,
 }
 
@@ -76,7 +75,7 @@ impl Default for FlowSettings {
             precision: Precision::F32,
             steps: StepsSetting::Auto,
             tolerance: None,
-            gap: 1e-4,
+            difference_step: 1e-4,
             boundary: None,
             normalisation: Normalisation::Tau,
             interpolation: None,
@@ -85,26 +84,26 @@ impl Default for FlowSettings {
 }
 
 impl FlowSettings {
-    /// Checks ranges, and what does not go together; `gridded` tells whether the velocity ends at a grid.
+    /// Checks ranges and combinations. `gridded`: the velocity ends at a grid.
+    ///
+    /// # Errors
+    /// The key at fault and the values that it accepts.
     pub fn check(&self, gridded: bool) -> Result<(), Refused> {
-        let flow = self;
-        if let StepsSetting::Fixed(steps) = flow.steps {
+        if let StepsSetting::Fixed(steps) = self.steps {
             count("flow.steps", steps, 1, 10_000_000)?;
         }
-        if let Some(tolerance) = flow.tolerance {
+        if let Some(tolerance) = self.tolerance {
             positive("flow.tolerance", tolerance)?;
         }
-        positive("flow.gap", flow.gap)?;
-        if gridded && flow.boundary == Some(Boundary::Unbounded) {
-            refuse("flow.boundary", "is \"unbounded\"", "stop, clamp, periodic or zero: gridded velocity ends at its grid")?;
+        positive("flow.difference_step", self.difference_step)?;
+        if gridded && self.boundary == Some(Boundary::Unbounded) {
+            let accepted = "stop, clamp, periodic or zero: gridded velocity ends at its grid";
+            return Err(Refused::new("flow.boundary", "is \"unbounded\"", accepted));
         }
-        if flow.integrator == Integrator::DormandPrince && flow.precision == Precision::F32 {
-            refuse("flow.precision", "is \"f32\"", "\"f64\" with integrator = \"dormand_prince\", which is the reference")?;
+        if self.integrator == Integrator::DormandPrince && self.precision == Precision::F32 {
+            let accepted = "\"f64\" with integrator = \"dormand_prince\", which is the reference";
+            return Err(Refused::new("flow.precision", "is \"f32\"", accepted));
         }
         Ok(())
     }
-}
-
-fn refuse(key: &str, found: &str, accepted: &str) -> Result<(), Refused> {
-    Err(Refused::new(key, found, accepted))
 }

@@ -1,13 +1,13 @@
-//! What a cubic interpolation reads along one axis, and with which weights.
+//! Nodes and weights of the cubic interpolation along one axis: a Hermite cubic with Catmull-Rom slopes.
 
 use super::axis_map::AxisMap;
 use crate::simd::Real;
 
 /// The four nodes that a Hermite cubic reads along one axis.
 pub struct Stencil<R> {
-    /// Before, first, second, behind.
+    /// Previous node, both nodes of the cell, next node.
     pub nodes: [usize; 4],
-    /// Of the four nodes' values.
+    /// Weights of the values at the four nodes.
     pub weights: [R; 4],
     /// d weights / d fraction.
     pub slopes: [R; 4],
@@ -15,7 +15,7 @@ pub struct Stencil<R> {
 
 impl<R: Real> Stencil<R> {
     #[inline(always)]
-    /// For a place at `fraction` of a cell.
+    /// Stencil for a location at `fraction` of a cell.
     pub fn new(axis: &AxisMap<R>, cell: u32, fraction: R) -> Self {
         let f = fraction.to_f64();
         let wrapped = |index: u32| if index >= axis.nodes { (index - axis.nodes) as usize } else { index as usize };
@@ -26,7 +26,7 @@ impl<R: Real> Stencil<R> {
         let derivative = [6.0 * f * (f - 1.0), 6.0 * f * (1.0 - f), (1.0 - f) * (1.0 - 3.0 * f), f * (3.0 * f - 2.0)];
         let combine = |h: [f64; 4]| {
             let mut w = [0.0, h[0], h[1], 0.0];
-            // Slope at the first node: (next - before) / (1 - before), or next - first.
+            // Slope at the first node: (second - previous) / (1 - before), or second - first at the end of the axis.
             match before {
                 Some(b) => {
                     w[0] -= h[2] / (1.0 - b);

@@ -1,21 +1,21 @@
-//! The log-stretch of a flow map's gradient: ln of its largest singular value.
+//! The log-stretch of a flow map's gradient J: ln of its largest singular value, which is |tau| FTLE (Shadden, Lekien and Marsden 2005).
 
 use crate::simd::{Lanes, Mask, array};
 
-/// ln sigma_max of a 2x2 or 3x3 matrix. Minus infinity for the zero matrix.
+/// Returns ln sigma_max of a 2x2 or 3x3 matrix; minus infinity for the zero matrix.
 #[inline(always)]
 pub fn log_stretch<L: Lanes, const C: usize>(m: &[[L; C]; C]) -> L {
-    // Scaling by the largest entry keeps squares in range.
-    let size = largest(m);
+    // Squares stay in range if the largest entry is scaled to 1.
+    let size = max_abs(m);
     let scale = L::one() / L::select(L::lt(L::zero(), size), size, L::one());
     let scaled: [[L; C]; C] = array(|i| array(|j| m[i][j] * scale));
     let sigma = if C == 2 { sigma_max_2(&scaled) } else { sigma_max_3(&scaled) };
     sigma.ln() - scale.ln()
 }
 
-/// Largest absolute entry.
+/// Largest absolute value of the entries.
 #[inline(always)]
-pub fn largest<L: Lanes, const C: usize, const D: usize>(m: &[[L; C]; D]) -> L {
+pub fn max_abs<L: Lanes, const C: usize, const D: usize>(m: &[[L; C]; D]) -> L {
     let mut size = L::zero();
     for row in m {
         for entry in row {
@@ -25,28 +25,28 @@ pub fn largest<L: Lanes, const C: usize, const D: usize>(m: &[[L; C]; D]) -> L {
     size
 }
 
-/// sigma_max = (|(a + d, b - c)| + |(a - d, b + c)|) / 2: a matrix is the sum of a scaled rotation and a scaled reflection. Nothing
-/// cancels.
+/// sigma_max = (|(a + d, b - c)| + |(a - d, b + c)|) / 2, since a matrix is the sum of a scaled rotation and a scaled reflection. The formula
+/// has no cancellation.
 #[inline(always)]
 fn sigma_max_2<L: Lanes, const C: usize>(m: &[[L; C]; C]) -> L {
     let ([a, b], [c, d]) = ([m[0][0], m[0][1]], [m[1][0], m[1][1]]);
     let length = |x: L, y: L| x.mul_add(x, y * y).sqrt();
-    (length(a + d, b - c) + length(a - d, b + c)) * L::of(0.5)
+    (length(a + d, b - c) + length(a - d, b + c)) * L::splat_f64(0.5)
 }
 
-/// Cyclic Jacobi sweeps over the Cauchy-Green tensor. They converge quadratically and, other than the trigonometric solution of the
-/// characteristic polynomial, lose nothing where the two largest eigenvalues come together.
+/// Cyclic Jacobi sweeps over the Cauchy-Green tensor J^T J. They converge quadratically. Unlike the trigonometric solution of the
+/// characteristic polynomial they stay accurate if the two largest eigenvalues are close.
 #[inline(always)]
 fn sigma_max_3<L: Lanes, const C: usize>(m: &[[L; C]; C]) -> L {
     const SWEEPS: usize = 5;
     let product = |i: usize, j: usize| m[0][i].mul_add(m[0][j], m[1][i].mul_add(m[1][j], m[2][i] * m[2][j]));
     let mut diagonal = [product(0, 0), product(1, 1), product(2, 2)];
-    // Entry k is the one off the diagonal that lies in neither row k nor column k.
+    // Entry k is the off-diagonal entry that lies in neither row k nor column k.
     let mut off = [product(1, 2), product(0, 2), product(0, 1)];
-    let tiny = L::of(1e-30);
+    let tiny = L::splat_f64(1e-30);
     for _ in 0..SWEEPS {
         for (p, q, r) in [(0, 1, 2), (0, 2, 1), (1, 2, 0)] {
-            // t = tan of the angle that makes entry (p, q) vanish, the smaller of the two.
+            // t is the tangent of the smaller angle that makes entry (p, q) vanish.
             let twice = off[r] + off[r];
             let difference = diagonal[q] - diagonal[p];
             let root = difference.mul_add(difference, twice * twice).sqrt();
@@ -66,14 +66,14 @@ fn sigma_max_3<L: Lanes, const C: usize>(m: &[[L; C]; C]) -> L {
     diagonal[0].max(diagonal[1]).max(diagonal[2]).max(L::zero()).sqrt()
 }
 
-/// Two to this power is taken out of a tangent that outgrows it, so that nothing overflows.
+/// Factor (2^40) by which tangents are rescaled before they overflow.
 const RESCALE: f64 = 1_099_511_627_776.0;
 
-/// Brings every tangent near 1 and adds the power of two taken out to `exponent`.
+/// Rescales tangents beyond [`RESCALE`] and adds the binary logarithm of the factor to `exponent`.
 #[inline(always)]
 pub fn rescale<L: Lanes, const C: usize, const D: usize>(m: &mut [[L; C]; D], exponent: &mut L) {
-    let size = largest(m);
-    let (low, high) = (L::of(1.0 / RESCALE), L::of(RESCALE));
+    let size = max_abs(m);
+    let (low, high) = (L::splat_f64(1.0 / RESCALE), L::splat_f64(RESCALE));
     let (small, large) = (L::lt(size, low), L::lt(high, size));
     if (small | large).any() {
         let factor = L::select(large, low, L::select(small, high, L::one()));
@@ -82,8 +82,8 @@ pub fn rescale<L: Lanes, const C: usize, const D: usize>(m: &mut [[L; C]; D], ex
                 *entry = *entry * factor;
             }
         }
-        let taken = L::of(RESCALE.log2());
-        *exponent += L::select(large, taken, L::select(small, -taken, L::zero()));
+        let log_factor = L::splat_f64(RESCALE.log2());
+        *exponent += L::select(large, log_factor, L::select(small, -log_factor, L::zero()));
     }
 }
 
@@ -115,7 +115,7 @@ mod tests {
         cases.push(std::array::from_fn(|i| std::array::from_fn(|j| if i == j { [7.0, 7.0 + 1e-9, 0.02][i] } else { 1e-9 })));
         cases.push([[1.0; C]; C]);
         for case in cases {
-            let lanes: [[L; C]; C] = case.map(|row| row.map(L::of));
+            let lanes: [[L; C]; C] = case.map(|row| row.map(L::splat_f64));
             let expected = library(lanes.map(|row| row.map(|entry| entry.lane(0).to_f64())));
             let found = log_stretch(&lanes).lane(L::LANES - 1).to_f64();
             assert!((found - expected).abs() < tolerance * expected.abs().max(1.0), "{case:?}: {found} {expected}");

@@ -1,24 +1,23 @@
-//! Batches: seeds sorted by cell, traced in lanes by all threads, and put back in order.
+//! Traces batches of seeds on the CPU: sorted by cell (Morton order), in lanes, by all threads.
 
-use super::rk4::{self, MAX_LANES, Paths};
-use super::steps::Chosen;
-use super::velocity::{Chart, Velocity};
-use super::voids::Voids;
-use super::{Boundary, Extras, Normalisation, Traced, Tracer, dormand_prince};
+use super::missing_cells::MissingCells;
+use super::rk4::{self, MAX_LANES, TracedBatch};
+use super::velocity::{Coordinates, Velocity};
+use super::{Boundary, Extras, Normalisation, StepChoice, Traced, Tracer, dormand_prince};
 use crate::field::Domain;
 use crate::simd::{Lanes, Mask, Real};
 use rayon::prelude::*;
 use std::marker::PhantomData;
 
-/// How a batch of at most `L::LANES` particles is traced.
+/// Integrator of a batch of at most `L::LANES` particles.
 pub trait Kernel<V, L: Lanes, const D: usize, const C: usize>: Send + Sync {
-    /// Steps a path gets; 0 where they are chosen on the way.
+    /// Steps per path; 0 if the step size is adaptive.
     fn steps(&self) -> usize;
-    /// Traces a batch.
-    fn paths(&self, field: &V, points: &[[f32; 3]]) -> Paths<L, D, C>;
+    /// Traces at most `L::LANES` points.
+    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C>;
 }
 
-/// All stage times of fixed steps, evaluated once.
+/// The velocity stages at all times of fixed steps, evaluated once.
 pub struct Stages<S> {
     stages: Vec<S>,
     step: f64,
@@ -50,7 +49,7 @@ impl<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize> Kernel<V, L
     fn steps(&self) -> usize {
         self.0.stages.len() / 2
     }
-    fn paths(&self, field: &V, points: &[[f32; 3]]) -> Paths<L, D, C> {
+    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C> {
         rk4::tangent(field, &self.0.stages, self.0.step, points)
     }
 }
@@ -62,7 +61,7 @@ impl<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize> Kernel<V, L
     fn steps(&self) -> usize {
         self.0.stages.len() / 2
     }
-    fn paths(&self, field: &V, points: &[[f32; 3]]) -> Paths<L, D, C> {
+    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<L, D, C> {
         rk4::differences(field, &self.0.stages, self.0.step, self.1, points)
     }
 }
@@ -81,54 +80,54 @@ impl<V: Velocity<f64, D, C>, const D: usize, const C: usize> Kernel<V, f64, D, C
     fn steps(&self) -> usize {
         0
     }
-    fn paths(&self, field: &V, points: &[[f32; 3]]) -> Paths<f64, D, C> {
+    fn trace_batch(&self, field: &V, points: &[[f32; 3]]) -> TracedBatch<f64, D, C> {
         dormand_prince::trace(field, self.from, self.to, self.tolerance, points)
     }
 }
 
-/// A field and a kernel, ready for seeds.
+/// The tracer of the CPU: a velocity and a kernel.
 pub struct CpuTracer<K, V, L, const D: usize, const C: usize> {
     /// The velocity.
     pub field: V,
-    /// What traces it.
+    /// The integrator.
     pub kernel: K,
-    /// Where seeds may lie.
+    /// Box in which seeds may lie.
     pub domain: Domain,
     /// Seed time.
     pub start: f64,
     /// |tau|.
     pub tau: f64,
-    /// Edge policy.
+    /// Boundary policy.
     pub boundary: Boundary,
     /// Divisor for particles that stopped early.
     pub normalisation: Normalisation,
-    /// Whether batches are sorted.
+    /// Order in which seeds are traced.
     pub order: Order,
-    /// How the number of steps was chosen, where it was.
-    pub chosen: Option<Chosen>,
-    /// Where seeds have no velocity.
-    pub voids: Voids,
-    /// Kind of lanes.
+    /// How the number of steps was chosen; `None` if it was given.
+    pub chosen: Option<StepChoice>,
+    /// Cells without a velocity at the start time.
+    pub missing_cells: MissingCells,
+    /// Type of the lanes.
     pub lanes: PhantomData<L>,
 }
 
-/// In which order seeds are traced.
+/// Order in which seeds are traced.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Order {
-    /// By cell where velocities are read from memory and the batch is large; otherwise as they come.
+    /// Sorted by cell if velocities are read from memory and the batch is large; otherwise as given.
     Auto,
-    /// As they come.
+    /// As given.
     Given,
 }
 
-/// Batches below this are not worth sorting.
+/// Smallest batch that is worth sorting.
 const SORT_FROM: usize = 1 << 12;
-/// Seeds that are sorted and traced at a time, which bounds the memory of the keys.
+/// Largest number of seeds sorted and traced at once, which bounds the memory of the keys.
 const BLOCK: usize = 1 << 22;
-/// Seeds that a thread takes at a time, at most.
+/// Largest number of seeds per task of a thread.
 const CHUNK: usize = 1 << 10;
 
-/// One array that threads write at indices of their own.
+/// An array of which each thread writes its own elements.
 struct Scatter<T>(*mut T);
 // SAFETY: threads write disjoint elements (see `put`), and `T: Send` values may be written from any thread.
 unsafe impl<T: Send> Sync for Scatter<T> {}
@@ -140,9 +139,9 @@ impl<T> Scatter<T> {
         (!values.is_empty()).then_some(Self(values.as_mut_ptr()))
     }
     /// # Safety
-    /// `index` is inside the array, and no other thread writes it.
-    unsafe fn put(&self, index: usize, value: T) {
-        // SAFETY: the caller's.
+    /// `index` is in bounds, and no other thread writes this element.
+    unsafe fn write(&self, index: usize, value: T) {
+        // SAFETY: guaranteed by the caller.
         unsafe { *self.0.add(index) = value }
     }
 }
@@ -150,10 +149,10 @@ impl<T> Scatter<T> {
 impl<K, V, L, const D: usize, const C: usize> CpuTracer<K, V, L, D, C>
 where
     K: Kernel<V, L, D, C>,
-    V: Chart<D, C>,
+    V: Coordinates<D, C>,
     L: Lanes,
 {
-    /// Indices of the seeds in the order in which they are traced.
+    /// Indices of the seeds in the order in which they are traced; `None` if that is the given order.
     fn sorted(&self, seeds: &[[f32; 3]]) -> Option<Vec<u32>> {
         if self.order == Order::Given || seeds.len() < SORT_FROM {
             return None;
@@ -165,10 +164,10 @@ where
         Some(keys.into_par_iter().map(|key| key as u32).collect())
     }
 
-    /// Log-stretch and lived share of a lane, with edge policy and normalisation applied.
-    fn verdict(&self, paths: &Paths<L, D, C>, lane: usize) -> (f64, f64) {
-        let (stretch, lived) = (paths.log_stretch.lane(lane).to_f64(), paths.lived.lane(lane).to_f64());
-        if self.boundary == Boundary::Zero && paths.left.lane(lane) {
+    /// Log-stretch and lifetime share of a lane, with boundary policy and normalisation applied.
+    fn normalised_stretch(&self, batch: &TracedBatch<L, D, C>, lane: usize) -> (f64, f64) {
+        let (stretch, lived) = (batch.log_stretch.lane(lane).to_f64(), batch.lived.lane(lane).to_f64());
+        if self.boundary == Boundary::Zero && batch.left_domain.lane(lane) {
             return (0.0, lived);
         }
         match self.normalisation {
@@ -177,11 +176,11 @@ where
         }
     }
 
-    fn jacobian(&self, paths: &Paths<L, D, C>, lane: usize, seed: [f32; 3]) -> [f32; 9] {
-        let factor = paths.exponent.lane(lane).to_f64().exp2();
-        let metric: [[f64; C]; C] = paths.metric.map(|row| row.map(|entry| entry.lane(lane).to_f64() * factor));
-        let state = paths.state.map(|x| x.lane(lane).to_f64());
-        let jacobian = self.field.coordinate_jacobian(seed.map(f64::from), &state, metric);
+    fn jacobian(&self, batch: &TracedBatch<L, D, C>, lane: usize, seed: [f32; 3]) -> [f32; 9] {
+        let factor = batch.exponent.lane(lane).to_f64().exp2();
+        let gradient: [[f64; C]; C] = batch.gradient.map(|row| row.map(|entry| entry.lane(lane).to_f64() * factor));
+        let state = batch.state.map(|x| x.lane(lane).to_f64());
+        let jacobian = self.field.coordinate_jacobian(seed.map(f64::from), &state, gradient);
         std::array::from_fn(|i| {
             let (row, column) = (i / 3, i % 3);
             if row < C && column < C { jacobian[row][column] as f32 } else { f32::from(u8::from(row == column)) }
@@ -192,7 +191,7 @@ where
 impl<K, V, L, const D: usize, const C: usize> Tracer for CpuTracer<K, V, L, D, C>
 where
     K: Kernel<V, L, D, C>,
-    V: Chart<D, C>,
+    V: Coordinates<D, C>,
     L: Lanes,
 {
     fn domain(&self) -> &Domain {
@@ -211,22 +210,17 @@ where
         self.kernel.steps()
     }
 
-    fn chosen(&self) -> Option<Chosen> {
+    fn step_choice(&self) -> Option<StepChoice> {
         self.chosen
     }
 
-    fn is_void(&self, seed: [f32; 3]) -> bool {
-        self.voids.hold(seed)
+    fn is_missing(&self, seed: [f32; 3]) -> bool {
+        self.missing_cells.is_missing(seed)
     }
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
         let double = size_of::<L::Real>() == size_of::<f64>();
-        let wanted = |yes: bool| if yes { seeds.len() } else { 0 };
-        out.log_stretch.resize(seeds.len(), 0.0);
-        out.lived.resize(seeds.len(), 0.0);
-        out.arrival.resize(wanted(extras.arrival), [0.0; 3]);
-        out.jacobian.resize(wanted(extras.jacobian), [0.0; 9]);
-        out.log_stretch_f64.resize(wanted(double), 0.0);
+        out.set_len(seeds.len(), extras, double);
         let threads = rayon::current_num_threads();
         for start in (0..seeds.len()).step_by(BLOCK) {
             let block = start..(start + BLOCK).min(seeds.len());
@@ -237,7 +231,7 @@ where
             let arrival = Scatter::new(if extras.arrival { &mut out.arrival[block.clone()] } else { &mut [] });
             let jacobian = Scatter::new(if extras.jacobian { &mut out.jacobian[block.clone()] } else { &mut [] });
             let precise = Scatter::new(if double { &mut out.log_stretch_f64[block.clone()] } else { &mut [] });
-            // Enough chunks that no thread waits long for the last one.
+            // Several chunks per thread, so that no thread waits long for the last one.
             let chunk = (seeds.len() / (8 * threads)).next_multiple_of(L::LANES).clamp(L::LANES, CHUNK);
             (0..seeds.len().div_ceil(chunk)).into_par_iter().for_each(|c| {
                 let mut points = [[0.0f32; 3]; MAX_LANES];
@@ -249,27 +243,27 @@ where
                         indices[lane] = order.as_ref().map_or(from + lane, |order| order[from + lane] as usize);
                         points[lane] = seeds[indices[lane]];
                     }
-                    let paths = self.kernel.paths(&self.field, &points[..count]);
+                    let batch = self.kernel.trace_batch(&self.field, &points[..count]);
                     for lane in 0..count {
-                        let (index, (s, share)) = (indices[lane], self.verdict(&paths, lane));
-                        // SAFETY: `order` is a permutation of the block's indices, so that each is written by one thread only, and
-                        // every array that is there has one element a seed of the block.
+                        let (index, (s, share)) = (indices[lane], self.normalised_stretch(&batch, lane));
+                        // SAFETY: `order` is a permutation of the block's indices, so that each element is written by one thread only,
+                        // and every array has one element per seed of the block.
                         unsafe {
                             if let Some(array) = &stretch {
-                                array.put(index, s as f32);
+                                array.write(index, s as f32);
                             }
                             if let Some(array) = &lived {
-                                array.put(index, share as f32);
+                                array.write(index, share as f32);
                             }
                             if let Some(array) = &precise {
-                                array.put(index, s);
+                                array.write(index, s);
                             }
                             if let Some(array) = &arrival {
-                                let state = paths.state.map(|x| x.lane(lane).to_f64());
-                                array.put(index, self.field.arrival(&state, points[lane]));
+                                let state = batch.state.map(|x| x.lane(lane).to_f64());
+                                array.write(index, self.field.arrival_point(&state, points[lane]));
                             }
                             if let Some(array) = &jacobian {
-                                array.put(index, self.jacobian(&paths, lane, points[lane]));
+                                array.write(index, self.jacobian(&batch, lane, points[lane]));
                             }
                         }
                     }

@@ -1,13 +1,14 @@
-//! How far two pictures are apart: PSNR and SSIM as they are seen, relative error in linear HDR.
+//! Differences of two pictures: PSNR and SSIM of the tone-mapped colours, relative error in linear HDR.
 
-use super::{PublishError, read_exr};
+use super::error::PublishError;
+use super::exr::read_exr;
 use crate::render::Film;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::path::Path;
 use thiserror::Error;
 
-/// Added to the squared reference in the relative error, so that black pixels do not rule it.
+/// Added to the squared reference in the relative error, so that black pixels do not dominate it.
 const RELATIVE_EPSILON: f64 = 0.01;
 /// Edge of the SSIM window, in pixels, and the deviation of its Gaussian weights (Wang, Bovik, Sheikh, Simoncelli 2004).
 const SSIM_WINDOW: usize = 11;
@@ -27,26 +28,26 @@ pub enum CompareError {
         /// Width and height of the second.
         b: [usize; 2],
     },
-    /// There is nothing in them.
+    /// They have no pixels.
     #[error("the pictures have no pixels")]
     Empty,
 }
 
-/// How far a picture is from its reference.
+/// Difference of a picture from its reference.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Comparison {
     /// Pixels across.
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Peak signal-to-noise ratio of the tone-mapped 8-bit colours, in dB (peak 255); none when they are identical.
+    /// Peak signal-to-noise ratio of the tone-mapped 8-bit colours, in dB (peak 255). `None` if they are identical.
     pub psnr: Option<f64>,
     /// Structural similarity of the tone-mapped luma (Wang et al. 2004: Gaussian window 11x11, deviation 1.5, mean over whole
-    /// windows); none when the picture is smaller than the window.
+    /// windows). `None` if the picture is smaller than the window.
     pub ssim: Option<f64>,
-    /// Mean of (a - b)^2 / (b^2 + 0.01) over the linear colours, b being the reference; none when no pixel is finite.
+    /// Mean of (a - b)^2 / (b^2 + 0.01) over the linear colours, b being the reference. `None` if no pixel is finite.
     pub relative_mse: Option<f64>,
-    /// Largest |a - b| of the linear colours; none when no pixel is finite.
+    /// Largest |a - b| of the linear colours. `None` if no pixel is finite.
     pub max_abs_difference: Option<f64>,
     /// Pixels left out of the two linear figures because a colour is not finite in one of the pictures.
     pub not_finite: usize,
@@ -74,11 +75,17 @@ impl fmt::Display for Comparison {
 }
 
 /// Compares two EXR files; `b` is the reference. `tone_map` is `[contrast, brightness, gamma]`.
+///
+/// # Errors
+/// A file that cannot be read, or pictures of different sizes or without pixels.
 pub fn compare_files(a: &Path, b: &Path, tone_map: [f64; 3]) -> Result<Comparison, CompareError> {
     compare_films(&read_exr(a)?, &read_exr(b)?, tone_map)
 }
 
 /// Compares two films; `b` is the reference. `tone_map` is `[contrast, brightness, gamma]`.
+///
+/// # Errors
+/// Films of different sizes or without pixels.
 pub fn compare_films(a: &Film, b: &Film, tone_map: [f64; 3]) -> Result<Comparison, CompareError> {
     let (width, height) = (a.width, a.height);
     if (width, height) != (b.width, b.height) || a.rgba.len() != b.rgba.len() {
@@ -120,8 +127,8 @@ fn luma(rgb: &[u8]) -> Vec<f64> {
 
 /// Mean structural similarity (Wang et al. 2004, equation 13, K1 = 0.01, K2 = 0.03, L = 255) over all windows inside the picture.
 ///
-/// Written out here because the `image-compare` crate (0.5) weights all pixels of disjoint 8x8 blocks alike and sums the covariances
-/// without dividing by their number: its figure is not the one that the literature states.
+/// Not taken from the `image-compare` crate (0.5), which weights all pixels of disjoint 8x8 blocks equally and does not divide the sum of
+/// covariances by their number.
 fn ssim(a: &[f64], b: &[f64], width: usize, height: usize) -> Option<f64> {
     if width < SSIM_WINDOW || height < SSIM_WINDOW {
         return None;
@@ -141,7 +148,7 @@ fn ssim(a: &[f64], b: &[f64], width: usize, height: usize) -> Option<f64> {
     Some(sum / mean_a.len() as f64)
 }
 
-/// Gaussian window means, one a whole window inside the picture.
+/// Gaussian means, one for each window inside the picture.
 fn gaussian(values: &[f64], width: usize, height: usize) -> Vec<f64> {
     let centre = (SSIM_WINDOW / 2) as f64;
     let mut weights: [f64; SSIM_WINDOW] = std::array::from_fn(|k| (-0.5 * ((k as f64 - centre) / SSIM_DEVIATION).powi(2)).exp());
@@ -159,7 +166,7 @@ fn gaussian(values: &[f64], width: usize, height: usize) -> Vec<f64> {
 mod tests {
     use super::*;
 
-    /// A tone map that shows linear values as they are.
+    /// The identity.
     const PLAIN: [f64; 3] = [1.0, 0.5, 1.0];
 
     fn film(width: usize, height: usize, colour: impl Fn(usize, usize) -> [f32; 3]) -> Film {

@@ -1,18 +1,24 @@
-//! The film as OpenEXR and back: one part, channels R, G, B, A and the layers `ftle.mean`, `trust.traced`, `variance`, `samples.count`, `missing.share`, `queries.count`,
-//! all f32, sorted by name, ZIP-compressed without loss.
+//! Films as OpenEXR: one part with the channels R, G, B, A and [`LAYERS`], all f32, sorted by name, ZIP compression (lossless).
 
-use super::{PublishError, run_folder::write_whole};
-use crate::{engine::FrameRecord, render::Film};
+use super::error::PublishError;
+use crate::files::write_whole;
+use crate::{render::Film, run::FrameRecord};
 use exr::meta::MetaData;
 use exr::prelude::*;
 use std::io::{Cursor, Read};
 use std::path::Path;
 
-/// Largest picture that is read: samples of all channels. A damaged header must not ask for all memory.
-const MOST_SAMPLES: usize = 1 << 30;
+/// Layers of a film beside its colours.
+const LAYERS: [&str; 6] = ["ftle.mean", "trust.traced", "variance", "samples.count", "missing.share", "queries.count"];
 
-/// The film as an EXR file in memory. The record goes into the attributes `ridgewatch.frame`, `ridgewatch.time` and
-/// `ridgewatch.record` (JSON). A layer that the film lacks (no entries) is left out; one of the wrong length is an error in words.
+/// Maximum number of samples of all channels of a file that is read, so that a damaged header cannot ask for all memory.
+const MAX_SAMPLES: usize = 1 << 30;
+
+/// Encodes the film as an EXR file. The record goes into the attributes `ridgewatch.frame`, `ridgewatch.time` and `ridgewatch.record` (JSON).
+/// Layers without entries are left out.
+///
+/// # Errors
+/// A film without pixels, or a layer of another length.
 pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Result<Vec<u8>, String> {
     let pixels = film.width * film.height;
     if pixels == 0 || film.rgba.len() != pixels {
@@ -20,15 +26,8 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     }
     let colour = |k: usize| film.rgba.iter().map(|p| p[k]).collect::<Vec<f32>>();
     let mut channels = vec![("R", colour(0)), ("G", colour(1)), ("B", colour(2)), ("A", colour(3))];
-    let layers = [
-        ("ftle.mean", &film.ftle_mean),
-        ("trust.traced", &film.traced),
-        ("variance", &film.variance),
-        ("samples.count", &film.samples),
-        ("missing.share", &film.missing),
-        ("queries.count", &film.queries),
-    ];
-    for (name, layer) in layers {
+    let layers = [&film.ftle_mean, &film.traced, &film.variance, &film.samples, &film.missing, &film.queries];
+    for (name, layer) in LAYERS.into_iter().zip(layers) {
         match layer.len() {
             0 => {}
             n if n == pixels => channels.push((name, layer.clone())),
@@ -55,31 +54,40 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     Ok(bytes.into_inner())
 }
 
-/// Writes the film; nothing half-written appears under `path`.
+/// Writes the film. An unfinished file never has the name `path`.
+///
+/// # Errors
+/// As [`encode_exr`], and errors of the system.
 pub fn write_exr(path: &Path, film: &Film, record: Option<&FrameRecord>) -> std::result::Result<(), PublishError> {
-    let problem = |problem: String| PublishError::Exr { path: path.to_owned(), problem };
+    let problem = |problem: String| PublishError::File { path: path.to_owned(), problem };
     let bytes = encode_exr(film, record).map_err(problem)?;
     write_whole(path, &bytes).map_err(|e| problem(e.to_string()))
 }
 
-/// Reads an EXR into a film: the first part that has R, G and B. Alpha is 1 where there is none; layers that the file lacks
-/// stay empty, and channels of other names are ignored.
+/// Reads the first part with R, G and B of an EXR file. Alpha is 1 if the file has none, missing layers stay empty, other channels are
+/// ignored.
+///
+/// # Errors
+/// A file that cannot be read or decoded, or has no colours.
 pub fn read_exr(path: &Path) -> std::result::Result<Film, PublishError> {
-    let problem = |problem: String| PublishError::Exr { path: path.to_owned(), problem };
+    let problem = |problem: String| PublishError::File { path: path.to_owned(), problem };
     let unreadable = |e: std::io::Error| problem(format!("cannot be read: {e}"));
     let mut bytes = Vec::new();
     crate::files::open(path).and_then(|mut file| file.read_to_end(&mut bytes)).map_err(unreadable)?;
     decode_exr(&bytes).map_err(problem)
 }
 
-/// Reads an EXR file in memory; see [`read_exr`].
+/// Decodes an EXR file; see [`read_exr`].
+///
+/// # Errors
+/// A file that cannot be decoded, or has no colours.
 pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
     let damaged = |e: exr::error::Error| format!("not a readable EXR file: {e}");
     let meta = MetaData::read_from_buffered(Cursor::new(bytes), false).map_err(damaged)?;
     for header in &meta.headers {
         let samples = header.layer_size.area().saturating_mul(header.channels.list.len());
-        if samples > MOST_SAMPLES {
-            return Err(format!("its header claims {samples} samples; at most {MOST_SAMPLES} are accepted"));
+        if samples > MAX_SAMPLES {
+            return Err(format!("its header claims {samples} samples; at most {MAX_SAMPLES} are accepted"));
         }
     }
     let image = read()
@@ -104,18 +112,10 @@ pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
         if values.len() == pixels { Ok(values) } else { Err(format!("channel {name} is subsampled; one value a pixel is accepted")) }
     };
     let (red, green, blue, alpha) = (full("R")?, full("G")?, full("B")?, full("A")?);
-    let layer_of = |name: &str| values(name).filter(|v| v.len() == pixels).unwrap_or_default();
-    Ok(Film {
-        width,
-        height,
-        rgba: (0..pixels).map(|i| [red[i], green[i], blue[i], alpha[i]]).collect(),
-        ftle_mean: layer_of("ftle.mean"),
-        traced: layer_of("trust.traced"),
-        variance: layer_of("variance"),
-        samples: layer_of("samples.count"),
-        missing: layer_of("missing.share"),
-        queries: layer_of("queries.count"),
-    })
+    let [ftle_mean, traced, variance, samples, missing, queries] =
+        LAYERS.map(|name| values(name).filter(|v| v.len() == pixels).unwrap_or_default());
+    let rgba = (0..pixels).map(|i| [red[i], green[i], blue[i], alpha[i]]).collect();
+    Ok(Film { width, height, rgba, ftle_mean, traced, variance, samples, missing, queries })
 }
 
 type Part = Layer<AnyChannels<FlatSamples>>;
@@ -163,7 +163,7 @@ mod tests {
         write_exr(&path, &film, Some(&FrameRecord { frame: 3, time: 1.5, ..Default::default() })).unwrap();
         let back = read_exr(&path).unwrap();
         assert_eq!((back.width, back.height, &back.rgba), (7, 3, &film.rgba));
-        // Through the bits, since NaN marks pixels without a collision.
+        // Compares bits, since NaN marks pixels without a collision.
         assert_eq!(bits(&back.ftle_mean), bits(&film.ftle_mean));
         assert_eq!((&back.traced, &back.variance, &back.samples), (&film.traced, &film.variance, &film.samples));
         assert_eq!((&back.missing, &back.queries), (&film.missing, &film.queries));

@@ -1,31 +1,34 @@
-//! The thread that writes the run folder, behind a short queue.
+//! Thread that writes the run folder, with a short queue.
 
-use super::{ExrFrames, FileStatistics, PublishError, PublishSettings, RunFolder, WhenFull};
-use crate::engine::{Frame, FrameRecord};
+use super::error::PublishError;
+use super::run_folder::RunFolder;
+use super::settings::{ExrFrames, PublishSettings, WhenDiskSlow};
+use super::summary::FileStatistics;
+use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// Frames with pictures that may wait for the disk.
-const PICTURES_WAITING: usize = 4;
-/// Records that may wait for it.
-const RECORDS_WAITING: usize = 1024;
-/// Longest that the cycle waits for a place in the queue, and the end of the run for the last frame: a disk that hangs longer loses.
+/// Maximum number of queued frames with pictures.
+const MAX_PICTURES: usize = 4;
+/// Maximum number of queued records.
+const MAX_RECORDS: usize = 1024;
+/// Longest wait for a place in the queue, and at the end of the run for the last frame.
 const DISK_LIMIT: Duration = Duration::from_secs(60);
 
-/// Writes frames behind the cycle's back.
+/// Writes frames asynchronously.
 #[derive(Debug)]
 pub(super) struct FileWriter {
     shared: Arc<Shared>,
-    /// None once finished.
+    /// `None` once finished.
     thread: Option<JoinHandle<RunFolder>>,
-    when_full: WhenFull,
+    when_disk_slow: WhenDiskSlow,
     limit: Duration,
 }
 
 impl Drop for FileWriter {
-    /// Left without [`FileWriter::finish`], after an error elsewhere: the thread writes what waits and ends; nobody waits for it.
+    /// Without [`FileWriter::finish`], after an error elsewhere, the thread empties the queue and ends by itself.
     fn drop(&mut self) {
         self.shared.lock().closed = true;
         self.shared.changed.notify_all();
@@ -43,7 +46,7 @@ struct State {
     queue: VecDeque<Job>,
     /// Frames with pictures in `queue`.
     pictures: usize,
-    /// A job is being written.
+    /// Whether a job is being written.
     busy: bool,
     closed: bool,
     statistics: FileStatistics,
@@ -69,27 +72,27 @@ impl FileWriter {
 
     fn start_with_limit(folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
         let shared = Arc::new(Shared::default());
-        let (theirs, when_full) = (Arc::clone(&shared), settings.when_full.unwrap_or(WhenFull::Wait));
+        let (theirs, when_disk_slow) = (Arc::clone(&shared), settings.when_disk_slow.unwrap_or(WhenDiskSlow::Wait));
         let name = "ridgewatch-files";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
             .spawn(move || write_all(&theirs, folder, &settings))
             .map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { shared, thread: Some(thread), when_full, limit })
+        Ok(Self { shared, thread: Some(thread), when_disk_slow, limit })
     }
 
-    /// Hands a frame over. With [`WhenFull::Wait`] it waits for a place in the queue, a minute at most.
+    /// Queues a frame. With [`WhenDiskSlow::Wait`] it waits for a place in the queue, a minute at most.
     pub(super) fn frame(&self, frame: Frame) {
         let mut state = self.shared.lock();
-        if self.when_full == WhenFull::Wait {
-            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.pictures >= PICTURES_WAITING);
+        if self.when_disk_slow == WhenDiskSlow::Wait {
+            let waited = self.shared.changed.wait_timeout_while(state, self.limit, |s| s.pictures >= MAX_PICTURES);
             state = waited.unwrap_or_else(PoisonError::into_inner).0;
         }
-        if state.pictures >= PICTURES_WAITING {
-            state.drop_oldest_pictures(self.when_full);
+        if state.pictures >= MAX_PICTURES {
+            state.drop_oldest_pictures(self.when_disk_slow);
         }
-        if state.queue.len() >= RECORDS_WAITING {
-            // Only records wait in front, since their pictures were dropped long before.
+        if state.queue.len() >= MAX_RECORDS {
+            // The first jobs are records, since their pictures were dropped before.
             state.queue.pop_front();
             state.statistics.records_lost += 1;
         }
@@ -98,7 +101,7 @@ impl FileWriter {
         self.shared.changed.notify_all();
     }
 
-    /// Waits for the last frame, a minute at most, and says what happened. The folder comes back unless the disk hangs.
+    /// Waits for the last frame, a minute at most. Returns the folder, unless the disk hangs, and the counts.
     pub(super) fn finish(mut self) -> (Option<RunFolder>, FileStatistics) {
         let deadline = Instant::now() + self.limit;
         let mut state = self.shared.lock();
@@ -123,15 +126,14 @@ impl FileWriter {
 }
 
 impl State {
-    fn drop_oldest_pictures(&mut self, when_full: WhenFull) {
+    fn drop_oldest_pictures(&mut self, when_disk_slow: WhenDiskSlow) {
         let oldest = self.queue.iter_mut().find(|job| matches!(job, Job::Whole(_)));
         if let Some(job) = oldest {
             if let Job::Whole(frame) = job {
                 *job = Job::Record(Arc::clone(&frame.record));
             }
             self.pictures -= 1;
-            if when_full == WhenFull::Wait {
-                // It was to be waited for, and was, for as long as may be.
+            if when_disk_slow == WhenDiskSlow::Wait {
                 self.statistics.pictures_failed += 1;
                 return;
             }
@@ -144,7 +146,7 @@ impl State {
 }
 
 fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings) -> RunFolder {
-    // A series of refusals is announced once.
+    // Only the first error of a series is reported.
     let mut refused = false;
     loop {
         let mut state = shared.lock();
@@ -179,19 +181,13 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
 
         let mut state = shared.lock();
         let statistics = &mut state.statistics;
-        let mut trouble = None;
-        match appended {
-            Ok(()) => statistics.records_written += 1,
-            Err(error) => {
-                statistics.records_lost += 1;
-                trouble = Some(error);
-            }
-        }
-        // Whether the record could be written then or not.
+        statistics.records_written += u64::from(appended.is_ok());
+        statistics.records_lost += u64::from(appended.is_err());
+        let mut trouble = appended.err();
         let removed = folder.records_removed();
         if removed > 0 && statistics.records_removed == 0 {
             tracing::warn!(
-                "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts what goes so",
+                "{}: the oldest {removed} records are removed, to stay within `publish.records_bytes`; the summary counts them",
                 folder.path().display()
             );
         }
@@ -213,19 +209,15 @@ fn write_all(shared: &Shared, mut folder: RunFolder, settings: &PublishSettings)
             statistics.refused.get_or_insert_with(|| error.to_string());
         }
         drop(state);
-        match trouble {
+        let path = folder.path().display();
+        match &trouble {
             Some(error) if !refused => {
-                refused = true;
-                let path = folder.path().display();
-                tracing::warn!("{path}: frame {} could not be written: {error}; the run goes on and counts such frames", record.frame);
+                tracing::warn!("{path}: frame {} could not be written: {error}; the run continues and counts such frames", record.frame);
             }
-            Some(_) => {}
-            None if refused => {
-                refused = false;
-                tracing::info!("{}: frames are written again from {} on", folder.path().display(), record.frame);
-            }
-            None => {}
+            None if refused => tracing::info!("{path}: frames are written again from {} on", record.frame),
+            _ => {}
         }
+        refused = trouble.is_some();
     }
 }
 
@@ -245,11 +237,11 @@ mod tests {
         text.lines().map(|l| serde_json::from_str::<FrameRecord>(l).unwrap().frame).collect()
     }
 
-    fn run(when_full: WhenFull, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
+    fn run(when_disk_slow: WhenDiskSlow, frames: u64, edge: usize) -> (FileStatistics, Vec<u64>) {
         let folder = tempfile::tempdir().unwrap();
-        let settings = PublishSettings { when_full: Some(when_full), ..Default::default() };
+        let settings = PublishSettings { when_disk_slow: Some(when_disk_slow), ..Default::default() };
         let writer = FileWriter::start(RunFolder::create(folder.path(), false).unwrap(), settings).unwrap();
-        // One picture for all, so that frames come at once.
+        // All frames share one film, so that they come at once.
         let film = frame(0, edge).film;
         for n in 0..frames {
             writer.frame(Frame { film: film.clone(), ..frame(n, 1) });
@@ -260,7 +252,7 @@ mod tests {
 
     #[test]
     fn waiting_loses_nothing() {
-        let (statistics, records) = run(WhenFull::Wait, 40, 64);
+        let (statistics, records) = run(WhenDiskSlow::Wait, 40, 64);
         assert_eq!((statistics.pictures_written, statistics.records_written), (40, 40));
         assert_eq!(records, (0..40).collect::<Vec<u64>>());
     }
@@ -282,7 +274,7 @@ mod tests {
     #[test]
     fn dropping_loses_pictures_but_no_record() {
         // Frames of a megapixel come far faster than they can be compressed.
-        let (statistics, records) = run(WhenFull::Drop, 30, 1024);
+        let (statistics, records) = run(WhenDiskSlow::Drop, 30, 1024);
         assert!(statistics.pictures_dropped >= 20, "{statistics:?}");
         assert_eq!(statistics.pictures_written + statistics.pictures_dropped, 30);
         assert_eq!(records, (0..30).collect::<Vec<u64>>(), "every record, in order");
@@ -317,7 +309,7 @@ mod tests {
         let limit = Duration::from_millis(200);
         let run = RunFolder::create(folder.path(), false).unwrap();
         let writer = FileWriter::start_with_limit(run, PublishSettings::default(), limit).unwrap();
-        // Opening a pipe that nobody reads hangs like a disk that went away.
+        // Opening a pipe without a reader hangs like a lost disk.
         let pipe = folder.path().join("frames/.frame_000000.exr.part");
         assert!(std::process::Command::new("mkfifo").arg(pipe).status().unwrap().success());
         for n in 0..2 {

@@ -1,10 +1,12 @@
-//! The door in front of the ZeroMQ socket: what subscribers send is looked at before the `zeromq` crate has it.
+//! Proxy in front of the ZeroMQ socket, which checks the bytes of subscribers before the `zeromq` crate reads them.
 //!
-//! The crate takes memory for any length that a peer announces, and its PUB socket reads subscriptions from everybody: nine bytes of a stranger could end
-//! the run. So the socket itself listens where nobody else can reach it, connections over TCP end here, and a peer's bytes are handed on only as far as they
-//! are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). Who announces more, or does not subscribe in time, is cut off, and nobody else
-//! notices. What the socket sends passes as it is. Who subscribes may stay, so that places are shared out by user on this machine, and by address else: where
-//! none is left, whoever has most of them gives up one, of those that have not subscribed yet if there are any, and of those the oldest.
+//! The crate allocates any length that a peer announces, and its PUB socket reads subscriptions from every peer: nine bytes of a stranger could
+//! end the run. Therefore the socket listens on a private Unix socket, and the proxy accepts the TCP connections. It passes a peer's bytes on
+//! only if they are a greeting and short frames of ZMTP 3 (rfc.zeromq.org/spec/23). A peer that announces more, or does not subscribe in time,
+//! is disconnected without affecting others. Bytes of the socket pass unchanged.
+//!
+//! The number of connections is limited. If all are taken, the owner with the most connections loses one, preferably one that has not
+//! subscribed yet, preferably the oldest. Owners are the users of this machine and the addresses of other machines.
 
 use std::fmt::{Display, Formatter};
 use std::fs::{File, OpenOptions};
@@ -21,26 +23,26 @@ use tokio::io::{AsyncBufReadExt, AsyncRead, AsyncReadExt, AsyncWrite, AsyncWrite
 use tokio::net::{TcpListener, TcpStream, UnixStream};
 use tokio::task::AbortHandle;
 
-/// Connections at once.
-const CONNECTIONS: usize = 256;
-/// Longest frame of a peer: names of topics and a few properties.
-const FRAME_BYTES: u64 = 1 << 16;
-/// Most bytes of messages (subscriptions) that one peer may send: the socket keeps them.
-const MESSAGE_BYTES: u64 = 1 << 20;
-/// Bytes of a greeting.
+/// Maximum number of connections.
+const MAX_CONNECTIONS: usize = 256;
+/// Maximum length of a frame from a peer, which holds a topic or a few properties.
+const MAX_FRAME_BYTES: u64 = 1 << 16;
+/// Maximum number of bytes of messages (subscriptions) from one peer, since the socket keeps them.
+const MAX_MESSAGE_BYTES: u64 = 1 << 20;
+/// Length of a greeting, in bytes.
 const GREETING: usize = 64;
-/// How long a peer may take until it has subscribed to something.
-const PATIENCE: Duration = Duration::from_secs(5);
-/// How many bytes of the socket are passed on at once.
-const PIECE: usize = 1 << 18;
+/// Time in which a peer must subscribe.
+const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Buffer of bytes from the socket.
+const BUFFER_BYTES: usize = 1 << 18;
 /// Bits of a frame's first byte.
 const MORE: u8 = 1;
 const LONG: u8 = 2;
 const COMMAND: u8 = 4;
-/// First byte of a message that subscribes (of ZMTP 3.0, which the socket speaks with all).
+/// First byte of a subscription in ZMTP 3.0, the version that the socket speaks.
 const SUBSCRIBE: u8 = 1;
 
-/// A listener that nobody else can reach, and its place. The folder in which it was made is gone, so that nothing stays behind however this process ends.
+/// Opens a listener that no other process can reach, with a handle of its place. Its folder is removed at once, so that no file remains.
 pub(super) fn private_listener() -> Result<(UnixListener, File)> {
     let folder = tempfile::Builder::new().prefix("ridgewatch-").tempdir()?;
     let path = folder.path().join("socket");
@@ -49,12 +51,12 @@ pub(super) fn private_listener() -> Result<(UnixListener, File)> {
     Ok((listener, place))
 }
 
-/// Whom a connection counts against.
+/// Owner of a connection, for the shares of connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Owner {
-    /// A user of this machine, by whichever of its addresses: each may take any of 127.0.0.0/8.
+    /// A user of this machine, whatever the address: a user may take any address of 127.0.0.0/8.
     User(u32),
-    /// Another machine; for users of this one that are not known, one address in place of all that are its own.
+    /// Another machine. Unknown users of this machine share one address.
     Address(IpAddr),
 }
 
@@ -75,47 +77,47 @@ impl Display for Owner {
     }
 }
 
-/// One connection.
-struct Guest {
+/// An accepted connection.
+struct Connection {
     owner: Owner,
     has_subscribed: Arc<AtomicBool>,
-    connection: AbortHandle,
+    task: AbortHandle,
 }
 
-/// Lets subscribers in, until it is dropped. The socket listens at `place`.
+/// Accepts connections until it is dropped, and passes them on to the socket at `place`.
 pub(super) async fn guard(listener: TcpListener, place: File) {
     let socket = PathBuf::from(format!("/proc/self/fd/{}", place.as_raw_fd()));
-    let mut guests: Vec<Guest> = Vec::new();
+    let mut connections: Vec<Connection> = Vec::new();
     loop {
         let Ok((stream, peer)) = listener.accept().await else {
-            // A peer that went before it was taken, or no descriptor left: later ones may fare better.
+            // The peer closed the connection, or no file descriptor is free. Later connections may succeed.
             tokio::time::sleep(Duration::from_millis(100)).await;
             continue;
         };
         let user = match stream.local_addr() {
-            // The system's table of connections may be long, and frames do not wait for it.
+            // The system's table of connections may be long; frames must not wait for it.
             Ok(here) => tokio::task::spawn_blocking(move || user_of(peer, here)).await.unwrap_or_default(),
             Err(_) => None,
         };
-        guests.retain(|guest| !guest.connection.is_finished());
-        if guests.len() >= CONNECTIONS {
-            let there: Vec<_> = guests.iter().map(|guest| (guest.owner, guest.has_subscribed.load(Ordering::Relaxed))).collect();
-            let Guest { owner, connection, .. } = guests.remove(displaced(&there));
-            tracing::debug!("a connection of {owner} is cut off: {CONNECTIONS} are there, and nobody has more of them");
-            connection.abort();
+        connections.retain(|connection| !connection.task.is_finished());
+        if connections.len() >= MAX_CONNECTIONS {
+            let present: Vec<_> = connections.iter().map(|one| (one.owner, one.has_subscribed.load(Ordering::Relaxed))).collect();
+            let Connection { owner, task, .. } = connections.remove(displaced(&present));
+            tracing::debug!("a connection of {owner} is closed: there are {MAX_CONNECTIONS}, and no owner has more");
+            task.abort();
         }
         let (socket, has_subscribed) = (socket.clone(), Arc::new(AtomicBool::new(false)));
         let subscribes = has_subscribed.clone();
-        let connection = tokio::spawn(async move {
-            if let Err(error) = connection(stream, &socket, &subscribes).await {
-                tracing::debug!("{peer} is cut off: {error}");
+        let task = tokio::spawn(async move {
+            if let Err(error) = serve(stream, &socket, &subscribes).await {
+                tracing::debug!("{peer} is disconnected: {error}");
             }
         });
-        guests.push(Guest { owner: Owner::of(peer.ip(), user), has_subscribed, connection: connection.abort_handle() });
+        connections.push(Connection { owner: Owner::of(peer.ip(), user), has_subscribed, task: task.abort_handle() });
     }
 }
 
-/// The user whose process of this machine holds the other end of a connection; none: it is of another machine, or not known.
+/// User whose process holds the other end of a connection. `None` if it is on another machine or not known.
 fn user_of(peer: SocketAddr, here: SocketAddr) -> Option<u32> {
     let plain = |address: SocketAddr| SocketAddr::new(address.ip().to_canonical(), address.port());
     let (peer, here) = (plain(peer), plain(here));
@@ -126,30 +128,29 @@ fn user_of(peer: SocketAddr, here: SocketAddr) -> Option<u32> {
     tables.flatten().find(|one| plain(one.local_address) == peer && plain(one.remote_address) == here).map(|one| one.uid)
 }
 
-/// Who goes, of guests as they came, each with whether it has subscribed: one of the owner with most places, rather one that has not, rather the
-/// first.
-fn displaced(guests: &[(Owner, bool)]) -> usize {
-    let places = |owner: Owner| guests.iter().filter(|(one, _)| *one == owner).count();
-    let weight = |(owner, has_subscribed): &(Owner, bool)| (places(*owner), !has_subscribed);
-    let most = guests.iter().map(weight).max();
-    guests.iter().position(|guest| Some(weight(guest)) == most).unwrap_or_default()
+/// Index of the connection to close. `connections` has the owner of each, oldest first, and whether it has subscribed.
+fn displaced(connections: &[(Owner, bool)]) -> usize {
+    let count = |owner: Owner| connections.iter().filter(|(one, _)| *one == owner).count();
+    let weight = |(owner, has_subscribed): &(Owner, bool)| (count(*owner), !has_subscribed);
+    let most = connections.iter().map(weight).max();
+    connections.iter().position(|connection| Some(weight(connection)) == most).unwrap_or_default()
 }
 
-/// One subscriber, until either side ends it.
-async fn connection(mut outside: TcpStream, socket: &Path, has_subscribed: &AtomicBool) -> Result<()> {
+/// Serves one subscriber until either side closes the connection.
+async fn serve(mut outside: TcpStream, socket: &Path, has_subscribed: &AtomicBool) -> Result<()> {
     outside.set_nodelay(true)?;
     let mut inside = UnixStream::connect(socket).await?;
     let ((from_peer, mut to_peer), (from_socket, to_socket)) = (outside.split(), inside.split());
-    let mut from_socket = BufReader::with_capacity(PIECE, from_socket);
+    let mut from_socket = BufReader::with_capacity(BUFFER_BYTES, from_socket);
     tokio::select! {
         done = pass(from_peer, to_socket, has_subscribed) => done,
         done = tokio::io::copy_buf(&mut from_socket, &mut to_peer) => done.map(|_| ()),
     }
 }
 
-/// Hands on what a peer sends, as long as it is what a subscriber may send.
+/// Passes on the bytes of a peer as long as a subscriber may send them.
 async fn pass(from: impl AsyncRead + Unpin, to: impl AsyncWrite + Unpin, has_subscribed: &AtomicBool) -> Result<()> {
-    let mut frames = Frames { from: BufReader::new(from), to, left: MESSAGE_BYTES, body: Vec::new() };
+    let mut frames = Frames { from: BufReader::new(from), to, left: MAX_MESSAGE_BYTES, body: Vec::new() };
     let handshake = async {
         frames.greeting().await?;
         while let Some(subscribes) = frames.next().await? {
@@ -159,18 +160,18 @@ async fn pass(from: impl AsyncRead + Unpin, to: impl AsyncWrite + Unpin, has_sub
         }
         Result::Ok(false)
     };
-    if tokio::time::timeout(PATIENCE, handshake).await?? {
+    if tokio::time::timeout(SUBSCRIBE_TIMEOUT, handshake).await?? {
         has_subscribed.store(true, Ordering::Relaxed);
         while frames.next().await?.is_some() {}
     }
     Ok(())
 }
 
-/// What a peer sends, on its way to the socket.
+/// Stream of frames from a peer to the socket.
 struct Frames<R, W> {
     from: BufReader<R>,
     to: W,
-    /// Bytes of messages that it may still send.
+    /// Number of message bytes that the peer may still send.
     left: u64,
     body: Vec<u8>,
 }
@@ -180,12 +181,12 @@ impl<R: AsyncRead + Unpin, W: AsyncWrite + Unpin> Frames<R, W> {
         let mut greeting = [0; GREETING];
         self.from.read_exact(&mut greeting).await?;
         if greeting[0] != 0xff || greeting[9] != 0x7f || greeting[10] < 3 {
-            return refuse("no greeting of ZMTP 3");
+            return refuse("not a greeting of ZMTP 3");
         }
         self.to.write_all(&greeting).await
     }
 
-    /// Hands the next frame on; whether it subscribes to something. None: the peer has ended.
+    /// Passes the next frame on. Returns whether it is a subscription; `None` at the end of the stream.
     async fn next(&mut self) -> Result<Option<bool>> {
         let Self { from, to, left, body } = self;
         if from.fill_buf().await?.is_empty() {
@@ -193,15 +194,15 @@ impl<R: AsyncRead + Unpin, W: AsyncWrite + Unpin> Frames<R, W> {
         }
         let flags = from.read_u8().await?;
         if flags & !(MORE | LONG | COMMAND) != 0 || flags & COMMAND != 0 && flags & MORE != 0 {
-            return refuse("no frame of ZMTP 3");
+            return refuse("not a frame of ZMTP 3");
         }
         let length = if flags & LONG != 0 { from.read_u64().await? } else { from.read_u8().await?.into() };
-        if length > FRAME_BYTES {
+        if length > MAX_FRAME_BYTES {
             return refuse("a frame longer than any subscription");
         }
         if flags & COMMAND == 0 {
-            // With a head that a short frame has, so that empty ones count too.
-            let Some(rest) = left.checked_sub(length + 2) else { return refuse("more subscriptions than are kept") };
+            // Includes the header of a short frame, so that empty frames count too.
+            let Some(rest) = left.checked_sub(length + 2) else { return refuse("more subscriptions than the limit") };
             *left = rest;
         }
         body.resize(length as usize, 0);
@@ -225,7 +226,7 @@ fn refuse<T>(why: &'static str) -> Result<T> {
 mod tests {
     use super::*;
 
-    /// What is handed on of these bytes, and why it ends.
+    /// Bytes passed on, and the result.
     fn passed(bytes: &[u8]) -> (Vec<u8>, Result<()>) {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let mut out = Vec::new();
@@ -246,7 +247,7 @@ mod tests {
     }
 
     #[test]
-    fn what_a_subscriber_sends_passes_unchanged() {
+    fn frames_of_a_subscriber_pass_unchanged() {
         let mut bytes = greeting();
         for (flags, length) in [(COMMAND, 41), (0, 6), (0, 0), (MORE, 1), (LONG, 1 << 16), (LONG | COMMAND, 300)] {
             bytes.extend(frame(flags, length, &vec![flags; length as usize]));
@@ -257,15 +258,15 @@ mod tests {
     }
 
     #[test]
-    fn what_no_subscriber_sends_ends_with_what_came_before() {
+    fn a_frame_that_no_subscriber_sends_ends_the_connection() {
         let mut ours = greeting();
         ours.extend(frame(COMMAND, 3, b"abc"));
         for (bytes, why) in [
             (frame(LONG, 1 << 50, b""), "longer"),
             (frame(LONG, (1 << 16) + 1, &[0; 100]), "longer"),
             (frame(LONG | COMMAND, u64::MAX, b""), "longer"),
-            (frame(8, 1, b"a"), "no frame"),
-            (frame(COMMAND | MORE, 1, b"a"), "no frame"),
+            (frame(8, 1, b"a"), "not a frame"),
+            (frame(COMMAND | MORE, 1, b"a"), "not a frame"),
             (frame(0, 9, b"cut"), "eof"),
         ] {
             let (out, done) = passed(&[ours.clone(), bytes].concat());
@@ -277,7 +278,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_has_most_places_gives_up_one_that_has_not_subscribed_or_the_oldest() {
+    fn the_owner_with_the_most_connections_loses_one_without_subscription_or_the_oldest() {
         // Negative: has not subscribed.
         let owner = |n: i32| (Owner::User(n.unsigned_abs()), n > 0);
         for (there, gone) in [
@@ -287,28 +288,28 @@ mod tests {
             (&[5], 0),
             (&[1, 1, -1, -1, 2], 2),
             (&[1, 2, -2, -1], 2),
-            // The newcomer of another is not driven out by somebody's many, whatever they do.
+            // Many connections of one owner do not displace a new one of another.
             (&[1, 1, 1, -2], 0),
         ] {
-            let guests: Vec<_> = there.iter().map(|n| owner(*n)).collect();
-            assert_eq!(displaced(&guests), gone, "{there:?}");
+            let connections: Vec<_> = there.iter().map(|n| owner(*n)).collect();
+            assert_eq!(displaced(&connections), gone, "{there:?}");
         }
     }
 
     #[test]
-    fn whoever_comes_from_many_addresses_of_this_machine_displaces_nobody_else() {
+    fn many_addresses_of_this_machine_displace_no_other_owner() {
         let loopback = |n: u8| IpAddr::from([127, 0, n, 7]);
         let subscriber = Owner::of(loopback(0), Some(1000));
         for stranger in [Some(1001), None] {
-            // All greet and subscribe, each from an address of its own; the last by the longer form of one.
+            // All subscribe, each from a different address; the last address has the IPv6 form.
             let mapped = std::net::Ipv4Addr::new(127, 9, 9, 9).to_ipv6_mapped();
             let addresses = (1..255).map(loopback).chain([IpAddr::from(mapped)]);
-            let guests: Vec<_> =
+            let connections: Vec<_> =
                 [(subscriber, true)].into_iter().chain(addresses.map(|address| (Owner::of(address, stranger), true))).collect();
-            assert_eq!(guests.len(), CONNECTIONS);
-            assert_eq!(displaced(&guests), 1, "{stranger:?}");
+            assert_eq!(connections.len(), MAX_CONNECTIONS);
+            assert_eq!(displaced(&connections), 1, "{stranger:?}");
         }
-        // One user is one owner wherever it comes from, and another machine is none of this one's.
+        // A user is one owner at every address; another machine is another owner.
         assert_eq!(Owner::of("192.0.2.1".parse().unwrap(), Some(1000)), subscriber);
         assert_ne!(Owner::of("192.0.2.1".parse().unwrap(), None), Owner::of(loopback(1), None));
     }
@@ -327,10 +328,10 @@ mod tests {
         assert!(subscribes([ready, frame(0, 6, b"\x01frame")].concat()) && subscribes(frame(0, 1, b"\x01")));
     }
 
-    /// The test's own process, whichever address of this machine it comes by.
+    /// For every address of this machine.
     #[test]
     fn a_peer_of_this_machine_is_known_by_its_user() {
-        // SAFETY: takes and touches nothing.
+        // SAFETY: has no arguments and cannot fail.
         let own = unsafe { libc::geteuid() };
         for address in ["127.0.0.1:0", "[::1]:0", "[::]:0"] {
             let listener = std::net::TcpListener::bind(address).unwrap();
@@ -356,10 +357,10 @@ mod tests {
     #[test]
     fn subscriptions_are_bounded() {
         let mut bytes = greeting();
-        // Empty parts of a message that never ends.
-        (0..MESSAGE_BYTES).for_each(|_| bytes.extend([MORE, 0]));
+        // Empty parts of an endless message.
+        (0..MAX_MESSAGE_BYTES).for_each(|_| bytes.extend([MORE, 0]));
         let (out, done) = passed(&bytes);
         assert!(done.unwrap_err().to_string().contains("more subscriptions"));
-        assert_eq!(out.len() as u64, GREETING as u64 + MESSAGE_BYTES);
+        assert_eq!(out.len() as u64, GREETING as u64 + MAX_MESSAGE_BYTES);
     }
 }

@@ -1,15 +1,17 @@
-//! What a published message says: topics, header, payload.
+//! Published messages: topics, header, payload.
 
-use super::{Payload, encode_exr, jpeg, png, preview};
-use crate::engine::{Frame, FrameRecord};
+use super::exr::encode_exr;
+use super::preview::{jpeg, png, raw};
+use super::settings::Payload;
+use crate::run::{Frame, FrameRecord};
 use serde::{Deserialize, Serialize};
 
 /// First part of a message with a picture.
 pub const FRAME_TOPIC: &str = "frame";
 /// First part of a message with a record alone.
 pub const RECORD_TOPIC: &str = "record";
-/// Version of the messages; grows when a client would have to change.
-pub const PROTOCOL: u32 = 2;
+/// Version of the messages; raised when a client would have to change.
+pub const PROTOCOL: u32 = 3;
 
 /// Second part of a `frame` message, as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -26,20 +28,23 @@ pub struct FrameHeader {
     pub dtype: String,
     /// Length of the payload, in bytes.
     pub payload_bytes: usize,
-    /// `[contrast, brightness, gamma]` that 8-bit pictures were mapped with, and that others should be.
+    /// `[contrast, brightness, gamma]` of 8-bit pictures, and the one to use for the others.
     pub tone_map: [f64; 3],
-    /// Everything that is known of the frame.
+    /// Record of the frame.
     pub record: FrameRecord,
 }
 
-/// The picture in the wanted form, with its header as JSON.
+/// Encodes the picture; returns its header as JSON, and the payload.
+///
+/// # Errors
+/// A film that the encoder refuses.
 pub fn encode_frame(frame: &Frame, payload: Payload) -> Result<(Vec<u8>, Vec<u8>), String> {
     let film = &frame.film;
     let (bytes, channels, dtype) = match payload {
         Payload::Jpeg => (jpeg(film, frame.tone_map).map_err(|e| e.to_string())?, 3, "uint8"),
         Payload::Png => (png(film, frame.tone_map).map_err(|e| e.to_string())?, 3, "uint8"),
         Payload::Exr => (encode_exr(film, Some(&frame.record))?, 4, "float32"),
-        Payload::Raw => (preview::raw(film), 4, "float32"),
+        Payload::Raw => (raw(film), 4, "float32"),
     };
     let header = FrameHeader {
         protocol: PROTOCOL,

@@ -1,7 +1,7 @@
-//! Frames out: ZeroMQ, EXR, PNG, records; and the comparison of pictures.
+//! Output of frames (ZeroMQ, EXR, PNG, records) and comparison of pictures.
 //!
-//! In: finished frames. Out: files and messages. Failure stays here: a slow subscriber or a full disk never stops the cycle.
-//! [`Output`] is the door that the cycle uses; docs/protocol.md describes what comes out. Calls `engine` and `render` for their types only.
+//! In: finished frames. Out: files and messages, described in docs/protocol.md. A slow subscriber or a full disk never stops the cycle, which
+//! calls [`Output`] alone. This room uses `engine` and `render` for their types only.
 
 mod compare;
 mod error;
@@ -26,6 +26,6 @@ pub use output::Output;
 pub use preview::{jpeg, png, raw, write_png};
 pub use run_folder::{RunFolder, Written};
 pub use scene::{refuse_foreign_scene, write_scene};
-pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, PublishSettings, WhenFull};
-pub use summary::{FileStatistics, Summary, Totals, peak_memory_bytes};
-pub use zmq::{PublishStatistics, Publisher};
+pub use settings::{DEFAULT_ENDPOINT, ExrFrames, Payload, PublishSettings, WhenDiskSlow};
+pub use summary::{FileStatistics, PublishStatistics, Summary, Totals, peak_memory_bytes};
+pub use zmq::Publisher;

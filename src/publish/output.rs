@@ -1,19 +1,20 @@
-//! The one door through which the cycle lets frames out.
+//! Output of all frames of a run.
 
+use super::error::PublishError;
 use super::file_writer::FileWriter;
+use super::run_folder::RunFolder;
+use super::settings::PublishSettings;
 use super::summary::{Summary, Totals, peak_memory_bytes};
-use super::{PublishError, PublishSettings, Publisher, RunFolder};
-use crate::engine::Frame;
-use std::path::{Path, PathBuf};
+use super::zmq::Publisher;
+use crate::run::Frame;
 use std::time::{Duration, Instant};
 
-/// Longest that the end of a run waits for subscribers to take the last frame.
+/// Longest wait at the end of a run for subscribers to receive the last frame.
 const LINGER: Duration = Duration::from_millis(500);
 
-/// Frames go to the run folder and to the socket, each at its own pace. Nothing that happens there reaches the cycle.
+/// Writes frames to the run folder and to the socket, each at its own pace. Errors of either never reach the cycle.
 #[derive(Debug)]
 pub struct Output {
-    folder: Option<PathBuf>,
     files: Option<FileWriter>,
     publisher: Option<Publisher>,
     totals: Totals,
@@ -22,35 +23,34 @@ pub struct Output {
 }
 
 impl Output {
-    /// Checks the settings, binds the socket (unless `settings.endpoint` is None) and takes the run folder over, which
-    /// [`RunFolder::create`] made ready. All that can be refused is refused here, before work starts.
+    /// Checks the settings, binds the socket (unless `settings.endpoint` is `None`) and starts to write to `folder`.
+    ///
+    /// # Errors
+    /// A setting that is not accepted, an endpoint that cannot be bound, or a thread that cannot be started.
     pub fn start(settings: &PublishSettings, folder: Option<RunFolder>) -> Result<Self, PublishError> {
         settings.check()?;
         let publisher = settings.endpoint.as_deref().map(|endpoint| Publisher::start(endpoint, settings)).transpose()?;
-        let path = folder.as_ref().map(|f| f.path().to_owned());
-        let files = folder.map(|folder| FileWriter::start(folder, settings.clone())).transpose()?;
-        Ok(Self { folder: path, files, publisher, totals: Totals::default(), frames: 0, started: Instant::now() })
+        let (totals, frames, started) = (Totals::default(), 0, Instant::now());
+        let mut output = Self { files: None, publisher, totals, frames, started };
+        folder.map_or(Ok(()), |folder| output.write_to(folder, settings))?;
+        Ok(output)
     }
 
-    /// Writes frames into a run folder from now on.
+    /// Starts to write frames to a run folder.
+    ///
+    /// # Errors
+    /// A thread that cannot be started.
     pub fn write_to(&mut self, folder: RunFolder, settings: &PublishSettings) -> Result<(), PublishError> {
-        self.folder = Some(folder.path().to_owned());
         self.files = Some(FileWriter::start(folder, settings.clone())?);
         Ok(())
     }
 
-    /// Where subscribers find the frames, with the port that was got.
+    /// Endpoint of the socket, with the port that was bound. `None` without a socket.
     pub fn endpoint(&self) -> Option<&str> {
         self.publisher.as_ref().map(Publisher::endpoint)
     }
 
-    /// The run folder.
-    pub fn folder(&self) -> Option<&Path> {
-        self.folder.as_deref()
-    }
-
-    /// Hands a frame over; never fails. With `when_full = "drop"` it does not wait either; with `"wait"` it waits while four frames
-    /// wait for the disk, a minute at most.
+    /// Takes a frame; never fails. With `when_disk_slow = "wait"` it waits while four frames wait for the disk, a minute at most.
     pub fn frame(&mut self, frame: Frame) {
         self.frames += 1;
         self.totals.add(&frame.record);
@@ -62,17 +62,11 @@ impl Output {
         }
     }
 
-    /// Finishes the files (a minute at most) and the socket (half a second at most), writes `summary.json` with the caller's values under
-    /// `run`, and returns the same. A summary that cannot be written is a warning.
+    /// Finishes the files (a minute at most) and the socket (half a second at most), and writes `summary.json` with the caller's values under
+    /// `run`. Returns the summary. If it cannot be written, that is a warning.
     pub fn finish(self, run: serde_json::Map<String, serde_json::Value>) -> Summary {
         let published = self.publisher.map(|publisher| publisher.finish(LINGER));
-        let (folder, files) = match self.files {
-            Some(files) => {
-                let (folder, statistics) = files.finish();
-                (folder, Some(statistics))
-            }
-            None => (None, None),
-        };
+        let (folder, files) = self.files.map(FileWriter::finish).unzip();
         let summary = Summary {
             frames: self.frames,
             totals: self.totals,
@@ -82,14 +76,14 @@ impl Output {
             peak_memory_bytes: peak_memory_bytes(),
             run,
         };
-        if let Some(mut folder) = folder {
-            // A run that ends before its first frame gives the folder back to the one that it was to replace.
-            let given_back = self.frames == 0
-                && folder.put_back().unwrap_or_else(|error| {
-                    tracing::warn!("{}: the run before cannot be put back: {error}", folder.path().display());
+        if let Some(mut folder) = folder.flatten() {
+            // A run without a frame does not replace the previous one.
+            let restored = self.frames == 0
+                && folder.restore_previous().unwrap_or_else(|error| {
+                    tracing::warn!("{}: the previous run cannot be restored: {error}", folder.path().display());
                     false
                 });
-            if !given_back && let Err(error) = folder.write_summary(&summary) {
+            if !restored && let Err(error) = folder.write_summary(&summary) {
                 tracing::warn!("{error}");
             }
         }

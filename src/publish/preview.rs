@@ -1,7 +1,7 @@
 //! Tone-mapped 8-bit previews.
 
-use super::PublishError;
-use super::run_folder::write_whole;
+use super::error::PublishError;
+use crate::files::write_whole;
 use crate::render::Film;
 use image::{ExtendedColorType, ImageEncoder, ImageError, codecs};
 use std::path::Path;
@@ -9,20 +9,29 @@ use std::path::Path;
 /// Quality of JPEG previews, of 100: no visible blocks on smooth ridges at about a tenth of the PNG's bytes.
 const JPEG_QUALITY: u8 = 88;
 
-/// The film as a PNG, tone-mapped with `[contrast, brightness, gamma]`.
+/// Encodes the film as a PNG, tone-mapped with `[contrast, brightness, gamma]`.
+///
+/// # Errors
+/// A film without pixels or with another number of colours.
 pub fn png(film: &Film, tone_map: [f64; 3]) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
     encode(codecs::png::PngEncoder::new(&mut bytes), film, tone_map)?;
     Ok(bytes)
 }
 
-/// Writes the film as a PNG; nothing half-written appears under `path`.
+/// Writes the film as a PNG. An unfinished file never has the name `path`.
+///
+/// # Errors
+/// As [`png`], and errors of the system.
 pub fn write_png(path: &Path, film: &Film, tone_map: [f64; 3]) -> Result<(), PublishError> {
-    let problem = |problem: String| PublishError::Png { path: path.to_owned(), problem };
+    let problem = |problem: String| PublishError::File { path: path.to_owned(), problem };
     write_whole(path, &png(film, tone_map).map_err(|e| problem(e.to_string()))?).map_err(|e| problem(e.to_string()))
 }
 
-/// The film as a JPEG, tone-mapped with `[contrast, brightness, gamma]`. JPEG ends at 65,535 pixels an edge.
+/// Encodes the film as a JPEG, tone-mapped with `[contrast, brightness, gamma]`. An edge has at most 65,535 pixels.
+///
+/// # Errors
+/// As [`png`], and a longer edge.
 pub fn jpeg(film: &Film, tone_map: [f64; 3]) -> Result<Vec<u8>, ImageError> {
     let mut bytes = Vec::new();
     encode(codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, JPEG_QUALITY), film, tone_map)?;
@@ -71,7 +80,7 @@ mod tests {
         let film = ramp(64, 32);
         let decoded = image::load_from_memory(&jpeg(&film, PLAIN).unwrap()).unwrap().to_rgb8().into_raw();
         let worst = decoded.iter().zip(film.tone_mapped(PLAIN)).map(|(a, b)| a.abs_diff(b)).max().unwrap();
-        // Quantisation at quality 88 moves a smooth ramp by a few levels of 255.
+        // Quantisation at quality 88 changes a smooth ramp by a few levels of 255.
         assert!(worst <= 12, "{worst}");
     }
 

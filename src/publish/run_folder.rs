@@ -1,63 +1,53 @@
 //! The run folder: `scene.toml`, `frames/frame_000000.exr` and `.png`, `records.jsonl` (and `records-1.jsonl`), `summary.json`.
 
+use super::error::PublishError;
+use super::exr::encode_exr;
+use super::preview::png;
 use super::scene::{is_ours, refuse_foreign_scene, write_scene};
-use super::{ExrFrames, PublishError, PublishSettings, encode_exr, png};
-use crate::engine::{Frame, FrameRecord};
+use super::settings::{ExrFrames, PublishSettings};
+use super::summary::Summary;
+use crate::files::write_whole;
+use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// Folder of the pictures, in the run folder.
+/// Folder of the pictures.
 const FRAMES: &str = "frames";
 /// Records, one JSON object a line.
 const RECORDS: &str = "records.jsonl";
-/// Those before, of a run whose records have come to their cap.
+/// Older records, if their size is capped.
 const OLDER_RECORDS: &str = "records-1.jsonl";
-/// Holds the files of the run that is about to be replaced.
+/// Holds the files of the previous run until the new one has a frame.
 const PREVIOUS: &str = ".previous";
-/// What the run is of.
+/// Scene of the run.
 const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
 
-/// Writes a whole file beside its place and renames it, so that nothing half-written has its final name.
-pub(super) fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    let name = path.file_name().ok_or_else(|| io::Error::new(io::ErrorKind::InvalidInput, "no file name"))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(name);
-    hidden.push(".part");
-    let part = path.with_file_name(hidden);
-    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
-    if written.is_err() {
-        // It may not exist; what matters is already in `written`.
-        let _ = fs::remove_file(&part);
-    }
-    written
-}
-
-/// A folder that this run alone writes.
+/// A folder that only this run writes to.
 #[derive(Debug)]
 pub struct RunFolder {
     path: PathBuf,
     records: File,
     /// Length of `records.jsonl` up to its last complete line.
     complete: u64,
-    /// Lines in it, and in `records-1.jsonl`.
+    /// Number of lines of `records.jsonl` and of `records-1.jsonl`.
     lines: [u64; 2],
-    /// Records of files that newer ones took the places of.
+    /// Number of records in files that were replaced.
     records_removed: u64,
-    /// Pictures that are there, oldest first.
+    /// Pictures in the folder, oldest first.
     kept: VecDeque<Kept>,
     kept_bytes: u64,
-    /// Where the files of the run before wait until this one has a frame.
+    /// Folder with the files of the previous run, until this one has a frame.
     previous: Option<PathBuf>,
 }
 
 #[derive(Debug)]
 struct Kept {
     slide: u64,
-    /// With their sizes in bytes.
+    /// Paths with sizes in bytes.
     files: Vec<(PathBuf, u64)>,
 }
 
@@ -67,20 +57,19 @@ impl Kept {
     }
 }
 
-/// What writing a frame's pictures did.
+/// Result of writing a frame's pictures.
 #[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub struct Written {
     /// Bytes of its pictures.
     pub bytes: u64,
-    /// Older frames whose pictures were deleted for it.
+    /// Number of older frames whose pictures were deleted.
     pub removed: u64,
-    /// Whether it replaces the EXR of an older frame of its slide.
+    /// Whether it replaced the EXR of an older frame of its slide.
     pub replaced: bool,
 }
 
 impl RunFolder {
-    /// `path`, or where that holds a run the first of `path-2`, `path-3` and so on that does not: a run that is started again goes on beside
-    /// what it made before.
+    /// Returns the first of `path`, `path-2`, `path-3` and so on that holds no run.
     ///
     /// # Errors
     /// A folder that cannot be read.
@@ -98,10 +87,10 @@ impl RunFolder {
         unreachable!("a folder holds fewer than 2^32 others")
     }
 
-    /// Refuses a folder that holds a run, unless `overwrite`, or a scene that no run wrote; changes nothing.
+    /// Checks that a run may be written to `path`; changes nothing.
     ///
     /// # Errors
-    /// It holds one, or cannot be read.
+    /// The folder holds a run (unless `overwrite`) or a scene that no run wrote, or cannot be read.
     pub fn refuse_occupied(path: &Path, overwrite: bool) -> Result<(), PublishError> {
         refuse_foreign_scene(&path.join(SCENE))?;
         if overwrite {
@@ -113,8 +102,11 @@ impl RunFolder {
         }
     }
 
-    /// Makes the folder ready and proves that it can be written, before any work starts. A folder that already holds a run is
-    /// refused, unless `overwrite`: then the files that a run writes are removed, and no others.
+    /// Creates the folder and checks that it can be written to. With `overwrite`, the files of a previous run, and no others, are moved to
+    /// `.previous` until this run has a frame.
+    ///
+    /// # Errors
+    /// As [`RunFolder::refuse_occupied`], or a folder that cannot be written to.
     pub fn create(path: &Path, overwrite: bool) -> Result<Self, PublishError> {
         let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
         let frames = path.join(FRAMES);
@@ -130,7 +122,6 @@ impl RunFolder {
                 fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
                 continue;
             }
-            // Kept until this run has a frame: one that fails before must not cost the one before.
             fs::create_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
             if let Some(name) = old.file_name() {
                 fs::rename(&old, aside.join(name)).map_err(|e| refuse(&old, e))?;
@@ -139,12 +130,12 @@ impl RunFolder {
         let probe = frames.join(".probe");
         if let Err(error) = fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)) {
             if aside.exists() {
-                put_back(path, &aside).map_err(|e| refuse(&aside, e))?;
+                restore(path, &aside).map_err(|e| refuse(&aside, e))?;
             }
             return Err(refuse(&frames, error));
         }
         let file = path.join(RECORDS);
-        // `create_new`: of two runs that start at once in one folder, one is told.
+        // `create_new` refuses the second of two runs that start in one folder at the same time.
         let records = OpenOptions::new().append(true).create_new(true).open(&file).map_err(|e| refuse(&file, e))?;
         Ok(Self {
             path: path.to_owned(),
@@ -158,13 +149,13 @@ impl RunFolder {
         })
     }
 
-    /// Puts the files of the run before back in their places and gives this one's up; whether there were any.
+    /// Moves the files of the previous run back and gives up this run. Returns whether there was a previous run.
     ///
     /// # Errors
-    /// Those of the system; what could not be put back lies in `.previous`.
-    pub fn put_back(&mut self) -> io::Result<bool> {
+    /// Errors of the system; files that could not be moved stay in `.previous`.
+    pub fn restore_previous(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
-        put_back(&self.path, &previous)?;
+        restore(&self.path, &previous)?;
         Ok(true)
     }
 
@@ -173,20 +164,23 @@ impl RunFolder {
         &self.path
     }
 
-    /// Bytes of the pictures that are there.
+    /// Bytes of the pictures in the folder.
     pub fn kept_bytes(&self) -> u64 {
         self.kept_bytes
     }
 
-    /// Appends one line to `records.jsonl`; where that would take it beyond half of `most_bytes`, the file becomes `records-1.jsonl` first, in the place of
-    /// the one before. After an error the file still ends with a complete line.
-    pub fn append_record(&mut self, record: &FrameRecord, most_bytes: Option<u64>) -> io::Result<()> {
+    /// Appends a line to `records.jsonl`. If the file would exceed half of `max_bytes`, it first replaces `records-1.jsonl`. After an error the
+    /// file still ends with a complete line.
+    ///
+    /// # Errors
+    /// Errors of the system.
+    pub fn append_record(&mut self, record: &FrameRecord, max_bytes: Option<u64>) -> io::Result<()> {
         let mut line = serde_json::to_vec(record)?;
         line.push(b'\n');
         self.trim()?;
-        let full = most_bytes.is_some_and(|most| self.complete > 0 && self.complete + line.len() as u64 > most / 2);
+        let full = max_bytes.is_some_and(|max| self.complete > 0 && self.complete + line.len() as u64 > max / 2);
         if full {
-            self.begin_records_anew()?;
+            self.rotate_records()?;
         }
         match self.records.write_all(&line) {
             Ok(()) => {
@@ -200,27 +194,27 @@ impl RunFolder {
                 Ok(())
             }
             Err(error) => {
-                // If this fails as well, the next append tries again before it writes.
+                // If this fails too, the next append tries again.
                 let _ = self.trim();
                 Err(error)
             }
         }
     }
 
-    /// Records that went with files in whose place newer ones were put.
+    /// Number of records removed to stay within the cap.
     pub fn records_removed(&self) -> u64 {
         self.records_removed
     }
 
-    /// Makes `records.jsonl` the older file. An attempt that failed half-way is gone on with.
-    fn begin_records_anew(&mut self) -> io::Result<()> {
+    /// Renames `records.jsonl` to `records-1.jsonl` and begins a new file. Also completes an attempt that failed half-way.
+    fn rotate_records(&mut self) -> io::Result<()> {
         let (path, older) = (self.path.join(RECORDS), self.path.join(OLDER_RECORDS));
         match fs::rename(&path, &older) {
             Ok(()) => {
                 self.records_removed += self.lines[1];
                 self.lines = [0, self.lines[0]];
             }
-            // It was renamed before, or somebody took it away.
+            // It was renamed by an earlier attempt, or removed by somebody.
             Err(error) if error.kind() == io::ErrorKind::NotFound => self.lines[0] = 0,
             Err(error) => return Err(error),
         }
@@ -229,13 +223,15 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Cuts off what a failed append left behind.
+    /// Removes the incomplete line of a failed append.
     fn trim(&mut self) -> io::Result<()> {
         if self.records.metadata()?.len() > self.complete { self.records.set_len(self.complete) } else { Ok(()) }
     }
 
-    /// Writes the frame's pictures as the settings say, then deletes those of the oldest frames beyond `keep` and `keep_bytes`.
-    /// On an error none of this frame's pictures stays.
+    /// Writes the frame's pictures, then deletes those of the oldest frames beyond `keep` and `keep_bytes`.
+    ///
+    /// # Errors
+    /// A film that cannot be encoded, or an error of the system. Then none of the frame's pictures remains.
     pub fn write_pictures(&mut self, frame: &Frame, settings: &PublishSettings) -> io::Result<Written> {
         let name = format!("frame_{:06}", frame.record.frame);
         let mut new = Kept { slide: frame.record.slide, files: Vec::new() };
@@ -261,7 +257,7 @@ impl RunFolder {
         Ok(Written { bytes, removed: self.make_room(settings), replaced })
     }
 
-    /// Deletes the EXR of the newest frame that is there, if it is of this slide; its preview stays.
+    /// Deletes the EXR of the newest frame in the folder if it belongs to this slide. Its preview remains.
     fn remove_exr_of_slide(&mut self, slide: u64) -> bool {
         let Some(last) = self.kept.back_mut().filter(|last| last.slide == slide) else { return false };
         let is_exr = |file: &(PathBuf, u64)| file.0.extension().is_some_and(|extension| extension == "exr");
@@ -282,11 +278,11 @@ impl RunFolder {
         Ok(())
     }
 
-    /// Deletes the oldest frames' pictures until both caps hold; the newest frame always stays.
+    /// Deletes pictures of the oldest frames until both caps hold. The newest frame is always kept.
     fn make_room(&mut self, settings: &PublishSettings) -> u64 {
-        let (most, most_bytes) = (settings.keep.unwrap_or(usize::MAX), settings.keep_bytes.unwrap_or(u64::MAX));
+        let (max, max_bytes) = (settings.keep.unwrap_or(usize::MAX), settings.keep_bytes.unwrap_or(u64::MAX));
         let mut removed = 0;
-        while self.kept.len() > 1 && (self.kept.len() > most || self.kept_bytes > most_bytes) {
+        while self.kept.len() > 1 && (self.kept.len() > max || self.kept_bytes > max_bytes) {
             let Some(oldest) = self.kept.pop_front() else { break };
             remove(&oldest.files);
             self.kept_bytes -= oldest.bytes();
@@ -295,20 +291,26 @@ impl RunFolder {
         removed
     }
 
-    /// Writes `scene.toml`, from which `command` makes the run again.
+    /// Writes `scene.toml`, from which `command` repeats the run.
+    ///
+    /// # Errors
+    /// Errors of the system.
     pub fn write_scene(&self, command: &str, scene: &str) -> Result<(), PublishError> {
         write_scene(&self.path.join(SCENE), command, scene)
     }
 
     /// Writes `summary.json`.
-    pub fn write_summary(&self, summary: &super::Summary) -> Result<(), PublishError> {
+    ///
+    /// # Errors
+    /// Errors of the system.
+    pub fn write_summary(&self, summary: &Summary) -> Result<(), PublishError> {
         let path = self.path.join(SUMMARY);
         let written = serde_json::to_vec_pretty(summary).map_err(io::Error::from).and_then(|json| write_whole(&path, &json));
         written.map_err(|source| PublishError::Folder { path, source })
     }
 }
 
-/// Removes a frame's pictures. A file that somebody else removed before is no trouble; any other is worth a word.
+/// Deletes pictures. Files that do not exist any more are ignored; other errors are warnings.
 fn remove(files: &[(PathBuf, u64)]) {
     for (file, _) in files {
         match fs::remove_file(file) {
@@ -320,9 +322,9 @@ fn remove(files: &[(PathBuf, u64)]) {
     }
 }
 
-/// Puts the files of the run before back in their places.
-fn put_back(path: &Path, previous: &Path) -> io::Result<()> {
-    // One that was made without a scene must not be left with this one's.
+/// Moves the files of the previous run back.
+fn restore(path: &Path, previous: &Path) -> io::Result<()> {
+    // A previous run without a scene must not keep the scene of this one.
     if let Err(error) = fs::remove_file(path.join(SCENE))
         && error.kind() != io::ErrorKind::NotFound
     {
@@ -336,7 +338,7 @@ fn put_back(path: &Path, previous: &Path) -> io::Result<()> {
     fs::remove_dir(previous)
 }
 
-/// Files that a run writes, as far as they are there.
+/// Files of a run in the folder.
 fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     let mut files: Vec<PathBuf> = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"]
         .iter()
@@ -356,9 +358,9 @@ fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
     Ok(files)
 }
 
-/// What of a run is in a folder, which need not be there.
+/// First file of a run in a folder. `None` if the folder holds no run or does not exist.
 fn occupied(path: &Path) -> io::Result<Option<String>> {
-    // Beside a run without a frame it was left by a process that was killed: it holds the run that counts.
+    // Left by a process that was killed before its first frame; it holds the previous run.
     if path.join(PREVIOUS).exists() {
         return Ok(Some(PREVIOUS.into()));
     }
@@ -370,7 +372,7 @@ fn occupied(path: &Path) -> io::Result<Option<String>> {
     Ok(files.first().filter(|_| holds).map(|file| file.strip_prefix(path).unwrap_or(file).display().to_string()))
 }
 
-/// Whether a file of a run is one that nobody could miss: of a run that failed before its first frame.
+/// Whether a file of a run may be lost, as those of a run that failed before its first frame.
 fn is_empty(file: &Path) -> bool {
     match file.file_name().and_then(|name| name.to_str()) {
         Some(RECORDS | OLDER_RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
@@ -379,7 +381,7 @@ fn is_empty(file: &Path) -> bool {
     }
 }
 
-/// Whether a run gives a picture this name, finished or in the making.
+/// Whether the name is that of a picture of a run, complete or not.
 fn is_picture(name: &str) -> bool {
     let name = name.strip_prefix('.').and_then(|n| n.strip_suffix(".part")).unwrap_or(name);
     let number = name.strip_prefix("frame_").and_then(|n| n.strip_suffix(".exr").or_else(|| n.strip_suffix(".png")));
@@ -417,11 +419,11 @@ mod tests {
         let mut failed = RunFolder::create(folder.path(), true).unwrap();
         assert!(!picture.exists());
         failed.write_scene("replay", "seed = 1\n").unwrap();
-        assert!(failed.put_back().unwrap() && scene().is_none(), "a run of before scenes were written");
+        assert!(failed.restore_previous().unwrap() && scene().is_none(), "a run of before scenes were written");
         failed.write_scene("replay", "seed = 2\n").unwrap();
         let mut failed = RunFolder::create(folder.path(), true).unwrap();
         failed.write_scene("replay", "seed = 3\n").unwrap();
-        assert!(failed.put_back().unwrap() && scene().unwrap().ends_with("again.\nseed = 2\n"));
+        assert!(failed.restore_previous().unwrap() && scene().unwrap().ends_with("again.\nseed = 2\n"));
         drop(failed);
         // A folder that cannot be written any more.
         let probe = folder.path().join(FRAMES).join(".probe");
@@ -430,15 +432,15 @@ mod tests {
         fs::remove_dir(&probe).unwrap();
         assert!(picture.exists() && fs::read(folder.path().join(RECORDS)).unwrap() == records);
         assert!(!folder.path().join(PREVIOUS).exists());
-        // Killed while it prepares: the earlier run is neither lost nor taken for nothing.
+        // Killed during its preparation: the earlier run is kept, and still occupies the folder.
         drop(RunFolder::create(folder.path(), true).unwrap());
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
         let mut second = RunFolder::create(folder.path(), true).unwrap();
-        assert!(second.put_back().unwrap() && picture.exists());
+        assert!(second.restore_previous().unwrap() && picture.exists());
         drop(second);
         let mut run = RunFolder::create(folder.path(), true).unwrap();
         run.append_record(&frame(0).record, None).unwrap();
-        assert!(!run.put_back().unwrap() && !picture.exists() && !folder.path().join(PREVIOUS).exists());
+        assert!(!run.restore_previous().unwrap() && !picture.exists() && !folder.path().join(PREVIOUS).exists());
     }
 
     fn frame(number: u64) -> Frame {
@@ -488,7 +490,7 @@ mod tests {
         };
         assert_eq!((101..112).map(&mut appended).collect::<Vec<_>>(), [0, 0, 0, 0, 0, 3, 3, 3, 6, 6, 6]);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![106, 107, 108], vec![109, 110, 111]));
-        // A file that cannot be begun is a record lost, and told; nothing else is lost by it.
+        // A file that cannot be created loses one record, with an error, and nothing else.
         let (records, away) = (folder.path().join(RECORDS), folder.path().join("away"));
         fs::rename(folder.path().join(OLDER_RECORDS), &away).unwrap();
         fs::create_dir(folder.path().join(OLDER_RECORDS)).unwrap();
@@ -497,7 +499,7 @@ mod tests {
         run.append_record(&frame(113).record, cap).unwrap();
         assert_eq!(run.records_removed(), 9);
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![109, 110, 111], vec![113]));
-        // Both are of the run: no other takes the folder, one that takes its place takes theirs.
+        // Both files belong to the run: another run is refused, and one with `overwrite` replaces both.
         fs::remove_file(&records).unwrap();
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
         drop(RunFolder::create(folder.path(), true).unwrap());
@@ -584,7 +586,7 @@ mod tests {
     fn a_failed_picture_leaves_nothing_under_its_name() {
         let folder = tempfile::tempdir().unwrap();
         let mut run = RunFolder::create(folder.path(), false).unwrap();
-        // The PNG cannot take its place, since a folder is there: the EXR written before it must go again.
+        // A folder has the name of the PNG: the EXR written before it must be removed.
         fs::create_dir_all(folder.path().join("frames/frame_000000.png/x")).unwrap();
         assert!(run.write_pictures(&frame(0), &PublishSettings::default()).is_err());
         assert_eq!(names(folder.path()), ["frame_000000.png"]);

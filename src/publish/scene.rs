@@ -1,45 +1,44 @@
-//! The scene of a run, beside what the run made.
+//! The scene file that a run leaves beside its results.
 
-use super::PublishError;
-use super::run_folder::write_whole;
+use super::error::PublishError;
+use crate::files::write_whole;
 use std::io::{self, Read};
 use std::path::Path;
 
-/// How such a file begins: what does not is somebody else's.
+/// First words of every such file, which tell it from a user's own scene.
 const FIRST_WORDS: &str = "# Written by ridgewatch ";
 
-/// Whether a run wrote the scene file that is there.
+/// Whether a run wrote the scene file at `path`.
 pub(super) fn is_ours(path: &Path) -> io::Result<bool> {
     let mut start = Vec::new();
     crate::files::open(path)?.take(FIRST_WORDS.len() as u64).read_to_end(&mut start)?;
     Ok(start == FIRST_WORDS.as_bytes())
 }
 
-/// Refuses a place at which there is a file that no run wrote: a user's own scene must not be replaced.
+/// Refuses to replace a scene file that no run wrote.
 ///
 /// # Errors
-/// There is one, or it cannot be read.
+/// Such a file exists, or the file cannot be read.
 pub fn refuse_foreign_scene(path: &Path) -> Result<(), PublishError> {
     match is_ours(path) {
         Ok(true) => Ok(()),
         Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory) => Ok(()),
-        Ok(false) => Err(PublishError::Scene {
+        Ok(false) => Err(PublishError::File {
             path: path.to_owned(),
-            problem: "no run wrote it, and the scene of this one goes there: choose another folder or name".to_owned(),
+            problem: "no run wrote it, so it is not replaced by the scene of this run: choose another folder or name".to_owned(),
         }),
-        Err(error) => Err(PublishError::Scene { path: path.to_owned(), problem: format!("what is there cannot be read: {error}") }),
+        Err(error) => Err(PublishError::File { path: path.to_owned(), problem: format!("cannot be read: {error}") }),
     }
 }
 
-/// Writes a scene (TOML) with the command that makes the same again from it.
+/// Writes a scene (TOML), with the command that repeats the run in its first line.
 ///
 /// # Errors
-/// Those of the system.
+/// Errors of the system.
 pub fn write_scene(path: &Path, command: &str, scene: &str) -> Result<(), PublishError> {
     let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let name = name.escape_debug();
-    let version = env!("CARGO_PKG_VERSION");
+    let (name, version) = (name.escape_debug(), env!("CARGO_PKG_VERSION"));
     let text = format!("{FIRST_WORDS}{version}, whose next run here replaces it: `ridgewatch {command} {name}` makes this again.\n{scene}");
-    let written = write_whole(path, text.as_bytes());
-    written.map_err(|error| PublishError::Scene { path: path.to_owned(), problem: format!("cannot be written: {error}") })
+    let failed = |error| PublishError::File { path: path.to_owned(), problem: format!("cannot be written: {error}") };
+    write_whole(path, text.as_bytes()).map_err(failed)
 }

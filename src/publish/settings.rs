@@ -3,7 +3,7 @@
 use crate::setting::{Refused, count, require};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Where frames go unless told otherwise: this machine only.
+/// Default endpoint, reachable from this machine only.
 pub const DEFAULT_ENDPOINT: &str = "tcp://127.0.0.1:5577";
 
 /// Form of the published picture.
@@ -20,23 +20,11 @@ pub enum Payload {
     Raw,
 }
 
-impl Payload {
-    /// Name in the header's `encoding`.
-    pub fn name(self) -> &'static str {
-        match self {
-            Payload::Jpeg => "jpeg",
-            Payload::Png => "png",
-            Payload::Exr => "exr",
-            Payload::Raw => "raw",
-        }
-    }
-}
-
-/// Which frames leave an EXR in the run folder.
+/// Frames whose EXR is written to the run folder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum ExrFrames {
-    /// One for each slide of the window: that of its newest frame, which replaces that of the frame before.
+    /// The newest frame of each slide; it replaces the EXR of the frame before.
     Slide,
     /// All.
     Every,
@@ -44,13 +32,13 @@ pub enum ExrFrames {
     None,
 }
 
-/// What happens to a frame when the disk is slower than the cycle.
+/// Policy when the disk is slower than the cycle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-pub enum WhenFull {
-    /// The cycle waits for the disk (replay: nothing is lost), for a minute at most.
+pub enum WhenDiskSlow {
+    /// The cycle waits for the disk, a minute at most. Default of replays.
     Wait,
-    /// The oldest waiting picture is dropped and counted (live: the cycle never waits). Its record is still written.
+    /// The oldest queued picture is dropped and counted; its record is still written. Default of live runs.
     Drop,
 }
 
@@ -58,28 +46,28 @@ pub enum WhenFull {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PublishSettings {
-    /// ZeroMQ endpoint, `tcp://HOST:PORT`; None (in a file: `"none"`) opens no socket. Port 0 takes a free one.
+    /// ZeroMQ endpoint, `tcp://HOST:PORT`; `None` (in a file: `"none"`) opens no socket. Port 0 binds a free port.
     #[serde(deserialize_with = "endpoint_or_none", serialize_with = "none_as_word")]
     pub endpoint: Option<String>,
     /// Form of the published picture.
     pub payload: Payload,
-    /// Pictures that may be on their way to subscribers at once.
+    /// Maximum number of pictures in flight to subscribers.
     pub frames_in_flight: usize,
-    /// Seconds after which a subscriber that still holds a picture is cut off.
+    /// Seconds after which a subscriber that still holds a picture is disconnected.
     pub stall_seconds: f64,
-    /// Newest frames whose pictures stay in the run folder; None keeps all, but of a live run see [`PublishSettings::of_live_run`].
+    /// Number of newest frames whose pictures are kept. `None` keeps all; for live runs see [`PublishSettings::of_live_run`].
     pub keep: Option<usize>,
-    /// Bytes that the pictures in the run folder may take; None sets no cap. The newest frame always stays.
+    /// Maximum bytes of the pictures in the run folder; `None`: no cap. The newest frame is always kept.
     pub keep_bytes: Option<u64>,
-    /// Bytes that the records in the run folder may take: the newest half of them at least stays. None sets no cap, but of a live run see
+    /// Maximum bytes of the records in the run folder, of which at least the newest half is kept. `None`: no cap; for live runs see
     /// [`PublishSettings::of_live_run`].
     pub records_bytes: Option<u64>,
     /// Whether a PNG of each frame is written.
     pub preview: bool,
-    /// Of which frames an EXR is written.
+    /// Frames whose EXR is written.
     pub exr: ExrFrames,
-    /// What happens when the disk is slower than the cycle; None waits, but of a live run see [`PublishSettings::of_live_run`].
-    pub when_full: Option<WhenFull>,
+    /// Policy when the disk is slower than the cycle. `None` waits; for live runs see [`PublishSettings::of_live_run`].
+    pub when_disk_slow: Option<WhenDiskSlow>,
 }
 
 impl Default for PublishSettings {
@@ -94,39 +82,41 @@ impl Default for PublishSettings {
             records_bytes: None,
             preview: true,
             exr: ExrFrames::Slide,
-            when_full: None,
+            when_disk_slow: None,
         }
     }
 }
 
-/// Newest frames whose pictures stay of a live run, which may go on for weeks, unless told otherwise.
+/// Default of `keep` for live runs, which may last weeks.
 const LIVE_FRAMES: usize = 100;
-/// Bytes of its records: some 700,000 of them.
-const LIVE_RECORDS: u64 = 1 << 30;
-/// Least cap on the bytes of records, which are one or two kilobytes each.
-const LEAST_RECORDS: u64 = 1 << 20;
+/// Default of `records_bytes` for live runs: some 700,000 records.
+const LIVE_RECORDS_BYTES: u64 = 1 << 30;
+/// Minimum of `records_bytes`. A record has one or two kilobytes.
+const MIN_RECORDS_BYTES: u64 = 1 << 20;
 
 impl PublishSettings {
-    /// These of a run that follows a simulation: what is not set neither waits for the disk nor fills it.
+    /// Adds the defaults of a live run, which neither waits for the disk nor fills it.
     pub fn of_live_run(self) -> Self {
-        // Who caps the bytes has set a bound.
         let bounded = self.keep.is_some() || self.keep_bytes.is_some();
         Self {
             keep: if bounded { self.keep } else { Some(LIVE_FRAMES) },
-            records_bytes: self.records_bytes.or(Some(LIVE_RECORDS)),
-            when_full: self.when_full.or(Some(WhenFull::Drop)),
+            records_bytes: self.records_bytes.or(Some(LIVE_RECORDS_BYTES)),
+            when_disk_slow: self.when_disk_slow.or(Some(WhenDiskSlow::Drop)),
             ..self
         }
     }
 
-    /// Checks ranges that the types do not.
+    /// Checks ranges.
+    ///
+    /// # Errors
+    /// The first value out of its range.
     pub fn check(&self) -> Result<(), Refused> {
         count("publish.frames_in_flight", self.frames_in_flight, 1, 64)?;
         require((0.1..=3600.0).contains(&self.stall_seconds), "publish.stall_seconds", self.stall_seconds, "a number from 0.1 to 3600")?;
         require(self.keep != Some(0), "publish.keep", 0, "at least 1, or no key to keep all frames")?;
-        let records = self.records_bytes.unwrap_or(LEAST_RECORDS);
+        let records = self.records_bytes.unwrap_or(MIN_RECORDS_BYTES);
         require(
-            records >= LEAST_RECORDS,
+            records >= MIN_RECORDS_BYTES,
             "publish.records_bytes",
             records,
             "at least 1048576, or no key for no cap (of a live run 1073741824)",
@@ -134,7 +124,7 @@ impl PublishSettings {
     }
 }
 
-/// TOML has no null, so that `"none"` (or an empty string) says it.
+/// TOML has no null; `"none"` (or an empty string) stands for it.
 fn endpoint_or_none<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Option<String>, D::Error> {
     Ok(Option::<String>::deserialize(deserializer)?.filter(|s| !s.is_empty() && s != "none"))
 }
@@ -148,7 +138,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn reads_what_it_writes_and_knows_none() {
+    fn settings_round_trip_and_none_is_a_word() {
         let settings = PublishSettings { endpoint: None, payload: Payload::Raw, keep: Some(3), ..Default::default() };
         let text = toml::to_string(&settings).unwrap();
         assert!(text.contains("endpoint = \"none\""), "{text}");

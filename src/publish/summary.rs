@@ -1,45 +1,44 @@
-//! What `summary.json` says at the end of a run.
+//! `summary.json`, written at the end of a run.
 
-use super::PublishStatistics;
-use crate::engine::FrameRecord;
+use crate::run::FrameRecord;
 use serde::{Deserialize, Serialize};
 
 /// `summary.json`.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Summary {
-    /// Frames that the cycle finished.
+    /// Frames finished by the cycle.
     pub frames: u64,
     /// Sums over the frames' records.
     pub totals: Totals,
-    /// What became of them on disk; none without a run folder.
+    /// Counts of the run folder. `None` without one.
     pub files: Option<FileStatistics>,
-    /// What became of them on the socket; none without one.
+    /// Counts of the socket. `None` without one.
     pub published: Option<PublishStatistics>,
     /// Wall-clock seconds from start to finish.
     pub seconds: f64,
-    /// Largest resident memory of the process, in bytes (VmHWM), where the system tells it.
+    /// Largest resident memory of the process, in bytes. `None` if the system does not report it.
     pub peak_memory_bytes: Option<u64>,
-    /// What the caller added.
+    /// Values of the caller.
     pub run: serde_json::Map<String, serde_json::Value>,
 }
 
 /// Sums over the records of all frames.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Serialize, Deserialize)]
 pub struct Totals {
-    /// Log-stretch queries that the renderer made.
+    /// Log-stretch queries of the renderer.
     pub queries: u64,
-    /// Of them, answered by RK4.
+    /// Queries answered by RK4.
     pub traced: u64,
-    /// Of the queries, without a value (land).
+    /// Queries without a value, at missing cells.
     pub missing: u64,
-    /// `traced / (queries - missing)`, as in the records; 0 where there is none.
+    /// `traced / (queries - missing)`; 0 without queries.
     pub traced_share: f64,
     /// Audit points traced.
     pub audited: u64,
     /// Queries whose extinction exceeded the majorant in force.
     pub majorant_exceeded: u64,
     /// Frames whose estimated residual exceeded the tolerance.
-    pub over_tolerance_frames: u64,
+    pub tolerance_exceeded_frames: u64,
     /// Optimizer steps.
     pub training_steps: u64,
     /// Times the weights were rolled back.
@@ -57,7 +56,7 @@ impl Totals {
         self.traced_share = self.traced as f64 / (self.queries - self.missing).max(1) as f64;
         self.audited += record.audited;
         self.majorant_exceeded += record.majorant_exceeded;
-        self.over_tolerance_frames += u64::from(record.over_tolerance.is_some());
+        self.tolerance_exceeded_frames += u64::from(record.tolerance_excess.is_some());
         if let Some(training) = &record.training {
             self.training_steps += training.steps;
             self.rollbacks += training.rollbacks;
@@ -66,15 +65,42 @@ impl Totals {
     }
 }
 
-/// What became of the frames on disk. `frames = pictures_written + pictures_dropped + pictures_failed + unfinished` when pictures
-/// are written at all.
+/// Counts of the socket. `frames = sent + superseded + without_subscriber + failed`, once finished.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct PublishStatistics {
+    /// Frames handed over by the cycle.
+    pub frames: u64,
+    /// Pictures given to the socket.
+    pub sent: u64,
+    /// Pictures replaced by a newer one before they could be sent.
+    pub superseded: u64,
+    /// Pictures without a subscriber; they are not encoded.
+    pub without_subscriber: u64,
+    /// Pictures that could not be encoded or sent.
+    pub failed: u64,
+    /// Records given to the socket, or without a subscriber.
+    pub records: u64,
+    /// Records dropped because too many waited.
+    pub records_dropped: u64,
+    /// Times that all connections were closed because a subscriber stalled.
+    pub stall_disconnects: u64,
+    /// Maximum number of subscribers at a time.
+    pub peak_subscribers: u64,
+    /// Maximum number of bytes queued in the socket at a time. Each subscriber may hold one further copy of the frame that is written to it.
+    pub peak_queued_bytes: u64,
+    /// Whether publishing ended early because no new socket could be opened.
+    pub socket_lost: bool,
+}
+
+/// Counts of the run folder. `frames = pictures_written + pictures_dropped + pictures_failed + unfinished` if
+/// pictures are written.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct FileStatistics {
     /// Records written.
     pub records_written: u64,
-    /// Of them, removed later by `records_bytes`: the others are the lines of `records-1.jsonl` and `records.jsonl`.
+    /// Records written and removed later by `records_bytes`. The others are the lines of `records-1.jsonl` and `records.jsonl`.
     pub records_removed: u64,
-    /// Records that the disk refused or that found the queue full.
+    /// Records that the disk refused, or for which the queue was full.
     pub records_lost: u64,
     /// Frames whose pictures were written.
     pub pictures_written: u64,
@@ -88,16 +114,16 @@ pub struct FileStatistics {
     pub exr_replaced: u64,
     /// Bytes of pictures written.
     pub bytes_written: u64,
-    /// Bytes of pictures that are still there.
+    /// Bytes of the pictures not removed.
     pub bytes_kept: u64,
-    /// Frames still unwritten when the run gave up waiting for the disk.
+    /// Frames not written when the run stopped waiting for the disk.
     pub unfinished: u64,
-    /// Why the disk refused the first record or picture that it refused.
+    /// Error of the first record or picture that the disk refused.
     pub refused: Option<String>,
 }
 
 impl FileStatistics {
-    /// What was to be written and is not, in words; none where all is there but what settings let go.
+    /// Describes records and pictures lost. `None` if everything is written, apart from what settings drop.
     pub fn lost(&self) -> Option<String> {
         let Self { pictures_written, pictures_failed, pictures_dropped, unfinished, records_lost, .. } = *self;
         let lost = pictures_failed + unfinished;
@@ -113,12 +139,9 @@ impl FileStatistics {
     }
 }
 
-/// Largest resident memory of this process so far, in bytes: VmHWM of `/proc/self/status`. None where there is no such file.
+/// Largest resident memory of this process so far, in bytes: VmHWM of `/proc/self/status`. `None` if the file does not exist.
 pub fn peak_memory_bytes() -> Option<u64> {
-    let status = std::fs::read_to_string("/proc/self/status").ok()?;
-    let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"))?;
-    let kibibytes: u64 = line.split_whitespace().next()?.parse().ok()?;
-    Some(kibibytes * 1024)
+    procfs::process::Process::myself().and_then(|process| process.status()).ok()?.vmhwm.map(|kibibytes| kibibytes * 1024)
 }
 
 #[cfg(test)]
@@ -138,9 +161,9 @@ mod tests {
     #[test]
     fn totals_add_up() {
         let mut totals = Totals::default();
-        totals.add(&FrameRecord { queries: 100, traced: 100, over_tolerance: Some(0.01), ..Default::default() });
+        totals.add(&FrameRecord { queries: 100, traced: 100, tolerance_excess: Some(0.01), ..Default::default() });
         totals.add(&FrameRecord { queries: 300, traced: 0, warnings: vec!["odd".into()], ..Default::default() });
-        assert_eq!((totals.queries, totals.traced_share, totals.over_tolerance_frames, totals.warnings), (400, 0.25, 1, 1));
+        assert_eq!((totals.queries, totals.traced_share, totals.tolerance_exceeded_frames, totals.warnings), (400, 0.25, 1, 1));
         totals.add(&FrameRecord { queries: 600, traced: 0, missing: 600, ..Default::default() });
         assert_eq!((totals.missing, totals.traced_share), (600, 0.25), "land is not traced, and no share of it");
     }

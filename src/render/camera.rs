@@ -1,13 +1,13 @@
-//! The camera: rays through points of the film.
+//! The camera: rays through points of the film (pinhole or parallel projection).
 
 use super::CameraSettings;
 use super::error::{RenderError, require, require_finite};
-use super::parameters::CameraParameters;
 use super::space::{cross, dot, length, scaled, subtract};
 use crate::field::Domain;
 
-/// A checked camera, in scene units.
-#[derive(Debug, Clone, PartialEq)]
+/// A checked camera, in scene units, in the layout that kernels read.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     eye: [f64; 3],
     /// W = look_at - eye.
@@ -16,17 +16,19 @@ pub struct Camera {
     right: [f64; 3],
     /// Half of the film's height, upward.
     up: [f64; 3],
-    orthographic: bool,
+    /// 1 for parallel projection, otherwise 0.
+    orthographic: i32,
+    pad: i32,
 }
 
 impl CameraSettings {
-    /// The camera of a bare data file, for a domain scaled by `scale` and a picture `aspect` times as wide as high. Two-dimensional
-    /// flows are seen from above, in parallel projection, filling the picture; three-dimensional ones from a corner above.
+    /// Default camera for a domain scaled by `scale` and a picture of aspect ratio `aspect` (width / height). Two-dimensional flows are seen
+    /// from above in parallel projection and fill the picture; three-dimensional ones are seen from above a corner.
     pub fn overview(domain: &Domain, scale: [f64; 3], aspect: f64) -> Self {
         let extent: [f64; 3] = std::array::from_fn(|k| domain.extent()[k] * scale[k]);
         let centre: [f64; 3] = std::array::from_fn(|k| 0.5 * (domain.min[k] + domain.max[k]) * scale[k]);
         if domain.dimensions == 2 {
-            // With 90 degrees the distance to the film plane is half of its width.
+            // At 90 degrees the distance to the film plane is half of its width.
             let distance = 0.5 * extent[0].max(extent[1] * aspect);
             let top = domain.max[2] * scale[2];
             return Self {
@@ -37,7 +39,7 @@ impl CameraSettings {
                 orthographic: true,
             };
         }
-        // The published camera divides the angle by the aspect, so tall pictures need a narrow one.
+        // The published camera divides the angle by the aspect ratio, so that tall pictures need a small angle.
         let field_of_view = 45.0 * aspect.min(1.0);
         let toward_eye = [-0.46, -0.72, 0.52];
         let toward_eye = scaled(toward_eye, 1.0 / length(toward_eye));
@@ -46,7 +48,7 @@ impl CameraSettings {
         let up = cross(toward_eye, right);
         let half = field_of_view.to_radians() / 2.0;
         let (across, down) = (half.tan(), (half / aspect).tan());
-        // Far enough that every corner falls into the film.
+        // The distance at which every corner is inside the film.
         let mut distance = 0.0_f64;
         for corner in 0..8 {
             let offset: [f64; 3] = std::array::from_fn(|k| if corner >> k & 1 == 1 { 0.5 * extent[k] } else { -0.5 * extent[k] });
@@ -59,7 +61,10 @@ impl CameraSettings {
 }
 
 impl Camera {
-    /// Checks the settings for a picture `aspect` times as wide as high.
+    /// Checks the settings for a picture of aspect ratio `aspect` (width / height).
+    ///
+    /// # Errors
+    /// The first key at fault and the values that it accepts.
     pub fn new(settings: &CameraSettings, aspect: f64) -> Result<Self, RenderError> {
         require_finite("camera.eye", &settings.eye)?;
         require_finite("camera.look_at", &settings.look_at)?;
@@ -78,7 +83,7 @@ impl Camera {
         let half_height = if settings.orthographic {
             half_width / aspect
         } else {
-            // The published camera divides the angle, not the width, by the aspect.
+            // The published camera divides the angle, not the width, by the aspect ratio.
             require(
                 half / aspect < std::f64::consts::FRAC_PI_2,
                 "camera.field_of_view",
@@ -94,20 +99,16 @@ impl Camera {
             forward,
             right: scaled(right, half_width),
             up: scaled(up, half_height),
-            orthographic: settings.orthographic,
+            orthographic: i32::from(settings.orthographic),
+            pad: 0,
         })
-    }
-
-    pub(super) fn parameters(&self) -> CameraParameters {
-        let Self { eye, forward, right, up, orthographic } = *self;
-        CameraParameters { eye, forward, right, up, orthographic: i32::from(orthographic), pad: 0 }
     }
 
     /// Origin and unit direction of the ray through a point of the film: `x` from -1 (left) to 1, `y` from -1 (bottom) to 1.
     pub fn ray(&self, x: f64, y: f64) -> ([f64; 3], [f64; 3]) {
         let offset: [f64; 3] = std::array::from_fn(|k| x * self.right[k] + y * self.up[k]);
         let unit = |v: [f64; 3]| scaled(v, 1.0 / length(v));
-        if self.orthographic {
+        if self.orthographic != 0 {
             (std::array::from_fn(|k| self.eye[k] + offset[k]), unit(self.forward))
         } else {
             (self.eye, unit(std::array::from_fn(|k| self.forward[k] + offset[k])))

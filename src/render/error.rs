@@ -1,11 +1,11 @@
-//! What can be wrong with a scene.
+//! Errors of rendering.
 
 use crate::setting::{Refused, shown};
 use serde::Serialize;
 use std::fmt::Debug;
 use thiserror::Error;
 
-/// Why a scene cannot be rendered, or two films cannot be merged.
+/// A scene cannot be rendered, or two films cannot be merged.
 #[derive(Debug, Clone, PartialEq, Error)]
 pub enum RenderError {
     /// A setting is out of range.
@@ -13,12 +13,12 @@ pub enum RenderError {
     Invalid {
         /// Key in the scene file, e.g. `render.width`.
         key: &'static str,
-        /// What was found.
+        /// Value found.
         found: String,
-        /// What is accepted.
+        /// Accepted values.
         accepted: &'static str,
     },
-    /// Films of different size cannot be merged.
+    /// The films have different sizes.
     #[error("a film of {found:?} pixels cannot be merged into one of {expected:?}")]
     FilmSize {
         /// Width and height of the other film.
@@ -26,14 +26,14 @@ pub enum RenderError {
         /// Width and height of this film.
         expected: [usize; 2],
     },
-    /// More samples than a frame can number.
-    #[error("samples {first}..{end} were asked for; accepted: a range that ends at most at {limit}")]
+    /// The range of samples is empty or exceeds the limit of a frame.
+    #[error("samples {first}..{end} were requested; accepted: a non-empty range that ends at most at {limit}")]
     Samples {
         /// First sample.
         first: u32,
         /// One after the last.
         end: u32,
-        /// Largest end.
+        /// Largest end accepted.
         limit: u32,
     },
 }
@@ -58,12 +58,12 @@ impl From<RenderError> for Refused {
     }
 }
 
-/// Refuses unless `holds`.
+/// Returns [`RenderError::Invalid`] unless `holds`.
 pub(super) fn require(holds: bool, key: &'static str, found: impl Serialize + Debug, accepted: &'static str) -> Result<(), RenderError> {
     if holds { Ok(()) } else { Err(RenderError::Invalid { key, found: shown(found), accepted }) }
 }
 
-/// Refuses a vector with a component that is not a finite number.
+/// Returns [`RenderError::Invalid`] if a component of the vector is not finite.
 pub(super) fn require_finite(key: &'static str, vector: &[f64]) -> Result<(), RenderError> {
     require(vector.iter().all(|v| v.is_finite()), key, vector, "finite numbers")
 }

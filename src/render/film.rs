@@ -1,8 +1,8 @@
-//! The film: what a frame's paths add up to.
+//! The film: means, variances and shares per pixel, by the running updates of Welford (1962) and Chan, Golub and LeVeque (1979).
 
 use super::RenderError;
 
-/// A finished picture: one entry a pixel, rows from the top, left to right.
+/// A picture: one entry per pixel, rows from the top, left to right.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Film {
     /// Pixels across.
@@ -11,18 +11,18 @@ pub struct Film {
     pub height: usize,
     /// Mean linear radiance (R, G, B) and alpha (share of paths that scattered).
     pub rgba: Vec<[f32; 4]>,
-    /// Mean FTLE at the real collisions seen through the pixel (NaN where there was none).
+    /// Mean FTLE at the real collisions seen through the pixel (1/time); NaN without collisions.
     pub ftle_mean: Vec<f32>,
-    /// Share of the pixel's queries that RK4 answered.
+    /// Share of the queries of the pixel that were traced.
     pub traced: Vec<f32>,
-    /// Variance of the mean luminance (Rec. 709 weights); NaN where fewer than two samples leave it unknown.
+    /// Variance of the mean luminance (Rec. 709 weights); NaN with fewer than two samples.
     pub variance: Vec<f32>,
-    /// Samples in the pixel.
+    /// Number of samples.
     pub samples: Vec<f32>,
-    /// Share of paths that left without scattering and saw missing values (land) at a point drawn uniformly along their way through
-    /// the box. Their colour is `render.missing`; for a map seen from above it is 1 on land and 0 elsewhere.
+    /// Share of paths that left the box without scattering and found a missing value at a point drawn uniformly along their way through it.
+    /// Their colour is `render.missing_color`. For a map seen from above the share is 1 over missing cells and 0 elsewhere.
     pub missing: Vec<f32>,
-    /// Log-stretch queries made for the pixel.
+    /// Number of log-stretch queries.
     pub queries: Vec<f32>,
 }
 
@@ -30,42 +30,68 @@ impl Film {
     /// A film without samples.
     pub fn new(width: usize, height: usize) -> Self {
         let pixels = width * height;
-        Self {
-            width,
-            height,
-            rgba: vec![[0.0; 4]; pixels],
-            ftle_mean: vec![f32::NAN; pixels],
-            traced: vec![0.0; pixels],
-            variance: vec![f32::NAN; pixels],
-            samples: vec![0.0; pixels],
-            missing: vec![0.0; pixels],
-            queries: vec![0.0; pixels],
-        }
+        Self::from_layers(width, height, vec![[0.0; 4]; pixels], |value| vec![value; pixels])
     }
 
-    /// The same with its memory in place: the pages of a fresh large film come one by one as they are first written, which takes longer than
-    /// the picture's copy, and longer than a frame's work on a GPU. So all threads of rayon's current pool write them.
+    /// A film without samples whose memory pages all threads of the current rayon pool touch. A large new film is mapped page by page at the
+    /// first write, which takes longer than copying the picture and longer than the work of a GPU on a frame.
     #[cfg(feature = "cuda")]
     pub(crate) fn resident(width: usize, height: usize) -> Self {
         use rayon::prelude::*;
-        /// Enough pages that a thread is worth waking.
-        const PIECE: usize = 1 << 16;
-        // Collected, since `vec![0.0; n]` has recycled memory zeroed by one thread.
+        /// Enough pages to be worth a task.
+        const PIXELS_PER_TASK: usize = 1 << 16;
+        // Collected, since one thread zeroes recycled memory for `vec![0.0; n]`.
         fn layer<T: Copy + Send + Sync>(pixels: usize, value: T) -> Vec<T> {
-            rayon::iter::repeat_n(value, pixels).with_min_len(PIECE).collect()
+            rayon::iter::repeat_n(value, pixels).with_min_len(PIXELS_PER_TASK).collect()
         }
         let pixels = width * height;
+        Self::from_layers(width, height, layer(pixels, [0.0; 4]), |value| layer(pixels, value))
+    }
+
+    fn from_layers(width: usize, height: usize, rgba: Vec<[f32; 4]>, layer: impl Fn(f32) -> Vec<f32>) -> Self {
         Self {
             width,
             height,
-            rgba: layer(pixels, [0.0; 4]),
-            ftle_mean: layer(pixels, f32::NAN),
-            traced: layer(pixels, 0.0),
-            variance: layer(pixels, f32::NAN),
-            samples: layer(pixels, 0.0),
-            missing: layer(pixels, 0.0),
-            queries: layer(pixels, 0.0),
+            rgba,
+            ftle_mean: layer(f32::NAN),
+            traced: layer(0.0),
+            variance: layer(f32::NAN),
+            samples: layer(0.0),
+            missing: layer(0.0),
+            queries: layer(0.0),
         }
+    }
+
+    /// Overwrites the pixels from index `first` on.
+    ///
+    /// # Panics
+    /// If there are more values than pixels.
+    pub fn write_pixels(&mut self, first: usize, values: &[PixelValue]) {
+        use rayon::prelude::*;
+        const CHUNK: usize = 1 << 15;
+        let range = first..first + values.len();
+        (
+            self.rgba[range.clone()].par_chunks_mut(CHUNK),
+            self.ftle_mean[range.clone()].par_chunks_mut(CHUNK),
+            self.traced[range.clone()].par_chunks_mut(CHUNK),
+            self.variance[range.clone()].par_chunks_mut(CHUNK),
+            self.samples[range.clone()].par_chunks_mut(CHUNK),
+            self.missing[range.clone()].par_chunks_mut(CHUNK),
+            self.queries[range].par_chunks_mut(CHUNK),
+            values.par_chunks(CHUNK),
+        )
+            .into_par_iter()
+            .for_each(|(rgba, ftle_mean, traced, variance, samples, missing, queries, values)| {
+                for (i, value) in values.iter().enumerate() {
+                    rgba[i] = value.rgba;
+                    ftle_mean[i] = value.ftle_mean;
+                    traced[i] = value.traced;
+                    variance[i] = value.variance;
+                    samples[i] = value.samples;
+                    missing[i] = value.missing;
+                    queries[i] = value.queries;
+                }
+            });
     }
 
     /// Tone-mapped 8-bit RGB with `((c - 0.5) * contrast + brightness)^(1/gamma)`.
@@ -77,7 +103,10 @@ impl Film {
         self.rgba.iter().flat_map(|p| [map(p[0]), map(p[1]), map(p[2])]).collect()
     }
 
-    /// Merges other samples of the same frame (a later pass, another rank), weighted by sample counts.
+    /// Merges other samples of the same frame (a later pass or another rank), weighted by sample counts.
+    ///
+    /// # Errors
+    /// [`RenderError::FilmSize`] if the films have different sizes.
     pub fn accumulate(&mut self, other: &Film) -> Result<(), RenderError> {
         if (self.width, self.height) != (other.width, other.height) {
             return Err(RenderError::FilmSize { found: [other.width, other.height], expected: [self.width, self.height] });
@@ -90,7 +119,27 @@ impl Film {
     }
 }
 
-/// Sums over one pixel's paths, in f64.
+/// One pixel of a picture; the fields are those of [`Film`], with the layout that kernels write.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct PixelValue {
+    /// R, G, B, alpha.
+    pub rgba: [f32; 4],
+    /// Mean FTLE.
+    pub ftle_mean: f32,
+    /// Traced share.
+    pub traced: f32,
+    /// Variance of the mean luminance.
+    pub variance: f32,
+    /// Samples.
+    pub samples: f32,
+    /// Share that saw missing values.
+    pub missing: f32,
+    /// Queries.
+    pub queries: f32,
+}
+
+/// Sums over the paths of a pixel, in f64.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct Pixel {
     samples: f64,
@@ -106,15 +155,15 @@ pub(super) struct Pixel {
     traced: f64,
 }
 
-/// What one path adds to its pixel.
+/// Contribution of a path to its pixel.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub(super) struct PathSample {
     pub(super) radiance: [f32; 3],
-    /// Weight of the path, if it scattered; else 0.
+    /// Weight of the path if it scattered, otherwise 0.
     pub(super) scattered: f32,
-    /// `scattered` times the FTLE there.
+    /// `scattered` times the FTLE at the collision.
     pub(super) ftle: f32,
-    /// Weight of the path, if it left and saw missing values; else 0.
+    /// Weight of the path if it left the box and found a missing value, otherwise 0.
     pub(super) missing: f32,
     pub(super) queries: u32,
     pub(super) traced: u32,
@@ -145,7 +194,7 @@ impl Pixel {
         let rgba = film.rgba[i].map(|v| f64::from(v) * samples);
         let [r, g, b, _] = film.rgba[i].map(f64::from);
         let queries = f64::from(film.queries[i]);
-        // An unknown mean or variance stands for a sum without terms.
+        // A NaN mean or variance means a sum without terms.
         let known = |v: f32, factor: f64| if v.is_nan() { 0.0 } else { f64::from(v) * factor };
         Self {
             samples,
@@ -159,7 +208,7 @@ impl Pixel {
         }
     }
 
-    /// Chan, Golub and LeVeque's pairwise update of the deviations; sums elsewhere.
+    /// Sums of both, with the pairwise update of the deviations of Chan, Golub and LeVeque (1979).
     fn merged(&self, other: &Self) -> Self {
         let samples = self.samples + other.samples;
         if samples == 0.0 {
@@ -223,7 +272,7 @@ mod tests {
     fn merging_is_as_good_as_one_go() {
         let values: Vec<f32> = (0..13).map(|i| (i * i % 7) as f32).collect();
         let mut merged = Film::new(1, 1);
-        // Cuts at even places keep `scattered` of each sample; a part of one sample has no variance of its own.
+        // Cuts at even indices keep `scattered` of each sample; a part of one sample has no variance.
         for part in [0..6, 6..6, 6..12, 12..13] {
             merged.accumulate(&film_of(&values[part])).unwrap();
         }

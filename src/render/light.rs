@@ -1,7 +1,8 @@
-//! The one light.
+//! The light: directional or point.
 
 use super::LightSettings;
 use super::error::{RenderError, require, require_finite};
+use super::parameters::LightParameters;
 use super::space::{length, scaled, subtract};
 
 /// A checked light, in scene units.
@@ -14,9 +15,9 @@ pub enum Light {
         /// Radiance of the red, green and blue channel.
         radiance: [f32; 3],
     },
-    /// A point that shines equally in all directions.
+    /// An isotropic point light.
     Point {
-        /// Where it is.
+        /// Position.
         position: [f64; 3],
         /// Radiant intensity of the red, green and blue channel.
         intensity: [f32; 3],
@@ -24,7 +25,7 @@ pub enum Light {
 }
 
 impl LightSettings {
-    /// Photons flying along `direction`, as bright in each channel.
+    /// Photons flying along `direction`, with the same radiance in each channel.
     pub fn directional(direction: [f64; 3], radiance: f64) -> Self {
         Self { direction: Some(direction), position: None, radiance: [radiance; 3] }
     }
@@ -32,6 +33,9 @@ impl LightSettings {
 
 impl Light {
     /// Checks the settings.
+    ///
+    /// # Errors
+    /// The first key at fault and the values that it accepts.
     pub fn new(settings: &LightSettings) -> Result<Self, RenderError> {
         let radiance = settings.radiance;
         require(radiance.iter().all(|r| r.is_finite() && *r >= 0.0), "light.radiance", radiance, "three finite numbers, 0 or above")?;
@@ -47,20 +51,21 @@ impl Light {
                 require_finite("light.position", &position)?;
                 Ok(Self::Point { position, intensity: radiance })
             }
-            (Some(_), Some(_)) => Err(RenderError::Invalid {
-                key: "light",
-                found: "given both `direction` and `position`".into(),
-                accepted: "exactly one of them",
-            }),
-            (None, None) => Err(RenderError::Invalid {
-                key: "light",
-                found: "given neither `direction` nor `position`".into(),
-                accepted: "exactly one of them",
-            }),
+            (direction, _) => {
+                let found = if direction.is_some() { "both `direction` and `position`" } else { "neither `direction` nor `position`" };
+                Err(RenderError::Invalid { key: "light", found: format!("given {found}"), accepted: "exactly one of them" })
+            }
         }
     }
 
-    /// Unit vector toward the light, distance to it, and the radiance that would arrive at `point` through empty space.
+    pub(super) fn parameters(&self) -> LightParameters {
+        match *self {
+            Self::Directional { toward, radiance } => LightParameters { vector: toward, radiance, is_point: 0 },
+            Self::Point { position, intensity } => LightParameters { vector: position, radiance: intensity, is_point: 1 },
+        }
+    }
+
+    /// Unit vector toward the light, distance to it, and the radiance that arrives at `point` through empty space.
     #[inline]
     pub(super) fn seen_from(&self, point: [f64; 3]) -> ([f64; 3], f64, [f32; 3]) {
         match self {

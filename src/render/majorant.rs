@@ -1,39 +1,39 @@
 //! The majorant grid: a bound on the extinction in each cell, learned from the queries.
 //!
-//! Cells start at the largest extinction of the transfer function, which is safe since its ramp saturates, and tighten as queries
-//! come. What a frame observes takes effect in later frames only, so that a frame's majorants do not depend on its own random
-//! numbers. Cells keep the largest FTLE, not extinction, so that another transfer function re-derives them without a query.
+//! Cells start at the largest extinction of the transfer function, which is a safe bound since its ramp saturates, and tighten with each
+//! query. Observations take effect in later frames only, so that the majorants of a frame do not depend on its own random numbers. Cells
+//! store the largest FTLE instead of the extinction, so that a new transfer function needs no new queries. The tracking stays unbiased if
+//! the extinction exceeds its majorant (see `tracking`).
 
 use super::Transfer;
-use super::parameters::SeenInCells;
 use crate::field::Domain;
 use rayon::prelude::*;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering::Relaxed};
+use std::sync::atomic::Ordering::Relaxed;
+use std::sync::atomic::{AtomicBool, AtomicU32};
 
-/// Ramp above the highest value seen that a cell's bound always keeps: what no sample showed must stay reachable, or it would be
-/// invisible rather than noisy.
+/// Margin of the bound above the largest ramp value observed, so that values that no sample has shown stay visible (as noise).
 const FLOOR: f32 = 0.02;
-/// The bound keeps `UNSEEN / samples` of ramp besides: with n samples, a share of about 3/n of the cell may still hold anything.
+/// The bound gets an additional `UNSEEN / samples`, since about 3/n of the cell may have any value after n samples (rule of three).
 const UNSEEN: f32 = 8.0;
-/// Relative margin on what this window showed, and on what the window before it showed.
+/// Relative margins on the largest ramp value observed in this window and in the previous one.
 const MARGIN: f32 = 1.1;
 const SLID_MARGIN: f32 = 1.25;
-/// What a sample of the window before counts against one of this window.
+/// Weight of a sample of the previous window.
 const SLID_WEIGHT: f32 = 0.25;
-/// Samples from which on a cell without a missing one is taken to hold none.
-const KNOWN_PRESENT: f32 = 16.0;
+/// Number of samples without a missing value after which a cell is assumed to have none.
+const MIN_SAMPLES_PRESENT: f32 = 16.0;
 
-/// What was seen in one cell.
+/// Observations in one cell.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Seen {
+struct CellStatistics {
     count: u32,
     highest: f32,
     missing: bool,
 }
 
-const NOTHING: Seen = Seen { count: 0, highest: f32::NEG_INFINITY, missing: false };
+const UNOBSERVED: CellStatistics = CellStatistics { count: 0, highest: f32::NEG_INFINITY, missing: false };
 
-impl Seen {
+impl CellStatistics {
     fn join(self, other: Self) -> Self {
         Self {
             count: self.count.saturating_add(other.count),
@@ -43,34 +43,52 @@ impl Seen {
     }
 }
 
-/// What the frame in progress sees. Counts, maxima and flags do not depend on the order in which threads come.
+/// Observations of the frame in progress. Counts, maxima and flags do not depend on the order of the threads.
 #[derive(Debug, Default)]
-struct Watch {
+struct CellObserver {
     count: AtomicU32,
-    /// Order-preserving image of the highest FTLE; 0 is none.
+    /// Order-preserving bits of the highest FTLE; 0 if there is none.
     highest: AtomicU32,
     missing: AtomicBool,
 }
 
-/// Maps floats to integers of the same order (no NaN).
-fn ordered(value: f32) -> u32 {
+impl Clone for CellObserver {
+    fn clone(&self) -> Self {
+        let (count, highest) = (self.count.load(Relaxed), self.highest.load(Relaxed));
+        Self { count: count.into(), highest: highest.into(), missing: self.missing.load(Relaxed).into() }
+    }
+}
+
+/// Maps floats (except NaN) to integers of the same order.
+fn ordered_bits(value: f32) -> u32 {
     let bits = value.to_bits();
     if bits >> 31 == 1 { !bits } else { bits | 1 << 31 }
 }
 
-fn from_ordered(image: u32) -> f32 {
+fn from_ordered_bits(image: u32) -> f32 {
     f32::from_bits(if image >> 31 == 1 { image ^ 1 << 31 } else { !image })
 }
 
+/// Observations in the cells of the majorant grid, made by a device (x fastest, one entry per cell in each array).
+#[derive(Debug, Clone, Default, PartialEq, Eq)]
+pub struct CellObservations {
+    /// Number of values observed, including missing ones.
+    pub count: Vec<u32>,
+    /// Order-preserving bits of the highest FTLE (see `ordered` in `kernels/majorant.cuh`); 0 if there is none.
+    pub highest: Vec<u32>,
+    /// 1 if a missing value was observed, otherwise 0.
+    pub missing: Vec<u32>,
+}
+
 /// Bounds on the extinction, x fastest, then y, then z.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub struct MajorantGrid {
     cells: [usize; 3],
     majorants: Vec<f32>,
-    may_miss: Vec<bool>,
-    watch: Vec<Watch>,
-    current: Vec<Seen>,
-    previous: Vec<Seen>,
+    may_be_missing: Vec<bool>,
+    observers: Vec<CellObserver>,
+    current: Vec<CellStatistics>,
+    previous: Vec<CellStatistics>,
 }
 
 impl MajorantGrid {
@@ -80,20 +98,22 @@ impl MajorantGrid {
         Self {
             cells,
             majorants: vec![transfer.extinction_max(); count],
-            may_miss: vec![true; count],
-            watch: std::iter::repeat_with(Watch::default).take(count).collect(),
-            current: vec![NOTHING; count],
-            previous: vec![NOTHING; count],
+            may_be_missing: vec![true; count],
+            observers: std::iter::repeat_with(CellObserver::default).take(count).collect(),
+            current: vec![UNOBSERVED; count],
+            previous: vec![UNOBSERVED; count],
         }
     }
 
-    /// Cells of about equal edges: 96 along the longest edge in two dimensions (one along z), 32 in three.
+    /// Cells with edges of about equal length: 96 along the longest edge in two dimensions (one along z), 32 in three.
     pub(super) fn default_cells(domain: &Domain, scale: [f64; 3]) -> [usize; 3] {
         let edges: [f64; 3] = std::array::from_fn(|k| domain.extent()[k] * scale[k]);
         let seen = &edges[..domain.dimensions];
         let longest = seen.iter().copied().fold(0.0, f64::max);
-        let most = if domain.dimensions == 2 { 96.0 } else { 32.0 };
-        std::array::from_fn(|k| if k < domain.dimensions { (most * edges[k] / longest).ceil().clamp(1.0, most) as usize } else { 1 })
+        let max_cells = if domain.dimensions == 2 { 96.0 } else { 32.0 };
+        std::array::from_fn(
+            |k| if k < domain.dimensions { (max_cells * edges[k] / longest).ceil().clamp(1.0, max_cells) as usize } else { 1 },
+        )
     }
 
     /// Cells along x, y and z.
@@ -101,15 +121,15 @@ impl MajorantGrid {
         self.cells
     }
 
-    /// The majorants in force, per unit of length.
+    /// The current majorants, per unit of length.
     pub fn majorants(&self) -> &[f32] {
         &self.majorants
     }
 
-    /// Whether a cell may hold missing values: some were seen, or too little was.
+    /// True if a cell may contain missing values: some were observed, or there are too few samples.
     #[inline]
-    pub(super) fn may_miss(&self, cell: usize) -> bool {
-        self.may_miss[cell]
+    pub(super) fn may_be_missing(&self, cell: usize) -> bool {
+        self.may_be_missing[cell]
     }
 
     /// Index of the cell at grid coordinates.
@@ -119,66 +139,66 @@ impl MajorantGrid {
         (z * self.cells[1] + y) * self.cells[0] + x
     }
 
-    /// Plants majorants.
+    /// Sets the majorants.
     #[cfg(test)]
     pub(super) fn set_for_test(&mut self, majorants: Vec<f32>) {
         assert_eq!(majorants.len(), self.majorants.len());
         self.majorants = majorants;
     }
 
-    /// Notes an FTLE seen in a cell.
+    /// Records an FTLE observed in a cell.
     #[inline]
     pub(super) fn observe(&self, cell: usize, ftle: f32) {
-        let watch = &self.watch[cell];
-        watch.count.fetch_add(1, Relaxed);
-        let image = ordered(ftle);
-        if image > watch.highest.load(Relaxed) {
-            watch.highest.fetch_max(image, Relaxed);
+        let observer = &self.observers[cell];
+        observer.count.fetch_add(1, Relaxed);
+        let image = ordered_bits(ftle);
+        if image > observer.highest.load(Relaxed) {
+            observer.highest.fetch_max(image, Relaxed);
         }
     }
 
-    /// Notes a missing value in a cell.
+    /// Records a missing value in a cell.
     #[inline]
     pub(super) fn observe_missing(&self, cell: usize) {
-        let watch = &self.watch[cell];
-        watch.count.fetch_add(1, Relaxed);
-        if !watch.missing.load(Relaxed) {
-            watch.missing.store(true, Relaxed);
+        let observer = &self.observers[cell];
+        observer.count.fetch_add(1, Relaxed);
+        if !observer.missing.load(Relaxed) {
+            observer.missing.store(true, Relaxed);
         }
     }
 
-    /// Which cells may hold missing values.
-    pub(super) fn may_miss_all(&self) -> &[bool] {
-        &self.may_miss
+    /// For each cell, whether it may contain missing values.
+    pub(super) fn may_be_missing_all(&self) -> &[bool] {
+        &self.may_be_missing
     }
 
-    /// Notes what an engine saw in all cells, as if each value had been observed here. False, and nothing noted, when it saw another grid.
+    /// Records observations made elsewhere in all cells. Returns false, and records nothing, if they are those of another grid.
     #[must_use]
-    pub(super) fn absorb(&self, seen: &SeenInCells) -> bool {
-        let cells = self.watch.len();
+    pub(super) fn absorb(&self, seen: &CellObservations) -> bool {
+        let cells = self.observers.len();
         if [seen.count.len(), seen.highest.len(), seen.missing.len()] != [cells; 3] {
             return false;
         }
-        for (i, watch) in self.watch.iter().enumerate() {
-            watch.count.fetch_add(seen.count[i], Relaxed);
-            watch.highest.fetch_max(seen.highest[i], Relaxed);
-            watch.missing.fetch_or(seen.missing[i] != 0, Relaxed);
+        for (i, observer) in self.observers.iter().enumerate() {
+            observer.count.fetch_add(seen.count[i], Relaxed);
+            observer.highest.fetch_max(seen.highest[i], Relaxed);
+            observer.missing.fetch_or(seen.missing[i] != 0, Relaxed);
         }
         true
     }
 
-    /// Puts what the frames so far have seen into force.
+    /// Applies the observations of all frames so far.
     pub(super) fn commit(&mut self, transfer: &Transfer) {
-        for (watch, current) in self.watch.iter_mut().zip(&mut self.current) {
-            let watch = std::mem::take(watch);
-            let image = watch.highest.into_inner();
-            let highest = if image == 0 { f32::NEG_INFINITY } else { from_ordered(image) };
-            *current = current.join(Seen { count: watch.count.into_inner(), highest, missing: watch.missing.into_inner() });
+        for (observer, current) in self.observers.iter_mut().zip(&mut self.current) {
+            let observer = std::mem::take(observer);
+            let image = observer.highest.into_inner();
+            let highest = if image == 0 { f32::NEG_INFINITY } else { from_ordered_bits(image) };
+            *current = current.join(CellStatistics { count: observer.count.into_inner(), highest, missing: observer.missing.into_inner() });
         }
         self.derive(transfer);
     }
 
-    /// The window has moved: what was seen counts for less, and may have moved into a neighbouring cell.
+    /// Adapts to a slide of the window: observations lose weight and may apply to a neighbouring cell.
     pub(super) fn slide(&mut self, transfer: &Transfer) {
         self.commit(transfer);
         let [nx, ny, nz] = self.cells;
@@ -187,18 +207,18 @@ impl MajorantGrid {
         self.previous.par_chunks_mut(nx).enumerate().with_min_len(16).for_each(|(row, previous)| {
             let (y, z) = (row % ny, row / ny);
             for (x, previous) in previous.iter_mut().enumerate() {
-                let mut joined = NOTHING;
+                let mut joined = UNOBSERVED;
                 for (k, j) in around(z, nz).flat_map(|k| around(y, ny).map(move |j| (k, j))) {
                     joined = around(x, nx).fold(joined, |all, i| all.join(current[(k * ny + j) * nx + i]));
                 }
-                *previous = Seen { count: current[row * nx + x].count, ..joined };
+                *previous = CellStatistics { count: current[row * nx + x].count, ..joined };
             }
         });
-        self.current.fill(NOTHING);
+        self.current.fill(UNOBSERVED);
         self.derive(transfer);
     }
 
-    /// Derives the majorants from what was seen.
+    /// Derives the majorants from the observations.
     pub(super) fn derive(&mut self, transfer: &Transfer) {
         let largest = transfer.extinction_max();
         // An empty interval has an empty ramp.
@@ -206,9 +226,9 @@ impl MajorantGrid {
         for (i, (current, previous)) in self.current.iter().zip(&self.previous).enumerate() {
             let count = current.count as f32 + SLID_WEIGHT * previous.count as f32;
             let seen = (MARGIN * ramp(current.highest)).max(SLID_MARGIN * ramp(previous.highest));
-            // With count 0 the bound is the largest extinction.
+            // With a count of 0 the bound is the largest extinction.
             self.majorants[i] = largest * (seen + FLOOR + UNSEEN / count).min(1.0);
-            self.may_miss[i] = current.missing | previous.missing || count < KNOWN_PRESENT;
+            self.may_be_missing[i] = current.missing | previous.missing || count < MIN_SAMPLES_PRESENT;
         }
     }
 }
@@ -227,10 +247,10 @@ mod tests {
     fn ordered_images_keep_the_order() {
         let values = [f32::NEG_INFINITY, -2.0, -1e-30, 0.0, 1e-30, 3.0, f32::INFINITY];
         for pair in values.windows(2) {
-            assert!(ordered(pair[0]) < ordered(pair[1]));
+            assert!(ordered_bits(pair[0]) < ordered_bits(pair[1]));
         }
-        values.iter().for_each(|&v| assert_eq!(from_ordered(ordered(v)), v));
-        assert!(ordered(f32::NEG_INFINITY) > 0, "0 stands for none");
+        values.iter().for_each(|&v| assert_eq!(from_ordered_bits(ordered_bits(v)), v));
+        assert!(ordered_bits(f32::NEG_INFINITY) > 0, "0 stands for none");
     }
 
     #[test]
@@ -280,13 +300,13 @@ mod tests {
     fn land_is_remembered_and_empty() {
         let transfer = transfer(100.0);
         let mut grid = MajorantGrid::new([2, 1, 1], &transfer);
-        assert!(grid.may_miss(0) && grid.may_miss(1), "nothing seen, nothing known");
+        assert!(grid.may_be_missing(0) && grid.may_be_missing(1), "nothing seen, nothing known");
         (0..8000).for_each(|_| grid.observe_missing(0));
         (0..8000).for_each(|_| grid.observe(1, -1.0));
         grid.commit(&transfer);
         // Floor 0.02 + 8/8000 of 100; f32 rounding.
         assert!((grid.majorants()[0] - 2.1).abs() < 1e-4);
-        assert!(grid.may_miss(0) && !grid.may_miss(1));
+        assert!(grid.may_be_missing(0) && !grid.may_be_missing(1));
         assert_eq!((grid.cell_at([0.9, 0.5, 0.5]), grid.cell_at([2.0, 1.0, 1.0])), (0, 1), "the far walls belong to the last cells");
     }
 

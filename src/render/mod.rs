@@ -1,11 +1,12 @@
 //! Monte Carlo volume rendering: camera, light, transfer function, majorant grid, tracking, film.
 //!
-//! In: a scene and something that answers log-stretch queries in batches. Out: a linear HDR film. Does not know who answers.
-//! Calls `field` for the domain only.
+//! In: a scene and a [`LogStretch`] that answers queries in batches. Out: a linear HDR film. Calls only `field` (the domain) and `setting`.
 //!
-//! A picture is an estimate of single scattering in a box: free flights by delta tracking, transmittance toward the light by ratio
-//! tracking, both through a grid of majorants. All flights advance together (a wavefront), so that whoever answers gets large batches.
+//! A picture is an unbiased estimate of single scattering in a box: free flights by delta tracking (Woodcock et al. 1965), transmittance to
+//! the light by ratio tracking (Novak et al. 2014), both through a grid of majorants. All flights advance together as a wavefront, so that
+//! queries come in large batches.
 
+mod albedo;
 mod camera;
 mod error;
 mod film;
@@ -22,23 +23,23 @@ mod wavefront;
 
 pub mod rng;
 
+pub use albedo::{ALBEDO_PRESETS, albedo_preset};
 pub use camera::Camera;
 pub use error::RenderError;
-pub use film::Film;
+pub use film::{Film, PixelValue};
 pub use light::Light;
-pub use majorant::MajorantGrid;
-pub use parameters::{FrameParameters, FrameSetup, PixelValue, SeenInCells};
-pub use renderer::{RenderStats, Renderer};
+pub use majorant::{CellObservations, MajorantGrid};
+pub use parameters::FrameParameters;
+pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
 pub(crate) use settings::MAX_SAMPLES;
 pub use settings::{CameraSettings, LightSettings, Method, RenderSettings, TransferSettings};
 pub use space::overview_scale;
-pub use transfer::{ALBEDO_PRESETS, Transfer, albedo_preset};
+pub use transfer::Transfer;
 
-/// Answers log-stretch queries. The renderer hands over the collision points of one wavefront step at a time.
+/// Answers log-stretch queries. The renderer passes the collision points of one wavefront step per call.
 pub trait LogStretch {
-    /// Writes the log-stretch at each point (domain coordinates) into `log_stretch` and whether it was traced by RK4 (true) or
-    /// predicted (false) into `traced`; all three have the same length. NaN means "no value here" (land): such a point is empty
-    /// space, and is counted.
+    /// Writes the log-stretch at each point (domain coordinates) to `log_stretch`, and to `traced` whether RK4 traced it (true) or a surrogate
+    /// predicted it (false). All three slices have the same length. NaN marks a point in a missing cell, which is empty space and is counted.
     fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]);
 }

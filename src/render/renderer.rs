@@ -1,13 +1,13 @@
-//! The renderer: a checked scene, its majorants, and the loop over waves.
+//! The renderer: a checked scene, its majorants, and the loop over the steps of the wavefront (see [`super::tracking`] for the estimators).
 
 use super::error::{RenderError, require};
 use super::film::Film;
-use super::majorant::MajorantGrid;
-use super::parameters::{FrameParameters, FrameSetup, SeenInCells};
+use super::majorant::{CellObservations, MajorantGrid};
+use super::parameters::FrameParameters;
 use super::rng::FrameRandom;
-use super::space::SceneBox;
+use super::space::{SceneBox, length};
 use super::tracking::FrameScene;
-use super::wavefront::{Lane, Schedule, Tally, collect};
+use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
 use super::{Camera, Light, LogStretch, Scene, Transfer};
 use crate::field::Domain;
 use rayon::prelude::*;
@@ -15,44 +15,55 @@ use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
-/// Flights of a lane: small enough for a core's cache.
-const LANE_FLIGHTS: usize = 1024;
-/// Flights of a wave, unless chosen otherwise.
+/// Flights per group, which fit into the cache of a core.
+const GROUP_FLIGHTS: usize = 1024;
+/// Default number of flights per wave.
 const WAVE_FLIGHTS: usize = 1 << 17;
 
-/// What a frame took.
+/// Counts and times of a frame.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct RenderStats {
-    /// Paths that ended.
+    /// Finished paths.
     pub paths: u64,
     /// Log-stretch queries.
     pub queries: u64,
-    /// Of them, answered by RK4.
+    /// Queries that were traced by RK4.
     pub traced: u64,
-    /// Of them, without a value (land).
+    /// Queries in missing cells.
     pub missing: u64,
-    /// Queries whose extinction exceeded the majorant in force.
+    /// Queries whose extinction exceeded the majorant.
     pub majorant_exceeded: u64,
-    /// Points that were answered besides, ahead of flights that ended before them.
-    pub ahead: u64,
+    /// Additional points that were answered in advance for flights that ended before them.
+    pub speculative_queries: u64,
     /// Calls of [`LogStretch::evaluate`].
     pub waves: u64,
     /// Wall-clock seconds of walking, accepting and summing.
     pub walk_seconds: f64,
     /// Wall-clock seconds inside [`LogStretch::evaluate`].
     pub evaluate_seconds: f64,
-    /// Both by a device's own clock, where it did them; 0 otherwise.
+    /// Seconds of both by the clock of the device that tracked the frame; 0 for the CPU.
     pub device_seconds: f64,
-    /// Whether `stop` ended the frame early: pixels that were not finished have 0 samples.
+    /// True if `stop` ended the frame early. Unfinished pixels have 0 samples.
     pub stopped: bool,
 }
 
-/// Renders frames of one scene. Keeps the majorants from frame to frame.
+/// Input of a device that tracks the paths of a frame itself.
 #[derive(Debug)]
+pub struct FrameSetup<'a> {
+    /// The scene.
+    pub parameters: FrameParameters,
+    /// The current majorants, x fastest.
+    pub majorants: &'a [f32],
+    /// For each cell, whether it may contain missing values.
+    pub may_be_missing: &'a [bool],
+}
+
+/// Renders the frames of one scene and keeps the majorants from frame to frame.
+#[derive(Debug, Clone)]
 pub struct Renderer {
     scene: Scene,
     domain: Domain,
-    per_tau: f32,
+    inverse_tau: f32,
     camera: Camera,
     light: Light,
     transfer: Transfer,
@@ -63,15 +74,19 @@ pub struct Renderer {
 }
 
 impl Renderer {
-    /// A renderer for FTLE = s / `tau` over `domain`. Everything in the scene is checked.
+    /// A renderer for FTLE = s / `tau` over `domain`. Checks everything in the scene.
+    ///
+    /// # Errors
+    /// The first key at fault and the values that it accepts.
     pub fn new(scene: Scene, domain: &Domain, tau: f64) -> Result<Self, RenderError> {
         require(tau.is_finite() && tau > 0.0, "time.tau", tau, "a finite number above 0")?;
         scene.check(domain)?;
-        let camera = Camera::new(&scene.camera, scene.aspect())?;
+        let camera = Camera::new(&scene.camera, scene.settings.aspect())?;
         let light = Light::new(&scene.light)?;
-        let transfer = Transfer::new(&scene.transfer, scene.shortest_edge(domain))?;
-        // Beyond this, f32 cannot tell one tentative collision from the next, and a flight might never end.
-        let depth = f64::from(transfer.extinction_max()) * scene.diagonal(domain);
+        let edges = scene.edges(domain);
+        let transfer = Transfer::new(&scene.transfer, edges.into_iter().fold(f64::INFINITY, f64::min))?;
+        // Beyond this depth f32 does not resolve the distance between tentative collisions, and a flight might never end.
+        let depth = f64::from(transfer.extinction_max()) * length(edges);
         let deep = "at most an optical depth of 100000 over the box's diagonal";
         require(depth <= 1e5, "transfer.extinction", transfer.extinction_max(), deep)?;
         let cells = scene.settings.majorant_cells.unwrap_or_else(|| MajorantGrid::default_cells(domain, scene.scale));
@@ -79,7 +94,7 @@ impl Renderer {
         let majorants = MajorantGrid::new(cells, &transfer);
         Ok(Self {
             domain: domain.clone(),
-            per_tau: (1.0 / tau) as f32,
+            inverse_tau: (1.0 / tau) as f32,
             camera,
             light,
             transfer,
@@ -91,8 +106,8 @@ impl Renderer {
         })
     }
 
-    /// The same with at most this many flights (rounded up to whole lanes of 1024) in a wave, and so points in a batch. The picture
-    /// does not depend on it.
+    /// Limits the number of flights per wave, and thus of points per batch (rounded up to whole groups of 1024). The picture does not depend on
+    /// it.
     pub fn with_wave_flights(mut self, flights: usize) -> Self {
         self.wave_flights = flights.clamp(1, 1 << 22);
         self
@@ -103,22 +118,24 @@ impl Renderer {
         &self.scene
     }
 
-    /// The transfer function in force.
+    /// The current transfer function.
     pub fn transfer(&self) -> &Transfer {
         &self.transfer
     }
 
-    /// The majorants in force.
+    /// The current majorants.
     pub fn majorants(&self) -> &MajorantGrid {
         &self.majorants
     }
 
-    /// Changes the scene between frames. Majorants are re-derived from the FTLE seen so far; they start anew only when their cells
-    /// change. On error everything is as before.
+    /// Changes the scene between frames. Majorants are derived anew from the FTLE observed so far; they are reset only if their cells change.
+    ///
+    /// # Errors
+    /// As [`Self::new`]; the renderer is unchanged then.
     pub fn set_scene(&mut self, scene: Scene) -> Result<(), RenderError> {
-        let mut next = Self::new(scene, &self.domain, f64::from(1.0 / self.per_tau))?;
+        let mut next = Self::new(scene, &self.domain, f64::from(1.0 / self.inverse_tau))?;
         next.wave_flights = self.wave_flights;
-        next.per_tau = self.per_tau;
+        next.inverse_tau = self.inverse_tau;
         next.last_frame = self.last_frame;
         if next.space.cells() == self.space.cells() {
             std::mem::swap(&mut next.majorants, &mut self.majorants);
@@ -128,23 +145,26 @@ impl Renderer {
         Ok(())
     }
 
-    /// Tells the majorants of log-stretch values known from elsewhere (a traced table, audit points; domain coordinates), from the next
-    /// frame on. A renderer that has seen nothing makes several times the queries in its first frame.
+    /// Records log-stretch values known from elsewhere (a traced table, audit points; domain coordinates) in the majorants, from the next frame
+    /// on. Without observations the first frame needs several times as many queries.
     pub fn observe(&self, points: &[[f32; 3]], log_stretch: &[f32]) {
         points.par_iter().with_min_len(1 << 12).zip(log_stretch).for_each(|(point, &s)| {
             let cell = self.majorants.cell_at(self.space.grid_of_domain(*point));
-            if s.is_finite() { self.majorants.observe(cell, s * self.per_tau) } else { self.majorants.observe_missing(cell) }
+            if s.is_finite() { self.majorants.observe(cell, s * self.inverse_tau) } else { self.majorants.observe_missing(cell) }
         });
     }
 
-    /// To be called when the window slides: majorants loosen, since the field has changed.
+    /// Loosens the majorants after a slide of the window.
     pub fn window_slid(&mut self) {
         self.majorants.slide(&self.transfer);
     }
 
-    /// Renders samples 0 to `samples` of every pixel. The film depends on scene, frame number, answers and majorants (what earlier
-    /// frames have seen), not on the number of threads. Walks on rayon's current pool; `answers` is called on this thread.
-    /// `progress` hears the share of paths done after each wave; setting `stop` ends the frame after the wave in progress.
+    /// Renders samples 0 to `samples` of every pixel. The film depends on scene, frame number, answers and majorants (observations of earlier
+    /// frames), not on the number of threads. Flights advance on the current rayon pool; `answers` is called on this thread. `progress` gets
+    /// the share of finished paths after each wave. Setting `stop` ends the frame after the current wave.
+    ///
+    /// # Errors
+    /// [`RenderError::Samples`] if there are no samples or too many.
     pub fn render(
         &mut self,
         frame: u64,
@@ -157,7 +177,7 @@ impl Renderer {
         self.render_samples(frame, 0..end, answers, progress, stop)
     }
 
-    /// Checks the range of samples and, when the frame is a new one, puts into force what the frames before have seen.
+    /// Checks the range of samples and, if the frame is new, applies the observations of earlier frames to the majorants.
     fn begin(&mut self, frame: u64, samples: &Range<u32>) -> Result<(), RenderError> {
         const LIMIT: u32 = 1 << 24;
         if samples.end > LIMIT || samples.start >= samples.end {
@@ -170,46 +190,10 @@ impl Renderer {
         Ok(())
     }
 
-    /// What an engine needs that tracks the paths of these samples itself; it hands what it saw to [`Self::absorb`].
-    pub fn set_up(&mut self, frame: u64, samples: Range<u32>) -> Result<FrameSetup<'_>, RenderError> {
-        self.begin(frame, &samples)?;
+    /// The scene of a frame, with the current majorants.
+    fn frame_scene(&self, frame: u64) -> FrameScene<'_> {
         let settings = &self.scene.settings;
-        let colours = [settings.background, settings.missing].map(|colour| colour.map(|c| c as f32));
-        Ok(FrameSetup {
-            parameters: FrameParameters::new(
-                &self.camera,
-                &self.light,
-                &self.transfer,
-                &self.space,
-                &FrameRandom::new(self.scene.seed, frame),
-                [settings.width, settings.height],
-                colours,
-                self.per_tau,
-            ),
-            majorants: self.majorants.majorants(),
-            may_miss: self.majorants.may_miss_all(),
-        })
-    }
-
-    /// Takes in what an engine saw while it tracked a frame; takes effect with the next. False when it is not of this grid.
-    #[must_use]
-    pub fn absorb(&self, seen: &SeenInCells) -> bool {
-        self.majorants.absorb(seen)
-    }
-
-    /// Renders a range of a frame's samples, to be merged with others by [`Film::accumulate`]: later passes, or other ranks. All
-    /// ranges of a frame see the same majorants; what they observe takes effect when another frame begins.
-    pub fn render_samples(
-        &mut self,
-        frame: u64,
-        samples: Range<u32>,
-        answers: &mut dyn LogStretch,
-        progress: Option<&dyn Fn(f32)>,
-        stop: &AtomicBool,
-    ) -> Result<(Film, RenderStats), RenderError> {
-        self.begin(frame, &samples)?;
-        let settings = &self.scene.settings;
-        let scene = FrameScene {
+        FrameScene {
             camera: &self.camera,
             light: &self.light,
             transfer: &self.transfer,
@@ -219,30 +203,66 @@ impl Renderer {
             width: settings.width,
             height: settings.height,
             background: settings.background.map(|c| c as f32),
-            missing: settings.missing.map(|c| c as f32),
-            per_tau: self.per_tau,
-        };
-        let mut film = Film::new(settings.width, settings.height);
+            missing: settings.missing_color.map(|c| c as f32),
+            inverse_tau: self.inverse_tau,
+        }
+    }
+
+    /// Begins a frame whose paths a device tracks itself and returns its input. The device passes its observations to [`Self::absorb`].
+    ///
+    /// # Errors
+    /// [`RenderError::Samples`] if the range is empty or too large.
+    pub fn frame_setup(&mut self, frame: u64, samples: Range<u32>) -> Result<FrameSetup<'_>, RenderError> {
+        self.begin(frame, &samples)?;
+        Ok(FrameSetup {
+            parameters: self.frame_scene(frame).parameters(),
+            majorants: self.majorants.majorants(),
+            may_be_missing: self.majorants.may_be_missing_all(),
+        })
+    }
+
+    /// Adds the observations of a device that tracked a frame; they take effect in the next. Returns false if they belong to another grid.
+    #[must_use]
+    pub fn absorb(&self, seen: &CellObservations) -> bool {
+        self.majorants.absorb(seen)
+    }
+
+    /// Renders a range of the samples of a frame, to be merged with others by [`Film::accumulate`] (later passes or other ranks). All ranges of
+    /// a frame use the same majorants. Their observations take effect when another frame begins.
+    ///
+    /// # Errors
+    /// [`RenderError::Samples`] if the range is empty or too large.
+    pub fn render_samples(
+        &mut self,
+        frame: u64,
+        samples: Range<u32>,
+        answers: &mut dyn LogStretch,
+        progress: Option<&dyn Fn(f32)>,
+        stop: &AtomicBool,
+    ) -> Result<(Film, RenderStats), RenderError> {
+        self.begin(frame, &samples)?;
+        let scene = self.frame_scene(frame);
+        let mut film = Film::new(scene.width, scene.height);
         let mut stats = RenderStats::default();
         let count = samples.end - samples.start;
         let paths = film.samples.len() as u64 * u64::from(count);
-        let lane_flights = LANE_FLIGHTS.min(self.wave_flights);
-        let lane_count = self.wave_flights.div_ceil(lane_flights).min(paths.div_ceil(lane_flights as u64) as usize);
-        let mut lanes: Vec<Lane> = std::iter::repeat_with(|| Lane::new(lane_flights)).take(lane_count).collect();
+        let group_flights = GROUP_FLIGHTS.min(self.wave_flights);
+        let group_count = self.wave_flights.div_ceil(group_flights).min(paths.div_ceil(group_flights as u64) as usize);
+        let mut groups: Vec<FlightGroup> = std::iter::repeat_with(|| FlightGroup::new(group_flights)).take(group_count).collect();
         let mut schedule = Schedule::new(film.samples.len() as u32, count);
         let (mut points, mut log_stretch, mut traced) = (Vec::new(), Vec::new(), Vec::new());
         loop {
             let began = Instant::now();
-            schedule.deal(&mut lanes, count);
-            advance(&mut lanes, &scene, &log_stretch, &traced, &samples);
-            collect(&mut lanes, &mut film);
-            gather(&lanes, &mut points);
+            schedule.assign_tiles(&mut groups, count);
+            advance(&mut groups, &scene, &log_stretch, &traced, &samples);
+            collect(&mut groups, &mut film);
+            gather(&groups, &mut points);
             stats.walk_seconds += began.elapsed().as_secs_f64();
             if let Some(progress) = progress {
-                let done: u64 = lanes.iter().map(|lane| lane.tally.paths).sum();
+                let done: u64 = groups.iter().map(|group| group.counts.paths).sum();
                 progress((done as f64 / paths as f64) as f32);
             }
-            if schedule.is_over(&lanes) {
+            if schedule.is_over(&groups) {
                 break;
             }
             if stop.load(Ordering::Relaxed) {
@@ -259,32 +279,33 @@ impl Renderer {
             stats.evaluate_seconds += began.elapsed().as_secs_f64();
             stats.waves += 1;
         }
-        let total = lanes.iter().fold(Tally::default(), |a, lane| a + lane.tally);
-        stats.paths = total.paths;
-        stats.queries = total.queries;
-        stats.traced = total.traced;
-        stats.missing = total.missing;
-        stats.majorant_exceeded = total.exceeded;
+        for PathCounts { queries, traced, exceeded, missing, paths } in groups.iter().map(|group| group.counts) {
+            stats.paths += paths;
+            stats.queries += queries;
+            stats.traced += traced;
+            stats.missing += missing;
+            stats.majorant_exceeded += exceeded;
+        }
         Ok((film, stats))
     }
 }
 
-/// Hands each lane its part of the answers.
-fn advance(lanes: &mut [Lane], scene: &FrameScene, log_stretch: &[f32], traced: &[bool], samples: &Range<u32>) {
+/// Advances each group with its part of the answers.
+fn advance(groups: &mut [FlightGroup], scene: &FrameScene, log_stretch: &[f32], traced: &[bool], samples: &Range<u32>) {
     let mut end = 0;
-    let parts: Vec<Range<usize>> = lanes
+    let parts: Vec<Range<usize>> = groups
         .iter()
-        .map(|lane| {
+        .map(|group| {
             let first = end;
-            end += lane.points.len();
+            end += group.points.len();
             first..end
         })
         .collect();
-    lanes.par_iter_mut().zip(parts).for_each(|(lane, own)| lane.advance(scene, &log_stretch[own.clone()], &traced[own], samples));
+    groups.par_iter_mut().zip(parts).for_each(|(group, own)| group.advance(scene, &log_stretch[own.clone()], &traced[own], samples));
 }
 
-/// Puts the lanes' points into one batch.
-fn gather(lanes: &[Lane], points: &mut Vec<[f32; 3]>) {
+/// Collects the points of all groups in one batch.
+fn gather(groups: &[FlightGroup], points: &mut Vec<[f32; 3]>) {
     points.clear();
-    lanes.iter().for_each(|lane| points.extend_from_slice(&lane.points));
+    groups.iter().for_each(|group| points.extend_from_slice(&group.points));
 }

@@ -1,7 +1,7 @@
 //! Counter-based random numbers: a pure function of (seed, frame, pixel, sample, dimension).
 //!
 //! Philox4x32-10 of Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3" (SC 2011): 32-bit integer
-//! operations only, so that every thread count, rank and device draws the same numbers.
+//! operations only, so that the numbers do not depend on the number of threads, the rank or the device.
 
 /// Round multipliers and key increments (Weyl constants) of Philox4x32, from table 2 and section 4.3 of the paper.
 const MULTIPLIERS: [u32; 2] = [0xD251_1F53, 0xCD9E_8D57];
@@ -38,7 +38,7 @@ pub struct FrameRandom {
 }
 
 impl FrameRandom {
-    /// Numbers for `frame` under `seed`. Frames beyond 2^32 go on in the upper half of the key.
+    /// Numbers for `frame` under `seed`. The upper half of the frame number is added to the upper half of the key.
     pub fn new(seed: u64, frame: u64) -> Self {
         Self { key: [seed as u32, ((seed >> 32) as u32).wrapping_add((frame >> 32) as u32)], frame: frame as u32 }
     }
@@ -80,7 +80,7 @@ mod tests {
     #[test]
     fn every_word_is_uniform_along_every_argument() {
         // 255 degrees of freedom: mean 255, deviation sqrt(510) = 22.6. Six deviations either way: a chance of 1e-9 a check, and
-        // seeds are fixed, so the test either passes for good or shows a fault.
+        // seeds are fixed, so the test either always passes or shows a fault.
         type Draw = fn(u32) -> [u32; 4];
         let draws: [Draw; 4] = [
             |i| FrameRandom::new(7, 0).words(i, 3, 5),

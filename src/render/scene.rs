@@ -1,4 +1,4 @@
-//! What a picture shows, and how.
+//! A scene: camera, light, transfer function and picture settings.
 
 use super::error::{RenderError, require};
 use super::{CameraSettings, LightSettings, RenderSettings, TransferSettings, overview_scale};
@@ -13,17 +13,17 @@ pub struct Scene {
     pub light: LightSettings,
     /// Transfer function; `low` and `high` must be set ([`TransferSettings::scaled_to`]).
     pub transfer: TransferSettings,
-    /// Size of the picture and the rest.
+    /// Size of the picture and other settings.
     pub settings: RenderSettings,
-    /// Seed of every random number.
+    /// Seed of all random numbers.
     pub seed: u64,
     /// Scene units per domain unit, along each axis.
     pub scale: [f64; 3],
 }
 
 impl Scene {
-    /// Puts a scene together from what a scene file gives; the rest are defaults. When it names a camera, a light's position or an
-    /// extinction, the scale is 1 and its numbers are lengths in domain coordinates, exactly; otherwise [`overview_scale`].
+    /// Makes a scene from the tables of a scene file, with defaults for missing ones. If a camera, the position of a light or an extinction is
+    /// given, the scale is 1 and their lengths are in domain coordinates; otherwise it is [`overview_scale`].
     pub fn assemble(
         domain: &Domain,
         camera: Option<CameraSettings>,
@@ -36,7 +36,7 @@ impl Scene {
         let exact = camera.is_some() || transfer.extinction.is_some() || light.as_ref().is_some_and(|l| l.position.is_some());
         let scale = if exact { [1.0; 3] } else { overview_scale(domain) };
         let aspect = settings.width.max(1) as f64 / settings.height.max(1) as f64;
-        // From above, over the shoulder. Maps are seen with north up, boxes with z up from the corner of low x and y.
+        // The light shines from above and behind the camera. Maps are seen with north up, boxes with z up from the corner of low x and y.
         let direction = if domain.dimensions == 2 { [-1.0, -1.0, -1.0] } else { [0.7, 0.5, -1.0] };
         Self {
             camera: camera.unwrap_or_else(|| CameraSettings::overview(domain, scale, aspect)),
@@ -48,24 +48,13 @@ impl Scene {
         }
     }
 
-    /// Width over height of the picture.
-    pub(super) fn aspect(&self) -> f64 {
-        self.settings.aspect()
-    }
-
-    /// Shortest edge of the box, in scene units.
-    pub(super) fn shortest_edge(&self, domain: &Domain) -> f64 {
+    /// Edges of the box, in scene units.
+    pub(super) fn edges(&self, domain: &Domain) -> [f64; 3] {
         let extent = domain.extent();
-        (0..3).map(|k| extent[k] * self.scale[k]).fold(f64::INFINITY, f64::min)
+        std::array::from_fn(|k| extent[k] * self.scale[k])
     }
 
-    /// Diagonal of the box, in scene units.
-    pub(super) fn diagonal(&self, domain: &Domain) -> f64 {
-        let extent = domain.extent();
-        super::space::length(std::array::from_fn(|k| extent[k] * self.scale[k]))
-    }
-
-    /// Checks what camera, light and transfer function do not check themselves.
+    /// Checks everything that camera, light and transfer function do not check themselves.
     pub(super) fn check(&self, domain: &Domain) -> Result<(), RenderError> {
         self.settings.check()?;
         let finite = domain.min.iter().chain(&domain.max).all(|v| v.is_finite());

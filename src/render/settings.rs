@@ -1,18 +1,19 @@
-//! The tables of a scene file that belong to this room.
+//! The tables `[camera]`, `[light]`, `[transfer]` and `[render]` of a scene file.
 
+use super::albedo::{albedo_preset, published_albedo};
 use super::error::{RenderError, require};
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// Largest picture edge, in pixels.
 const MAX_EDGE: usize = 16_384;
-/// Largest number of pixels: a film of them takes 3 GB.
+/// Largest number of pixels; their film takes 3 GB.
 const MAX_PIXELS: usize = 1 << 26;
-/// Largest number of samples a pixel in one call.
+/// Largest number of samples per pixel in one call.
 pub(crate) const MAX_SAMPLES: usize = 1 << 24;
 /// Largest number of majorant cells along one axis.
 const MAX_CELLS: usize = 1024;
 
-/// Which answers a picture is made of.
+/// Source of the answers to log-stretch queries.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Method {
@@ -38,7 +39,7 @@ pub struct CameraSettings {
     /// Horizontal field of view, degrees.
     #[serde(default = "ninety")]
     pub field_of_view: f64,
-    /// Parallel projection, whose film plane is `half_width` by `half_width / aspect` as above: a map without perspective.
+    /// Parallel projection. The film plane has the half-width above and the half-height `half_width / aspect`.
     #[serde(default)]
     pub orthographic: bool,
 }
@@ -51,7 +52,7 @@ fn ninety() -> f64 {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LightSettings {
-    /// Direction in which photons fly (directional light); exactly one of `direction` and `position` is given.
+    /// Direction in which photons fly (directional light). Exactly one of `direction` and `position` is given.
     pub direction: Option<[f64; 3]>,
     /// Position of a point light.
     pub position: Option<[f64; 3]>,
@@ -64,22 +65,22 @@ pub struct LightSettings {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct TransferSettings {
-    /// FTLE at which extinction begins; None: median of the first frame's FTLE.
+    /// FTLE at which the extinction begins. `None`: median of the FTLE of the first frame.
     pub low: Option<f64>,
-    /// FTLE at which it saturates; None: 99.5th percentile of the first frame's FTLE.
+    /// FTLE at which the extinction saturates. `None`: 99.5th percentile of the FTLE of the first frame.
     pub high: Option<f64>,
-    /// Largest extinction, per unit of length; None: 12 over the domain's shortest visible edge.
+    /// Largest extinction, per unit of length. `None`: 12 over the shortest visible edge of the domain.
     pub extinction: Option<f64>,
-    /// Polynomial coefficients of the red, green and blue albedo, lowest power first. A scene file may give the name of a preset
-    /// instead ([`super::ALBEDO_PRESETS`]).
+    /// Polynomial coefficients of the red, green and blue albedo, lowest power first. A scene file may name a preset instead
+    /// ([`super::ALBEDO_PRESETS`]).
     #[serde(deserialize_with = "albedo_or_preset")]
     pub albedo: [Vec<f64>; 3],
 }
 
 impl Default for TransferSettings {
-    /// Scaled to the first frame, colours of the published renderer.
+    /// Range of the first frame, colours of the published renderer.
     fn default() -> Self {
-        Self { low: None, high: None, extinction: None, albedo: super::transfer::published_albedo() }
+        Self { low: None, high: None, extinction: None, albedo: published_albedo() }
     }
 }
 
@@ -92,7 +93,7 @@ fn albedo_or_preset<'de, D: Deserializer<'de>>(deserializer: D) -> Result<[Vec<f
     }
     match Given::deserialize(deserializer)? {
         Given::Coefficients(albedo) => Ok(albedo),
-        Given::Preset(name) => super::albedo_preset(&name).map_err(serde::de::Error::custom),
+        Given::Preset(name) => albedo_preset(&name).map_err(serde::de::Error::custom),
     }
 }
 
@@ -106,13 +107,13 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Samples a pixel and frame.
+    /// Samples per pixel and frame.
     pub samples: usize,
     /// Background colour, linear.
     pub background: [f64; 3],
-    /// Colour, linear, of camera paths that leave and saw missing values: land, as opposed to background.
-    pub missing: [f64; 3],
-    /// Majorant cells along x, y, z; None: chosen from the domain.
+    /// Colour (linear) of missing cells, seen by camera paths that leave the box through them.
+    pub missing_color: [f64; 3],
+    /// Majorant cells along x, y, z. `None`: chosen from the domain.
     pub majorant_cells: Option<[usize; 3]>,
     /// Tone map: `((c - 0.5) * contrast + brightness)^(1/gamma)`: `[contrast, brightness, gamma]`.
     pub tone_map: [f64; 3],
@@ -126,7 +127,7 @@ impl Default for RenderSettings {
             height: 160,
             samples: 8,
             background: [1.0; 3],
-            missing: [0.3; 3],
+            missing_color: [0.3; 3],
             majorant_cells: None,
             tone_map: [1.85, 0.75, 1.4],
         }
@@ -140,6 +141,9 @@ impl RenderSettings {
     }
 
     /// Checks every range.
+    ///
+    /// # Errors
+    /// The first key at fault and the values that it accepts.
     pub fn check(&self) -> Result<(), RenderError> {
         let settings = self;
         let size = "1 to 16384 pixels";
@@ -150,7 +154,7 @@ impl RenderSettings {
         require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
-        require(colour(settings.missing), "render.missing", settings.missing, "three finite numbers, 0 or above")?;
+        require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;
         let [contrast, brightness, gamma] = settings.tone_map;
         let tone_map = "[contrast, brightness, gamma]: finite numbers, gamma above 0";
         require(contrast.is_finite() && brightness.is_finite(), "render.tone_map", settings.tone_map, tone_map)?;

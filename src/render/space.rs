@@ -1,15 +1,12 @@
-//! Three frames of reference: the domain (data coordinates), the scene (lengths, in which camera, light and extinction live), and
-//! the grid (majorant cells).
+//! The three frames of reference: domain (data coordinates), scene (lengths, for camera, light and extinction) and grid (majorant cells).
 
-use super::parameters::BoxParameters;
 use crate::field::{Domain, VERTICAL_EDGE};
 
-/// A factor per axis from domain to scene coordinates, for views that the program chooses itself: the longest edge becomes 1 and x
-/// and y keep their ratio. The third axis keeps it too ([`Domain::lengths`]), unless the flow is two-dimensional (the slab's thickness has
-/// no meaning) or its edge would come out shorter than a twentieth or longer than the others; then the edge becomes a quarter.
+/// Factors per axis from domain to scene coordinates for default views: the longer of the edges along x and y becomes 1, and their ratio is
+/// kept. The third axis keeps its ratio too ([`Domain::lengths`]), unless the flow is two-dimensional (the thickness of the slab has no
+/// meaning) or the edge would be shorter than a twentieth or longer than the others; then it becomes a quarter.
 ///
-/// A scene that names its camera, a light's position or its extinction is rendered at scale 1: its numbers are lengths in domain
-/// coordinates.
+/// A scene with a camera, the position of a light or an extinction is rendered at scale 1, with lengths in domain coordinates.
 pub fn overview_scale(domain: &Domain) -> [f64; 3] {
     let lengths = domain.lengths();
     let horizontal = 1.0 / lengths[0].max(lengths[1]);
@@ -19,22 +16,24 @@ pub fn overview_scale(domain: &Domain) -> [f64; 3] {
     [horizontal * domain.scale[0], horizontal * domain.scale[1], vertical]
 }
 
-/// The rendered box.
-#[derive(Debug, Clone, PartialEq)]
+/// The rendered box, in the layout that kernels read.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct SceneBox {
     /// Corners in scene units.
     min: [f64; 3],
     max: [f64; 3],
     /// Domain coordinates of the lower corner.
     domain_min: [f64; 3],
-    /// The closed box in f32, rounded inward, so that no query lies outside of it.
-    inward_min: [f32; 3],
-    inward_max: [f32; 3],
     /// Scene units per majorant cell.
     cell_edge: [f64; 3],
     /// Domain units per majorant cell.
     cell_extent: [f64; 3],
-    cells: [usize; 3],
+    /// Corners of the closed box in f32, rounded inward, so that no query lies outside of it.
+    inward_min: [f32; 3],
+    inward_max: [f32; 3],
+    cells: [i32; 3],
+    pad: i32,
 }
 
 impl SceneBox {
@@ -56,21 +55,16 @@ impl SceneBox {
             inward_max: domain.max.map(|v| inward(v, false)),
             cell_edge: std::array::from_fn(|k| extent[k] * scale[k] / cells[k] as f64),
             cell_extent: std::array::from_fn(|k| extent[k] / cells[k] as f64),
-            cells,
+            cells: cells.map(|n| n as i32),
+            pad: 0,
         }
     }
 
-    pub(super) fn parameters(&self) -> BoxParameters {
-        let Self { min, max, domain_min, inward_min, inward_max, cell_edge, cell_extent, cells } = *self;
-        let cells = cells.map(|n| n as i32);
-        BoxParameters { min, max, domain_min, cell_edge, cell_extent, inward_min, inward_max, cells, pad: 0 }
-    }
-
     pub(super) fn cells(&self) -> [usize; 3] {
-        self.cells
+        self.cells.map(|n| n as usize)
     }
 
-    /// Distances at which a ray enters and leaves the box; none when it misses or the box lies behind.
+    /// Distances at which a ray enters and leaves the box; `None` if it misses the box or the box lies behind.
     pub(super) fn intersect(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<(f64, f64)> {
         let (mut enter, mut leave) = (0.0_f64, f64::INFINITY);
         for k in 0..3 {
@@ -87,19 +81,19 @@ impl SceneBox {
         (enter < leave).then_some((enter, leave))
     }
 
-    /// Grid coordinates of a scene point, within the grid.
+    /// Grid coordinates of a scene point, clamped to the grid.
     pub(super) fn grid_point(&self, point: [f64; 3]) -> [f32; 3] {
         std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32))
     }
 
-    /// Grid coordinates of a domain point, within the grid.
+    /// Grid coordinates of a domain point, clamped to the grid.
     pub(super) fn grid_of_domain(&self, point: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| {
             (((f64::from(point[k]) - self.domain_min[k]) / self.cell_extent[k]) as f32).clamp(0.0, self.cells[k] as f32)
         })
     }
 
-    /// Cells per scene length along a scene direction.
+    /// Converts a scene direction to cells per scene length.
     #[inline]
     pub(super) fn grid_direction(&self, direction: [f64; 3]) -> [f32; 3] {
         std::array::from_fn(|k| (direction[k] / self.cell_edge[k]) as f32)
@@ -111,7 +105,7 @@ impl SceneBox {
         std::array::from_fn(|k| self.min[k] + f64::from(grid[k]) * self.cell_edge[k])
     }
 
-    /// Domain point of grid coordinates, within the box.
+    /// Domain point of grid coordinates, clamped to the box.
     #[inline]
     pub(super) fn domain_point(&self, grid: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| {
@@ -119,7 +113,7 @@ impl SceneBox {
         })
     }
 
-    /// Scene length along `direction` (grid) from `from` (grid) to where it leaves the grid.
+    /// Scene length along `direction` from `from` (both in grid coordinates) to the end of the grid.
     #[inline]
     pub(super) fn exit(&self, from: [f32; 3], direction: [f32; 3]) -> f32 {
         let mut leave = f32::INFINITY;

@@ -1,21 +1,23 @@
-//! One path: free flight by delta tracking, then transmittance toward the light by ratio tracking.
+//! A path: free flight by delta tracking (Woodcock et al. 1965), then transmittance to the light by ratio tracking (Novak, Selle and Jarosz
+//! 2014), with isotropic single scattering.
 //!
-//! Both walk the majorant grid by a digital differential analyser (Amanatides and Woo 1987) and stop at tentative collisions,
-//! where the extinction is asked for. Above its majorant, an extinction makes the probability of a null collision negative; such
-//! a collision is then drawn in proportion to absolute rates and carries a weight (Galtier et al. 2013), which keeps the mean right.
+//! Both traverse the majorant grid by a digital differential analyser (Amanatides and Woo 1987) and stop at tentative collisions, which need
+//! the extinction there. If the extinction exceeds its majorant, the probability of a null collision is negative. The collision is then drawn
+//! in proportion to the absolute rates and carries a weight (Galtier et al. 2013), so that the estimate stays unbiased.
 
 use super::film::PathSample;
 use super::majorant::MajorantGrid;
+use super::parameters::FrameParameters;
 use super::rng::{FrameRandom, unit};
 use super::space::SceneBox;
 use super::{Camera, Light, Transfer};
 
 /// Isotropic phase function.
 const PHASE: f32 = 1.0 / (4.0 * std::f32::consts::PI);
-/// Transmittance below which Russian roulette decides whether a shadow flight goes on. Unbiased; queries are dear.
+/// Transmittance below which Russian roulette ends shadow flights. It is unbiased and saves expensive queries.
 const ROULETTE: f32 = 1.0 / 16.0;
 
-/// Everything that stays the same during a frame.
+/// Everything that is constant during a frame.
 pub(super) struct FrameScene<'a> {
     pub(super) camera: &'a Camera,
     pub(super) light: &'a Light,
@@ -27,26 +29,48 @@ pub(super) struct FrameScene<'a> {
     pub(super) height: usize,
     pub(super) background: [f32; 3],
     pub(super) missing: [f32; 3],
-    pub(super) per_tau: f32,
+    pub(super) inverse_tau: f32,
 }
 
-/// What a path is after.
+impl FrameScene<'_> {
+    /// The parameters that a device needs to track the paths itself.
+    pub(super) fn parameters(&self) -> FrameParameters {
+        let (key, frame) = self.random.parts();
+        FrameParameters {
+            camera: *self.camera,
+            space: *self.space,
+            light: self.light.parameters(),
+            transfer: self.transfer.parameters(),
+            key,
+            frame,
+            pad: 0,
+            width: self.width as u32,
+            height: self.height as u32,
+            background: self.background,
+            missing: self.missing,
+            inverse_tau: self.inverse_tau,
+            pad_end: 0.0,
+        }
+    }
+}
+
+/// Stage of a path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Stage {
     /// From the camera to the first real collision.
     Camera,
-    /// From there to the light.
+    /// From the collision to the light.
     Shadow,
-    /// Past the box without a collision: one point of the way through it tells land from background.
-    Probe,
+    /// Left the box without a collision: a random point of the way through it decides between the colours of missing cells and background.
+    MissingProbe,
 }
 
-/// What becomes of a flight.
+/// Result of advancing a flight.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Outcome {
-    /// It waits for the extinction at its tentative collision.
+    /// The flight waits for the extinction at its tentative collision.
     Pending,
-    /// Its path is over.
+    /// The path has ended.
     Done(PathSample),
 }
 
@@ -62,21 +86,21 @@ pub(super) struct Flight {
     /// Cell of the tentative collision and its majorant.
     cell: u32,
     majorant: f32,
-    /// Random numbers that decide there.
+    /// Random numbers for the decisions at the collision.
     decision: f32,
     roulette: f32,
     pixel: u32,
     sample: u32,
     dimension: u32,
     stage: Stage,
-    /// What the path adds at full transmittance.
+    /// Contribution of the path at full transmittance.
     path: PathSample,
-    /// Where its lane keeps the result.
+    /// Index of the result in its group.
     pub(super) slot: u32,
 }
 
 impl Flight {
-    /// Starts the path of a sample and walks to its first tentative collision.
+    /// Starts the path of a sample and advances it to its first tentative collision.
     pub(super) fn start(scene: &FrameScene, pixel: u32, sample: u32, slot: u32) -> (Self, Outcome) {
         let [jitter_x, jitter_y, ..] = scene.random.words(pixel, sample, 0).map(|w| f64::from(unit(w)));
         let (column, row) = (pixel as usize % scene.width, pixel as usize / scene.width);
@@ -101,12 +125,12 @@ impl Flight {
             slot,
         };
         let Some((enter, leave)) = scene.space.intersect(origin, direction) else {
-            let outcome = flight.see(scene.background, 0.0);
+            let outcome = flight.finish_unscattered(scene.background, 0.0);
             return (flight, outcome);
         };
         flight.origin = scene.space.grid_point(std::array::from_fn(|k| origin[k] + enter * direction[k]));
         flight.end = (leave - enter) as f32;
-        let outcome = flight.fly(scene);
+        let outcome = flight.continue_flight(scene);
         (flight, outcome)
     }
 
@@ -116,9 +140,9 @@ impl Flight {
         std::array::from_fn(|k| self.origin[k] + self.t * self.direction[k])
     }
 
-    /// Draws a free flight and walks it; past the end the path is over.
+    /// Draws an optical depth and advances the flight to the next tentative collision or to its end.
     #[inline]
-    fn fly(&mut self, scene: &FrameScene) -> Outcome {
+    fn continue_flight(&mut self, scene: &FrameScene) -> Outcome {
         let words = scene.random.words(self.pixel, self.sample, self.dimension);
         self.dimension += 1;
         self.decision = unit(words[1]);
@@ -130,47 +154,51 @@ impl Flight {
                 (self.t, self.cell, self.majorant) = (hit.t, hit.cell, hit.majorant);
                 Outcome::Pending
             }
-            None => self.leave(scene, unit(words[3])),
+            None => self.exit_box(scene, unit(words[3])),
         }
     }
 
-    /// The walk has come to its end. A camera flight probes a point drawn uniformly along its way through the box: a choice that
-    /// does not depend on majorants, so that neither does the picture. Cells known to hold no missing value need no query.
-    fn leave(&mut self, scene: &FrameScene, place: f32) -> Outcome {
+    /// Ends a flight that has left the box or reached the light. A camera flight queries a point drawn uniformly along its way through the box.
+    /// The point does not depend on the majorants, so that the picture does not either. Cells without missing values need no query.
+    fn exit_box(&mut self, scene: &FrameScene, position: f32) -> Outcome {
         if self.stage == Stage::Shadow {
             self.path.radiance = self.path.radiance.map(|c| c * self.weight);
             return Outcome::Done(self.path);
         }
-        self.t = place * self.end;
+        self.t = position * self.end;
         let cell = scene.majorants.cell_at(self.point());
-        if !scene.majorants.may_miss(cell) {
-            return self.see(scene.background, 0.0);
+        if !scene.majorants.may_be_missing(cell) {
+            return self.finish_unscattered(scene.background, 0.0);
         }
         self.cell = cell as u32;
-        self.stage = Stage::Probe;
+        self.stage = Stage::MissingProbe;
         Outcome::Pending
     }
 
-    /// A camera path that did not scatter sees what lies behind.
-    fn see(&mut self, colour: [f32; 3], missing: f32) -> Outcome {
+    /// Ends a camera path that did not scatter with the colour behind the box.
+    fn finish_unscattered(&mut self, colour: [f32; 3], missing: f32) -> Outcome {
         self.path.radiance = colour.map(|c| c * self.weight);
         self.path.missing = missing * self.weight;
         Outcome::Done(self.path)
     }
 
-    /// Takes the answer at the tentative collision and goes on to the next. `exceeded` counts extinctions above their majorant.
+    /// Processes the answer at the tentative collision and advances to the next. `exceeded` counts extinctions above their majorant.
     #[inline]
     pub(super) fn resolve(&mut self, scene: &FrameScene, log_stretch: f32, traced: bool, exceeded: &mut u64) -> Outcome {
         self.path.queries += 1;
         self.path.traced += u32::from(traced);
         if !log_stretch.is_finite() {
             scene.majorants.observe_missing(self.cell as usize);
-            return if self.stage == Stage::Probe { self.see(scene.missing, 1.0) } else { self.fly(scene) };
+            return if self.stage == Stage::MissingProbe {
+                self.finish_unscattered(scene.missing, 1.0)
+            } else {
+                self.continue_flight(scene)
+            };
         }
-        let ftle = log_stretch * scene.per_tau;
+        let ftle = log_stretch * scene.inverse_tau;
         scene.majorants.observe(self.cell as usize, ftle);
-        if self.stage == Stage::Probe {
-            return self.see(scene.background, 0.0);
+        if self.stage == Stage::MissingProbe {
+            return self.finish_unscattered(scene.background, 0.0);
         }
         let ratio = scene.transfer.extinction(ftle) / self.majorant;
         *exceeded += u64::from(ratio > 1.0);
@@ -199,10 +227,10 @@ impl Flight {
                 }
             }
         }
-        self.fly(scene)
+        self.continue_flight(scene)
     }
 
-    /// A real collision: the path turns toward the light.
+    /// Real collision: starts the shadow flight to the light.
     fn scatter(&mut self, scene: &FrameScene, ftle: f32) -> Outcome {
         let point = self.point();
         let (direction, distance, radiance) = scene.light.seen_from(scene.space.scene_point(point));
@@ -216,11 +244,11 @@ impl Flight {
         self.t = 0.0;
         self.weight = 1.0;
         self.stage = Stage::Shadow;
-        self.fly(scene)
+        self.continue_flight(scene)
     }
 }
 
-/// Where a walk used up its optical depth.
+/// The point at which the optical depth of a flight is used up.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Hit {
     t: f32,
@@ -228,16 +256,16 @@ struct Hit {
     majorant: f32,
 }
 
-/// Walks from `t` along `origin + t direction` (grid coordinates) until the majorants add up to `depth`; none when that lies beyond
-/// `end`. Touches at most as many cells as the grid has along its three axes together.
+/// Traverses the grid from `t` along `origin + t direction` (grid coordinates) until the majorants integrate to `depth`; `None` if that is
+/// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 #[inline]
 fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
     let cells = grid.cells();
     let majorants = grid.majorants();
     let strides = [1, cells[0] as isize, (cells[0] * cells[1]) as isize];
     let mut index = 0_isize;
-    // Cells left along each axis before the walk leaves the grid, t of the next wall, and t between walls.
-    let (mut left, mut wall, mut pace, mut step) = ([0_i32; 3], [f32::INFINITY; 3], [0.0_f32; 3], [0_isize; 3]);
+    // Per axis: cells left before the ray leaves the grid, t of the next cell wall, and the difference in t between walls.
+    let (mut left, mut wall, mut wall_spacing, mut step) = ([0_i32; 3], [f32::INFINITY; 3], [0.0_f32; 3], [0_isize; 3]);
     for k in 0..3 {
         let place = origin[k] + t * direction[k];
         let cell = (place as i32).clamp(0, cells[k] as i32 - 1);
@@ -246,7 +274,7 @@ fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, 
             let ahead = direction[k] > 0.0;
             let inverse = 1.0 / direction[k];
             wall[k] = ((cell + i32::from(ahead)) as f32 - origin[k]) * inverse;
-            pace[k] = inverse.abs();
+            wall_spacing[k] = inverse.abs();
             left[k] = if ahead { cells[k] as i32 - 1 - cell } else { cell };
             step[k] = if ahead { strides[k] } else { -strides[k] };
         }
@@ -261,7 +289,7 @@ fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, 
         };
         let stop = wall[axis].min(end);
         let majorant = majorants[index as usize];
-        // Rounding may put a wall a little behind t.
+        // Rounding may put a wall slightly before t.
         let crossed = majorant * (stop - t).max(0.0);
         if crossed > depth {
             return Some(Hit { t: t + depth / majorant, cell: index as u32, majorant });
@@ -273,7 +301,7 @@ fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, 
         t = t.max(stop);
         left[axis] -= 1;
         index += step[axis];
-        wall[axis] += pace[axis];
+        wall[axis] += wall_spacing[axis];
     }
 }
 

@@ -103,7 +103,7 @@ fn with_scene<R>(extinction: f64, majorant: f32, photons: [f64; 3], test: impl F
         height: 1,
         background: [0.0; 3],
         missing: [0.0; 3],
-        per_tau: 1.0,
+        inverse_tau: 1.0,
     })
 }
 

@@ -1,53 +1,25 @@
-//! Transfer function: FTLE to extinction and albedo.
+//! The transfer function: extinction and albedo as functions of the FTLE.
 
 use super::TransferSettings;
 use super::error::{RenderError, require, require_finite};
+use super::parameters::{MAX_ALBEDO_COEFFICIENTS, TransferParameters};
 
-/// Names that `transfer.albedo` accepts in place of coefficients.
-pub const ALBEDO_PRESETS: [&str; 4] = ["published", "grey", "ember", "deep"];
-
-/// How far an albedo polynomial may leave [0, 1]: the published one touches -0.0013.
+/// Largest distance of an albedo polynomial from [0, 1]; the published one reaches -0.0013.
 const ALBEDO_SLACK: f64 = 0.05;
 
-/// Optical depth of the shortest edge at full extinction, when no extinction is given.
+/// Default optical depth of the shortest edge at full extinction.
 const DEFAULT_OPTICAL_DEPTH: f64 = 12.0;
 
-/// Coefficients a0..a4 of the small renderer published with Günther, Kuhn and Theisel, "MCFTLE" (2016): dark red ridges, pale
-/// yellow flanks, blue rims.
-pub(super) fn published_albedo() -> [Vec<f64>; 3] {
-    [
-        vec![0.6639, 1.4380, 1.1657, -8.0915, 5.0048],
-        vec![-0.0013, 1.2767, 7.4696, -15.9415, 7.4158],
-        vec![0.1685, -1.4886, 11.9910, -16.2287, 6.1246],
-    ]
-}
-
-/// Albedo polynomials by name: `published`; `grey` (0.9 everywhere); `ember` (dark red ridges to pale flanks); `deep` (dark blue
-/// ridges to pale flanks).
-pub fn albedo_preset(name: &str) -> Result<[Vec<f64>; 3], RenderError> {
-    match name {
-        "published" => Ok(published_albedo()),
-        "grey" => Ok([vec![0.9], vec![0.9], vec![0.9]]),
-        "ember" => Ok([vec![0.55, 0.42], vec![0.05, 0.85], vec![0.03, 0.15, 0.62]]),
-        "deep" => Ok([vec![0.03, 0.15, 0.62], vec![0.18, 0.72], vec![0.45, 0.50]]),
-        _ => Err(RenderError::Invalid {
-            key: "transfer.albedo",
-            found: format!("{name:?}"),
-            accepted: "\"published\", \"grey\", \"ember\", \"deep\", or three lists of polynomial coefficients",
-        }),
-    }
-}
-
 impl TransferSettings {
-    /// The same with `low` and `high`, where they are not given, set to the median and the 99.5th percentile of `ftle`.
-    /// Non-finite values are left out. A field without contrast gets a ramp that starts at its value.
+    /// Returns these settings with `low` and `high`, unless given, set to the median and the 99.5th percentile of `ftle` (1/time). Non-finite
+    /// values are ignored. A field without contrast gets a ramp that starts at its value.
     pub fn scaled_to(&self, ftle: &[f32]) -> Self {
         let mut sorted: Vec<f32> = ftle.iter().copied().filter(|f| f.is_finite()).collect();
         sorted.sort_unstable_by(f32::total_cmp);
         let quantile = |q: f64| sorted.get((q * sorted.len() as f64) as usize).map_or(0.0, |&f| f64::from(f));
         let low = self.low.unwrap_or_else(|| quantile(0.5));
-        let least = low + (low.abs() * 1e-3).max(f64::from(f32::MIN_POSITIVE) * 1e6);
-        let high = self.high.unwrap_or_else(|| quantile(0.995).max(least));
+        let min_high = low + (low.abs() * 1e-3).max(f64::from(f32::MIN_POSITIVE) * 1e6);
+        let high = self.high.unwrap_or_else(|| quantile(0.995).max(min_high));
         Self { low: Some(low), high: Some(high), ..self.clone() }
     }
 }
@@ -62,7 +34,10 @@ pub struct Transfer {
 }
 
 impl Transfer {
-    /// Checks the settings. `shortest_edge` of the box, in scene units, stands in for a missing extinction.
+    /// Checks the settings. `shortest_edge` of the box, in scene units, determines the extinction unless it is given.
+    ///
+    /// # Errors
+    /// The first key at fault and the values that it accepts.
     pub fn new(settings: &TransferSettings, shortest_edge: f64) -> Result<Self, RenderError> {
         let number = "a number; it is set from the first frame's FTLE when left out of a scene file";
         let (Some(low), Some(high)) = (settings.low, settings.high) else {
@@ -80,7 +55,12 @@ impl Transfer {
         let extinction = settings.extinction.unwrap_or(DEFAULT_OPTICAL_DEPTH / shortest_edge);
         require(extinction.is_finite() && extinction >= 0.0, "transfer.extinction", extinction, "a finite number, 0 or above")?;
         for channel in &settings.albedo {
-            require((1..=16).contains(&channel.len()), "transfer.albedo", channel, "1 to 16 coefficients a channel")?;
+            require(
+                (1..=MAX_ALBEDO_COEFFICIENTS).contains(&channel.len()),
+                "transfer.albedo",
+                channel,
+                "1 to 16 coefficients per channel",
+            )?;
             require_finite("transfer.albedo", channel)?;
             let worst =
                 (0..=256).map(|i| polynomial(channel, f64::from(i) / 256.0)).find(|a| !(-ALBEDO_SLACK..=1.0 + ALBEDO_SLACK).contains(a));
@@ -90,19 +70,22 @@ impl Transfer {
         Ok(Self { low: low as f32, per_range: 1.0 / range, extinction_max: extinction as f32, albedo })
     }
 
-    /// Low, 1 / (high - low), largest extinction, albedo coefficients.
-    pub(super) fn parts(&self) -> (f32, f32, f32, &[Vec<f32>; 3]) {
-        (self.low, self.per_range, self.extinction_max, &self.albedo)
+    pub(super) fn parameters(&self) -> TransferParameters {
+        let mut albedo = [[0.0; MAX_ALBEDO_COEFFICIENTS]; 3];
+        for (padded, channel) in albedo.iter_mut().zip(&self.albedo) {
+            padded[..channel.len()].copy_from_slice(channel);
+        }
+        let coefficients = self.albedo.each_ref().map(|channel| channel.len() as i32);
+        TransferParameters { low: self.low, per_range: self.per_range, extinction_max: self.extinction_max, coefficients, albedo }
     }
 
-    /// What the ramp of a log-stretch over `tau` needs: low, 1 / (high - low), and tau.
+    /// Parameters of the ramp of a log-stretch over `tau`: low, 1 / (high - low), and tau.
     #[cfg(feature = "cuda")]
     pub(crate) fn ramp_parts(&self, tau: f64) -> (f32, f32, f32) {
         (self.low, self.per_range, tau as f32)
     }
 
-    /// saturate((FTLE - low) / (high - low)), in [0, 1]: the normalised extinction, in which optical residuals are measured. NaN
-    /// stays NaN.
+    /// Normalised extinction saturate((FTLE - low) / (high - low)), in [0, 1], in which optical residuals are measured. NaN stays NaN.
     #[inline]
     pub fn ramp(&self, ftle: f32) -> f32 {
         ((ftle - self.low) * self.per_range).clamp(0.0, 1.0)
@@ -125,12 +108,6 @@ impl Transfer {
         let t = 1.0 - self.ramp(ftle);
         self.albedo.each_ref().map(|channel| channel.iter().rev().fold(0.0, |sum, &a| sum * t + a))
     }
-
-    /// Extinction's bound over the FTLE interval `[low, high]`. The ramp never falls, so the upper end decides; an empty interval
-    /// (low above high) bounds nothing and gives 0.
-    pub fn majorant(&self, low: f32, high: f32) -> f32 {
-        if low > high { 0.0 } else { self.extinction(high) }
-    }
 }
 
 fn polynomial(coefficients: &[f64], t: f64) -> f64 {
@@ -140,6 +117,7 @@ fn polynomial(coefficients: &[f64], t: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::render::ALBEDO_PRESETS;
 
     fn published() -> TransferSettings {
         TransferSettings { low: Some(0.05), high: Some(0.235), extinction: Some(100.0), ..TransferSettings::default() }
@@ -161,16 +139,6 @@ mod tests {
         let found = transfer.albedo(0.1425);
         // Coefficients of 16 in f32.
         (0..3).for_each(|k| assert!((f64::from(found[k]) - expected[k]).abs() < 1e-5));
-    }
-
-    #[test]
-    fn majorants_bound_the_interval() {
-        let transfer = Transfer::new(&published(), 1.0).unwrap();
-        for i in 0..=100 {
-            let ftle = 0.02 + 0.15 * i as f32 / 100.0;
-            assert!(transfer.extinction(ftle) <= transfer.majorant(0.02, 0.17));
-        }
-        assert_eq!(transfer.majorant(f32::INFINITY, f32::NEG_INFINITY), 0.0);
     }
 
     #[test]

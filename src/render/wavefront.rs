@@ -1,16 +1,16 @@
-//! The wavefront: lanes of flights that advance together, wave by wave.
+//! The wavefront: groups of flights that advance together, one tentative collision per wave.
 //!
-//! Each lane owns a number of flights and a ring of results. Paths start in the order of (pixel, sample) and end in any order; the
-//! ring lets them retire in the order in which they started, so that a pixel's sum never depends on threads, lanes or waves, and
-//! memory is bounded whatever the number of samples.
+//! Each group owns a number of flights and a ring buffer of results. Paths start in the order of (pixel, sample) and end in any order. The ring
+//! buffer releases them in the order in which they started, so that the sum of a pixel does not depend on threads, groups or waves, and memory
+//! does not grow with the number of samples.
 
 use super::film::{Film, PathSample, Pixel};
 use super::tracking::{Flight, FrameScene, Outcome};
 use std::collections::VecDeque;
 
-/// Results a lane holds back, as a multiple of its flights: how far a long path may delay the ones behind it.
-const RING_FACTOR: usize = 4;
-/// Paths that are handed to a lane at a time.
+/// Capacity of the ring buffer of results per flight. It limits how many later paths wait for a long one.
+const RESULTS_PER_FLIGHT: usize = 4;
+/// Paths assigned to a group at a time.
 const TILE_PATHS: u64 = 512;
 
 /// A run of pixels.
@@ -20,9 +20,9 @@ struct Tile {
     end: u32,
 }
 
-/// What a lane's waves added up to.
+/// Counts over the waves of a group.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Tally {
+pub(super) struct PathCounts {
     pub(super) queries: u64,
     pub(super) traced: u64,
     pub(super) exceeded: u64,
@@ -30,46 +30,32 @@ pub(super) struct Tally {
     pub(super) paths: u64,
 }
 
-impl std::ops::Add for Tally {
-    type Output = Self;
-
-    fn add(self, other: Self) -> Self {
-        Self {
-            queries: self.queries + other.queries,
-            traced: self.traced + other.traced,
-            exceeded: self.exceeded + other.exceeded,
-            missing: self.missing + other.missing,
-            paths: self.paths + other.paths,
-        }
-    }
-}
-
 /// A group of flights that one thread advances at a time.
-pub(super) struct Lane {
+pub(super) struct FlightGroup {
     capacity: usize,
     flights: Vec<Flight>,
     /// Domain coordinates of the flights' tentative collisions.
     pub(super) points: Vec<[f32; 3]>,
-    ring: Vec<Option<PathSample>>,
+    results: Vec<Option<PathSample>>,
     started: u64,
     retired: u64,
     tiles: VecDeque<Tile>,
-    /// Sample of the front tile's first pixel that starts next.
+    /// Next sample of the first pixel of the front tile.
     next_sample: u32,
-    /// Pixels of the paths in the ring, oldest first; the front one is being summed in `sum`.
+    /// Pixels of the paths in `results`, oldest first; `sum` belongs to the front one.
     open: VecDeque<u32>,
     sum: Pixel,
     finished: Vec<(u32, Pixel)>,
-    pub(super) tally: Tally,
+    pub(super) counts: PathCounts,
 }
 
-impl Lane {
+impl FlightGroup {
     pub(super) fn new(capacity: usize) -> Self {
         Self {
             capacity,
             flights: Vec::new(),
             points: Vec::new(),
-            ring: vec![None; capacity * RING_FACTOR],
+            results: vec![None; capacity * RESULTS_PER_FLIGHT],
             started: 0,
             retired: 0,
             tiles: VecDeque::new(),
@@ -77,24 +63,24 @@ impl Lane {
             open: VecDeque::new(),
             sum: Pixel::default(),
             finished: Vec::new(),
-            tally: Tally::default(),
+            counts: PathCounts::default(),
         }
     }
 
-    /// Takes the answers for this lane's points, advances every flight to its next tentative collision and starts new paths in the
-    /// room that ended ones leave.
+    /// Processes the answers for the points of this group, advances every flight to its next tentative collision and replaces finished paths by
+    /// new ones.
     pub(super) fn advance(&mut self, scene: &FrameScene, log_stretch: &[f32], traced: &[bool], samples: &std::ops::Range<u32>) {
         let mut kept = 0;
         for i in 0..self.flights.len() {
-            self.tally.queries += 1;
-            self.tally.traced += u64::from(traced[i]);
-            self.tally.missing += u64::from(!log_stretch[i].is_finite());
-            match self.flights[i].resolve(scene, log_stretch[i], traced[i], &mut self.tally.exceeded) {
+            self.counts.queries += 1;
+            self.counts.traced += u64::from(traced[i]);
+            self.counts.missing += u64::from(!log_stretch[i].is_finite());
+            match self.flights[i].resolve(scene, log_stretch[i], traced[i], &mut self.counts.exceeded) {
                 Outcome::Pending => {
                     self.flights.swap(kept, i);
                     kept += 1;
                 }
-                Outcome::Done(path) => self.ring[self.flights[i].slot as usize] = Some(path),
+                Outcome::Done(path) => self.results[self.flights[i].slot as usize] = Some(path),
             }
         }
         self.flights.truncate(kept);
@@ -106,9 +92,9 @@ impl Lane {
 
     fn refill(&mut self, scene: &FrameScene, samples: &std::ops::Range<u32>) {
         while self.flights.len() < self.capacity && !self.tiles.is_empty() {
-            if self.started - self.retired == self.ring.len() as u64 {
+            if self.started - self.retired == self.results.len() as u64 {
                 self.retire(samples);
-                if self.started - self.retired == self.ring.len() as u64 {
+                if self.started - self.retired == self.results.len() as u64 {
                     return;
                 }
             }
@@ -125,23 +111,23 @@ impl Lane {
                     self.tiles.pop_front();
                 }
             }
-            let slot = (self.started % self.ring.len() as u64) as u32;
+            let slot = (self.started % self.results.len() as u64) as u32;
             self.started += 1;
             match Flight::start(scene, pixel, sample, slot) {
                 (flight, Outcome::Pending) => self.flights.push(flight),
-                (_, Outcome::Done(path)) => self.ring[slot as usize] = Some(path),
+                (_, Outcome::Done(path)) => self.results[slot as usize] = Some(path),
             }
         }
         self.retire(samples);
     }
 
-    /// Adds finished paths to their pixels, in the order in which they started, up to the first that is still in flight.
+    /// Adds finished paths to their pixels in the order in which they started, up to the first unfinished path.
     fn retire(&mut self, samples: &std::ops::Range<u32>) {
         while self.retired < self.started {
-            let slot = (self.retired % self.ring.len() as u64) as usize;
-            let Some(path) = self.ring[slot].take() else { return };
+            let slot = (self.retired % self.results.len() as u64) as usize;
+            let Some(path) = self.results[slot].take() else { return };
             self.retired += 1;
-            self.tally.paths += 1;
+            self.counts.paths += 1;
             self.sum.add(&path);
             if self.sum.samples() == samples.end - samples.start
                 && let Some(pixel) = self.open.pop_front()
@@ -156,7 +142,7 @@ impl Lane {
     }
 }
 
-/// Hands pixels out to lanes.
+/// Distributes pixels over groups.
 pub(super) struct Schedule {
     next: u32,
     pixels: u32,
@@ -168,33 +154,33 @@ impl Schedule {
         Self { next: 0, pixels, per_tile: (TILE_PATHS / u64::from(samples)).clamp(1, 512) as u32 }
     }
 
-    /// Gives tiles, one lane after the other, to those whose waiting paths do not fill them.
-    pub(super) fn deal(&mut self, lanes: &mut [Lane], samples: u32) {
-        let mut hungry = true;
-        while hungry && self.next < self.pixels {
-            hungry = false;
-            for lane in lanes.iter_mut() {
-                let waiting: u64 = lane.tiles.iter().map(|t| u64::from(t.end - t.first) * u64::from(samples)).sum();
-                if self.next < self.pixels && lane.flights.len() as u64 + waiting < lane.capacity as u64 + u64::from(lane.next_sample) {
+    /// Assigns tiles in turn to the groups whose waiting paths are fewer than their free flights.
+    pub(super) fn assign_tiles(&mut self, groups: &mut [FlightGroup], samples: u32) {
+        let mut assigned = true;
+        while assigned && self.next < self.pixels {
+            assigned = false;
+            for group in groups.iter_mut() {
+                let waiting: u64 = group.tiles.iter().map(|t| u64::from(t.end - t.first) * u64::from(samples)).sum();
+                if self.next < self.pixels && group.flights.len() as u64 + waiting < group.capacity as u64 + u64::from(group.next_sample) {
                     let end = (self.next + self.per_tile).min(self.pixels);
-                    lane.tiles.push_back(Tile { first: self.next, end });
+                    group.tiles.push_back(Tile { first: self.next, end });
                     self.next = end;
-                    hungry = true;
+                    assigned = true;
                 }
             }
         }
     }
 
-    /// Whether every path has ended.
-    pub(super) fn is_over(&self, lanes: &[Lane]) -> bool {
-        self.next == self.pixels && lanes.iter().all(Lane::idle)
+    /// True if every path has ended.
+    pub(super) fn is_over(&self, groups: &[FlightGroup]) -> bool {
+        self.next == self.pixels && groups.iter().all(FlightGroup::idle)
     }
 }
 
-/// Writes the pixels that lanes have finished.
-pub(super) fn collect(lanes: &mut [Lane], film: &mut Film) {
-    for lane in lanes {
-        for (pixel, sum) in lane.finished.drain(..) {
+/// Writes the finished pixels of all groups.
+pub(super) fn collect(groups: &mut [FlightGroup], film: &mut Film) {
+    for group in groups {
+        for (pixel, sum) in group.finished.drain(..) {
             sum.write(film, pixel as usize);
         }
     }

@@ -1,9 +1,12 @@
 //! One lane: `f32` and `f64`.
 
-use super::trigonometry::{Bits, HALF_PI_F64, PI_F32, half_turns, half_turns_pi, quarter_turns, trigonometry};
-use super::{Lanes, Mask, Real};
+use super::trigonometry::{
+    HALF_PI_F64, PI_F32, RoundingBits, sin_cos_half_turns, sin_cos_half_turns_pi, sin_cos_quarter_turns, trigonometry,
+};
+use super::{Lanes, Mask, Real, inherent};
 
 impl Mask for bool {
+    const LANES: usize = 1;
     #[inline(always)]
     fn splat(value: bool) -> Self {
         value
@@ -40,22 +43,7 @@ macro_rules! scalar {
             fn lane(self, _: usize) -> $real {
                 self
             }
-            #[inline(always)]
-            fn mul_add(self, a: Self, b: Self) -> Self {
-                $real::mul_add(self, a, b)
-            }
-            #[inline(always)]
-            fn sqrt(self) -> Self {
-                $real::sqrt(self)
-            }
-            #[inline(always)]
-            fn abs(self) -> Self {
-                $real::abs(self)
-            }
-            #[inline(always)]
-            fn floor(self) -> Self {
-                $real::floor(self)
-            }
+            inherent!($real: mul_add(a, b), sqrt(), abs(), floor(), ln(), atan2(x));
             #[inline(always)]
             fn min(self, other: Self) -> Self {
                 if self < other { self } else { other }
@@ -63,14 +51,6 @@ macro_rules! scalar {
             #[inline(always)]
             fn max(self, other: Self) -> Self {
                 if self > other { self } else { other }
-            }
-            #[inline(always)]
-            fn ln(self) -> Self {
-                $real::ln(self)
-            }
-            #[inline(always)]
-            fn atan2(self, x: Self) -> Self {
-                $real::atan2(self, x)
             }
             trigonometry!($real);
             #[inline(always)]
@@ -106,7 +86,7 @@ macro_rules! scalar {
                 self.next_down()
             }
         }
-        impl Bits for $real {
+        impl RoundingBits for $real {
             #[inline(always)]
             fn nearest(self) -> Self {
                 self.round_ties_even()

@@ -27,7 +27,7 @@ fn sine_and_cosine() {
     assert!(worst::<f32x8>() < 1.8e-7, "{}", worst::<f32x8>());
     assert!(worst::<f64>() < 6e-16, "{}", worst::<f64>());
     assert!(worst::<f64x4>() < 6e-16, "{}", worst::<f64x4>());
-    assert!(worst::<Two<f64x4>>() < 6e-16);
+    assert!(worst::<LanePair<f64x4>>() < 6e-16);
 }
 
 #[test]
@@ -46,10 +46,10 @@ fn truncation_stays_in_range() {
 #[test]
 fn gathered_components_are_where_they_belong() {
     struct Counting;
-    impl<P: NodePair> Rows<P, 1> for Counting {
-        fn rows(&self, lane: usize) -> [P; 1] {
+    impl<P: NodePair> NodePairReader<P, 1> for Counting {
+        fn read_pairs(&self, lane: usize) -> [P; 1] {
             let at = |component: usize| (10 * lane + component) as f32;
-            [P::joined([0, 1, 2, 3].map(at), [4, 5, 6, 7].map(at))]
+            [P::from_nodes([0, 1, 2, 3].map(at), [4, 5, 6, 7].map(at))]
         }
     }
     fn check<L: Gather>() {

@@ -1,8 +1,9 @@
-//! What can be wrong with an archive, in words that name the file, the variable, what was found and what is accepted.
+//! Errors of the sources. Each names the file, the variable, what was found and what is accepted.
 
-use crate::field::AxisFault;
+use super::formats::FormatError;
 use crate::setting::Refused;
-use std::path::PathBuf;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
 use thiserror::Error;
 
 /// Why velocity data could not be read.
@@ -17,90 +18,18 @@ pub enum SourceError {
         /// The pattern.
         pattern: String,
     },
-    /// The operating system refuses.
-    #[error("{}: cannot be opened: {cause}", path.display())]
-    Open {
+    /// A file that cannot be opened or read.
+    #[error(transparent)]
+    Format(#[from] FormatError),
+    /// A file whose contents do not fit, or that cannot be written.
+    #[error("{}: {what}", path.display())]
+    File {
         /// The file.
         path: PathBuf,
-        /// What the operating system says.
-        cause: std::io::Error,
-    },
-    /// HDF5 locks a file before it reads it, and cannot.
-    #[error(
-        "{}: cannot be locked, as HDF5 does before it reads: {why} (the library: {what}). To read it all the same, set HDF5_USE_FILE_LOCKING=FALSE in the environment",
-        path.display()
-    )]
-    Locked {
-        /// The file.
-        path: PathBuf,
-        /// Who or what is in the way.
-        why: String,
-        /// What the library says.
+        /// The misfit, and what is accepted.
         what: String,
     },
-    /// Some other format.
-    #[error("{}: neither NetCDF nor HDF5 ({found}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4 and HDF5", path.display())]
-    NotNetCdf {
-        /// The file.
-        path: PathBuf,
-        /// What it seems to be.
-        found: String,
-    },
-    /// The file is shorter than its header says.
-    #[error("{}: truncated: {found} bytes, but its header needs {expected}", path.display())]
-    Truncated {
-        /// The file.
-        path: PathBuf,
-        /// Bytes that the header needs.
-        expected: u64,
-        /// Bytes there are.
-        found: u64,
-    },
-    /// A header that contradicts itself, or that the NetCDF library refuses.
-    #[error("{}: damaged or truncated: {what}", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What does not fit.
-        what: String,
-    },
-    /// Values of a variable cannot be read.
-    #[error("{}: variable `{variable}` cannot be read: {what}", path.display())]
-    Read {
-        /// The file.
-        path: PathBuf,
-        /// The variable.
-        variable: String,
-        /// What the library says.
-        what: String,
-    },
-    /// No pair of variables is a horizontal velocity.
-    #[error(
-        "{}: no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
-         Variables in the file:\n{candidates}",
-        path.display()
-    )]
-    NoVelocity {
-        /// The file.
-        path: PathBuf,
-        /// Which component is lacking.
-        lacking: String,
-        /// One line a variable: what it is and what it lacks.
-        candidates: String,
-    },
-    /// A unit that is not understood.
-    #[error("{}: variable `{variable}` has unit `{unit}`; accepted are {accepted}", path.display())]
-    UnknownUnit {
-        /// The file.
-        path: PathBuf,
-        /// The variable.
-        variable: String,
-        /// Its unit.
-        unit: String,
-        /// Accepted units.
-        accepted: String,
-    },
-    /// A variable that the settings name is not there.
+    /// The settings name a variable that the file lacks.
     #[error("{}: `{key} = \"{variable}\"` names no variable of the file{nearest}; it has {present}", path.display())]
     VariableNotFound {
         /// The file.
@@ -109,63 +38,19 @@ pub enum SourceError {
         key: String,
         /// Its value.
         variable: String,
-        /// The nearest name, in words; may be empty.
+        /// Sentence about the nearest name; may be empty.
         nearest: String,
         /// Names in the file.
         present: String,
     },
-    /// Components on different points.
-    #[error(
-        "{}: `{first}` lies on ({first_dimensions}) but `{second}` on ({second_dimensions}): staggered components \
-         are read where they are WRF's (dimensions `..._stag`, with PH and PHB) or have longitudes and latitudes of their own",
-        path.display()
-    )]
-    Staggered {
-        /// The file.
-        path: PathBuf,
-        /// A component.
-        first: String,
-        /// Its dimensions.
-        first_dimensions: String,
-        /// Another component.
-        second: String,
-        /// Its dimensions.
-        second_dimensions: String,
-    },
-    /// The dimensions of the velocity do not make a grid.
-    #[error("{}: variable `{variable}`: {what}", path.display())]
-    Layout {
-        /// The file.
-        path: PathBuf,
-        /// The variable.
-        variable: String,
-        /// What does not fit and what would.
-        what: String,
-    },
-    /// Coordinates that make no axis.
-    #[error("{}: {fault}", path.display())]
-    Axis {
-        /// The file.
-        path: PathBuf,
-        /// Why not.
-        fault: AxisFault,
-    },
-    /// The times are missing or not understood.
-    #[error("{}: time: {what}", path.display())]
-    Time {
-        /// The file.
-        path: PathBuf,
-        /// What does not fit and what would.
-        what: String,
-    },
     /// Two snapshots of one time.
     #[error("{} and {} both hold a snapshot of {time}: remove one", first.display(), second.display())]
     DuplicateTime {
-        /// The time, as a date where there is a calendar.
+        /// The time, as a date if there is a calendar.
         time: String,
         /// A file.
         first: PathBuf,
-        /// Another file (or the same).
+        /// Another file, or the same.
         second: PathBuf,
     },
     /// Files that do not belong together.
@@ -173,22 +58,22 @@ pub enum SourceError {
     Mixed {
         /// The first file.
         first: PathBuf,
-        /// The one that differs.
+        /// The file that differs.
         second: PathBuf,
-        /// What differs.
+        /// The difference.
         what: String,
     },
-    /// A setting whose value does not fit the file.
+    /// A setting whose value does not fit the data.
     #[error("`{key}` = {found}: {accepted}")]
     Setting {
         /// Key.
         key: &'static str,
         /// Its value.
         found: String,
-        /// What is accepted.
+        /// Accepted values.
         accepted: String,
     },
-    /// One time, and nothing said about others.
+    /// Only one time, and no setting that takes the flow as steady.
     #[error(
         "{source_name} holds one time ({time}): the FTLE needs velocities over a duration. Add files of other times or, to take the flow as \
          steady, set `archive.steady = true` and `time.tau`"
@@ -210,60 +95,69 @@ pub enum SourceError {
         tau: f64,
         /// Snapshots needed at the archive's median interval.
         needed: usize,
-        /// Snapshots there are.
+        /// Number of snapshots.
         found: usize,
         /// Median interval.
         interval: f64,
         /// Span of the archive.
         span: f64,
     },
-    /// A snapshot that is not there.
+    /// An index beyond the last snapshot.
     #[error("snapshot {index} was asked for, but there are {count} (counted from 0)")]
     NoSuchSnapshot {
         /// Index.
         index: usize,
-        /// How many there are.
+        /// Number of snapshots.
         count: usize,
     },
-    /// An archive cannot be written.
-    #[error("{}: cannot be written: {what}", path.display())]
-    Write {
-        /// The file or folder.
-        path: PathBuf,
-        /// What the library or the operating system says.
-        what: String,
-    },
-    /// In-memory data that do not fit together.
-    #[error("{what}")]
-    Inconsistent {
-        /// What does not fit.
-        what: String,
-    },
-    /// A simulation that runs now.
+    /// In-memory data that do not fit together, or a thread that cannot start.
+    #[error("{0}")]
+    Inconsistent(String),
+    /// A running simulation.
     #[error(transparent)]
     Live(#[from] ridgewatch_wire::WireError),
-    /// The I/O thread is gone.
+    /// The I/O thread ended early.
     #[error("the reading thread ended before snapshot {index} of {count}: {what}")]
     ReaderStopped {
-        /// Snapshots that came.
+        /// Snapshots received.
         index: usize,
         /// Snapshots expected.
         count: usize,
-        /// What is known about it.
+        /// The reason, as far as it is known.
         what: String,
     },
-    /// The thread that follows a simulation is gone; the simulation may run on.
+    /// The thread that follows a simulation ended; the simulation may still run.
     #[error("the thread that follows the simulation ended after {steps} steps: {what}")]
     LiveStopped {
-        /// Whole steps that came.
+        /// Whole steps received.
         steps: u64,
-        /// What is known about it.
+        /// The reason, as far as it is known.
         what: String,
     },
 }
 
 impl SourceError {
-    /// The setting at fault, where it is one.
+    /// A setting whose value does not fit.
+    pub(super) fn setting(key: &'static str, found: impl ToString, accepted: impl Into<String>) -> Self {
+        Self::Setting { key, found: found.to_string(), accepted: accepted.into() }
+    }
+
+    /// A file whose contents do not fit.
+    pub(super) fn file(path: &Path, what: impl ToString) -> Self {
+        Self::File { path: path.into(), what: what.to_string() }
+    }
+
+    /// A variable that does not fit.
+    pub(super) fn variable(path: &Path, variable: &str, what: impl Display) -> Self {
+        Self::file(path, format!("variable `{variable}`: {what}"))
+    }
+
+    /// A file or folder that cannot be written.
+    pub(super) fn write(path: &Path, what: impl Display) -> Self {
+        Self::file(path, format!("cannot be written: {what}"))
+    }
+
+    /// The setting at fault, if the error is about a setting.
     pub fn refused(&self) -> Option<Refused> {
         let qualified = |key: &str| match key {
             "tau" => "time.tau".to_owned(),

@@ -1,8 +1,8 @@
 //! Checkpoints in the safetensors format: an 8-byte little-endian header length, a JSON header, then raw little-endian f32. Any
-//! safetensors reader opens them; what is no tensor (shape, step count, rate) stands as text under `__metadata__`.
+//! safetensors reader opens them; other values (shape, step count, rate) are text under `__metadata__`.
 //!
-//! Written to a temporary file beside the target and renamed over it, so that a reader never sees half a checkpoint. Read completely and
-//! checked before anything is changed.
+//! A checkpoint is written to a temporary file beside the target and then renamed, so that readers never see a partial file. On reading, the whole
+//! file is checked before any state changes.
 
 use super::CheckpointError;
 use serde_json::{Map, Value, json};
@@ -12,9 +12,9 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
-/// Marks our files, with the version of the layout.
+/// Format name with the version of the layout.
 const FORMAT: &str = "ridgewatch-surrogate-1";
-/// Headers are a few kilobytes; more is a foreign file.
+/// Maximum size of a header, in bytes. Headers of this format take a few kilobytes.
 const LONGEST_HEADER: u64 = 1 << 20;
 
 /// One tensor of f32.
@@ -35,7 +35,7 @@ fn checksum(words: impl Iterator<Item = u32>) -> u64 {
     words.fold(0xcbf2_9ce4_8422_2325, |sum, word| (sum ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3))
 }
 
-/// A checkpoint on its way out or in.
+/// Contents of a checkpoint file.
 pub(super) struct Checkpoint<'a> {
     path: PathBuf,
     notes: Map<String, Value>,
@@ -43,7 +43,7 @@ pub(super) struct Checkpoint<'a> {
 }
 
 impl<'a> Checkpoint<'a> {
-    /// An empty one for a surrogate of this kind.
+    /// Creates an empty checkpoint for a surrogate of this kind.
     pub(super) fn new(kind: &str) -> Self {
         let mut notes = Map::new();
         notes.insert("format".into(), FORMAT.into());
@@ -51,7 +51,7 @@ impl<'a> Checkpoint<'a> {
         Self { path: PathBuf::new(), notes, entries: Vec::new() }
     }
 
-    /// States something as text.
+    /// Adds a value as text.
     pub(super) fn note(&mut self, key: &str, text: String) {
         self.notes.insert(key.into(), text.into());
     }
@@ -61,7 +61,7 @@ impl<'a> Checkpoint<'a> {
         self.entries.push(entry);
     }
 
-    /// Writes the file, atomically, and gives its size in bytes.
+    /// Writes the file atomically and returns its size in bytes.
     pub(super) fn write(&mut self, path: &Path) -> Result<u64, CheckpointError> {
         let checksum = checksum(self.entries.iter().flat_map(|entry| entry.values.iter().map(|value| value.to_bits())));
         self.note("checksum", format!("{checksum:016x}"));
@@ -74,11 +74,11 @@ impl<'a> Checkpoint<'a> {
             offset = end;
         }
         let mut header = Value::Object(header).to_string();
-        // The format asks that tensors start on a multiple of 8 bytes; spaces are its padding.
+        // The format requires tensors to start at a multiple of 8 bytes, with spaces as padding.
         header.extend(std::iter::repeat_n(' ', header.len().next_multiple_of(8) - header.len()));
         let io = |source| CheckpointError::Io { path: path.into(), source };
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        // A file like any other, by the umask; temporary ones are for their owner alone otherwise.
+        // Permissions follow the umask; temporary files are otherwise readable by their owner only.
         let mut file = tempfile::Builder::new().permissions(std::fs::Permissions::from_mode(0o666)).tempfile_in(folder).map_err(io)?;
         let mut out = std::io::BufWriter::new(file.as_file_mut());
         let mut write = || -> std::io::Result<()> {
@@ -126,7 +126,7 @@ impl<'a> Checkpoint<'a> {
         checkpoint.expect_note("format", FORMAT)?;
         checkpoint.expect_note("kind", kind)?;
         let mut data = Vec::new();
-        // Nothing beyond the file's own size is ever allocated.
+        // Allocations are bounded by the size of the file.
         file.read_to_end(&mut data).map_err(io)?;
         let mut used = 0;
         for (name, tensor) in header {
@@ -162,7 +162,7 @@ impl<'a> Checkpoint<'a> {
         self.notes.get(key).and_then(Value::as_str)
     }
 
-    /// Fails unless the note says exactly this.
+    /// Fails unless the note has exactly this value.
     pub(super) fn expect_note(&self, key: &str, expected: &str) -> Result<(), CheckpointError> {
         match self.text(key) {
             Some(found) if found == expected => Ok(()),
@@ -170,7 +170,7 @@ impl<'a> Checkpoint<'a> {
         }
     }
 
-    /// A note as a number or another readable value.
+    /// Parses a note as a number or another value.
     pub(super) fn number<T: FromStr>(&self, key: &str) -> Result<T, CheckpointError> {
         let text = self.text(key);
         text.and_then(|text| text.parse().ok())

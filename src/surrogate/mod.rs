@@ -1,35 +1,37 @@
-//! What remembers the log-stretch: a traced table, a network, or a network on a table.
+//! Surrogates of the log-stretch: a traced table, a network, or a table with a network for its residual.
 //!
-//! In: traced samples. Out: predictions with a known cost and size. Calls `flow` for its types only.
+//! In: traced samples. Out: predictions with a known cost and size. Calls `flow` and `field`.
 
+use crate::backend::DeviceError;
 use crate::field::Domain;
-use crate::flow::Tracer;
 use crate::setting::Refused;
 use network::NetworkSettings;
 use serde::{Deserialize, Serialize};
-use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
-use trainer::Trainer;
 
 mod checkpoint;
-mod draft;
+mod checkpoint_state;
+mod device;
+mod host;
+mod hybrid;
 pub mod network;
-mod offload;
-mod residual;
-mod ring;
+mod replay_buffer;
 mod sizing;
 mod table;
+mod trace;
 mod trainer;
 
-pub use draft::Draft;
-pub use offload::{Brought, Copied, DeviceLost, NotTaken, Offload, OffloadedCopy, OffloadedNetwork, OffloadedTraining};
-pub use residual::ResidualNetwork;
-pub use ring::{KEEP_STALE, RingMark, SampleRing};
+pub use checkpoint_state::CheckpointState;
+pub use device::{DeviceTable, Download, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training};
+pub use host::{FrozenNetwork, Host, HostSurrogate, HostTraining, build};
+pub use hybrid::{FrozenHybrid, Hybrid};
+pub use replay_buffer::{BufferMark, KEEP_STALE, ReplayBuffer};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;
+pub use trace::Trace;
 
-/// A number that was not given before.
-fn fresh_stamp() -> u64 {
+/// Returns a number that is unique in this process.
+pub(crate) fn fresh_stamp() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
@@ -45,7 +47,7 @@ pub struct Samples {
     pub arrival: Vec<[f32; 3]>,
     /// d arrival / d point in unit coordinates, row-major; empty unless the target is the flow map.
     pub jacobian: Vec<[f32; 9]>,
-    /// Start time and duration of each in unit intervals ([`network::Times`]); empty where that of all is the same.
+    /// Start time and duration of each in unit intervals ([`network::Times`]); empty if all samples have the same.
     pub times: Vec<[f32; 2]>,
 }
 
@@ -55,12 +57,12 @@ impl Samples {
         self.points.len()
     }
 
-    /// Whether there are none.
+    /// True if there are no samples.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
     }
 
-    /// What a network may be shown of sample `index`.
+    /// Network input of sample `index`.
     pub(crate) fn row(&self, index: usize) -> network::Row {
         network::row(self.points[index], self.times_of(index))
     }
@@ -71,38 +73,38 @@ impl Samples {
     }
 }
 
-/// What one call of [`Surrogate::learn`] did.
+/// Result of one or several calls of [`Hybrid::learn`].
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct Learned {
-    /// Optimizer steps taken, without those that the same call lost by roll-backs; a frame may have several calls, of which a later one may lose an earlier
-    /// one's steps: these count here and in `lost_steps`.
+    /// Optimizer steps, without those that the same call lost by roll-backs. If a later call of the frame loses steps of an earlier one, they
+    /// count both here and in `lost_steps`.
     pub steps: u64,
-    /// Optimizer steps taken and lost by roll-backs, or with a device: those of earlier calls too that had not come back from it.
+    /// Optimizer steps lost by roll-backs or with a device, including steps of earlier calls that were not downloaded yet.
     #[serde(default)]
     pub lost_steps: u64,
     /// Samples used, with repetition.
     pub samples: u64,
-    /// Mean training loss over the steps taken, lost ones included, but for those at which it diverged (none where no step is left).
+    /// Mean training loss over all steps, lost ones included, except those at which training diverged. `None` without such steps.
     pub loss: Option<f64>,
-    /// Samples of the ring that were left out, since they are not finite; of several calls that of the one with the most, since each finds
-    /// them anew. Labels that were traced on a device and stay there are left out there, and not counted.
+    /// Samples of the replay buffer that were skipped because they are not finite. The maximum over several calls, since each call counts them again.
+    /// Labels that stay on a device are skipped there and not counted.
     pub dropped: u64,
-    /// Times the weights were rolled back because the loss diverged.
+    /// Number of roll-backs of the weights because the loss diverged.
     pub rollbacks: u64,
     /// Wall-clock seconds.
     pub seconds: f64,
-    /// Of them, seconds of a device that took the steps; none where the CPU took them.
+    /// Device time of the steps, in seconds; `None` if the CPU took them.
     #[serde(default)]
     pub device_seconds: Option<f64>,
-    /// What should be told of a device that works but lacks memory, in words, once each.
+    /// Warnings of a device that works but is short of memory, each given once.
     #[serde(skip)]
     pub warnings: Vec<String>,
 }
 
 impl Learned {
-    /// Both together: steps, samples and seconds add up, losses are averaged with the samples of their calls as weights.
+    /// Combines two results: steps, samples and seconds are added, losses are averaged with the numbers of samples as weights.
     pub fn and(self, other: Learned) -> Learned {
-        // Not over steps: those that a call lost may be an earlier one's.
+        // Weighted by samples and not by steps, since a call may lose steps of an earlier one.
         let [mine, theirs] = [&self, &other].map(|l| l.loss.map_or((0.0, 0), |loss| (loss, l.samples)));
         let weight = (mine.1 + theirs.1) as f64;
         let loss = mine.0 * mine.1 as f64 + theirs.0 * theirs.1 as f64;
@@ -120,90 +122,32 @@ impl Learned {
     }
 }
 
-/// Something that answers log-stretch queries and does not change: a surrogate, or what one was when it was frozen.
+/// Immutable predictor of the log-stretch.
 pub trait Predict: Send + Sync {
     /// `table`, `network` or `residual`.
     fn name(&self) -> &'static str;
+
     /// Writes the predicted log-stretch at each unit point into `out` (same length). Parallelises over rayon's current pool.
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]);
-    /// Memory of what prediction reads, in bytes.
+    ///
+    /// # Errors
+    /// The device that predicts fails or is out of memory; `out` is then unspecified.
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
+
+    /// Memory that prediction reads, bytes.
     fn bytes(&self) -> usize;
-    /// Itself, for engines that know how to predict on a device what this kind of surrogate predicts here; none: nobody does.
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        None
-    }
-    /// The network in it as numbers, for engines that evaluate networks on a device; none where there is none.
-    fn network(&self) -> Option<NetworkState<'_>> {
-        None
-    }
 }
 
-/// A network that does not change, and what it stands on.
-#[derive(Clone, Copy)]
-pub struct NetworkState<'a> {
-    /// Of these parameters, and no others in this process.
-    pub stamp: u64,
-    /// What is stored where.
-    pub shape: &'a network::Architecture,
-    /// What the outputs mean.
-    pub objective: &'a network::Objective,
-    /// Hash-grid tables; empty for the frequency encoding.
-    pub tables: &'a [f32],
-    /// Weights and biases of all layers.
-    pub layers: &'a [f32],
-    /// Start time and duration that it is asked for, in unit intervals.
-    pub times: [f32; 2],
-    /// The same network where a device trains it; the numbers here are then those that came back last.
-    pub on_device: Option<&'a dyn OffloadedNetwork>,
-    /// A table below, and the factor on the network above it.
-    pub base: Option<(&'a Table, f32)>,
-}
-
-/// A memory of the log-stretch over the domain, which learns between or beside frames.
-pub trait Surrogate: Predict {
-    /// What it would answer now, for good: frames are rendered with it while training goes on.
-    fn freeze(&self) -> Arc<dyn Predict>;
-    /// Whether `learn` does anything.
-    fn learns(&self) -> bool;
-    /// Trains on the ring's samples for at most `seconds` of wall clock and at most `max_steps` optimizer steps.
-    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned;
-    /// Trains on a device from now on, where that takes it.
-    fn offload(&mut self, _to: &Arc<dyn Offload>) {}
-    /// Whether the latest steps were taken on a device.
-    fn is_offloaded(&self) -> bool {
-        false
-    }
-    /// The window slid: `tracer` traces the new one. Tables are traced anew, weights carry over; a network with the start time as an input
-    /// goes on learning as before, and predicts for the new start.
-    fn window_slid(&mut self, tracer: &dyn Tracer);
-    /// Lets go of the table that a device holds, its values coming over: another surrogate is about to take this one's place.
-    fn leave_device(&mut self) {}
-    /// Everything needed to go on (weights, optimizer state, base table) as it is now. Where a device trains, its numbers are waited for.
-    fn draft(&self) -> Draft;
-    /// The same without waiting, to be written by another thread: where a device trains, it copies its numbers, which come back as they are
-    /// written. None while an earlier copy is still on its way. Where it has no room for a copy, its numbers are waited for, and the draft says so.
-    fn draft_behind(&mut self) -> Option<Draft> {
-        Some(self.draft())
-    }
-    /// Writes [`Surrogate::draft`] into the file.
-    fn save(&self, path: &std::path::Path) -> Result<(), CheckpointError> {
-        self.draft().write(path).map(drop)
-    }
-    /// Restores what was written; a checkpoint of another shape is an error and changes nothing.
-    fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError>;
-}
-
-/// Why a surrogate cannot be built.
+/// Error of building a surrogate.
 #[derive(Debug, Clone, thiserror::Error)]
 pub enum SurrogateError {
-    /// A setting out of range.
+    /// A setting is out of range.
     #[error("setting {key} = {found} is not accepted; accepted: {accepted}")]
     Setting {
         /// Its key in the scene file.
         key: String,
-        /// What was found.
+        /// The value found.
         found: String,
-        /// What is accepted.
+        /// Accepted values.
         accepted: String,
     },
 }
@@ -215,65 +159,76 @@ impl From<SurrogateError> for Refused {
     }
 }
 
-/// Why a checkpoint was not written or read.
+/// Error of writing or reading a checkpoint.
 #[derive(Debug, thiserror::Error)]
 pub enum CheckpointError {
-    /// File trouble.
+    /// The file system fails.
     #[error("checkpoint {path}: {source}")]
     Io {
         /// The file.
         path: std::path::PathBuf,
-        /// What the system said.
+        /// Error of the system.
         source: std::io::Error,
     },
-    /// Not a checkpoint, or one of another network.
+    /// The file is not a checkpoint, or one of another surrogate.
     #[error("checkpoint {path} does not fit: {found}; expected {expected}")]
     Mismatch {
         /// The file.
         path: std::path::PathBuf,
-        /// What it holds.
+        /// Contents of the file.
         found: String,
         /// What is accepted.
         expected: String,
     },
-    /// Nothing was written.
-    #[error("checkpoint {path}: {source} before {what} had come back; nothing is written")]
+    /// The device was lost before the download was complete; nothing was written.
+    #[error("checkpoint {path}: {source} before the download of {what} was complete; nothing is written")]
     Lost {
         /// The file.
         path: std::path::PathBuf,
-        /// Of the surrogate, in words.
+        /// Missing part of the surrogate.
         what: &'static str,
-        /// What trained.
-        source: DeviceLost,
+        /// Error of the device.
+        source: DeviceError,
     },
-    /// The disk did not take it in time; what was there before stays.
+    /// The disk did not respond in time. The previous file remains.
     #[error("checkpoint {path}: not written within {seconds} seconds")]
     Hangs {
         /// The file.
         path: std::path::PathBuf,
-        /// How long it was waited for.
+        /// Time limit, in seconds.
         seconds: u64,
     },
-    /// What writes it has ended without a result.
+    /// The thread that writes the file ended without a result.
     #[error("checkpoint {path}: {why}")]
     Writer {
         /// The file.
         path: std::path::PathBuf,
-        /// In words.
+        /// The reason.
         why: String,
     },
 }
 
-/// Which surrogate.
+/// Kind of surrogate.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Kind {
-    /// The log-stretch traced at grid nodes, interpolated.
+    /// A table of the log-stretch, traced at grid nodes and interpolated.
     Table,
-    /// The network alone.
+    /// A network.
     Network,
-    /// A coarse traced table plus a learned residual, zero at first.
+    /// A coarse traced table plus a network for the residual, which starts at zero.
     Residual,
+}
+
+impl Kind {
+    /// Name in settings.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Table => "table",
+            Self::Network => "network",
+            Self::Residual => "residual",
+        }
+    }
 }
 
 /// `[surrogate]` of a scene file.
@@ -293,18 +248,21 @@ impl Default for SurrogateSettings {
     }
 }
 
-/// Nodes along the longest edge of a table for which none are set, where no data say how many: alone, and below a network.
+/// Default nodes along the longest edge of a table for closed forms: of a table alone, and of a table below a network.
 const DEFAULT_NODES: [usize; 2] = [256, 128];
-/// Most nodes of a table that was given the data's own: every slide traces them anew, which two cores do in some ten seconds.
+/// Maximum nodes of a table with the nodes of the data. Every slide traces them again, which takes two cores about ten seconds.
 const MOST_OWN_NODES: usize = 1 << 21;
-/// Most nodes of a table: 4 GiB of f32.
+/// Maximum nodes of a table: 4 GiB of f32.
 const MOST_NODES: usize = 1 << 30;
 
 impl SurrogateSettings {
-    /// Checks what does not depend on the domain.
+    /// Checks the settings that do not depend on the domain.
+    ///
+    /// # Errors
+    /// The first setting that is not accepted.
     pub fn check(&self, network: &NetworkSettings) -> Result<(), SurrogateError> {
         if self.table_nodes.is_some() {
-            // No flow varies along fewer than two axes; the third is looked at when the domain is known.
+            // Every flow varies along at least two axes. The third is checked when the domain is known.
             self.check_nodes(2)?;
         }
         if !network.inputs.is_empty() && self.kind != Kind::Network {
@@ -314,10 +272,13 @@ impl SurrogateSettings {
                 accepted: "none, or surrogate.kind = \"network\": a table knows one window and one duration".into(),
             });
         }
-        if self.kind == Kind::Residual { ResidualNetwork::check(network) } else { Ok(()) }
+        if self.kind == Kind::Residual { hybrid::check_residual(network) } else { Ok(()) }
     }
 
-    /// Checks the nodes along as many axes as the flow varies along.
+    /// Checks the table nodes along the first `dimensions` axes.
+    ///
+    /// # Errors
+    /// Fewer than 2 nodes along such an axis, or more than 2^30 nodes.
     pub fn check_nodes(&self, dimensions: usize) -> Result<(), SurrogateError> {
         let Some(nodes) = self.table_nodes else { return Ok(()) };
         let refuse = |accepted: &str| {
@@ -333,8 +294,8 @@ impl SurrogateSettings {
         Ok(())
     }
 
-    /// The same with the nodes of gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set; all axes are divided
-    /// alike where that would be more than 2^21 nodes, or more than `most`.
+    /// Returns the settings with the nodes of the gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set. All axes are
+    /// reduced by the same factor if that gives more than 2^21 nodes, or more than `most`.
     pub fn at_resolution_of(&self, shape: [usize; 3], most: usize) -> Self {
         let all: f64 = shape.iter().map(|&n| n as f64).product();
         let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
@@ -343,91 +304,17 @@ impl SurrogateSettings {
         Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
     }
 
-    /// Nodes of the table: those set, else 256 along the longest edge (128 below a network) and in proportion along the others.
+    /// Nodes of the table: those set, or 256 along the longest edge (128 below a network) and in proportion along the others; one along z in two
+    /// dimensions.
     pub(crate) fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
         let dimensions = domain.dimensions.clamp(1, 3);
         self.check_nodes(dimensions)?;
-        if let Some(nodes) = self.table_nodes {
-            return Ok(nodes);
-        }
         let longest = DEFAULT_NODES[usize::from(self.kind == Kind::Residual)];
         let lengths = domain.lengths();
         let most = lengths[..dimensions].iter().copied().fold(f64::MIN_POSITIVE, f64::max);
-        Ok(std::array::from_fn(|axis| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest)))
-    }
-}
-
-/// Builds the surrogate that the settings ask for; tables are traced at once. `seed` draws the network's first weights and its batches.
-pub fn build(
-    settings: &SurrogateSettings,
-    network: &NetworkSettings,
-    domain: &Domain,
-    seed: u64,
-    tracer: &dyn Tracer,
-) -> Result<Box<dyn Surrogate>, SurrogateError> {
-    Ok(match settings.kind {
-        Kind::Table => Box::new(Table::trace(tracer, settings.nodes(domain)?)),
-        Kind::Network => Box::new(Network { trainer: Trainer::new(network, tracer, seed, false)? }),
-        Kind::Residual => Box::new(ResidualNetwork::new(network, settings.nodes(domain)?, seed, tracer)?),
-    })
-}
-
-/// The network alone.
-struct Network {
-    trainer: Trainer,
-}
-
-impl Predict for Network {
-    fn name(&self) -> &'static str {
-        "network"
-    }
-
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.trainer.predict(points, out);
-    }
-
-    fn bytes(&self) -> usize {
-        self.trainer.bytes()
-    }
-}
-
-impl Surrogate for Network {
-    fn freeze(&self) -> Arc<dyn Predict> {
-        Arc::new(self.trainer.frozen())
-    }
-
-    fn learns(&self) -> bool {
-        true
-    }
-
-    fn learn(&mut self, ring: &SampleRing, seconds: f64, max_steps: u64) -> Learned {
-        self.trainer.learn(ring, None, seconds, max_steps)
-    }
-
-    fn offload(&mut self, to: &Arc<dyn Offload>) {
-        self.trainer.offload(to);
-    }
-
-    fn is_offloaded(&self) -> bool {
-        self.trainer.is_offloaded()
-    }
-
-    fn window_slid(&mut self, tracer: &dyn Tracer) {
-        self.trainer.window_slid(tracer);
-    }
-
-    fn draft(&self) -> Draft {
-        Draft::new(self.name(), None, Some(self.trainer.draft()))
-    }
-
-    fn draft_behind(&mut self) -> Option<Draft> {
-        let (network, waited_for) = self.trainer.draft_behind()?;
-        Some(Draft::new(self.name(), None, Some(network)).waited_for(waited_for))
-    }
-
-    fn load(&mut self, path: &std::path::Path) -> Result<(), CheckpointError> {
-        let checkpoint = checkpoint::Checkpoint::read(path, "network")?;
-        self.trainer.restored(&checkpoint)
+        let in_proportion = |axis: usize| ((lengths[axis] / most * longest as f64).round() as usize).clamp(2, longest);
+        let nodes = self.table_nodes.unwrap_or_else(|| std::array::from_fn(in_proportion));
+        Ok(std::array::from_fn(|axis| if axis < dimensions.max(2) { nodes[axis].max(2) } else { 1 }))
     }
 }
 

@@ -1,60 +1,60 @@
-//! `size = "auto"`: how large table and network are, decided by the error that is measured.
+//! `size = "auto"`: search for the size of table and network, based on the measured error.
 //!
-//! Starts small. Grows while the optical residual over the whole domain (an error that the transfer function hides is none) is above the
-//! tolerance and the last growth made it fall; goes back when it did not; shrinks when the residual is far below. Every size tried is
-//! remembered, so that no size is tried twice in vain and the search ends.
+//! The search starts small. The size grows while the optical residual over the whole domain (which ignores errors that the transfer function hides)
+//! exceeds the tolerance and the last growth reduced it. It returns to the previous size otherwise, and shrinks if the residual is far below the
+//! tolerance. Rejected sizes are remembered, so that the search ends.
 
 use super::network::{Encoding, NetworkSettings};
 use super::{Kind, MOST_OWN_NODES, SurrogateError, SurrogateSettings};
 use crate::field::Domain;
 
-/// Frames that a size is given before it is judged: the first one's weights have seen next to nothing.
+/// Frames before a size is judged, since new weights need some training first.
 const FRAMES_TO_JUDGE: u32 = 4;
-/// Share of the residual that must be left at most for a growth to have been worth its cost.
+/// Maximum ratio of the residuals after and before a growth for the growth to be kept.
 const STILL_FALLS: f64 = 0.9;
 /// Share of the tolerance below which a smaller size is tried.
 const FAR_BELOW: f64 = 0.25;
-/// Largest size; each doubles the bytes.
+/// Largest size. Each size has twice the bytes of the previous one.
 const LARGEST: u32 = 12;
-/// Size at which a table has the nodes that a fixed one would have.
+/// Size at which a table has as many nodes as with `size = "fixed"`.
 const PLAIN: u32 = 2;
-/// Entries a level of the smallest hash grid, as a power of two.
+/// Base-2 logarithm of the entries per level of the smallest hash grid.
 const SMALLEST_LOG2_TABLE: u32 = 12;
 /// Width of the smallest network.
 const SMALLEST_WIDTH: usize = 16;
 
-/// Finds the size.
+/// Search for the size.
 #[derive(Debug, Clone)]
 pub struct Sizing {
-    /// Nodes of a table of plain size, and axes along which they count.
+    /// Nodes of a table of fixed size, and the number of axes along which they vary.
     nodes: [usize; 3],
     axes: usize,
     size: u32,
-    /// Sizes outside have been found useless: too small or not worth it.
+    /// Sizes outside this range were rejected: too small, or not worth their cost.
     least: u32,
     most: u32,
-    /// Residual of the smaller size that was left last, until the growth is judged.
+    /// Residual before the last growth, until the growth is judged.
     before_growth: Option<f64>,
     frames: u32,
-    /// Sum of the mean squares of the frames that count.
+    /// Sum of the mean squares of the judged frames.
     squares: f64,
     counted: u32,
 }
 
-/// A change of size, and why.
+/// A change of size, with its reason.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Resize {
     /// The new size, from 0; each step doubles the bytes until the scene's own bounds are reached.
     pub size: u32,
-    /// In words.
+    /// Reason for the record.
     pub why: String,
 }
 
 impl Sizing {
-    /// Starts with the smallest size of what the settings say at most.
+    /// Starts with the smallest size. The settings give the largest one.
     ///
     /// # Errors
-    /// Table nodes that are not accepted.
+    /// The table nodes are not accepted.
     pub fn new(settings: &SurrogateSettings, network: &NetworkSettings, domain: &Domain) -> Result<Self, SurrogateError> {
         let (nodes, axes) = (settings.nodes(domain)?, domain.dimensions);
         let matters = |size: u32| {
@@ -65,7 +65,7 @@ impl Sizing {
                 Kind::Residual => (table.table_nodes, network.width, network.log2_table),
             }
         };
-        // Beyond the scene's bounds a larger size is the same.
+        // Larger sizes do not differ beyond the scene's bounds.
         let most = (0..LARGEST).rev().find(|&size| matters(size) != matters(size + 1)).map_or(0, |size| size + 1);
         Ok(Self { nodes, axes, ..Self::up_to(most) })
     }
@@ -74,15 +74,15 @@ impl Sizing {
         Self { nodes: [2; 3], axes: 3, size: 0, least: 0, most, before_growth: None, frames: 0, squares: 0.0, counted: 0 }
     }
 
-    /// The settings at the size in force.
+    /// Settings at the present size.
     pub fn settings(&self, settings: &SurrogateSettings, network: &NetworkSettings) -> (SurrogateSettings, NetworkSettings) {
         at_size(settings, network, self.nodes, self.axes, self.size)
     }
 
-    /// Takes in a frame's root mean square optical residual over the whole domain; gives the size to change to, if it should change.
+    /// Adds a frame's root mean square optical residual over the whole domain. Returns the new size if it should change.
     pub fn observe(&mut self, residual: f64, tolerance: f64) -> Option<Resize> {
         self.frames += 1;
-        // The first half of the frames still learns.
+        // The network is still learning in the first half of the frames.
         if self.frames > FRAMES_TO_JUDGE / 2 && residual.is_finite() {
             self.squares += residual * residual;
             self.counted += 1;
@@ -97,12 +97,12 @@ impl Sizing {
         if residual > tolerance {
             if let Some(before) = before.filter(|before| residual > STILL_FALLS * before) {
                 self.most = self.size - 1;
-                return Some(self.change_to(self.size - 1, format!("{state}: growing hardly lowered it from {before:.4}, so back to")));
+                return Some(self.change_to(self.size - 1, format!("{state}: growth hardly reduced it from {before:.4}, so back to")));
             }
             self.least = self.least.max((self.size + 1).min(self.most));
             if self.size < self.most {
                 self.before_growth = Some(residual);
-                return Some(self.change_to(self.size + 1, format!("{state}, and it still falls: grow to")));
+                return Some(self.change_to(self.size + 1, format!("{state}, and still falling: grow to")));
             }
         } else if residual < FAR_BELOW * tolerance && self.size > self.least {
             return Some(self.change_to(self.size - 1, format!("{state}, far below: shrink to")));
@@ -116,8 +116,8 @@ impl Sizing {
     }
 }
 
-/// The settings at a size. A table starts with a quarter of the nodes that are set (or that the data have) and doubles them at every
-/// size, up to those set or 2^21, whichever is more; the network starts small and ends at the scene's.
+/// Settings at a size. A table starts with a quarter of the nodes that are set (or of the data's) and has twice as many at every further size,
+/// up to those set or 2^21, whichever is more. The network starts small and ends at the scene's size.
 fn at_size(
     settings: &SurrogateSettings,
     network: &NetworkSettings,
@@ -142,7 +142,7 @@ fn at_size(
 mod tests {
     use super::*;
 
-    /// Runs frames whose residual is a function of the size; gives the sizes after each change.
+    /// Runs frames whose residual is a function of the size. Returns the sizes after each change.
     fn sizes(residual: impl Fn(u32) -> f64, tolerance: f64) -> Vec<u32> {
         let mut sizing = Sizing::up_to(LARGEST);
         (0..200).filter_map(|_| sizing.observe(residual(sizing.size), tolerance)).map(|resize| resize.size).collect()
@@ -163,7 +163,7 @@ mod tests {
     #[test]
     fn it_is_bounded_and_shrinks_when_far_below() {
         assert_eq!(sizes(|size| 10.0 * 0.8f64.powi(size as i32), 1e-6).last(), Some(&LARGEST));
-        // The flow calms down: what was needed no longer is.
+        // The flow calms down, and a smaller size suffices.
         let mut sizing = Sizing { size: 5, ..Sizing::up_to(LARGEST) };
         let sizes: Vec<u32> =
             (0..100).filter_map(|_| sizing.observe(0.001 * f64::from(1 << (5 - sizing.size)), 0.03)).map(|r| r.size).collect();

@@ -1,12 +1,13 @@
 //! The log-stretch traced at the nodes of a regular grid over the unit domain, interpolated multilinearly.
 
+use super::CheckpointError;
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
-use super::{CheckpointError, DeviceLost, Draft, Learned, Predict, SampleRing, Surrogate, fresh_stamp};
-use crate::flow::{Extras, Traced, TracedNodes, Tracer};
+use super::trace::Trace;
+use crate::backend::DeviceError;
+use crate::flow::{Extras, Traced};
 use rayon::prelude::*;
-use std::path::Path;
-use std::sync::{Arc, OnceLock};
+use std::sync::Arc;
 use wide::{f32x8, i32x8};
 
 /// Seeds traced at once while a table is built: bounds the memory beside the table itself.
@@ -17,68 +18,58 @@ const TRACE_AT_ONCE: usize = 1 << 20;
 pub struct Table {
     nodes: [usize; 3],
     dimensions: usize,
-    values: Values,
+    /// Values at the nodes, x fastest. Clones share them; a slide allocates new memory if a clone exists.
+    values: Arc<Vec<f32>>,
     not_finite: usize,
-    /// Of these values, and no others in this process.
-    stamp: u64,
-}
-
-/// Values at the nodes, x fastest. Shared with frozen copies; a slide writes into a place of its own.
-#[derive(Debug, Clone)]
-enum Values {
-    /// On the host.
-    Here(Arc<Vec<f32>>),
-    /// With the device that traced them, and on the host once somebody there asked for them.
-    There(Arc<dyn TracedNodes>, Arc<OnceLock<Arc<Vec<f32>>>>),
 }
 
 impl Table {
     /// Traces every node. `nodes` along z is ignored in two dimensions; fewer than 2 along an active axis are taken as 2.
-    pub fn trace(tracer: &dyn Tracer, nodes: [usize; 3]) -> Self {
-        let dimensions = tracer.domain().dimensions.clamp(2, 3);
+    ///
+    /// # Errors
+    /// The tracer's device fails.
+    pub fn trace(tracer: &dyn Trace, nodes: [usize; 3]) -> Result<Self, DeviceError> {
+        let dimensions = tracer.flow().domain().dimensions.clamp(2, 3);
         let nodes: [usize; 3] = std::array::from_fn(|axis| if axis < dimensions { nodes[axis].max(2) } else { 1 });
-        let mut table = Self { nodes, dimensions, values: Values::Here(Arc::default()), not_finite: 0, stamp: 0 };
-        table.retrace(tracer);
-        table
+        let mut table = Self { nodes, dimensions, values: Arc::default(), not_finite: 0 };
+        table.retrace(tracer)?;
+        Ok(table)
     }
 
-    /// Traces every node anew, after the window has slid.
-    pub fn retrace(&mut self, tracer: &dyn Tracer) {
-        let (nodes, dimensions) = (self.nodes, self.dimensions);
+    /// Creates a table from values that were traced on a device, x fastest.
+    pub fn from_values(nodes: [usize; 3], values: Vec<f32>, not_finite: usize) -> Self {
+        Self { nodes, dimensions: if nodes[2] > 1 { 3 } else { 2 }, values: Arc::new(values), not_finite }
+    }
+
+    /// Traces every node again, after the window has slid.
+    ///
+    /// # Errors
+    /// The tracer's device fails; values are then unspecified.
+    pub fn retrace(&mut self, tracer: &dyn Trace) -> Result<(), DeviceError> {
+        let (nodes, dimensions, domain) = (self.nodes, self.dimensions, tracer.flow().domain());
         let unit = |index: usize| -> [f32; 3] {
             let node = [index % nodes[0], index / nodes[0] % nodes[1], index / (nodes[0] * nodes[1])];
-            // The slab's middle stands for an axis that the flow does not depend on.
+            // Two-dimensional flows are traced in the middle of the slab.
             std::array::from_fn(|axis| if axis < dimensions { node[axis] as f32 / (nodes[axis] - 1) as f32 } else { 0.5 })
         };
         let mut traced = Traced::default();
         self.not_finite = 0;
-        self.stamp = fresh_stamp();
-        // What a device holds goes first, so that old and new never need its memory together.
-        let mut here = match std::mem::replace(&mut self.values, Values::Here(Arc::default())) {
-            Values::Here(values) => values,
-            Values::There(..) => Arc::default(),
-        };
-        if let Some(there) = tracer.trace_nodes(nodes) {
-            self.not_finite = there.not_finite();
-            self.values = Values::There(there, Arc::default());
-            return;
-        }
         let all = nodes.iter().product();
-        if Arc::get_mut(&mut here).is_none_or(|values| values.len() != all) {
-            // A frame still renders with the old values, none of which is needed here.
-            here = Arc::new(vec![0.0; all]);
+        if Arc::get_mut(&mut self.values).is_none_or(|values| values.len() != all) {
+            // A frame still renders with the old values, so the new ones get their own memory.
+            self.values = Arc::new(vec![0.0; all]);
         }
-        for (part, values) in Arc::make_mut(&mut here).chunks_mut(TRACE_AT_ONCE).enumerate() {
+        for (part, values) in Arc::make_mut(&mut self.values).chunks_mut(TRACE_AT_ONCE).enumerate() {
             let first = part * TRACE_AT_ONCE;
-            let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| tracer.domain().from_unit(unit(first + i))).collect();
-            tracer.trace(&seeds, Extras::default(), &mut traced);
+            let seeds: Vec<[f32; 3]> = (0..values.len()).into_par_iter().map(|i| domain.from_unit(unit(first + i))).collect();
+            tracer.trace(&seeds, Extras::default(), &mut traced)?;
             for (value, &traced) in values.iter_mut().zip(&traced.log_stretch) {
-                // A node without a value would spread over all cells around it; no stretch is the value of a particle that never moved.
+                // A NaN would spread to all adjacent cells. Zero stretch is the value of a particle at rest.
                 *value = if traced.is_finite() { traced } else { 0.0 };
                 self.not_finite += usize::from(!traced.is_finite());
             }
         }
-        self.values = Values::Here(here);
+        Ok(())
     }
 
     /// Nodes along x, y, z.
@@ -86,38 +77,14 @@ impl Table {
         self.nodes
     }
 
-    /// Values at the nodes, x fastest. Those that a device holds are brought over at the first call.
+    /// Values at the nodes, x fastest.
     pub fn values(&self) -> &[f32] {
-        match &self.values {
-            Values::Here(values) => values,
-            Values::There(there, copy) => copy.get_or_init(|| Arc::new(there.values())),
-        }
-    }
-
-    /// Brings values over that a device holds, and lets go of that: its memory is free once nobody else holds it.
-    pub(super) fn leave_device(&mut self) {
-        if let Values::There(there, copy) = &self.values {
-            self.values = Values::Here(copy.get_or_init(|| Arc::new(there.values())).clone());
-        }
-    }
-
-    /// What holds the values, where that is a device.
-    pub fn on_device(&self) -> Option<&dyn TracedNodes> {
-        match &self.values {
-            Values::Here(_) => None,
-            Values::There(there, _) => Some(&**there),
-        }
+        &self.values
     }
 
     /// Nodes whose trace was not finite; they hold 0.
     pub fn not_finite(&self) -> usize {
         self.not_finite
-    }
-
-    /// A number that tables in this process share only when they share their values: whoever keeps a copy elsewhere knows by it whether it
-    /// still holds.
-    pub fn stamp(&self) -> u64 {
-        self.stamp
     }
 
     /// Interpolates at eight points.
@@ -157,92 +124,30 @@ impl Table {
         }
     }
 
-    /// Adds notes and values, unless those went with the device that held them.
-    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceLost> {
-        let values = self.values();
-        // Nodes without a value hold 0.
-        if values.iter().any(|value| value.is_nan()) {
-            return Err(DeviceLost);
-        }
-        checkpoint.note("table.nodes", format!("{:?}", self.nodes));
-        checkpoint.note("table.not_finite", self.not_finite.to_string());
-        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], values));
-        Ok(())
+    /// Writes the interpolated value at each unit point into `out` (same length). Points outside the domain take the value at its edge.
+    pub fn interpolate(&self, points: &[[f32; 3]], out: &mut [f32]) {
+        assert_eq!(points.len(), out.len(), "one value a point");
+        points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(&self.values, points, out));
     }
 
+    /// Adds notes and values.
+    pub(super) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) {
+        checkpoint.note("table.nodes", format!("{:?}", self.nodes));
+        checkpoint.note("table.not_finite", self.not_finite.to_string());
+        checkpoint.push(Entry::new("table.values", &[self.nodes[2], self.nodes[1], self.nodes[0]], &*self.values));
+    }
+
+    /// The table with the values of a checkpoint.
     pub(super) fn restored(&self, checkpoint: &Checkpoint<'_>) -> Result<Self, CheckpointError> {
         checkpoint.expect_note("table.nodes", &format!("{:?}", self.nodes))?;
-        let values = checkpoint.values("table.values", self.nodes.iter().product())?;
-        let not_finite = checkpoint.number("table.not_finite")?;
-        Ok(Self {
-            nodes: self.nodes,
-            dimensions: self.dimensions,
-            values: Values::Here(Arc::new(values)),
-            not_finite,
-            stamp: fresh_stamp(),
-        })
+        let values = Arc::new(checkpoint.values("table.values", self.nodes.iter().product())?);
+        Ok(Self { nodes: self.nodes, dimensions: self.dimensions, values, not_finite: checkpoint.number("table.not_finite")? })
     }
 }
 
 impl Field for Table {
     fn values(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        self.predict_chunk(Table::values(self), points, out);
-    }
-}
-
-impl Predict for Table {
-    fn name(&self) -> &'static str {
-        "table"
-    }
-
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) {
-        assert_eq!(points.len(), out.len(), "one value a point");
-        // Whether or not there is a copy by now, so that runs do not differ by it.
-        if self.on_device().is_some_and(|there| there.interpolate(points, out)) {
-            return;
-        }
-        let values = self.values();
-        points.par_chunks(4096).zip(out.par_chunks_mut(4096)).for_each(|(points, out)| self.predict_chunk(values, points, out));
-    }
-
-    fn bytes(&self) -> usize {
-        self.nodes.iter().product::<usize>() * size_of::<f32>()
-    }
-
-    fn as_any(&self) -> Option<&dyn std::any::Any> {
-        Some(self)
-    }
-}
-
-impl Surrogate for Table {
-    fn freeze(&self) -> Arc<dyn Predict> {
-        Arc::new(self.clone())
-    }
-
-    fn learns(&self) -> bool {
-        false
-    }
-
-    fn learn(&mut self, _: &SampleRing, _: f64, _: u64) -> Learned {
-        Learned::default()
-    }
-
-    fn window_slid(&mut self, tracer: &dyn Tracer) {
-        self.retrace(tracer);
-    }
-
-    fn leave_device(&mut self) {
-        Self::leave_device(self);
-    }
-
-    fn draft(&self) -> Draft {
-        Draft::new(self.name(), Some(self.clone()), None)
-    }
-
-    fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
-        let checkpoint = Checkpoint::read(path, "table")?;
-        *self = self.restored(&checkpoint)?;
-        Ok(())
+        self.predict_chunk(&self.values, points, out);
     }
 }
 
@@ -250,6 +155,7 @@ impl Surrogate for Table {
 mod tests {
     use super::*;
     use crate::field::Domain;
+    use crate::flow::Tracer;
 
     /// Log-stretch 1 + 2x + 3y + 4z in unit coordinates, NaN left of `hole`.
     struct Plane(Domain, f32);
@@ -281,26 +187,26 @@ mod tests {
     #[test]
     fn a_linear_field_is_exact_in_three_dimensions() {
         let tracer = Plane(Domain::cuboid([-1.0, 0.0, 2.0], [3.0, 1.0, 5.0]), -1.0);
-        let table = Table::trace(&tracer, [5, 3, 4]);
+        let table = Table::trace(&tracer, [5, 3, 4]).unwrap();
         let mut points = points(1003);
         points.push([1.0; 3]);
         points.push([0.0; 3]);
         let mut out = vec![0.0; points.len()];
-        table.predict(&points, &mut out);
+        table.interpolate(&points, &mut out);
         for (p, value) in points.iter().zip(out) {
             // A few roundings of values up to 10.
             assert!((value - (1.0 + 2.0 * p[0] + 3.0 * p[1] + 4.0 * p[2])).abs() < 1e-5, "{p:?} {value}");
         }
-        assert_eq!(table.bytes(), 5 * 3 * 4 * 4);
+        assert_eq!(table.values().len(), 5 * 3 * 4);
     }
 
     #[test]
     fn the_slab_axis_is_ignored_and_points_outside_are_clamped() {
         let tracer = Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0);
-        let table = Table::trace(&tracer, [3, 3, 77]);
+        let table = Table::trace(&tracer, [3, 3, 77]).unwrap();
         assert_eq!(table.nodes(), [3, 3, 1]);
         let mut out = [0.0; 4];
-        table.predict(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]], &mut out);
+        table.interpolate(&[[0.5, 0.25, 0.0], [0.5, 0.25, 1.0], [2.0, -1.0, 0.0], [f32::NAN, 0.0, 0.0]], &mut out);
         // The tracer sees the slab's middle: z = 0.5 adds 2. NaN is clamped like a point below the domain.
         assert_eq!(out, [4.75, 4.75, 5.0, 3.0]);
     }
@@ -308,26 +214,24 @@ mod tests {
     #[test]
     fn a_frozen_table_shares_its_values_until_the_window_slides() {
         let domain = Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0));
-        let mut table = Table::trace(&Plane(domain.clone(), -1.0), [3, 3, 1]);
+        let mut table = Table::trace(&Plane(domain.clone(), -1.0), [3, 3, 1]).unwrap();
         let frozen = table.clone();
         assert!(std::ptr::eq(frozen.values(), table.values()), "nothing is copied");
-        assert_eq!(frozen.stamp(), table.stamp());
         let before = frozen.values().to_vec();
         // The new window has no value in the left half.
-        table.retrace(&Plane(domain, 0.4));
+        table.retrace(&Plane(domain, 0.4)).unwrap();
         assert_eq!(frozen.values(), before, "what a frame renders with stays");
-        assert_ne!(frozen.stamp(), table.stamp(), "other values, another stamp");
         assert_eq!((table.values()[0], table.values()[8]), (0.0, before[8]));
         let own = table.values().as_ptr();
         drop(frozen);
-        table.window_slid(&Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0));
+        table.retrace(&Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), -1.0)).unwrap();
         assert_eq!(table.values().as_ptr(), own, "with nobody else looking it is written in place");
     }
 
     #[test]
     fn nodes_without_a_value_are_counted() {
         let tracer = Plane(Domain::slab([0.0, 0.0], [1.0, 1.0], (0.0, 1.0)), 0.5);
-        let table = Table::trace(&tracer, [5, 2, 1]);
+        let table = Table::trace(&tracer, [5, 2, 1]).unwrap();
         assert_eq!(table.not_finite(), 4);
         assert!(table.values().iter().all(|v| v.is_finite()));
     }

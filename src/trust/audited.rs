@@ -1,9 +1,9 @@
-//! Residuals of audit points, added up cell by cell.
+//! Residuals of audit points, summed per cell.
 
 use super::{Residual, Strata};
 use rayon::prelude::*;
 
-/// What the audit points of one cell add up to, in f64 and in the order in which they were drawn, so that every engine finds the same bits.
+/// Sums over the audit points of one cell, in f64 and in the order in which they were drawn, so that every device finds the same bits.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CellErrors {
@@ -15,7 +15,7 @@ pub struct CellErrors {
     pub square: f64,
     /// Sum of their fourth powers.
     pub fourth: f64,
-    /// Sum over the points of d^2, where d is by how much a squared residual differs from the cell's mean.
+    /// Sum of d^2 over the points, where d is the deviation of a squared residual from its mean in the cell.
     pub second: f64,
     /// Sum of d^3.
     pub third: f64,
@@ -24,8 +24,8 @@ pub struct CellErrors {
 }
 
 impl CellErrors {
-    /// Of a cell's residuals, optical and of the log-stretch; those that are no number are left out.
-    fn of(residuals: &[(f32, f32)]) -> Self {
+    /// Sums over the residuals of a cell (optical, log-stretch). NaN is left out.
+    fn from_residuals(residuals: &[(f32, f32)]) -> Self {
         let mut sums = Self::default();
         let finite = || residuals.iter().filter(|(optical, _)| !optical.is_nan());
         for &(optical, log_stretch) in finite() {
@@ -46,19 +46,19 @@ impl CellErrors {
     }
 }
 
-/// Residuals of points drawn as `strata` says.
+/// Residuals of the points drawn in `strata`.
 #[derive(Debug, Clone)]
 pub struct Audited {
     strata: Strata,
     cells: Vec<CellErrors>,
-    /// Optical residuals, cell by cell; NaN where a point has none.
+    /// Optical residuals, cell by cell; NaN for a point without residual.
     optical: Vec<f32>,
-    /// Where each cell's begin, and the end of the last.
-    begins: Vec<usize>,
+    /// Index of the first optical residual of each cell, and the end of the last.
+    offsets: Vec<usize>,
 }
 
-/// Where each of `counts` begins when they stand in a row, and their end.
-fn begins(counts: impl Iterator<Item = usize>) -> Vec<usize> {
+/// Offsets of consecutive groups with the given numbers of elements, and the end of the last.
+fn offsets(counts: impl Iterator<Item = usize>) -> Vec<usize> {
     let mut end = 0;
     std::iter::once(0)
         .chain(counts.map(|count| {
@@ -69,7 +69,7 @@ fn begins(counts: impl Iterator<Item = usize>) -> Vec<usize> {
 }
 
 impl Audited {
-    /// Sorts residuals into the cells that they lie in and adds them up. Those that are no number are left out.
+    /// Sorts residuals into the cells of their points and sums them. NaN is left out.
     pub fn of(residuals: &[Residual], strata: Strata) -> Self {
         let finite: Vec<(usize, (f32, f32))> = (residuals.par_iter().with_min_len(1 << 12))
             .filter(|r| r.optical.is_finite())
@@ -77,59 +77,60 @@ impl Audited {
             .collect();
         let mut counts = vec![0; strata.drawn.len()];
         finite.iter().for_each(|&(cell, _)| counts[cell] += 1);
-        let begins = begins(counts.into_iter());
-        let mut next = begins.clone();
+        let offsets = offsets(counts.into_iter());
+        let mut next = offsets.clone();
         let mut sorted = vec![(0.0, 0.0); finite.len()];
         for (cell, residual) in finite {
             sorted[next[cell]] = residual;
             next[cell] += 1;
         }
-        Self::added_up(&sorted, begins, strata)
+        Self::sum(&sorted, offsets, strata)
     }
 
-    /// Adds up the residuals, optical and of the log-stretch, of all points in the order in which `strata` draws them: cell by cell, NaN where
-    /// there is none.
+    /// Sums the residuals (optical, log-stretch) of all points in the order in which `strata` draws them: cell by cell, NaN for a point
+    /// without residual.
     ///
     /// # Panics
-    /// When there are not as many as `strata` says.
+    /// If the number of entries is not that of the points drawn.
     pub fn in_order(residuals: &[(f32, f32)], strata: Strata) -> Self {
-        assert_eq!(residuals.len(), strata.total(), "one entry a point");
-        let begins = begins(strata.drawn.iter().map(|&n| n as usize));
-        Self::added_up(residuals, begins, strata)
+        assert_eq!(residuals.len(), strata.total(), "one entry per point");
+        let offsets = offsets(strata.drawn.iter().map(|&n| n as usize));
+        Self::sum(residuals, offsets, strata)
     }
 
-    fn added_up(residuals: &[(f32, f32)], begins: Vec<usize>, strata: Strata) -> Self {
+    fn sum(residuals: &[(f32, f32)], offsets: Vec<usize>, strata: Strata) -> Self {
         let cells = (0..strata.drawn.len()).into_par_iter().with_min_len(64);
-        let cells = cells.map(|cell| CellErrors::of(&residuals[begins[cell]..begins[cell + 1]])).collect();
-        Self { strata, cells, optical: residuals.iter().map(|residual| residual.0).collect(), begins }
+        let cells = cells.map(|cell| CellErrors::from_residuals(&residuals[offsets[cell]..offsets[cell + 1]])).collect();
+        Self { strata, cells, optical: residuals.iter().map(|residual| residual.0).collect(), offsets }
     }
 
-    /// Of sums made elsewhere, one for each cell, and the optical residual of each point that was drawn, cell by cell: NaN where it has none.
+    /// Residuals summed elsewhere: one entry per cell, and the optical residual of each point drawn, cell by cell (NaN for a point without
+    /// residual).
     ///
     /// # Panics
-    /// When there are not as many as `strata` says.
+    /// If the numbers of entries are not those of the cells and points drawn.
     pub fn new(strata: Strata, cells: Vec<CellErrors>, optical: Vec<f32>) -> Self {
-        assert_eq!((cells.len(), optical.len()), (strata.drawn.len(), strata.total()), "one entry a cell, and one a point");
-        let begins = begins(strata.drawn.iter().map(|&n| n as usize));
-        Self { strata, cells, optical, begins }
+        assert_eq!((cells.len(), optical.len()), (strata.drawn.len(), strata.total()), "one entry per cell and one per point");
+        let offsets = offsets(strata.drawn.iter().map(|&n| n as usize));
+        Self { strata, cells, optical, offsets }
     }
 
-    /// How the points were drawn.
+    /// Numbers of points drawn per cell.
     pub fn strata(&self) -> &Strata {
         &self.strata
     }
 
-    /// What each cell's points add up to, x fastest.
+    /// Sums per cell, x fastest.
     pub fn cells(&self) -> &[CellErrors] {
         &self.cells
     }
 
     /// Optical residuals of a cell.
     pub(super) fn optical(&self, cell: usize) -> impl Iterator<Item = f32> {
-        self.optical[self.begins[cell]..self.begins[cell + 1]].iter().copied().filter(|optical| !optical.is_nan())
+        self.optical[self.offsets[cell]..self.offsets[cell + 1]].iter().copied().filter(|optical| !optical.is_nan())
     }
 
-    /// Mean over all cells of what `sum` adds up, each point for the volume that it was drawn for; NaN without points.
+    /// Mean of a summed quantity over the domain, each point weighted with the volume that it represents; NaN without points.
     pub(super) fn mean(&self, sum: impl Fn(&CellErrors) -> f64) -> f64 {
         let cells = || self.cells.iter().zip(&self.strata.drawn).filter(|(cell, _)| cell.count > 0.0);
         let weighted = |f: &dyn Fn(&CellErrors) -> f64| cells().map(|(cell, &drawn)| f(cell) / f64::from(drawn.max(1))).sum::<f64>();
@@ -159,9 +160,9 @@ mod tests {
         assert_eq!(first.second, deviations.iter().map(|d| d * d).sum::<f64>());
         assert_eq!(first.third, deviations.iter().map(|d| d * d * d).sum::<f64>());
         assert_eq!((second.count, third.count, third.second), (0.0, 1.0, 0.0));
-        // Each point stands for its cell's volume over the points drawn there.
+        // Each point represents the volume of its cell over the number of points drawn there.
         assert!((audited.mean(|cell| cell.square) - (1.25 / 4.0 + 1.0) / (3.0 / 4.0 + 1.0)).abs() < 1e-15);
-        // The same in the order of drawing, with places for points that have no residual, and from sums made elsewhere.
+        // The same in the order of drawing, with entries for points without residual, and from sums made elsewhere.
         let optical = vec![0.5, f32::NAN, 1.0, 0.0, f32::NAN, f32::NAN, 1.0];
         let pairs: Vec<(f32, f32)> = optical.iter().map(|&o| (o, 2.0 * o)).collect();
         assert_eq!(Audited::in_order(&pairs, strata.clone()).cells(), audited.cells());

@@ -1,43 +1,45 @@
-//! What is said about the surrogate's error in the trusted region.
+//! Statistics of the surrogate's error in the trusted region: stratified sampling (Cochran 1977) with a confidence interval for skewed data
+//! (Hall 1992).
 
 #[cfg(test)]
 use super::Residual;
 use super::Strata;
 use super::audited::{Audited, CellErrors};
 #[cfg(test)]
-use super::map::Seen;
+use super::strata::PreviousAudit;
 use serde::{Deserialize, Serialize};
 
-/// Residuals of the surrogate over points that lie in trusted cells and decided nothing about which cells those are.
+/// Residuals of the surrogate at points in trusted cells that had no influence on the choice of these cells.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
 pub struct TrustedError {
-    /// Points measured.
+    /// Number of points.
     pub points: u64,
     /// Mean |ramp(predicted) - ramp(traced)|.
     pub optical_mean: f64,
-    /// Root mean square of it.
+    /// Root mean square of the optical residual.
     pub optical_rms: f64,
-    /// 95 % interval of the root mean square.
+    /// 95 % confidence interval of the root mean square.
     pub optical_rms_interval: [f64; 2],
-    /// 99th percentile of it.
+    /// 99th percentile of the optical residual.
     pub optical_p99: f64,
     /// Root mean square residual of the log-stretch.
     pub log_stretch_rms: f64,
 }
 
 impl TrustedError {
-    /// Statistics of the points in those cells that count; none when there are fewer than two.
+    /// Statistics of the points in the cells for which `counts` is true; `None` with fewer than two points.
     ///
-    /// Each residual counts for its cell's volume over the points drawn there, so that cells may get different numbers of points
-    /// (stratified sampling, Cochran 1977, chapter 5). Squares of residuals are skewed: a few ridges carry most of the mean. The
-    /// interval is that of the mean square by Hall's transformation of Student's t, which takes the skewness out (Hall 1992,
-    /// J. R. Stat. Soc. B 54, 221). Points that happen to miss a cell's few large residuals give too small a mean and too small a
-    /// variance at once; therefore the variance of a cell is pooled with that of the frame before's audit points there, which count for as
-    /// many points at most as were drawn now, and with one point that varies like the whole region: a cell that has shown nothing may
-    /// still hold something, and where few points were drawn that weighs most. The pooled variance may widen the interval, not narrow it.
+    /// The weight of a residual is the volume of its cell over the number of points drawn there, so that cells may have different numbers of
+    /// points (stratified sampling, Cochran 1977, chapter 5). Squared residuals are skewed: a few ridges carry most of the mean. The interval
+    /// is that of the mean square by Hall's transformation of Student's t, which removes the skewness (Hall 1992, J. R. Stat. Soc. B 54, 221).
+    ///
+    /// Points that miss the few large residuals of a cell give too small a mean and too small a variance. Therefore the variance of a cell is
+    /// pooled with that of the audit points of the previous frame there, which count for at most as many points as were drawn now. It is also
+    /// pooled with one point that has the variance of the whole region, which matters most in cells with few points. The pooled variance may
+    /// widen the interval but not narrow it.
     pub fn of(audited: &Audited, counts: impl Fn(usize) -> bool) -> Option<Self> {
-        let Strata { drawn, seen, .. } = audited.strata();
-        // What one point of a cell stands for, in cells.
+        let Strata { drawn, previous, .. } = audited.strata();
+        // Volume that one point of a cell represents, in cells.
         let weight = |cell: usize| 1.0 / f64::from(drawn[cell].max(1));
         let cells: Vec<(usize, &CellErrors)> =
             audited.cells().iter().enumerate().filter(|&(number, cell)| cell.count > 0.0 && counts(number)).collect();
@@ -48,8 +50,8 @@ impl TrustedError {
         let weighted = |f: fn(&CellErrors) -> f64| cells.iter().map(|&(number, cell)| weight(number) * f(cell)).sum::<f64>();
         let whole = weighted(|cell| cell.count);
         let square = weighted(|cell| cell.square) / whole;
-        // Second and third moment of the estimate: the sums over points of the deviation from their cell's mean, each with its share of
-        // the whole. Where a cell has one point only, the mean over all cells stands for its own.
+        // Second and third moment of the estimate: sums over the points of the deviation from the mean of their cell, each weighted with its
+        // share of the whole. In a cell with a single point the mean over all cells replaces its own.
         let moments = |number: usize, cell: &CellErrors| {
             let share = weight(number) / whole;
             if cell.count > 1.0 {
@@ -59,19 +61,19 @@ impl TrustedError {
                 (deviation.powi(2), deviation.powi(3))
             }
         };
-        // Skewness is that of the points themselves; the variance below only grows.
+        // The skewness is that of the points alone; pooling below can only increase the variance.
         let (own, third) = cells.iter().map(|&(number, cell)| moments(number, cell)).fold((0.0, 0.0), |a, b| (a.0 + b.0, a.1 + b.1));
         let gamma = if own > 0.0 { third / own.powf(1.5) } else { 0.0 };
         let of_region = (weighted(|cell| cell.fourth) / whole - square * square).max(0.0);
         let pooled = |&(number, cell): &(usize, &CellErrors)| {
-            let seen = seen.get(number).copied().unwrap_or_default();
-            let few = seen.weight.min(cell.count);
+            let previous = previous.get(number).copied().unwrap_or_default();
+            let pooled = previous.weight.min(cell.count);
             let share = cell.count * (weight(number) / whole).powi(2);
-            (cell.count * moments(number, cell).0 + share * (few * seen.variance + of_region)) / (cell.count + few + 1.0)
+            (cell.count * moments(number, cell).0 + share * (pooled * previous.variance + of_region)) / (cell.count + pooled + 1.0)
         };
         let variance = cells.iter().map(pooled).sum::<f64>().max(own);
         let bound = |z: f64| (square - variance.sqrt() * hall_inverse(z, gamma)).max(0.0).sqrt();
-        // Residuals that are all alike say nothing of those not drawn: a share of 3 / n of the region may hold anything (rule of three).
+        // If all residuals are equal, a share of 3 / n of the region may still have any residual (rule of three).
         let interval = if variance > 0.0 { [bound(1.96), bound(-1.96)] } else { [0.0, (square + 3.0 / n).min(1.0).sqrt()] };
         let optical = || cells.iter().flat_map(|&(number, _)| audited.optical(number).map(move |optical| (optical, weight(number))));
         Some(Self {
@@ -85,9 +87,9 @@ impl TrustedError {
     }
 }
 
-/// The least of non-negative `(value, weight)` pairs up to which the weights add up to `share`; the largest where they never do. The leading
-/// bits of a number that is not negative are in its own order: the weights of each pattern tell which of them holds the quantile, and only
-/// the values of that one are sorted. 0 without pairs.
+/// Weighted quantile: the smallest value of non-negative `(value, weight)` pairs up to which the weights sum to `share`, or the largest value if
+/// they never do; 0 without pairs. The bit patterns of non-negative floats have the order of their values. A histogram over the leading bits
+/// therefore finds the bin of the quantile, and only the values in that bin are sorted.
 fn quantile<I: Iterator<Item = (f32, f64)>>(pairs: impl Fn() -> I, share: f64) -> f64 {
     const LEADING: u32 = 12;
     let pattern = |value: f32| (value.to_bits() >> (32 - LEADING)) as usize;
@@ -110,7 +112,7 @@ fn quantile<I: Iterator<Item = (f32, f64)>>(pairs: impl Fn() -> I, share: f64) -
     at.map_or(values.last(), |at| values.get(at)).map_or(0.0, |pair| f64::from(pair.0))
 }
 
-/// Inverse of Hall's transformation g(t) = t + gamma t^2 / 3 + gamma^2 t^3 / 27 + gamma / 6, with gamma = skewness / sqrt(n).
+/// Inverse of Hall's transformation g(t) = t + gamma t^2 / 3 + gamma^2 t^3 / 27 + gamma / 6 with gamma = skewness / sqrt(n) (Hall 1992).
 fn hall_inverse(x: f64, gamma: f64) -> f64 {
     if gamma.abs() < 1e-6 {
         return x;
@@ -195,7 +197,7 @@ mod tests {
         assert_eq!(of(&alike, &Strata::even([1; 3], 300)).unwrap().optical_rms_interval, [0.0, 0.1]);
     }
 
-    /// A quarter of the cells holds nearly all of the error; they get most of the points, and the figures stay those of the whole.
+    /// A quarter of the cells has nearly all of the error and gets most of the points. The statistics stay those of the whole region.
     #[test]
     fn cells_with_more_points_do_not_count_for_more() {
         let cells = [16, 1, 1];
@@ -227,14 +229,14 @@ mod tests {
         assert!(width / f64::from(trials) < 2.0 * 1.96 * spread, "{} {spread}", width / f64::from(trials));
     }
 
-    /// One residual in two hundred is large: with twenty points a cell many a cell shows none, and the points' own spread is too small
-    /// just when their mean is. What earlier frames saw mends it.
+    /// One residual in two hundred is large. With twenty points per cell, many cells show none, and their variance is too small whenever
+    /// their mean is. The residuals of earlier frames correct this.
     #[test]
     fn a_spread_seen_before_keeps_the_interval_wide() {
         let cells = [16, 1, 1];
         let (mean, fourth) = (0.005 * 0.09 / 3.0, 0.005 * 0.0081 / 5.0);
-        let held = |seen: Vec<Seen>| {
-            let strata = Strata { seen, ..Strata::even(cells, 20) };
+        let held = |previous: Vec<PreviousAudit>| {
+            let strata = Strata { previous, ..Strata::even(cells, 20) };
             let mut state = 11;
             let covered = (0..400).filter(|_| {
                 let mut sample = Vec::new();
@@ -252,7 +254,7 @@ mod tests {
             });
             covered.count()
         };
-        let (alone, with) = (held(Vec::new()), held(vec![Seen { weight: 20.0, variance: fourth - mean * mean }; 16]));
+        let (alone, with) = (held(Vec::new()), held(vec![PreviousAudit { weight: 20.0, variance: fourth - mean * mean }; 16]));
         // 400 trials of 0.95 less three standard errors: 367.
         assert!(alone < 367 && with >= 367, "{alone} without, {with} with");
     }

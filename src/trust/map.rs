@@ -1,20 +1,13 @@
-//! The trust map: what each cell of the domain is known to err by.
+//! The trust map: residual statistics per cell of the domain, and the gate that follows from them.
+//!
+//! A cell is trusted if the upper 95 % bound of its mean square residual (normal approximation) is within the tolerance. Audit points are
+//! distributed over the trusted cells by optimal allocation (Neyman 1934).
 
+use super::strata::{PreviousAudit, Residual, Strata, cell_of};
 use super::{Audited, CellErrors, TrustSettings};
 use crate::field::Domain;
 
-/// A traced sample held against the surrogate's prediction, made with weights that had not seen it.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Residual {
-    /// Unit coordinates.
-    pub point: [f32; 3],
-    /// |ramp(predicted) - ramp(traced)|, in [0, 1].
-    pub optical: f32,
-    /// predicted - traced log-stretch.
-    pub log_stretch: f32,
-}
-
-/// Decayed sums of one cell.
+/// Decayed sums over the residuals of one cell.
 #[derive(Debug, Clone, Copy, Default)]
 struct Cell {
     weight: f64,
@@ -28,55 +21,30 @@ pub struct TrustMap {
     shape: [usize; 3],
     cells: Vec<Cell>,
     settings: TrustSettings,
-    /// Sums over the audit points of the latest frame alone: neither inflated nor mixed with samples that pictures chose.
+    /// Sums over the audit points of the latest frame alone, without inflation and without samples of pictures.
     audited: Vec<Cell>,
-    /// Mean square residual over the latest uniform points; its ratio across a slide is the drift.
-    before_slide: Option<f64>,
+    /// Mean square residual of the latest audit points. Its growth across a slide is the drift.
+    latest_mean_square: Option<f64>,
     just_slid: bool,
     measured_growth: f64,
 }
 
-/// Which cells the surrogate answers, frozen for one frame.
+/// The cells that the surrogate answers during one frame.
 #[derive(Debug, Clone)]
 pub struct Gate {
     shape: [usize; 3],
     trusted: Vec<bool>,
 }
 
-/// How many points were drawn in each cell, uniformly inside it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Strata {
-    /// Cells along x, y and z of the unit cube.
-    pub shape: [usize; 3],
-    /// Points drawn in each cell, x fastest.
-    pub drawn: Vec<u32>,
-    /// What the audit points of the frame before saw in each cell; empty where there were none.
-    pub(super) seen: Vec<Seen>,
-}
-
-/// Squared optical residuals of a cell's audit points in the frame before.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Seen {
-    /// How many points there were.
-    pub(super) weight: f64,
-    /// Variance of the squared residual.
-    pub(super) variance: f64,
-}
-
 /// One-sided 95 % quantile of the normal distribution.
 const Z95: f64 = 1.645;
-/// What a frame leaves of the older frames' sums: the weights change, so old residuals lose their meaning.
+/// Factor on the sums of older frames per frame, since the weights change and old residuals become obsolete.
 const DECAY: f64 = 0.6;
-/// What a slide leaves of them.
+/// Factor on the sums per slide.
 const SLIDE_DECAY: f64 = 0.25;
 
-fn cell_of(shape: [usize; 3], point: [f32; 3]) -> usize {
-    let index = |k: usize| ((point[k].clamp(0.0, 1.0) * shape[k] as f32) as usize).min(shape[k] - 1);
-    (index(2) * shape[1] + index(1)) * shape[0] + index(0)
-}
-
 /// About `count` cells over the axes along which the flow varies, as cubic as the domain's lengths allow.
-pub(crate) fn cubic_cells(domain: &Domain, count: usize) -> [usize; 3] {
+fn cubic_cells(domain: &Domain, count: usize) -> [usize; 3] {
     let lengths = domain.lengths();
     let axes = domain.dimensions;
     let volume: f64 = lengths[..axes].iter().product();
@@ -92,21 +60,21 @@ impl Cell {
         self.optical_fourth += square * square;
     }
 
-    fn take(&mut self, errors: &CellErrors) {
+    fn add_errors(&mut self, errors: &CellErrors) {
         self.weight += errors.count;
         self.optical_square += errors.square;
         self.optical_fourth += errors.fourth;
     }
 
-    fn seen(&self) -> Seen {
+    fn previous(&self) -> PreviousAudit {
         let weight = self.weight.max(f64::MIN_POSITIVE);
         let variance = (self.optical_fourth / weight - (self.optical_square / weight).powi(2)).max(0.0);
-        Seen { weight: self.weight, variance }
+        PreviousAudit { weight: self.weight, variance }
     }
 }
 
 impl TrustMap {
-    /// A map that trusts nothing yet.
+    /// A map without samples, which trusts no cell.
     pub fn new(settings: &TrustSettings, domain: &Domain) -> Self {
         let shape = match settings.cells {
             Some([x, y, z]) => [x, y, if domain.dimensions == 3 { z } else { 1 }],
@@ -118,7 +86,7 @@ impl TrustMap {
             audited: cells.clone(),
             cells,
             settings: settings.clone(),
-            before_slide: None,
+            latest_mean_square: None,
             just_slid: false,
             measured_growth: 1.0,
         }
@@ -129,7 +97,7 @@ impl TrustMap {
         self.shape
     }
 
-    /// Older residuals lose weight, since the weights that they were measured with have changed. Call once a frame.
+    /// Reduces the weight of older residuals, since the surrogate has changed since. Call once per frame.
     pub fn decay(&mut self) {
         self.audited.fill(Cell::default());
         for cell in &mut self.cells {
@@ -139,23 +107,23 @@ impl TrustMap {
         }
     }
 
-    /// Takes residuals in: those of points drawn over the whole domain, from which drift is read off, and those of points drawn otherwise.
+    /// Adds residuals: those of audit points, which also measure the drift, and those of other points.
     pub fn observe(&mut self, audited: Option<&Audited>, others: &[Residual]) {
         let mean = audited.map(|audited| audited.mean(|cell| cell.square));
         if let Some(mean) = mean.filter(|mean| !mean.is_nan()) {
             if self.just_slid
-                && let Some(before) = self.before_slide.filter(|b| *b > 0.0)
+                && let Some(before) = self.latest_mean_square.filter(|b| *b > 0.0)
             {
                 self.measured_growth = mean / before;
             }
-            self.before_slide = Some(mean);
+            self.latest_mean_square = Some(mean);
             self.just_slid = false;
         }
         if let Some(audited) = audited {
             for (number, errors) in audited.cells().iter().enumerate() {
                 let cell = cell_of(self.shape, audited.strata().centre(number));
-                self.cells[cell].take(errors);
-                self.audited[cell].take(errors);
+                self.cells[cell].add_errors(errors);
+                self.audited[cell].add_errors(errors);
             }
         }
         for residual in others.iter().filter(|r| r.optical.is_finite()) {
@@ -163,8 +131,9 @@ impl TrustMap {
         }
     }
 
-    /// The window slid: labels and predictions are of an older field. Residuals grow by the larger of the setting and the growth
-    /// measured at the slide before, and count for less, so that trust must be earned again.
+    /// Adapts the statistics to a slide of the window, after which labels and predictions are those of an older field. Mean square residuals
+    /// grow by the larger of the setting and the growth measured at the previous slide. Their weight decreases, so that cells must earn their
+    /// trust again.
     pub fn window_slid(&mut self) {
         let inflation = self.settings.slide_inflation.max(self.measured_growth);
         for cell in &mut self.cells {
@@ -176,41 +145,42 @@ impl TrustMap {
         self.just_slid = true;
     }
 
-    /// Forgets everything: another surrogate has taken the place of the one that was measured.
+    /// Forgets all residuals, for use when another surrogate replaces the one that was measured.
     pub fn reset(&mut self) {
         self.cells.fill(Cell::default());
         self.audited.fill(Cell::default());
-        self.before_slide = None;
+        self.latest_mean_square = None;
         self.just_slid = false;
     }
 
-    /// Upper 95 % bound of a cell's mean square optical residual; none with too few samples.
+    /// Upper 95 % bound of the mean square optical residual of a cell; `None` with too few samples.
     ///
-    /// The bound is that of the normal approximation; one pseudo-sample at twice the tolerance stands for what so few samples
-    /// cannot have seen.
+    /// The bound is that of the normal approximation, with one additional pseudo-sample at twice the tolerance that stands for residuals
+    /// that few samples are unlikely to show.
     fn upper_bound(&self, cell: &Cell) -> Option<f64> {
         if cell.weight < self.settings.min_samples * (1.0 - 1e-9) {
             return None;
         }
-        let unseen = (2.0 * self.settings.tolerance).powi(2);
+        let pseudo = (2.0 * self.settings.tolerance).powi(2);
         let n = cell.weight + 1.0;
-        let mean = (cell.optical_square + unseen) / n;
-        let variance = ((cell.optical_fourth + unseen * unseen) / n - mean * mean).max(0.0);
+        let mean = (cell.optical_square + pseudo) / n;
+        let variance = ((cell.optical_fourth + pseudo * pseudo) / n - mean * mean).max(0.0);
         Some(mean + Z95 * (variance / n).sqrt())
     }
 
-    /// How many audit points each cell gets, from what earlier frames have seen: `least` everywhere, and in trusted cells as many more,
-    /// in proportion to the spread of the squared residual there (Neyman 1934), as bring the standard error of the stated root mean
-    /// square to the setting's share of it, within the setting's bound.
-    pub fn audit_strata(&self, gate: &Gate, least: usize) -> Strata {
-        let mut strata = Strata { seen: self.audited.iter().map(Cell::seen).collect(), ..Strata::even(self.shape, least as u32) };
+    /// Number of audit points per cell, from the residuals of earlier frames: `min_per_cell` in every cell, and more in trusted cells, in
+    /// proportion to the standard deviation of the squared residual there (Neyman 1934). Their total brings the relative standard error of the
+    /// stated root mean square to `audit_precision`, within `audit_max_per_cell`.
+    pub fn audit_strata(&self, gate: &Gate, min_per_cell: usize) -> Strata {
+        let mut strata =
+            Strata { previous: self.audited.iter().map(Cell::previous).collect(), ..Strata::even(self.shape, min_per_cell as u32) };
         let trusted = || self.cells.iter().zip(&gate.trusted).filter(|(_, trusted)| **trusted).map(|(cell, _)| cell);
         let cells = trusted().count();
         let weight: f64 = trusted().map(|c| c.weight).sum();
         if cells == 0 || weight == 0.0 || gate.shape != self.shape {
             return strata;
         }
-        // One pseudo-sample a cell, like the whole trusted region: a cell that has shown nothing yet may still hold something.
+        // Each cell gets one pseudo-sample with the moments of the whole trusted region, since few samples may miss large residuals.
         let prior = [trusted().map(|c| c.optical_square).sum::<f64>() / weight, trusted().map(|c| c.optical_fourth).sum::<f64>() / weight];
         let mean = |cell: &Cell| (cell.optical_square + prior[0]) / (cell.weight + 1.0);
         let spread = |cell: &Cell| ((cell.optical_fourth + prior[1]) / (cell.weight + 1.0) - mean(cell).powi(2)).max(0.0).sqrt();
@@ -219,9 +189,9 @@ impl TrustMap {
         if mean_square <= 0.0 || spreads <= 0.0 {
             return strata;
         }
-        // The relative error of a root is half of that of the square.
+        // The relative error of a root is half that of the square.
         let needed = (spreads / cells as f64 / (2.0 * self.settings.audit_precision * mean_square)).powi(2);
-        let more = needed.min((self.settings.audit_most_per_cell.saturating_sub(least) * cells) as f64);
+        let more = needed.min((self.settings.audit_max_per_cell.saturating_sub(min_per_cell) * cells) as f64);
         for ((drawn, cell), trusted) in strata.drawn.iter_mut().zip(&self.cells).zip(&gate.trusted) {
             if *trusted {
                 *drawn += (more * spread(cell) / spreads).round() as u32;
@@ -230,44 +200,11 @@ impl TrustMap {
         strata
     }
 
-    /// The gate for the next frame.
+    /// Returns the gate for the next frame.
     pub fn gate(&self) -> Gate {
         let limit = self.settings.tolerance.powi(2);
         let trusted = self.cells.iter().map(|cell| self.upper_bound(cell).is_some_and(|bound| bound <= limit)).collect();
         Gate { shape: self.shape, trusted }
-    }
-}
-
-impl Strata {
-    /// As many points in every cell.
-    pub fn even(shape: [usize; 3], per_cell: u32) -> Self {
-        Self::new(shape, vec![per_cell; shape.iter().product()])
-    }
-
-    /// So many points in each cell, x fastest.
-    ///
-    /// # Panics
-    /// When there are not as many numbers as cells.
-    pub fn new(shape: [usize; 3], drawn: Vec<u32>) -> Self {
-        assert_eq!(drawn.len(), shape.iter().product::<usize>(), "one number a cell");
-        Self { shape, drawn, seen: Vec::new() }
-    }
-
-    /// Points in all.
-    pub fn total(&self) -> usize {
-        self.drawn.iter().map(|&n| n as usize).sum()
-    }
-
-    /// The cell of a unit point.
-    pub(super) fn cell(&self, point: [f32; 3]) -> usize {
-        cell_of(self.shape, point)
-    }
-
-    /// The middle of a cell, in unit coordinates.
-    pub fn centre(&self, cell: usize) -> [f32; 3] {
-        let [nx, ny, _] = self.shape;
-        let index = [cell % nx, cell / nx % ny, cell / (nx * ny)];
-        std::array::from_fn(|k| (index[k] as f32 + 0.5) / self.shape[k] as f32)
     }
 }
 
@@ -277,7 +214,7 @@ impl Gate {
         Self { shape: [1; 3], trusted: vec![all] }
     }
 
-    /// Whether the surrogate answers at this unit point.
+    /// True if the surrogate answers at a unit point.
     pub fn trusts(&self, point: [f32; 3]) -> bool {
         self.trusted[cell_of(self.shape, point)]
     }
@@ -287,7 +224,7 @@ impl Gate {
         self.shape
     }
 
-    /// Which cells are trusted, x fastest.
+    /// For each cell, x fastest, whether it is trusted.
     pub fn cells(&self) -> &[bool] {
         &self.trusted
     }
@@ -324,7 +261,7 @@ mod tests {
         let cube = Domain::cuboid([0.0; 3], [1.0; 3]);
         assert_eq!(TrustMap::new(&TrustSettings::default(), &cube).shape(), [16, 16, 16]);
         let globe = Domain { scale: [1.0, 1.0, 90.0 / 28_000.0], ..Domain::cuboid([0.0, -90.0, 1e3], [360.0, 90.0, 29e3]) };
-        assert_eq!(TrustMap::new(&TrustSettings::default(), &globe).shape(), [32, 16, 8], "metres are no degrees");
+        assert_eq!(TrustMap::new(&TrustSettings::default(), &globe).shape(), [32, 16, 8], "metres and degrees do not compare");
     }
 
     #[test]
@@ -382,7 +319,7 @@ mod tests {
 
     #[test]
     fn audits_go_where_the_error_is_spread() {
-        let settings = TrustSettings { audit_most_per_cell: 32, ..TrustSettings::default() };
+        let settings = TrustSettings { audit_max_per_cell: 32, ..TrustSettings::default() };
         let mut map = TrustMap::new(&settings, &domain());
         filled(&mut map, 0.001, 64);
         let ridge = [0.51, 0.51, 0.0];

@@ -1,18 +1,20 @@
 //! Frames that a surrogate answers where it is trusted, and scenes with land: walked, predicted and traced on the GPU, against the CPU.
 
 use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
-use ridgewatch::engine::cuda::{
-    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, Division, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs, Panel,
-    SnapshotStore, Tuning, keeps_label,
+use ridgewatch::backend::cuda::{
+    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, FrameQueries, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs,
+    QueryRouter, SnapshotStore, Tuning, keeps_label,
 };
-use ridgewatch::engine::{Answers, Device, RunOptions, Tally, residuals, stratified_points, trace};
+use ridgewatch::backend::{Device, QueryRouter as HostRouter, Routing, Tally, audit, residuals, stratified_points};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
 };
 use ridgewatch::publish::compare_films;
 use ridgewatch::render::{Film, RenderSettings, RenderStats, Renderer, Scene, TransferSettings};
-use ridgewatch::surrogate::{Predict, Samples, Table};
+use ridgewatch::run::RunOptions;
+use ridgewatch::surrogate::network::NetworkSettings;
+use ridgewatch::surrogate::{HostSurrogate, Kind, Predict, Samples, SurrogateSettings, Trace, build};
 use ridgewatch::trust::{Audited, Gate, Strata, TrustMap, TrustSettings};
 use std::cell::RefCell;
 use std::sync::Arc;
@@ -27,7 +29,7 @@ fn map(tau: f64, steps: usize) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary: Boundary::Clamp,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -40,9 +42,14 @@ struct Stage {
     host: Box<dyn Tracer>,
     cuda: CudaTracer,
     scene: Scene,
-    table: Table,
+    table: HostSurrogate,
     on_device: DeviceTable,
     gate: Gate,
+}
+
+fn table_of(host: &dyn Trace, nodes: [usize; 3]) -> HostSurrogate {
+    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+    build(&settings, &NetworkSettings::default(), host.flow().domain(), 5, host).unwrap()
 }
 
 impl Stage {
@@ -58,14 +65,14 @@ impl Stage {
         let cuda = CudaTracer::new(store, &gpu, source, map, 0.0, Tuning::default()).unwrap();
         let settings = RenderSettings { width: 160, height: 80, ..RenderSettings::default() };
         let scene = Scene::assemble(host.domain(), None, None, Some(transfer), settings, 3);
-        let table = Table::trace(&*host, nodes);
-        let on_device = DeviceTable::upload(&gpu, host.domain(), &table).unwrap();
+        let table = table_of(&host, nodes);
+        let on_device = DeviceTable::upload(&gpu, host.domain(), table.table().unwrap()).unwrap();
         // A gate as runs earn it, probes held against the table, at the first tolerance that trusts a third of the cells.
         let trust = |tolerance: f64| TrustMap::new(&TrustSettings { tolerance, ..TrustSettings::default() }, host.domain());
         let strata = Strata::even(trust(0.03).shape(), 32);
-        let probes = trace(&*host, &stratified_points(&strata, 5, 0), Extras::default());
+        let probes = audit::trace(&host, &stratified_points(&strata, 5, 0), Extras::default()).unwrap();
         let renderer = Renderer::new(scene.clone(), host.domain(), map.tau).unwrap();
-        let measured = residuals(&table, &probes.samples, renderer.transfer(), map.tau);
+        let measured = residuals(&table.freeze().unwrap(), &probes.samples, renderer.transfer(), map.tau).unwrap();
         let gate = |i: i32| {
             let mut trust = trust(0.03 * 1.1_f64.powi(i));
             trust.observe(Some(&Audited::of(&measured, strata.clone())), &[]);
@@ -84,10 +91,13 @@ impl Stage {
     }
 
     fn on_cpu(&self, renderer: &mut Renderer, frame: u64, samples: u32, how: &How<'_>) -> (Film, RenderStats, Tally) {
-        let surrogate = how.surrogate.then_some(&self.table as &dyn Predict);
-        let mut answers = Answers::new(&*self.host, surrogate, &self.gate, how.budget, 0);
-        let (film, stats) = renderer.render_samples(frame, 0..samples, &mut answers, None, &NEVER).unwrap();
-        (film, stats, answers.tally)
+        let frozen = self.table.freeze().unwrap();
+        let surrogate = how.surrogate.then_some(&frozen as &dyn Predict);
+        let routing = Routing { gate: &self.gate, trace_budget: how.budget, keep: 0, extras: Extras::default() };
+        let mut router = HostRouter::new(&self.host, surrogate, routing);
+        let (film, stats) = renderer.render_samples(frame, 0..samples, &mut router, None, &NEVER).unwrap();
+        let (tally, _) = router.finish().unwrap();
+        (film, stats, tally)
     }
 
     fn on_gpu(
@@ -100,13 +110,13 @@ impl Stage {
     ) -> (Film, RenderStats, Tally, Samples) {
         // What a kernel reads before it has written it would show.
         side.renderer.poison().unwrap();
-        side.division.poison().unwrap();
-        let mut divided = side
-            .division
-            .begin(Panel {
+        side.router.poison().unwrap();
+        let mut routed = side
+            .router
+            .begin(FrameQueries {
                 tracer: self.cuda.device(),
                 domain: self.domain(),
-                land: self.cuda.land(),
+                missing_cells: self.cuda.missing_cells(),
                 surrogate: how.surrogate.then_some(&self.on_device as &dyn DevicePredict),
                 label_sink: how.label_sink,
                 gate: &self.gate,
@@ -115,16 +125,16 @@ impl Stage {
                 arrivals: how.label_sink.is_some(),
             })
             .unwrap();
-        let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut divided, None, &NEVER).unwrap();
-        let labels = divided.labels();
-        assert!(divided.trace_seconds() >= 0.0 && divided.predict_seconds() > 0.0);
+        let (film, stats) = side.renderer.render_samples(renderer, frame, 0..samples, &mut routed, None, &NEVER).unwrap();
+        let labels = routed.labels();
+        assert!(routed.trace_seconds() >= 0.0 && routed.predict_seconds() > 0.0);
         let tally = Tally {
             queries: stats.queries,
             traced: stats.traced,
             missing: stats.missing,
             over_budget: side.renderer.over_budget(),
-            trace_seconds: divided.trace_seconds(),
-            predict_seconds: divided.predict_seconds(),
+            trace_seconds: routed.trace_seconds(),
+            predict_seconds: routed.predict_seconds(),
         };
         (film, stats, tally, labels)
     }
@@ -133,12 +143,12 @@ impl Stage {
 /// What the GPU keeps from frame to frame.
 struct Side {
     renderer: GpuRenderer,
-    division: Division,
+    router: QueryRouter,
 }
 
 impl Side {
     fn new(gpu: &Arc<Gpu>) -> Self {
-        Self { renderer: GpuRenderer::new(gpu).unwrap(), division: Division::new(gpu).unwrap() }
+        Self { renderer: GpuRenderer::new(gpu).unwrap(), router: QueryRouter::new(gpu).unwrap() }
     }
 }
 
@@ -228,11 +238,11 @@ fn pictures_with_land_are_the_cpu_s() {
     let gpu = gpu();
     let host = cpu_tracer(source.clone(), &backward, 3.5).unwrap();
     let cuda = CudaTracer::new(store(), &gpu, source, &backward, 3.5, Tuning::default()).unwrap();
-    assert!(cuda.land().is_some());
+    assert!(cuda.missing_cells().is_some());
     let settings = RenderSettings { width: 160, height: 80, ..RenderSettings::default() };
     let scene = Scene::assemble(host.domain(), None, None, Some(transfer), settings, 3);
-    let table = Table::trace(&*host, [40, 30, 20]);
-    let on_device = DeviceTable::upload(&gpu, host.domain(), &table).unwrap();
+    let table = table_of(&host, [40, 30, 20]);
+    let on_device = DeviceTable::upload(&gpu, host.domain(), table.table().unwrap()).unwrap();
     let mut stage = Stage { gpu, host, cuda, scene, table, on_device, gate: Gate::uniform(false) };
     let tally = pictures_agree(&stage, &How { surrogate: false, ..GATED }, "reference with land");
     assert!(tally.missing > tally.queries / 100 && tally.traced + tally.missing == tally.queries, "{tally:?}");
@@ -262,7 +272,7 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
         assert!(first.points.iter().all(|&p| !stage.gate.trusts(p)));
         let points: Vec<[f32; 3]> = first.points.iter().map(|&p| stage.domain().from_unit(p)).collect();
         let mut exact = ridgewatch::flow::Traced::default();
-        stage.host.trace(&points, Extras::default(), &mut exact);
+        stage.host.trace(&points, Extras::default(), &mut exact).unwrap();
         let mut errors: Vec<f32> = exact.log_stretch.iter().zip(&first.log_stretch).map(|(a, b)| (a - b).abs()).collect();
         errors.sort_by(f32::total_cmp);
         // Unit coordinates round the seed, by 1e-7 of a domain of 96 cells: 1e-5 of a cell, stretched by up to e^4.
@@ -368,17 +378,17 @@ fn a_run_walks_on_the_device_and_records_what_the_cpu_s_would() {
         assert_eq!(found.len(), expected.len());
         for (found, expected) in found.iter().zip(&expected) {
             let (gpu, cpu) = (&found.record, &expected.record);
-            println!("{method}: trusted share {:.3} and {:.3}, {:?}", gpu.trusted_share, cpu.trusted_share, gpu.seconds);
+            println!("{method}: trusted share {:.3} and {:.3}, {:?}", gpu.trusted_volume, cpu.trusted_volume, gpu.seconds);
             assert!(gpu.device.starts_with("cuda:0") && gpu.warnings == cpu.warnings, "{:?}", gpu.warnings);
             // Points ahead of their flights are answered by a GPU that walks, and by nobody else.
-            assert!(gpu.traced_ahead > 0 && cpu.traced_ahead == 0);
+            assert!(gpu.speculative_traces > 0 && cpu.speculative_traces == 0);
             assert!((gpu.queries as f64 / cpu.queries as f64 - 1.0).abs() < 0.01, "{} and {}", gpu.queries, cpu.queries);
             // Cells at the edge of the tolerance may fall to either side: other labels are kept.
-            assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_share - cpu.trusted_share).abs() < 0.05);
+            assert!((gpu.traced_share - cpu.traced_share).abs() < 0.05 && (gpu.trusted_volume - cpu.trusted_volume).abs() < 0.05);
             let psnr = compare_films(&found.film, &expected.film, found.tone_map).unwrap().psnr.unwrap_or(f64::INFINITY);
             measured!("a run, `{method}`: {psnr:.1} dB; traced share {:.3} and {:.3}", gpu.traced_share, cpu.traced_share);
-            println!("stated {:?} and {:?}", gpu.trusted, cpu.trusted);
-            if let (Some(gpu), Some(cpu)) = (gpu.trusted.filter(|_| method == "surrogate"), cpu.trusted) {
+            println!("stated {:?} and {:?}", gpu.trusted_error, cpu.trusted_error);
+            if let (Some(gpu), Some(cpu)) = (gpu.trusted_error.filter(|_| method == "surrogate"), cpu.trusted_error) {
                 // The same points, unless rounding puts one more into a cell.
                 assert!((gpu.optical_rms / cpu.optical_rms - 1.0).abs() < 0.02, "{gpu:?} for {cpu:?}");
             }

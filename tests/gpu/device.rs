@@ -1,7 +1,7 @@
 //! The device itself: kernels kept on disk, memory under a cap.
 
 use super::scenes::{gpu, opened};
-use ridgewatch::engine::cuda::{DeviceError, Gpu, GpuSettings, probe};
+use ridgewatch::backend::cuda::{DeviceError, Gpu, GpuSettings, probe};
 
 #[test]
 #[ignore = "needs a GPU"]

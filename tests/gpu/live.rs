@@ -1,12 +1,13 @@
 //! A simulation that runs now, followed on the device: its snapshots come over while frames are made of the ones before.
 
 use super::scenes::*;
+use ridgewatch::backend::Device;
+use ridgewatch::backend::cuda::GpuSettings;
 use ridgewatch::config::SceneFile;
-use ridgewatch::engine::cuda::GpuSettings;
-use ridgewatch::engine::{Device, Frame, RunOptions, Setup};
 use ridgewatch::field::Grid;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::publish::compare_films;
+use ridgewatch::run::{Frame, RunOptions, Setup};
 use ridgewatch::source::live::Live;
 use ridgewatch_wire::{AxisDescription, Description, Element, Field, Geometry, Policy, Producer};
 use std::path::Path;
@@ -25,7 +26,7 @@ follow = \"every\"
 at_end = \"stop\"
 [time]
 tau = 8
-stride = 1
+snapshots_per_slide = 1
 [flow]
 steps = 16
 boundary = \"clamp\"

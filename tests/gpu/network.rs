@@ -7,13 +7,13 @@ use super::small;
 use burn::backend::Flex;
 use burn::module::Param;
 use burn::tensor::{Tensor, TensorData};
-use ridgewatch::engine::cuda::{CudaOffload, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
+use ridgewatch::backend::cuda::{CudaTraining, DeviceError, DeviceNetwork, DevicePredict, DeviceTable, DeviceTraining, is_fused};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Boundary, FlowMap, Precision, cpu_tracer};
 use ridgewatch::surrogate::network::{
-    Architecture, Average, Encoding, Input, Loss, Model, NetworkSettings, Objective, PlannedStep, Row, Target, row, stock_step,
+    Architecture, Encoding, Input, Loss, Model, NetworkSettings, Objective, PlannedStep, Row, Target, row, stock_step,
 };
-use ridgewatch::surrogate::{Brought, Offload, Predict, SampleRing, Samples, Table};
+use ridgewatch::surrogate::{HostNetwork, Labels, ReplayBuffer, Samples, SyncedSamples, Table, Training};
 
 /// Whether all inputs have their places in a point, and there is one output; the others are tested in `network_flow_map`.
 pub(super) fn is_plain(case: &Case) -> bool {
@@ -339,7 +339,7 @@ fn a_table_below_adds_up() {
     let (gpu, source) = (gpu(), turbulence([40, 24, 24], 4));
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let tracer = cpu_tracer(source.clone(), &map, 0.0).unwrap();
-    let table = Table::trace(&*tracer, [20, 12, 12]);
+    let table = Table::trace(&tracer, [20, 12, 12]).unwrap();
     let base = DeviceTable::upload(&gpu, &domain(&source), &table).unwrap();
     let (model, objective, _) = prepare(&cases()[1]);
     let points = fresh(&Domain::cuboid([0.0; 3], [1.0; 3]), 4001);
@@ -347,7 +347,7 @@ fn a_table_below_adds_up() {
     let alone = predict(&network, &points);
     let sum = predict(&network.above(Some((&base, 0.7))), &points);
     let mut below = vec![0.0; points.len()];
-    table.predict(&points, &mut below);
+    table.interpolate(&points, &mut below);
     for ((sum, alone), below) in sum.iter().zip(&alone).zip(&below) {
         assert!((sum - (below + 0.7 * alone)).abs() < 1e-5, "{sum} = {below} + 0.7 * {alone}");
     }
@@ -474,14 +474,14 @@ fn what_is_kept_comes_back() {
 #[ignore = "needs a GPU"]
 fn a_ring_is_followed_wherever_it_writes() {
     let (model, objective, _) = prepare(&cases()[1]);
-    let average = Average { tables: model.tables(), layers: model.layers() };
-    let offload = CudaOffload::new(&gpu());
-    assert!(offload.takes(&model.shape, &objective));
-    let mut device = offload.training(&model, &objective, &average, 1 << 16, 1 << 10).unwrap();
-    let mut ring = SampleRing::new(1000);
-    let mut follow = |ring: &SampleRing, broken: usize| {
-        assert_eq!(device.bring(ring, None).unwrap(), Brought { usable: ring.len() - broken, dropped: broken });
-        let found = device.steps(&[step(ring.len(), 1e-12)]).unwrap()[0];
+    assert!(DeviceTraining::takes(&gpu(), &model.shape, &objective));
+    let mut device = CudaTraining::new(&gpu(), HostNetwork::fresh(model.clone()), true);
+    device.begin(&objective, 1 << 16, 1 << 10).unwrap();
+    let mut ring = ReplayBuffer::new(1000);
+    let mut follow = |ring: &ReplayBuffer, broken: usize| {
+        let labels = Labels { buffer: ring, base: None };
+        assert_eq!(device.sync(&objective, labels).unwrap(), SyncedSamples { usable: ring.len() - broken, dropped: broken });
+        let found = device.train(&objective, labels, &[step(ring.len(), 1e-12)]).unwrap()[0];
         let finite: Vec<usize> = (0..ring.len()).filter(|&i| ring.samples().log_stretch[i].is_finite()).collect();
         let samples = Samples {
             points: finite.iter().map(|&i| ring.samples().points[i]).collect(),
@@ -506,8 +506,8 @@ fn a_ring_is_followed_wherever_it_writes() {
     follow(&ring, 1);
     ring.revalidate(1.0);
     follow(&ring, 1);
-    follow(&SampleRing::holding(&labels(700, 10)), 0);
-    assert!(device.device_seconds() > 0.0 && device.device_seconds() == 0.0, "asked for once");
+    follow(&ReplayBuffer::holding(&labels(700, 10)), 0);
+    assert!(device.device_seconds().unwrap() > 0.0 && device.device_seconds() == Some(0.0), "asked for once");
 }
 
 #[test]

@@ -7,9 +7,10 @@ use super::network_support::{self, Case};
 use super::scenes::*;
 use super::small;
 use nalgebra::DMatrix;
-use ridgewatch::engine::cuda::{DeviceNetwork, GpuSettings};
-use ridgewatch::engine::{Device, Frame, RunOptions};
+use ridgewatch::backend::Device;
+use ridgewatch::backend::cuda::{DeviceNetwork, GpuSettings};
 use ridgewatch::field::Domain;
+use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings, Objective, Target, row};
 
 /// Of the cases that the CPU trains, those that are not plain; and what fills registers, and goes through the kernels in tiles.
@@ -131,7 +132,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.5
+seed_step = 0.5
 slides = 2
 frames_per_slide = 3
 [flow]
@@ -181,7 +182,7 @@ fn runs_learn_on_the_device_what_the_cpu_learns() {
                 assert!(record.warnings.is_empty(), "{name}: {:?}", record.warnings);
                 assert_eq!(record.training.as_ref().unwrap().device_seconds.is_some(), there, "{name}");
                 // A GPU that walks answers points ahead of their flights; one that only traces does not.
-                assert_eq!(record.traced_ahead > 0, there, "{name}");
+                assert_eq!(record.speculative_traces > 0, there, "{name}");
             }
         }
         if small() {

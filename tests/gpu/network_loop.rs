@@ -1,14 +1,13 @@
 //! Runs whose network is trained on the device, against the same runs on the CPU.
 
-use super::network_support::{DoubleGyre, traced, uniform_points};
+use super::network_support::{traced, uniform_points};
 use super::scenes::*;
 use super::small;
-use ridgewatch::engine::cuda::{CudaOffload, GpuSettings};
-use ridgewatch::engine::{Device, Frame, RunOptions, WhenLost};
-use ridgewatch::flow::Tracer;
+use ridgewatch::backend::cuda::{CudaTracer, GpuSettings, SnapshotStore, Tuning};
+use ridgewatch::backend::{Device, WhenLost};
+use ridgewatch::run::{Frame, RunOptions};
 use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
-use ridgewatch::surrogate::{Kind, Offload, SampleRing, SurrogateSettings, build};
-use std::sync::Arc;
+use ridgewatch::surrogate::{Kind, ReplayBuffer};
 
 /// A small run that trains a fixed number of steps a frame.
 const SCENE: &str = "
@@ -62,7 +61,7 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
         for frame in &frames {
             let learned = frame.record.training.clone().unwrap();
             assert_eq!((learned.steps, learned.rollbacks), (steps, 0));
-            assert_eq!(learned.device_seconds.is_some(), matches!(device, Device::Gpu { .. }));
+            assert_eq!(learned.device_seconds.is_some(), device.is_gpu());
             assert!(frame.record.warnings.is_empty(), "{:?}", frame.record.warnings);
         }
         let psnr = |frame: &Frame| frame.record.surrogate_psnr.unwrap();
@@ -99,7 +98,7 @@ min = [0, 0, 0]
 max = [2, 1, 0.2]
 [time]
 tau = 5
-step = 0.5
+seed_step = 0.5
 slides = 4
 frames_per_slide = 4
 [flow]
@@ -127,11 +126,11 @@ samples = 4
         for pair in frames.windows(2) {
             let [before, after] = [&pair[0].record, &pair[1].record];
             assert!(
-                after.sample_ring > before.sample_ring,
+                after.replay_samples > before.replay_samples,
                 "frame {}: {} samples, then {}",
                 after.frame,
-                before.sample_ring,
-                after.sample_ring
+                before.replay_samples,
+                after.replay_samples
             );
             assert!(after.warnings.is_empty(), "{:?}", after.warnings);
             assert_eq!(after.training.as_ref().unwrap().device_seconds.is_some(), learns_there);
@@ -212,7 +211,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
         let record = &frame.record;
         assert!(record.device.starts_with("cuda:0") && record.warnings.is_empty(), "{:?}", record.warnings);
         // A GPU that walks answers points ahead of their flights; one that only traces does not.
-        assert!(record.traced_ahead > 0, "the device walks");
+        assert!(record.speculative_traces > 0, "the device walks");
         assert!(record.traced_share > 0.05 && record.traced_share < 0.9, "traced: {}", record.traced_share);
     }
     if small() {
@@ -275,7 +274,8 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
 }
 
 /// A cap that frames keep to and training does not, for its ring, for the network itself, or for what its steps need beside both: the network is
-/// trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it.
+/// trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it. The plan of the slide foresees the first
+/// two; the third shows as a shortage in the first frame, which is made again.
 #[test]
 #[ignore = "needs a GPU"]
 fn without_memory_for_training_frames_stay_on_the_device() {
@@ -290,20 +290,20 @@ fn without_memory_for_training_frames_stay_on_the_device() {
         "network.learning_rate=1e-4",
     ];
     let cases: [(u64, &str, &[&str]); 3] = [
-        (512, "samples", &["training.ring=67108864"]),
-        (192, "network", &["network.levels=8", "network.log2_table=21"]),
+        (512, "surrogate and training need", &["training.replay_buffer=67108864"]),
+        (192, "surrogate and training need", &["network.levels=8", "network.log2_table=21"]),
         (2048, "the layers' values", &published),
     ];
     for (mib, what, more) in cases.into_iter().take(if small() { 1 } else { 3 }) {
-        let settings = GpuSettings { memory_cap: Some(mib << 20), when_lost: WhenLost::Stop, ..GpuSettings::default() };
+        let settings = GpuSettings { memory_cap: Some(mib << 20), ..GpuSettings::default() };
         let keys = ["surrogate.kind=\"network\"", "training.steps_per_frame=5"].iter().chain(more).map(ToString::to_string);
-        let options = RunOptions { device: device(settings), ..RunOptions::default() };
+        let options = RunOptions { device: device_when_lost(settings, WhenLost::Stop), ..RunOptions::default() };
         let frames = frames(SCENE, &keys.collect::<Vec<_>>(), &options);
         assert_eq!(frames.len(), 3);
         for (i, Frame { record, .. }) in frames.iter().enumerate() {
             let learned = record.training.as_ref().unwrap();
             assert_eq!((learned.steps, learned.device_seconds), (5, None), "{what}, frame {i}");
-            assert!(record.device.starts_with("cuda:0") && record.traced_ahead > 0, "{what}, frame {i}: the device walks");
+            assert!(record.device.starts_with("cuda:0") && record.speculative_traces > 0, "{what}, frame {i}: the device walks");
             assert_eq!(record.warnings.len(), usize::from(i == 0), "{what}, frame {i}: {:?}", record.warnings);
         }
         let told = &frames[0].record.warnings[0];
@@ -313,37 +313,36 @@ fn without_memory_for_training_frames_stay_on_the_device() {
 }
 
 /// A checkpoint that is written while training goes on is, byte for byte, the one that training would have waited for; its room on the device is
-/// taken once; where there is none, training waits and the draft says why.
+/// taken once; where there is none, training waits and the checkpoint says why.
 #[test]
 #[ignore = "needs a GPU"]
 fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     let gpu = opened(GpuSettings { memory_cap: Some(2 << 30), ..GpuSettings::default() });
-    let offload: Arc<dyn Offload> = Arc::new(CudaOffload::new(&gpu));
-    let tracer = DoubleGyre::new(0.0, 10.0, 40);
+    let source = gyre([0.0, 0.0], [2.0, 1.0]);
+    let tracer = CudaTracer::new(&SnapshotStore::new(&gpu), &gpu, source, &map(10.0, 40), 0.0, Tuning::default()).unwrap();
     // 60 MB on the device, in several pieces and a rest.
     let (log2_table, batch) = if small() { (12, 1 << 10) } else { (18, 1 << 16) };
     let network = NetworkSettings { levels: 8, log2_table, batch, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: batch / 4, ..NetworkSettings::default() };
-    let ring = SampleRing::holding(&traced(&tracer, uniform_points(1, 20_000), false));
+    let ring = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
     let (rounds, steps) = if small() { (1, 10) } else { (3, 1000) };
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);
     let bytes = |name: &str| std::fs::read(file(name)).unwrap();
     for (kind, network) in [(Kind::Network, &network), (Kind::Residual, &network), (Kind::Network, &frequency)] {
-        let settings = SurrogateSettings { kind, table_nodes: Some([257, 129, 2]) };
-        let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        surrogate.offload(&offload);
-        surrogate.learn(&ring, f64::INFINITY, steps / 5);
+        let built = || resident(&gpu, kind, [257, 129, 2], network, &tracer);
+        let mut surrogate = built();
+        surrogate.learn(&ring, f64::INFINITY, steps / 5).unwrap();
         let before = gpu.memory().0;
         let mut room = None;
         for round in 0..rounds {
             surrogate.save(&file("waited for")).unwrap();
-            let draft = surrogate.draft_behind().unwrap();
-            assert_eq!(draft.not_behind(), None);
-            assert!(surrogate.draft_behind().is_none(), "one at a time");
+            let state = surrogate.checkpoint_async().unwrap().unwrap();
+            assert_eq!(state.wait_reason(), None);
+            assert!(surrogate.checkpoint_async().unwrap().is_none(), "one at a time");
             std::thread::scope(|scope| {
-                let learning = scope.spawn(|| surrogate.learn(&ring, f64::INFINITY, steps));
-                draft.write(&file("behind")).unwrap();
+                let learning = scope.spawn(|| surrogate.learn(&ring, f64::INFINITY, steps).unwrap());
+                state.write(&file("behind")).unwrap();
                 assert_eq!(learning.join().unwrap().steps, steps);
             });
             assert!(bytes("behind") == bytes("waited for"), "{kind:?}, round {round}");
@@ -355,17 +354,15 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
         println!("{kind:?}: {} bytes of room, {} bytes a file", room.unwrap(), bytes("behind").len());
         drop(surrogate);
         // What others have leaves no room.
-        let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        surrogate.offload(&offload);
-        surrogate.learn(&ring, f64::INFINITY, steps / 50 + 1);
+        let mut surrogate = built();
+        surrogate.learn(&ring, f64::INFINITY, steps / 50 + 1).unwrap();
         let others = gpu.alloc::<u8>("what others have", (gpu.memory_left() - (1 << 16)) as usize).unwrap();
         surrogate.save(&file("waited for")).unwrap();
-        let draft = surrogate.draft_behind().unwrap();
-        assert!(draft.not_behind().is_some_and(|why| why.contains("left")), "{:?}", draft.not_behind());
-        draft.write(&file("behind")).unwrap();
+        let state = surrogate.checkpoint_async().unwrap().unwrap();
+        assert!(state.wait_reason().is_some_and(|why| why.contains("left")), "{:?}", state.wait_reason());
+        state.write(&file("behind")).unwrap();
         assert!(bytes("behind") == bytes("waited for"));
         drop(others);
-        assert_eq!(surrogate.draft_behind().unwrap().not_behind(), None, "there is room again");
+        assert_eq!(surrogate.checkpoint_async().unwrap().unwrap().wait_reason(), None, "there is room again");
     }
-    assert_eq!(gpu.health().failure(), None);
 }

@@ -2,21 +2,17 @@
 
 use super::network::{SAMPLES, cases, gradients, predict, prepare, prepared, roundings, step, stored, training};
 use super::network_support::reference::{Kernel, Reference, Rounding, labels, norm, target};
-use super::network_support::{DoubleGyre, traced, uniform_points};
+use super::network_support::{traced, uniform_points};
 use super::scenes::*;
 use super::small;
 use burn::backend::Flex;
 use burn::module::Param;
 use burn::optim::{Adam, AdamConfig, AdamState, SimpleOptimizer};
 use burn::tensor::Tensor;
-use ridgewatch::engine::cuda::{CudaOffload, DeviceNetwork, is_fused};
-use ridgewatch::flow::Tracer;
-use ridgewatch::surrogate::network::{
-    Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, Pick, PlannedStep, Row, Step, row,
-};
-use ridgewatch::surrogate::{Kind, Offload, SampleRing, Samples, SurrogateSettings, build};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceNetwork, Tuning, is_fused};
+use ridgewatch::surrogate::network::{Architecture, Average, Fused, Input, Model, NetworkSettings, Objective, PlannedStep, Row, Step, row};
+use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, Samples};
 use std::ops::Range;
-use std::sync::Arc;
 
 /// Weights as training leaves them: halves then decide which neurons near 0 pass. How far that takes a gradient from the exact one is no
 /// property of the kernels (2e-3 of it with 1,000 samples; where 13 are all there is, one neuron of one sample is up to 7e-2), so they are
@@ -183,8 +179,7 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
     let mut expected = Vec::new();
     Fused::new(&model, &objective, count).steps(&mut model, &objective, &mut average, |done, loss| {
         expected.extend(loss);
-        let pick = Pick::Random { seed: 21, counter: done * count as u64, among: None, hold_out: true };
-        (done < all).then_some(Step { samples: &samples, pick, count, rate: 1e-2, average_share: share(done), lazy: true, base: None })
+        steps.get(done as usize).map(|step| Step::of(step, &samples, None, None))
     });
     // The same batches: the first loss is the same up to halves, later ones drift apart like two runs of one training.
     assert!((found[0] / expected[0] - 1.0).abs() < 1e-3, "{name}: first losses {} and {}", found[0], expected[0]);
@@ -224,26 +219,25 @@ fn learns_what_the_cpu_learns(name: &str, axes: &[usize], time: Option<Input>) {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_loss_that_is_no_number_is_rolled_back() {
-    let tracer = DoubleGyre::new(0.0, 10.0, 20);
-    let samples = traced(&tracer, uniform_points(1, 5_000), false);
+    let source = gyre([0.0, 0.0], [2.0, 1.0]);
+    let tracer = CudaTracer::new(store(), &gpu(), source, &map(10.0, 20), 0.0, Tuning::default()).unwrap();
+    let samples = traced(tracer.host(), uniform_points(1, 5_000), false);
     let settings = NetworkSettings { levels: 6, log2_table: 12, width: 32, batch: 2048, ..NetworkSettings::default() };
-    let kind = SurrogateSettings { kind: Kind::Network, table_nodes: None };
-    let mut network = build(&kind, &settings, tracer.domain(), 5, &tracer).unwrap();
-    network.offload(&(Arc::new(CudaOffload::new(&gpu())) as Arc<dyn Offload>));
+    let mut network = resident(&gpu(), Kind::Network, [2; 3], &settings, &tracer);
     let points = uniform_points(2, 2_000);
-    let mut predictions = |learned: &SampleRing, seconds, steps| {
-        let learned = network.learn(learned, seconds, steps);
-        assert!(network.is_offloaded() && learned.device_seconds.is_some_and(|seconds| seconds > 0.0), "{learned:?}");
+    let mut predictions = |learned: &ReplayBuffer, seconds, steps| {
+        let learned = network.learn(learned, seconds, steps).unwrap();
+        assert!(network.trains_on_device() && learned.device_seconds.is_some_and(|seconds| seconds > 0.0), "{learned:?}");
         let mut values = vec![f32::NAN; points.len()];
-        network.predict(&points, &mut values);
+        network.predict(&points, &mut values).unwrap();
         (learned, values)
     };
     // As many at least as lie between two copies of what is good.
     let steps = if small() { 64 } else { 100 };
-    let (learned, before) = predictions(&SampleRing::holding(&samples), 600.0, steps);
+    let (learned, before) = predictions(&ReplayBuffer::holding(&samples), 600.0, steps);
     assert_eq!((learned.steps, learned.rollbacks, learned.lost_steps), (steps, 0, 0));
     let poison = Samples { log_stretch: vec![1e30; samples.len()], ..samples };
-    let (learned, after) = predictions(&SampleRing::holding(&poison), 2.0, 20);
+    let (learned, after) = predictions(&ReplayBuffer::holding(&poison), 2.0, 20);
     assert!(learned.rollbacks > 0 && learned.steps == 0 && learned.lost_steps > 0, "{learned:?}");
     assert!(before.iter().all(|value| value.is_finite()) && after == before, "what predicts is what it was");
 }

@@ -1,7 +1,7 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
 use crate::scenes::{gpu, opened, store, turbulence};
-use ridgewatch::engine::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, Traced, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, TraceAll, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{
@@ -134,7 +134,7 @@ fn map(tau: f64, steps: usize, boundary: Boundary) -> FlowMap {
         integrator: Integrator::Tangent,
         precision: Precision::F32,
         steps: Steps::Fixed(steps),
-        gap: 1e-4,
+        difference_step: 1e-4,
         boundary,
         normalisation: Normalisation::Tau,
         interpolation: Interpolation::Linear,
@@ -168,7 +168,7 @@ fn traced_pictures_agree(name: &str, source: VelocitySource, map: &FlowMap, scen
         let (expected, cpu_stats) = cpu.render_samples(frame, samples.clone(), &mut by_cpu, None, &NEVER).unwrap();
         device.poison().unwrap();
         let (found, stats) =
-            device.render_samples(&mut renderer, frame, samples.clone(), &mut Traced(tracer.device()), None, &NEVER).unwrap();
+            device.render_samples(&mut renderer, frame, samples.clone(), &mut TraceAll(tracer.device()), None, &NEVER).unwrap();
         let comparison = compare_films(&found, &expected, tone_map).unwrap();
         let psnr = comparison.psnr.unwrap_or(f64::INFINITY);
         measured!("traced, {name}, {} samples: {psnr:.1} dB, {} and {} queries", samples.end, stats.queries, cpu_stats.queries);

@@ -1,18 +1,35 @@
 //! The table on the device against the CPU's.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, DeviceTable, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceTable, OnGpu, Tuning};
 use ridgewatch::flow::{Boundary, FlowMap, Precision, VelocitySource, cpu_tracer};
-use ridgewatch::surrogate::{Predict, Surrogate, Table};
+use ridgewatch::surrogate::network::NetworkSettings;
+use ridgewatch::surrogate::{DeviceTable as _, HostSurrogate, Hybrid, Kind, Predict, SurrogateSettings, Table, build};
+
+fn on_device(tracer: &CudaTracer, nodes: [usize; 3]) -> Hybrid<OnGpu> {
+    resident(&gpu(), Kind::Table, nodes, &NetworkSettings::default(), tracer)
+}
+
+fn on_host(source: &VelocitySource, map: &FlowMap, nodes: [usize; 3]) -> HostSurrogate {
+    let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+    let tracer = cpu_tracer(source.clone(), map, 0.0).unwrap();
+    build(&settings, &NetworkSettings::default(), &domain(source), 5, &tracer).unwrap()
+}
+
+/// The values, brought over.
+fn values(surrogate: &Hybrid<OnGpu>) -> Table {
+    surrogate.table().unwrap().to_host().unwrap()
+}
 
 fn check(source: &VelocitySource, nodes: [usize; 3]) {
     let map = FlowMap { boundary: Boundary::Clamp, precision: Precision::F32, ..map(3.0, 9) };
     let gpu = gpu();
     let tracer = CudaTracer::new(store(), &gpu, source.clone(), &map, 0.0, Tuning::default()).unwrap();
-    let table = Table::trace(&tracer, nodes);
-    let on_cpu = |map: &FlowMap| Table::trace(&*cpu_tracer(source.clone(), map, 0.0).unwrap(), nodes);
-    let exact = on_cpu(&FlowMap { precision: Precision::F64, ..map.clone() });
-    let single = on_cpu(&map);
+    let there = on_device(&tracer, nodes);
+    let table = values(&there);
+    let double = on_host(source, &FlowMap { precision: Precision::F64, ..map.clone() }, nodes);
+    let mut host = on_host(source, &map, nodes);
+    let (exact, single) = (double.table().unwrap(), host.table().unwrap());
     assert_eq!((table.nodes(), table.not_finite()), (exact.nodes(), exact.not_finite()));
     // Rounding in single precision, amplified by the stretch (up to e^4): no worse than the CPU's. Nodes on a cell face may take the gradient of
     // either side, as theirs do.
@@ -28,15 +45,14 @@ fn check(source: &VelocitySource, nodes: [usize; 3]) {
     }
     // Lookups in and around the unit cube, against the same values on the host: every one.
     let file = tempfile::NamedTempFile::new().unwrap();
-    table.save(file.path()).unwrap();
-    let mut host = single;
+    there.save(file.path()).unwrap();
     host.load(file.path()).unwrap();
     let points = fresh(&ridgewatch::field::Domain::cuboid([-0.1; 3], [1.1; 3]), 30_001);
-    let (mut there, mut here) = (vec![f32::NAN; points.len()], vec![f32::NAN; points.len()]);
-    assert!(DeviceTable::of(&table).is_some());
-    table.predict(&points, &mut there);
-    host.predict(&points, &mut here);
-    for (point, (there, here)) in points.iter().zip(there.iter().zip(&here)) {
+    let (mut found, mut here) = (vec![f32::NAN; points.len()], vec![f32::NAN; points.len()]);
+    assert!(there.table().unwrap().device().is_ok());
+    there.predict(&points, &mut found).unwrap();
+    host.predict(&points, &mut here).unwrap();
+    for (point, (there, here)) in points.iter().zip(found.iter().zip(&here)) {
         // Seven interpolations between values of up to 5, each rounded once or, where the CPU does not fuse, twice.
         assert!((there - here).abs() <= 5e-6, "{nodes:?} at {point:?}: {there} on the device, {here} on the host");
     }
@@ -51,7 +67,7 @@ fn tables_are_the_cpus() {
     check(&smooth(&cartesian(even(&[19, 13])), 0.6, false), [37, 25, 1]);
 }
 
-/// A table traced through the engine's seam stays on the device: what it answers there, what comes over, and what a checkpoint holds.
+/// The table of a surrogate stays on the device: what it answers there, what comes over, and what a checkpoint holds.
 #[test]
 #[ignore = "needs a GPU"]
 fn a_table_of_a_run_stays_on_the_device() {
@@ -60,32 +76,32 @@ fn a_table_of_a_run_stays_on_the_device() {
     let source = turbulence([40, 24, 24], 5);
     let tracer = |t0: f64| CudaTracer::new(store(), &gpu, source.clone(), &map, t0, Tuning::default()).unwrap();
     let domain = domain(&source);
-    let mut table = Table::trace(&tracer(0.0), nodes);
+    let mut table = on_device(&tracer(0.0), nodes);
     let points = fresh(&ridgewatch::field::Domain::cuboid([0.0; 3], [1.0; 3]), 30_001);
     for t0 in [0.0, 1.0] {
         if t0 > 0.0 {
-            let frozen = table.freeze();
-            table.window_slid(&tracer(t0));
+            let frozen = table.freeze().unwrap();
+            table.window_slid(&tracer(t0)).unwrap();
             let (mut before, mut after) = (vec![f32::NAN; points.len()], vec![f32::NAN; points.len()]);
-            frozen.predict(&points, &mut before);
-            table.predict(&points, &mut after);
+            frozen.predict(&points, &mut before).unwrap();
+            table.predict(&points, &mut after).unwrap();
             assert_ne!(before, after, "what a frame renders with stays that of its window");
         }
         let expected = DeviceTable::trace(tracer(t0).device(), &domain, nodes).unwrap();
-        assert!(DeviceTable::of(&table).is_some());
+        assert!(table.table().unwrap().device().is_ok());
         let mut there = vec![f32::NAN; points.len()];
-        table.predict(&points, &mut there);
-        assert_eq!(table.values(), expected.values().unwrap(), "the same kernels");
-        assert_eq!(table.not_finite(), expected.not_finite());
+        table.predict(&points, &mut there).unwrap();
+        let found = values(&table);
+        assert_eq!(found.values(), expected.values().unwrap(), "the same kernels");
+        assert_eq!(found.not_finite(), expected.not_finite());
         let file = tempfile::NamedTempFile::new().unwrap();
         table.save(file.path()).unwrap();
-        let mut restored = Table::trace(&*cpu_tracer(source.clone(), &map, 0.0).unwrap(), nodes);
+        let mut restored = on_host(&source, &map, nodes);
         restored.load(file.path()).unwrap();
-        assert_eq!(restored.values(), table.values());
+        assert_eq!(restored.table().unwrap().values(), found.values());
         let mut here = vec![f32::NAN; points.len()];
-        restored.predict(&points, &mut here);
+        restored.predict(&points, &mut here).unwrap();
         // Seven interpolations between values of up to 5, each rounded once or, where the CPU does not fuse, twice.
         assert!(there.iter().zip(&here).all(|(a, b)| (a - b).abs() <= 5e-6), "on the device and on the host");
     }
-    assert_eq!(gpu.health().failure(), None);
 }

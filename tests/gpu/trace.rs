@@ -1,7 +1,7 @@
 //! Tracing kernels against the CPU in f64.
 
 use super::scenes::*;
-use ridgewatch::engine::cuda::{CudaTracer, DeviceTracer, Outputs, Storage, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceTracer, Outputs, Storage, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Traced, VelocitySource};
@@ -52,8 +52,11 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
     }
     // Every variant of the kernel in single precision: no worse than the CPU's single precision, but for the order of rounding.
-    let single =
-        FlowMap { precision: Precision::F32, gap: if map.integrator == Integrator::Differences { 1e-2 } else { map.gap }, ..map.clone() };
+    let single = FlowMap {
+        precision: Precision::F32,
+        difference_step: if map.integrator == Integrator::Differences { 1e-2 } else { map.difference_step },
+        ..map.clone()
+    };
     let wide = FlowMap { precision: Precision::F64, ..single.clone() };
     let exact = on_cpu(source, &wide, t0, &seeds);
     let theirs = on_cpu(source, &single, t0, &seeds);
@@ -176,10 +179,10 @@ fn windows_in_space() {
 #[ignore = "needs a GPU"]
 fn windows_on_the_sphere() {
     // A particle at a pole, where the grid's cells meet, would be decided by rounding: Clamp lets all live.
-    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, interpolation: Interpolation::Cubic, difference_step: 1e-3, ..map(3.2, 16) };
     check("globe, cubic", &smooth(&sphere((-180.0, 170.0, 36), (-90.0, 90.0, 37), true), 1.0, false), &around, 0.1);
     let region = || sphere((-30.0, 10.0, 21), (20.0, 60.0, 21), false);
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("region, linear, holes", &smooth(&region(), 0.8, true), &stop, 3.4);
 }
 
@@ -188,10 +191,10 @@ fn windows_on_the_sphere() {
 fn levels_on_the_sphere() {
     let heights = [0.0, 0.3, 0.7, 1.2, 1.8, 2.5, 3.4];
     let globe = levels((-180.0, 170.0, 36), (-90.0, 90.0, 37), &heights, true);
-    let around = FlowMap { boundary: Boundary::Clamp, gap: 1e-3, ..map(3.2, 16) };
+    let around = FlowMap { boundary: Boundary::Clamp, difference_step: 1e-3, ..map(3.2, 16) };
     check("levels, globe", &smooth(&globe, 0.8, false), &around, 0.1);
     let region = levels((-30.0, 10.0, 21), (20.0, 60.0, 21), &heights, false);
-    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, gap: 1e-3, ..map(3.2, 16) };
+    let stop = FlowMap { boundary: Boundary::Stop, direction: Direction::Backward, difference_step: 1e-3, ..map(3.2, 16) };
     check("levels, region, holes", &smooth(&region, 0.5, true), &stop, 3.4);
     check("levels, cubic", &smooth(&region, 0.5, false), &FlowMap { interpolation: Interpolation::Cubic, ..stop.clone() }, 3.4);
     check("levels, differences", &smooth(&region, 0.5, false), &FlowMap { integrator: Integrator::Differences, ..stop }, 3.4);

@@ -1,4 +1,5 @@
-//! A scalar Runge-Kutta tracer of the double gyre with its tangent flow, in f64: slow, short, and independent of the program's own.
+//! Double gyre (Shadden, Lekien and Marsden 2005) with its tangent flow, traced by a scalar Runge-Kutta method in f64, independent of the
+//! program's tracers.
 #![allow(dead_code)]
 
 pub mod reference;
@@ -7,6 +8,7 @@ use rayon::prelude::*;
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{Extras, Traced, Tracer};
 use ridgewatch::surrogate::network::{Encoding, Input, Loss, NetworkSettings, Target};
+use ridgewatch::surrogate::{Predict, Samples};
 use std::f64::consts::PI;
 
 /// A = 0.1, eps = 0.25, omega = 2 pi / 10, forward from `start` over `tau`.
@@ -95,7 +97,7 @@ pub fn uniform_points(seed: u64, count: usize) -> Vec<[f32; 3]> {
 }
 
 /// Traced samples at unit points, flow-map labels included, in unit coordinates.
-pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> ridgewatch::surrogate::Samples {
+pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> Samples {
     let domain = tracer.domain();
     let seeds: Vec<[f32; 3]> = points.iter().map(|&p| domain.from_unit(p)).collect();
     let mut out = Traced::default();
@@ -103,7 +105,7 @@ pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> rid
     let extent = domain.extent();
     let unit = |p: &[f32; 3]| std::array::from_fn(|k| ((f64::from(p[k]) - domain.min[k]) / extent[k]) as f32);
     let scaled = |j: &[f32; 9]| std::array::from_fn(|i| j[i] * (extent[i % 3] / extent[i / 3]) as f32);
-    ridgewatch::surrogate::Samples {
+    Samples {
         points,
         log_stretch: out.log_stretch,
         arrival: out.arrival.iter().map(unit).collect(),
@@ -112,7 +114,15 @@ pub fn traced(tracer: &dyn Tracer, points: Vec<[f32; 3]>, flow_map: bool) -> rid
     }
 }
 
-/// A network that gradients are checked of.
+/// Root mean square error of the predicted log-stretch.
+pub fn rms(surrogate: &dyn Predict, samples: &Samples) -> f64 {
+    let mut predicted = vec![0.0; samples.len()];
+    surrogate.predict(&samples.points, &mut predicted).unwrap();
+    let sum: f64 = predicted.iter().zip(&samples.log_stretch).map(|(p, t)| f64::from(p - t).powi(2)).sum();
+    (sum / samples.len() as f64).sqrt()
+}
+
+/// A network whose gradients are checked.
 pub struct Case {
     pub name: &'static str,
     pub settings: NetworkSettings,
@@ -143,7 +153,7 @@ pub fn cases() -> Vec<Case> {
     vec![
         case("2 axes", plane, |_| ()),
         case("3 axes, width 64", space, |s| s.width = 64),
-        case("8 levels, finer than 8 samples a node", space, |s| (s.levels, s.log2_table) = (8, 12)),
+        case("8 levels, finer than 8 samples per node", space, |s| (s.levels, s.log2_table) = (8, 12)),
         case("4 features, width 128", space, |s| (s.features, s.width) = (4, 128)),
         case("8 features, x and z", &[0, 2], |s| s.features = 8),
         case("1 feature, 1 axis, odd width", &[1], |s| (s.features, s.width) = (1, 21)),

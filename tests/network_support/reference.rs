@@ -1,34 +1,34 @@
-//! Networks in f64, and labels for them.
+//! Networks in f64, written from the definition, and labels for them.
 
 use super::uniform_points;
 use rayon::prelude::*;
 use ridgewatch::surrogate::Samples;
 use ridgewatch::surrogate::network::{Architecture, Encoding, Level, Loss, Model, Objective, Row, Target, row};
 
-/// Rounded to half precision (11 bits, 2^-24 at least apart), ties to even.
+/// Rounds to half precision (11 bits, spacing at least 2^-24), ties to even.
 fn half(x: f64) -> f64 {
     let exponent = if x == 0.0 { -14.0 } else { x.abs().log2().floor().max(-14.0) };
     let spacing = (exponent - 10.0).exp2();
     (x / spacing).round_ties_even() * spacing
 }
 
-/// The same network in f64, written from the definition: no tiles, no panels, no burn.
+/// A network in f64, without tiles, panels or burn.
 pub struct Reference<'a> {
     pub shape: &'a Architecture,
     pub tables: Vec<f64>,
     pub layers: Vec<f64>,
-    /// What is done to values between layers.
+    /// Rounding of values between layers.
     between: fn(f64) -> f64,
 }
 
 impl<'a> Reference<'a> {
-    /// Of the model's parameters as they are.
+    /// The network of the model's parameters, unrounded.
     pub fn new(model: &'a Model) -> Self {
         let wide = |values: Vec<f32>| values.into_iter().map(f64::from).collect();
         Self { shape: &model.shape, tables: wide(model.tables()), layers: wide(model.layers()), between: |x| x }
     }
 
-    /// The same with tables, weights and the values between layers in half precision, biases and sums as they are.
+    /// The network with tables, weights and values between layers in half precision; biases and sums are unrounded.
     pub fn in_halves(model: &'a Model) -> Self {
         let mut halves = Self { between: half, ..Self::new(model) };
         halves.tables.iter_mut().for_each(|x| *x = half(*x));
@@ -43,13 +43,13 @@ impl<'a> Reference<'a> {
         self.shape.axes.iter().map(|&a| row[a]).collect()
     }
 
-    /// Entries around a point, and what each counts for the value and for the derivative along each input.
+    /// Entries around a point, with their factors for the value and for the derivative along each input.
     fn corners(level: &Level, x: &[f32]) -> Vec<(usize, Vec<f64>)> {
         let d = x.len();
         let mut cell = vec![0_u32; d];
         let mut share = vec![0.0_f64; d];
         for a in 0..d {
-            // The cell is found in f32 as everywhere: a point on an edge must not fall to the other side.
+            // The cell is found in f32, as in the kernels, so that a point on an edge falls to the same side.
             let position = x[a] * level.cells[a] as f32;
             cell[a] = (position as u32).min(level.cells[a] - 1);
             share[a] = f64::from(position - cell[a] as f32);
@@ -174,8 +174,8 @@ impl<'a> Reference<'a> {
         loss
     }
 
-    /// Gradient of [`Self::loss`], tables first; of the target `ftle` without the penalty on means. With halves, gradients with respect to the
-    /// layers' sums are in half precision too where they are multiplied.
+    /// Gradient of [`Self::loss`] for the target `ftle` without the penalty on means, tables first. In half precision, the factors of
+    /// products with gradients of the layers' sums are rounded too.
     pub fn gradient(&self, objective: &Objective, samples: &Samples, kernel: Kernel, rounding: Rounding) -> Vec<f64> {
         assert!(objective.target == Target::Ftle && (objective.loss == Loss::MeanSquare || objective.mean_penalty == 0.0));
         let zeros = || vec![0.0; self.tables.len() + self.layers.len()];
@@ -193,7 +193,7 @@ impl<'a> Reference<'a> {
         all
     }
 
-    /// What goes into each layer, and the outputs last. ReLU passes what is not 0 after it was rounded.
+    /// Inputs of each layer, then the outputs. ReLU is active if its rounded result is not 0.
     fn values(&self, x: &[f32], rounding: &mut Rounding) -> Vec<Vec<f64>> {
         let (shape, between) = (self.shape, self.between);
         let mut values = vec![self.encoded(x).swap_remove(0)];
@@ -216,19 +216,19 @@ impl<'a> Reference<'a> {
         values
     }
 
-    /// The only output at each point, its sums off by `rounding`.
+    /// The single output at each point, with sums perturbed by `rounding`.
     pub fn rounded_outputs(&self, rows: &[Row], rounding: Rounding) -> Vec<f64> {
         let of_one = |(i, row): (usize, &Row)| self.values(&self.inputs(*row), &mut rounding.of(i))[self.shape.layers.len()][0];
         rows.par_iter().enumerate().map(of_one).collect()
     }
 
-    /// Adds the gradient of one sample's squared error.
+    /// Adds the gradient of the squared error of one sample.
     fn add_gradient(&self, to: &mut [f64], row: Row, target: f64, kernel: Kernel, rounding: &mut Rounding) {
         let (shape, between, x) = (self.shape, self.between, self.inputs(row));
         let values = self.values(&x, rounding);
         let slope = 2.0 * (values[shape.layers.len()][0] - target);
         let (tables, layers) = to.split_at_mut(self.tables.len());
-        // With respect to the sums of the layer at hand: as it is, and as it is multiplied.
+        // With respect to the sums of the layer: unrounded, and as a factor of the products.
         let mut delta = vec![slope];
         for (number, layer) in shape.layers.iter().enumerate().rev() {
             let is_head = number + 1 == shape.layers.len();
@@ -257,16 +257,16 @@ impl<'a> Reference<'a> {
     }
 }
 
-/// Which kernels of the device a gradient is compared with: they round at different places.
+/// Kernels of the device that a gradient is compared with; they round at different places.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kernel {
-    /// `network_fused.cu`: what is added up over samples is in halves; what goes to the tables is not.
+    /// `network_fused.cu`: sums over samples add halves; gradients of the tables are not rounded.
     Fused,
     /// `network_batched.cu`: the other way round.
     Batched,
 }
 
-/// What sums are off by, at random: up to `part` of the sum of their terms' magnitudes.
+/// Random perturbation of sums by up to `part` of the sum of their terms' magnitudes.
 #[derive(Debug, Clone, Copy)]
 pub struct Rounding {
     pub part: f64,
@@ -276,7 +276,7 @@ pub struct Rounding {
 impl Rounding {
     pub const NONE: Self = Self { part: 0.0, seed: 0 };
 
-    /// Of one sample's sums.
+    /// Rounding of one sample's sums.
     fn of(self, sample: usize) -> Self {
         Self { seed: (self.seed << 32) + sample as u64, ..self }
     }
@@ -287,7 +287,7 @@ impl Rounding {
     }
 }
 
-/// What the output is to be.
+/// Target of the output.
 pub fn target(objective: &Objective, log_stretch: f32) -> f64 {
     let s = f64::from(log_stretch);
     match objective.loss {
@@ -299,7 +299,7 @@ pub fn target(objective: &Objective, log_stretch: f32) -> f64 {
     }
 }
 
-/// Smooth labels, not those of any flow: the gradients do not care.
+/// Smooth labels, of no real flow: gradients do not depend on that.
 pub fn labels(count: usize, seed: u64) -> Samples {
     let points = uniform_points(seed, count);
     let value = |p: &[f32; 3]| 1.5 * (4.0 * p[0]).sin() + (3.0 * p[1]).cos() * p[2] - 0.4;
@@ -314,7 +314,7 @@ pub fn labels(count: usize, seed: u64) -> Samples {
     }
 }
 
-/// Euclidean.
+/// Euclidean norm.
 pub fn norm(values: &[f64]) -> f64 {
     values.iter().map(|v| v * v).sum::<f64>().sqrt()
 }

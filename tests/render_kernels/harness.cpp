@@ -1,13 +1,13 @@
-// The rendering kernels' numerics as host C++: reads one request from standard input, writes the answer to standard output.
+// The rendering kernels' numerics as host C++. Reads the input of one request from standard input and writes its results to standard output.
 #include <cstdio>
 #include <cstdlib>
 #include <string>
 #include <vector>
 
-#include "answer.cuh"
-#include "audit.cuh"
-#include "table.cuh"
-#include "wavefront.cuh"
+#include "rendering/answer.cuh"
+#include "rendering/audit.cuh"
+#include "rendering/wavefront.cuh"
+#include "tracing/table.cuh"
 
 using namespace rw;
 
@@ -20,13 +20,13 @@ template <class T> T take_one() { return take<T>(1)[0]; }
 template <class T> void give(const std::vector<T>& values) { fwrite(values.data(), sizeof(T), values.size(), stdout); }
 template <class T> void give_one(const T& value) { fwrite(&value, sizeof(T), 1, stdout); }
 
-// The field of `Waves` in the test, evaluated in f32 with the same operations.
+// The field `Waves` of the test, evaluated in f32 with the same operations.
 static Answer waves(const float* p) {
     const float value = sinf(7.0f * p[0] + 3.0f * p[2]) * cosf(9.0f * p[1]);
     return {p[0] > 1.8f && p[1] < 0.3f ? NAN : value, (unsigned char)(p[1] > 0.5f ? TRACED : PREDICTED)};
 }
 
-// A table of the request, and the memory behind it.
+// A table from the input, with its memory.
 struct TakenTable {
     std::vector<float> values;
     Table table = {};
@@ -38,38 +38,38 @@ struct TakenTable {
     }
 };
 
-// Who answers, from the request: gate, land, table.
-struct Desk {
-    std::vector<unsigned char> trusted, empty;
+// Gate, missing cells and table from the input, with their memory.
+struct AnswerSetup {
+    std::vector<unsigned char> trusted, missing;
     std::vector<double> nodes[3];
     Choice choice = {};
     TakenTable table;
 
-    static Choice take_choice(Desk& desk) {
+    static Choice take_choice(AnswerSetup& setup) {
         Choice choice = {};
         choice.domain = take_one<UnitBox>();
         choice.budget_spent = take_one<int>();
         for (int& n : choice.gate.shape) n = take_one<int>();
-        desk.trusted = take<unsigned char>(size_t(choice.gate.shape[0]) * choice.gate.shape[1] * choice.gate.shape[2]);
-        choice.gate.trusted = desk.trusted.empty() ? nullptr : desk.trusted.data();
-        choice.land.dimensions = take_one<int>();
-        size_t cells = choice.land.dimensions ? 1 : 0;
-        for (int k = 0; k < choice.land.dimensions; ++k) {
-            LandAxis& axis = choice.land.axes[k];
+        setup.trusted = take<unsigned char>(size_t(choice.gate.shape[0]) * choice.gate.shape[1] * choice.gate.shape[2]);
+        choice.gate.trusted = setup.trusted.empty() ? nullptr : setup.trusted.data();
+        choice.missing_cells.dimensions = take_one<int>();
+        size_t cells = choice.missing_cells.dimensions ? 1 : 0;
+        for (int k = 0; k < choice.missing_cells.dimensions; ++k) {
+            MissingCellsAxis& axis = choice.missing_cells.axes[k];
             axis.period = take_one<double>();
             axis.count = take_one<int>();
-            desk.nodes[k] = take<double>(axis.count);
-            axis.nodes = desk.nodes[k].data();
-            choice.land.cells[k] = axis.period != 0.0 ? axis.count : axis.count - 1;
-            cells *= choice.land.cells[k];
+            setup.nodes[k] = take<double>(axis.count);
+            axis.nodes = setup.nodes[k].data();
+            choice.missing_cells.cells[k] = axis.period != 0.0 ? axis.count : axis.count - 1;
+            cells *= choice.missing_cells.cells[k];
         }
-        desk.empty = take<unsigned char>(cells);
-        choice.land.empty = cells ? desk.empty.data() : nullptr;
+        setup.missing = take<unsigned char>(cells);
+        choice.missing_cells.missing = cells ? setup.missing.data() : nullptr;
         return choice;
     }
-    Desk() : choice(take_choice(*this)), table() {}
+    AnswerSetup() : choice(take_choice(*this)), table() {}
 
-    // As answer_split and answer_join do; what is traced has the value of `waves`.
+    // As answer_split and answer_join do; traced points have the value of `waves`.
     Answer answer(const float* p) const {
         float unit_point[3];
         const Answerer who = choose(choice, p, unit_point);
@@ -91,18 +91,18 @@ template <class Answers> static void frame(const Answers& answers) {
     std::vector<uint32_t> count(cells), highest(cells), missing(cells);
     const Watch watch = {count.data(), highest.data(), missing.data()};
     const uint32_t slot_count = band.pixels * band.parts;
-    std::vector<Four> place(slot_count), way(slot_count), colour(slot_count);
-    std::vector<Words4> progress(slot_count);
-    std::vector<Two> seen(slot_count);
+    std::vector<Float4> place(slot_count), way(slot_count), colour(slot_count);
+    std::vector<Uint4> progress(slot_count);
+    std::vector<Float2> seen(slot_count);
     std::vector<uint32_t> first(slot_count);
-    // Poisoned, so that what is read before it is written shows.
+    // NaN shows reads before the first write.
     std::vector<double> sums(size_t(slot_count) * PIXEL_SUM_FIELDS, NAN);
     const Slots slots = {place.data(), way.data(), colour.data(), progress.data(), seen.data(), first.data(), sums.data(), slot_count, 0};
 
     const size_t capacity = size_t(slot_count) * (ahead_camera > ahead_shadow ? ahead_camera : ahead_shadow);
     std::vector<float> points(3 * capacity), log_stretch(capacity);
     std::vector<unsigned char> by(capacity);
-    std::vector<Four> hits[2] = {std::vector<Four>(capacity), std::vector<Four>(capacity)};
+    std::vector<Float4> hits[2] = {std::vector<Float4>(capacity), std::vector<Float4>(capacity)};
     std::vector<uint32_t> live(slot_count), next;
     for (uint32_t i = 0; i < slot_count; ++i) live[i] = i;
     Counts counts = {};
@@ -110,7 +110,7 @@ template <class Answers> static void frame(const Answers& answers) {
         uint32_t length = 0;
         const Queue queue = {points.data(), hits[wave % 2].data(), &length, hits[1 - wave % 2].data(), log_stretch.data(), by.data()};
         next.clear();
-        // Backwards every other wave: the order in which slots come must not matter.
+        // Every other wave is in reverse order: the order of slots must not matter.
         for (size_t i = 0; i < live.size(); ++i) {
             const uint32_t slot = live[wave % 2 ? live.size() - 1 - i : i];
             if (advance(scene, grid, watch, band, slots, queue, slot, wave == 0, ahead_camera, ahead_shadow, counts)) next.push_back(slot);
@@ -141,7 +141,7 @@ int main(int, char** arguments) {
             give_one(words(random, c[3], c[4], c[5]));
         }
     } else if (request == "scene") {
-        // Rays, the light, and the transfer function of a scene, at random places.
+        // Rays and the transfer function of a scene at random points.
         const FrameScene scene = take_one<FrameScene>();
         const uint32_t n = take_one<uint32_t>();
         for (uint32_t i = 0; i < n; ++i) {
@@ -176,7 +176,7 @@ int main(int, char** arguments) {
         const uint32_t shift = take_one<uint32_t>(), n = take_one<uint32_t>();
         for (uint32_t i = 0; i < n; ++i) give_one<unsigned char>(keeps_label(take<float>(3).data(), shift));
     } else if (request == "audit") {
-        // Points of every cell, and what given residuals add up to.
+        // Points of every cell, and sums of given residuals.
         const AuditCells cells = take_one<AuditCells>();
         const auto ramp = take<float>(3);
         const uint32_t n = uint32_t(cells.shape[0] * cells.shape[1] * cells.shape[2]);
@@ -189,11 +189,11 @@ int main(int, char** arguments) {
                 float point[3];
                 audit_point(cells, cell, number++, point);
                 for (float u : point) give_one(u);
-                const auto x = take<float>(4);  // land, lived, predicted, traced
-                const bool land = x[0] != 0.0f;
-                const Residual found = land ? Residual{not_a_number(), not_a_number()} : residual(ramp[0], ramp[1], ramp[2], x[2], x[3]);
+                const auto x = take<float>(4);  // missing, lived, predicted, traced
+                const bool missing = x[0] != 0.0f;
+                const Residual found = missing ? Residual{not_a_number(), not_a_number()} : residual(ramp[0], ramp[1], ramp[2], x[2], x[3]);
                 add_residual(sums, found);
-                add_point(sums, land, x[1], x[3]);
+                add_point(sums, missing, x[1], x[3]);
                 optical.push_back(found.optical);
             }
             const double mean = sums.square / sums.count;
@@ -201,18 +201,18 @@ int main(int, char** arguments) {
             give_one(sums);
         }
     } else if (request == "gated") {
-        const Desk desk;
-        frame([&](const float* p) { return desk.answer(p); });
+        const AnswerSetup setup;
+        frame([&](const float* p) { return setup.answer(p); });
     } else if (request == "choices") {
-        // Who answers, and what the surrogate says.
-        const Desk desk;
+        // Answerer and prediction at each point.
+        const AnswerSetup setup;
         const uint32_t n = take_one<uint32_t>();
         for (uint32_t i = 0; i < n; ++i) {
             const auto p = take<float>(3);
             float unit_point[3] = {0.0f, 0.0f, 0.0f};
-            give_one<int>(choose(desk.choice, p.data(), unit_point));
+            give_one<int>(choose(setup.choice, p.data(), unit_point));
             for (float u : unit_point) give_one(u);
-            give_one(look_up(desk.table.table, unit_point));
+            give_one(look_up(setup.table.table, unit_point));
         }
     } else if (request == "frame") {
         frame(waves);

@@ -1,10 +1,10 @@
-/* A decomposed solver: each MPI rank publishes its block of a 3-D field, with ghost cells left out by strides.
+/* A decomposed solver: each MPI rank publishes its block of a 3-D field, and strides exclude the ghost cells.
  *
  *     mpicc mpi_solver.c $(pkg-config --cflags --libs ridgewatch) -lm -o mpi_solver
  *     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/mpi mpirun -n 4 ./mpi_solver 200
  *
- * The field is the ABC flow with a drifting phase, so that every rank knows its values without asking another; the ghost exchange of a real
- * solver changes nothing for publishing. Arguments: steps (100), nodes along each axis (48), milliseconds a step (20), wait limit in ms (0). */
+ * The field is the ABC flow with a drifting phase, so that every rank computes its values alone. The ghost exchange of a real solver does
+ * not affect publishing. Arguments: steps (100), nodes along each axis (48), milliseconds per step (20), wait limit in ms (0). */
 #include <math.h>
 #include <mpi.h>
 #include <stdio.h>
@@ -38,7 +38,7 @@ int main(int argc, char **argv) {
     rw_description *grid = rw_describe(3);
     for (uint32_t axis = 0; axis < 3; axis++) rw_describe_uniform(grid, axis, 0.0, box * (n - 1) / n, n, box);
     rw_describe_block(grid, (uint32_t)rank, (uint32_t)ranks, offset, extent);
-    /* One number for this start, so that a restart with more or fewer ranks is not mistaken for it. */
+    /* One number for this start distinguishes it from a restart with more or fewer ranks. */
     struct timespec now;
     clock_gettime(CLOCK_REALTIME, &now);
     uint64_t start = (uint64_t)now.tv_sec * 1000000000 + (uint64_t)now.tv_nsec;
@@ -65,7 +65,7 @@ int main(int argc, char **argv) {
                     v[at] = (float)(b * sin(x) + a * cos(z));
                     w[at] = (float)(c * sin(y) + b * cos(x));
                 }
-        /* A step begins together, as any solver's does. */
+        /* All ranks begin a step together, as in any solver. */
         MPI_Barrier(MPI_COMM_WORLD);
         if (rw_publish_strided_f32(field, step, t, u + first, v + first, w + first, strides) > RW_OFF)
             fprintf(stderr, "rank %d, step %ld: %s\n", rank, step, rw_error());

@@ -1,8 +1,8 @@
-/* How long a solver's step takes, publishing with it: a seven-point diffusion of three components, the part of a solver that memory bounds.
+/* Measures a solver's step including publishing: a seven-point diffusion of three components, which is limited by memory bandwidth.
  *
- * Arguments: nodes along each axis (96), steps, microseconds of rest after each, which are not counted (0). Prints the median and 99th percentile of a
+ * Arguments: nodes along each axis (96), steps, microseconds of pause after each, which are not counted (0). Prints the median and 99th percentile of a
  * whole step and the median of publishing alone, in ms. Without steps it reads commands and answers each with a line: "open RING" ("-": none), "run STEPS", "close", and
- * "spin MILLISECONDS": rounds of pure arithmetic a microsecond, by which threads of one core are told from cores. */
+ * "spin MILLISECONDS": rounds of pure arithmetic per microsecond, which distinguish threads of one core from cores. */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -27,7 +27,7 @@ static int by_size(const void *a, const void *b) {
     return (x > y) - (x < y);
 }
 
-/* `ring` NULL: as the environment says. */
+/* `ring` NULL: the ring that RIDGEWATCH_RING names. */
 static void open_ring(const char *ring) {
     rw_description *grid = rw_describe(3);
     for (uint32_t axis = 0; axis < 3; axis++) rw_describe_uniform(grid, axis, 0.0, 1.0, n, 0.0);
@@ -68,7 +68,7 @@ static void run(const char *word, long steps, long rest) {
     free(publishing);
 }
 
-/* Sums that do not wait for each other and stay in registers: what another thread of the same core takes from, and nothing else does. */
+/* Independent sums in registers, which only another thread of the same core can slow down. */
 static void spin(long milliseconds) {
     double sums[8] = {1, 2, 3, 4, 5, 6, 7, 8}, rounds = 0;
     const double begin = now();

@@ -1,16 +1,19 @@
-//! The C ABI over [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` is generated from this file (`make header`), its words are the comments here.
+//! C ABI of [`ridgewatch_wire::Producer`]. `include/ridgewatch.h` is generated from this file (`make header`), including its comments.
 //!
-//! Nothing here may unwind into C or abort: bodies run under `catch_unwind`, and every fault is a status with words in [`rw_error`]. Rust aborts
-//! where memory is out, so what is large is asked for (`copied`), and whoever describes or opens asks first for what all that is small may take (`SMALL`).
+//! No function unwinds into C or aborts: bodies run under `catch_unwind`, and every fault is a status with a text in [`rw_error`]. Rust aborts if a small
+//! allocation fails. Therefore large memory is reserved fallibly (`copied`), and functions that describe or open first test whether the memory for all small
+//! allocations is available (`SMALL`).
 //!
-//! What C promises with each pointer that it gives: it is null, or from this library and not yet freed, or points to as many values as the
-//! function's comment says; texts end with a zero. A description and `rw_close` are for one thread at a time.
+//! # Safety
+//! C guarantees for each pointer: it is null, or it comes from this library and was not freed, or it points to as many values as the function's comment says.
+//! Texts end with a zero. Only one thread at a time uses a description or calls `rw_close`.
 
-// The promises of the callers stand above, once for all functions.
+// The module documentation has one Safety section for all functions.
 #![allow(clippy::missing_safety_doc)]
 
 use ridgewatch_wire::{
-    AXIS_NODES, AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE, TEXT, WireError, even,
+    AXIS_NODES, AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, TEXT, WireError, even,
+    ring_from_environment,
 };
 use std::cell::RefCell;
 use std::ffi::{CStr, c_char};
@@ -19,37 +22,37 @@ use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-/// What a call came to.
+/// Result of a call.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-// In C the names of a type's values stand beside all others.
+// C enumerators share one namespace, so they need the prefix.
 #[allow(clippy::enum_variant_names)]
 pub enum Status {
-    /// Done.
+    /// Success.
     RwOk = 0,
-    /// No handle, or no ring was asked for: nothing was done.
+    /// The handle is null, or no ring was requested: nothing was done.
     RwOff = 1,
-    /// A value that cannot be.
+    /// An argument is invalid.
     RwArgument = 2,
-    /// Another producer has this name.
+    /// Another producer has the ring.
     RwInUse = 3,
-    /// No room for the ring, or it is a longer file than the process may make.
+    /// There is no room for the ring, or it exceeds the process limit of a file's length.
     RwNoSpace = 4,
-    /// The folder or file belongs to somebody else.
+    /// The folder or a file belongs to another user, or others may write into it.
     RwForeign = 5,
-    /// The system refused, or has no memory.
+    /// A system call failed, or there is no memory.
     RwSystem = 6,
-    /// The handle was opened by the parent process.
+    /// The parent process opened the handle.
     RwForked = 7,
-    /// A fault of this library, which was caught.
+    /// Internal error of this library.
     RwInternal = 8,
 }
 
-/// Of this version of the header.
+/// Version of this header.
 pub const RW_VERSION: u32 = 2;
 const DEFAULT_SLOTS: u32 = 4;
 
-/// A grid as far as it is described.
+/// Description of a grid.
 #[derive(Debug)]
 pub struct RwDescription {
     geometry: Geometry,
@@ -71,18 +74,18 @@ pub struct RwField {
     overwrote: AtomicU64,
 }
 
-/// Longest message, with its closing zero.
+/// Bytes of the longest error text, including its final zero.
 const MESSAGE: usize = 512;
 
 thread_local! {
-    /// Of fixed length: a failure of `rw_publish` takes no memory that is kept.
+    /// Fixed length: an error of `rw_publish_*` allocates nothing.
     static ERROR: RefCell<[u8; MESSAGE]> = const { RefCell::new([0; MESSAGE]) };
 }
 
-/// Why a call came to nothing.
+/// Error of a call.
 enum Failure {
     Off,
-    /// An argument that cannot be; the words are in [`ERROR`] already, since the calls after opening take no memory for them.
+    /// An invalid argument. The text is in [`ERROR`] already, because calls after opening allocate nothing.
     Argument,
     Wire(WireError),
 }
@@ -110,14 +113,14 @@ impl Failure {
     }
 }
 
-/// Writes into a thread's message as much as fits.
+/// Writes to a thread's error text, as much as fits.
 struct Message<'a>(&'a mut [u8; MESSAGE], usize);
 
 impl std::fmt::Write for Message<'_> {
     fn write_str(&mut self, text: &str) -> std::fmt::Result {
         let room = MESSAGE - 1 - self.1;
         let mut length = text.len().min(room);
-        // Whole characters only.
+        // Complete characters only.
         while !text.is_char_boundary(length) {
             length -= 1;
         }
@@ -127,8 +130,8 @@ impl std::fmt::Write for Message<'_> {
     }
 }
 
-fn tell(text: std::fmt::Arguments) {
-    // A thread that is ending has no message any more.
+fn set_error(text: std::fmt::Arguments) {
+    // A thread that ends has no error text any more.
     let _ = ERROR.try_with(|error| {
         if let Ok(mut error) = error.try_borrow_mut() {
             let mut message = Message(&mut error, 0);
@@ -139,86 +142,86 @@ fn tell(text: std::fmt::Arguments) {
     });
 }
 
-/// Refuses an argument: what was found, and what is accepted.
+/// Error of an argument, with the value found and the accepted values.
 fn refused(argument: &str, found: impl std::fmt::Display, accepted: std::fmt::Arguments) -> Failure {
-    tell(format_args!("`{argument}` is {found}; accepted: {accepted}"));
+    set_error(format_args!("`{argument}` is {found}; accepted: {accepted}"));
     Failure::Argument
 }
 
-/// Most bytes that one call takes beside coordinates: texts, paths, the handles, the words of an error; however many blocks there are, since those of a
-/// folder are looked at one by one. Less than from where malloc maps memory of its own, so that what was asked for and given back is there for what follows.
+/// Most bytes that one call allocates besides coordinates: texts, paths, handles and error texts. The number of blocks does not matter, because those of a folder
+/// are examined one after another. The value is below malloc's mmap threshold, so that memory that was reserved and freed is available afterwards.
 const SMALL: usize = 1 << 16;
 
-/// Longest path of a ring, in bytes: the system's, whose copies [`SMALL`] is for.
+/// Most bytes of a ring's path: the system's limit. [`SMALL`] covers the copies of a path.
 const PATH: usize = 4095;
 
-/// Asks for memory.
+/// Reserves memory.
 fn room<T>(count: usize) -> Result<Vec<T>, WireError> {
     let mut room = Vec::new();
     room.try_reserve_exact(count).map_err(|_| WireError::NoMemory { bytes: count.saturating_mul(size_of::<T>()) })?;
     Ok(room)
 }
 
-/// Coordinates in memory that was asked for.
+/// Copies coordinates to memory that was reserved.
 fn copied(coordinates: impl ExactSizeIterator<Item = f64>) -> Result<Vec<f64>, WireError> {
     let mut copy = room(coordinates.len())?;
     copy.extend(coordinates);
     Ok(copy)
 }
 
-/// [`guarded`] for what takes memory.
+/// [`guarded`] for functions that allocate.
 fn guarded_with_room(body: impl FnOnce() -> Result<(), Failure>) -> Status {
     guarded(|| {
-        // Kept from being optimised away.
+        // The black box keeps the allocation from being optimised away.
         std::hint::black_box(&mut room::<u8>(SMALL)?);
         body()
     })
 }
 
-/// Runs a body so that neither an error nor a panic leaves it but as a status.
+/// Runs a body, and returns errors and panics as a status.
 fn guarded(body: impl FnOnce() -> Result<(), Failure>) -> Status {
     match catch_unwind(AssertUnwindSafe(body)) {
         Ok(Ok(())) => {
-            tell(format_args!(""));
+            set_error(format_args!(""));
             Status::RwOk
         }
         Ok(Err(failure)) => {
             match &failure {
-                Failure::Off => tell(format_args!("")),
+                Failure::Off => set_error(format_args!("")),
                 Failure::Argument => {}
-                Failure::Wire(error) => tell(format_args!("{error}")),
+                Failure::Wire(error) => set_error(format_args!("{error}")),
             }
             failure.status()
         }
         Err(_) => {
-            tell(format_args!("an internal fault of the adapter, which was caught"));
+            set_error(format_args!("an internal error of the adapter"));
             Status::RwInternal
         }
     }
 }
 
-/// The library's version; another number than `RW_VERSION`: another header.
+/// Version of the library. It differs from `RW_VERSION` if the header belongs to another library.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_version() -> u32 {
     RW_VERSION
 }
 
-/// Why the last call of this thread failed; empty when none did. Valid until the thread's next call.
+/// Text of the error of this thread's last call; empty if it succeeded. Valid until the thread's next call.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_error() -> *const c_char {
     ERROR.try_with(|error| error.as_ptr().cast::<c_char>().cast_const()).unwrap_or(c"".as_ptr())
 }
 
-/// Makes this text what `rw_error` returns: for modules of other languages, which refuse what they do not pass on. Null: none. Takes no memory.
+/// Sets the text that `rw_error` returns, for modules of other languages with their own checks. Null: an empty text. Allocates nothing.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_set_error(text: *const c_char) {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     let text = if text.is_null() { c"" } else { unsafe { CStr::from_ptr(text) } };
-    tell(format_args!("{}", text.to_str().unwrap_or("a text that is not UTF-8")));
+    set_error(format_args!("{}", text.to_str().unwrap_or("a text that is not UTF-8")));
 }
 
-/// Begins a description of a grid of 2 or 3 dimensions, whose velocity has as many components. Null when there is no memory or the
-/// dimensions are wrong.
+/// Begins the description of a grid of 2 or 3 dimensions, whose velocity has as many components. Null if there is no memory or another
+/// number of dimensions.
 #[unsafe(no_mangle)]
 pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     let mut made = std::ptr::null_mut();
@@ -240,12 +243,12 @@ pub extern "C" fn rw_describe(dimensions: u32) -> *mut RwDescription {
     made
 }
 
-/// Ends a description; rings that were opened with it do not need it.
+/// Frees a description. Rings that were opened with it do not need it.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
     guarded(|| {
         if !description.is_null() {
-            // SAFETY: the caller's promise.
+            // SAFETY: guaranteed by the caller.
             drop(unsafe { Box::from_raw(description) });
         }
         Ok(())
@@ -253,19 +256,19 @@ pub unsafe extern "C" fn rw_free_description(description: *mut RwDescription) {
 }
 
 fn no_description() -> Failure {
-    refused("description", "null", format_args!("what rw_describe returned"))
+    refused("description", "null", format_args!("a result of rw_describe"))
 }
 
 /// # Safety
-/// `description` is null or points to a description that nobody else uses.
+/// `description` is null, or points to a description that no other thread uses.
 unsafe fn describe(description: *mut RwDescription, change: impl FnOnce(&mut RwDescription) -> Result<(), Failure>) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     guarded_with_room(|| change(unsafe { description.as_mut() }.ok_or_else(no_description)?))
 }
 
 const NAMES: [&str; 3] = ["x", "y", "z"];
 
-/// What an axis is but for its coordinates.
+/// An axis with its standard name.
 fn axis_of(axis: u32, coordinates: Vec<f64>, period: Option<f64>) -> AxisDescription {
     AxisDescription { name: NAMES.get(axis as usize).copied().unwrap_or_default().into(), unit: String::new(), coordinates, period }
 }
@@ -284,7 +287,7 @@ fn set_axis(
     Ok(())
 }
 
-/// An axis (0: x, 1: y, 2: z) of evenly spaced nodes of the global grid. `period`: length after which the axis repeats, 0: it does not.
+/// Describes an axis (0: x, 1: y, 2: z) of the global grid with evenly spaced nodes. `period`: period of the axis; 0: not periodic.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_uniform(
     description: *mut RwDescription,
@@ -294,11 +297,11 @@ pub unsafe extern "C" fn rw_describe_uniform(
     nodes: u64,
     period: f64,
 ) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, |d| set_axis(d, axis, even(first, last, nodes), period)) }
 }
 
-/// An axis with its own `nodes` coordinates, strictly ascending.
+/// Describes an axis of the global grid by its `nodes` coordinates, strictly ascending.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_rectilinear(
     description: *mut RwDescription,
@@ -314,27 +317,27 @@ pub unsafe extern "C" fn rw_describe_rectilinear(
         if nodes > AXIS_NODES {
             return Err(refused("nodes", nodes, format_args!("2 to {AXIS_NODES}")));
         }
-        // SAFETY: the caller's promise, for a number of nodes that was checked.
+        // SAFETY: guaranteed by the caller, for a number of nodes that was checked.
         let coordinates = unsafe { std::slice::from_raw_parts(coordinates, nodes as usize) };
         set_axis(d, axis, coordinates.iter().copied(), period)
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// Axes 0 and 1 are longitude and latitude in degrees, on a sphere of this radius; velocities are eastward, northward (and upward).
+/// Makes axes 0 and 1 longitude and latitude in degrees, on a sphere of this radius. Velocities are eastward, northward (and upward).
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_sphere(description: *mut RwDescription, radius: f64) -> Status {
     let change = |d: &mut RwDescription| {
         d.geometry = Geometry::Sphere { radius };
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// This process has a block of the global grid: nodes [offset, offset + extent) along x, y, z; blocks must not overlap (leave ghost cells
-/// out) and cover the grid together. Block `index` is of `count`. Arrays have one value for each of the dimensions.
+/// Describes this process's block of the global grid: nodes [offset, offset + extent) along x, y, z, as block `index` of `count`. All blocks
+/// together must cover the grid without overlap (without ghost cells). The arrays have one value per dimension.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_block(
     description: *mut RwDescription,
@@ -355,37 +358,37 @@ pub unsafe extern "C" fn rw_describe_block(
                 if k >= dimensions {
                     return beyond;
                 }
-                // SAFETY: a number a dimension, by the caller's promise.
+                // SAFETY: the caller guarantees one number per dimension.
                 unsafe { *numbers.add(k) }
             })
         };
         d.block = Some(BlockExtent { index, count, offset: of(offset, 0), extent: of(extent, 1) });
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// A number that all blocks of this start of the simulation name, and those of its next start do not: the clock of one rank, for example,
-/// that it tells the others. Steps of two starts are then never put together, whatever their blocks are. 0 (default): none.
+/// Sets a number that all blocks of this start of the simulation share, and the next start does not: for example the clock of one rank,
+/// broadcast to the others. Steps of two starts are then never joined, whatever their blocks are. 0 (default): none.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_start(description: *mut RwDescription, start: u64) -> Status {
     let change = |d: &mut RwDescription| {
         d.start = start;
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// Unit of the times, for people, 64 bytes at most; default "s".
+/// Sets the unit of the times, for display, at most 64 bytes; default "s".
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, unit: *const c_char) -> Status {
     let change = |d: &mut RwDescription| {
         if unit.is_null() {
             return Err(refused("unit", "null", format_args!("a text")));
         }
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let unit = unsafe { CStr::from_ptr(unit) }.to_bytes();
         if unit.len() > TEXT {
             return Err(refused("unit", format_args!("{} bytes long", unit.len()), format_args!("at most {TEXT} bytes")));
@@ -394,54 +397,54 @@ pub unsafe extern "C" fn rw_describe_time_unit(description: *mut RwDescription, 
         d.time_unit = text.to_owned();
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// Steps that the ring holds; default 4, at least 2. Its memory is that many copies of the block, 4 bytes a value.
+/// Sets the number of steps that the ring holds; default 4, at least 2. Its memory is that many copies of the block, 4 bytes per value.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_slots(description: *mut RwDescription, slots: u32) -> Status {
     let change = |d: &mut RwDescription| {
         d.slots = slots;
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// When ridgewatch has not taken the step that is to be overwritten: wait for it, so many milliseconds at most, and then not again before
-/// it moves. 0 (default): overwrite, never wait.
+/// Sets the longest wait, in milliseconds, for ridgewatch to take the step that would be overwritten. After a timeout the next wait begins only
+/// when ridgewatch has taken a step. 0 (default): overwrite, never wait.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_describe_wait(description: *mut RwDescription, milliseconds: u32) -> Status {
     let change = |d: &mut RwDescription| {
         d.wait = Duration::from_millis(milliseconds.into());
         Ok(())
     };
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { describe(description, change) }
 }
 
-/// Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, and `RW_OFF` where it is not set. All memory is taken here.
-/// `*field` is null unless `RW_OK` is returned. The ring of a run that is over is replaced: where there is room for
-/// both, followers read the old one to its end; where there is not, it is given up for the new one.
+/// Opens the ring in a folder; null: the folder that `RIDGEWATCH_RING` names, or `RW_OFF` if it is not set. All memory is allocated here.
+/// `*field` is null unless `RW_OK` is returned. The ring of an earlier run is replaced: followers read it to its end if there is room for
+/// both; otherwise it is removed to make room.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDescription, field: *mut *mut RwField) -> Status {
     guarded_with_room(|| {
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let field = unsafe { field.as_mut() }.ok_or_else(|| refused("field", "null", format_args!("the address of a pointer")))?;
         *field = std::ptr::null_mut();
         let ring = if ring.is_null() {
-            PathBuf::from(std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).ok_or(Failure::Off)?)
+            ring_from_environment().ok_or(Failure::Off)?
         } else {
             use std::os::unix::ffi::OsStrExt;
-            // SAFETY: the caller's promise.
+            // SAFETY: guaranteed by the caller.
             PathBuf::from(std::ffi::OsStr::from_bytes(unsafe { CStr::from_ptr(ring) }.to_bytes()))
         };
         let bytes = ring.as_os_str().len();
         if bytes > PATH {
             return Err(refused("ring", format_args!("a path of {bytes} bytes"), format_args!("at most {PATH} bytes")));
         }
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let given = unsafe { description.as_ref() }.ok_or_else(no_description)?;
         let axes = given.axes.len();
         let copy = |(axis, given): (usize, &Option<AxisDescription>)| {
@@ -465,7 +468,7 @@ pub unsafe extern "C" fn rw_open(ring: *const c_char, description: *const RwDesc
 }
 
 /// # Safety
-/// `field` is null or open; the components and strides are those of the header.
+/// `field` is null or open; the components and strides are as the header says.
 unsafe fn publish(
     field: *const RwField,
     step: u64,
@@ -475,7 +478,7 @@ unsafe fn publish(
     strides: Option<*const i64>,
 ) -> Status {
     guarded(|| {
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let field = unsafe { field.as_ref() }.ok_or(Failure::Off)?;
         let components = &components[..field.dimensions];
         let mut values = Field::packed(components, element, field.extent);
@@ -484,11 +487,11 @@ unsafe fn publish(
                 return Err(refused("strides", "null", format_args!("the address of {} numbers", field.dimensions)));
             }
             for k in 0..field.dimensions {
-                // SAFETY: a stride a dimension, by the caller's promise.
+                // SAFETY: the caller guarantees one stride per dimension.
                 values.strides[k] = unsafe { *strides.add(k) } as isize;
             }
         }
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         let published = unsafe { field.producer.publish(step, time, &values) }?;
         field.published.fetch_max(published.count, Ordering::Relaxed);
         field.overwrote.fetch_add(u64::from(published.overwrote), Ordering::Relaxed);
@@ -496,24 +499,24 @@ unsafe fn publish(
     })
 }
 
-/// Publishes a step whose components are arrays of their own, packed, x fastest. `w` is not read in two dimensions.
-/// `step` must rise from call to call: it tells which blocks of a decomposed domain belong together. Where it does not, the solver counts as set
-/// back: all blocks must be, at the same step, and none of the steps after it is put together with one from before. Steps that are one block are
-/// followed by `time` alone, whatever their numbers.
+/// Publishes a step whose components are separate packed arrays, x fastest. `w` is not read in two dimensions. `step` must rise from call to
+/// call: blocks of a decomposed domain with the same number belong together. A number that does not rise sets the solver back: all blocks must
+/// be set back at the same step, and blocks before and after it are never joined. A field in one block is followed by `time` alone, whatever
+/// its numbers.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_f32(field: *mut RwField, step: u64, time: f64, u: *const f32, v: *const f32, w: *const f32) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, None) }
 }
 
-/// The same of doubles, which are rounded to floats.
+/// `rw_publish_f32` for doubles, which are rounded to floats.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_f64(field: *mut RwField, step: u64, time: f64, u: *const f64, v: *const f64, w: *const f64) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, None) }
 }
 
-/// The same with strides, in elements, along x, y, z (two of them in two dimensions): value (i, j, k) of u is
+/// `rw_publish_f32` with strides, in elements, along x, y, z (two values in two dimensions): value (i, j, k) of u is
 /// `u[i * strides[0] + j * strides[1] + k * strides[2]]`. Interleaved components: u = a, v = a + 1, w = a + 2,
 /// strides {3, 3 nx, 3 nx ny}.
 #[unsafe(no_mangle)]
@@ -526,11 +529,11 @@ pub unsafe extern "C" fn rw_publish_strided_f32(
     w: *const f32,
     strides: *const i64,
 ) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F32, Some(strides)) }
 }
 
-/// The same of doubles, which are rounded to floats.
+/// `rw_publish_strided_f32` for doubles, which are rounded to floats.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_publish_strided_f64(
     field: *mut RwField,
@@ -541,15 +544,15 @@ pub unsafe extern "C" fn rw_publish_strided_f64(
     w: *const f64,
     strides: *const i64,
 ) -> Status {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { publish(field, step, time, [u.cast(), v.cast(), w.cast()], Element::F64, Some(strides)) }
 }
 
-/// Steps published, and how many of them overwrote one that nobody had taken; either may be null.
+/// Counts the published steps, and those that overwrote a step that no follower had taken; either pointer may be null.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u64, overwrote: *mut u64) -> Status {
     guarded(|| {
-        // SAFETY: the caller's promise, here and below.
+        // SAFETY: guaranteed by the caller, here and below.
         let field = unsafe { field.as_ref() }.ok_or(Failure::Off)?;
         for (to, from) in [(published, &field.published), (overwrote, &field.overwrote)] {
             // SAFETY: as above.
@@ -561,15 +564,15 @@ pub unsafe extern "C" fn rw_statistics(field: *const RwField, published: *mut u6
     })
 }
 
-/// Ends the ring. In a fork it only lets go of the memory. No other thread may be in a call with this handle. Where memory is out
-/// (`RW_SYSTEM`) the ring stays open and may be closed later.
+/// Ends the ring; in a fork it only frees the memory. No other thread may use this handle during the call. If there is no memory (`RW_SYSTEM`)
+/// the ring stays open and may be closed later.
 #[unsafe(no_mangle)]
 pub unsafe extern "C" fn rw_close(field: *mut RwField) -> Status {
     guarded_with_room(|| {
         if field.is_null() {
             return Err(Failure::Off);
         }
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         drop(unsafe { Box::from_raw(field) });
         Ok(())
     })

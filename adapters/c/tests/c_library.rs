@@ -1,4 +1,4 @@
-//! The library as C sees it: the header against the exported functions, a C solver compiled and run, and what is read behind it.
+//! Tests of the C library: the header against the exported functions, and C programs that are compiled, run and followed.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
@@ -6,7 +6,7 @@ use ridgewatch_wire::{Following, Geometry, Limits, Read, RingReader};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-/// The folder where cargo puts the shared library beside the tests.
+/// The folder in which cargo puts the shared library and the tests.
 fn library_folder() -> PathBuf {
     let folder = std::env::current_exe().unwrap().parent().unwrap().to_owned();
     assert!(folder.join("libridgewatch_adapter.so").exists(), "no library in {}", folder.display());
@@ -29,7 +29,7 @@ impl Drop for Folder {
     }
 }
 
-/// How a program has the library.
+/// Kind of linking.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Link {
     Shared,
@@ -44,14 +44,14 @@ fn compile(source: &Path, to: &Path, link: Link, extra: &[&str]) {
     cc.arg(source).arg("-o").arg(to);
     match link {
         Link::Shared => cc.arg("-L").arg(libraries).arg("-lridgewatch_adapter"),
-        // As ridgewatch.pc says it under Libs.private.
+        // As in Libs.private of ridgewatch.pc.
         Link::Static => cc.arg(libraries.join("libridgewatch_adapter.a")).args(["-lpthread", "-ldl"]),
     };
     let out = cc.arg("-lm").args(extra).output().expect("a C compiler");
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
 }
 
-/// With `RIDGEWATCH_WRITE_HEADER` set it is written instead: `make header`.
+/// Writes the header if `RIDGEWATCH_WRITE_HEADER` is set (`make header`).
 #[test]
 fn the_header_is_that_of_the_library() {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
@@ -62,7 +62,7 @@ fn the_header_is_that_of_the_library() {
     if std::env::var_os("RIDGEWATCH_WRITE_HEADER").is_some() {
         std::fs::write(&path, &generated).unwrap();
     }
-    assert!(std::fs::read_to_string(&path).unwrap() == generated, "include/ridgewatch.h is not what src/lib.rs gives: make header");
+    assert!(std::fs::read_to_string(&path).unwrap() == generated, "include/ridgewatch.h differs from src/lib.rs: run make header");
 }
 
 #[test]
@@ -105,13 +105,13 @@ fn a_c_solver_is_followed_and_needs_nobody() {
     }
     assert_eq!(reader.read(&mut values).unwrap(), Read::Ended);
     drop(following);
-    assert!(!ring.0.exists(), "nothing stays behind");
+    assert!(!ring.0.exists(), "nothing is left behind");
     // Refused, and the solver goes on.
     let (good, said, told) = run(Some(Path::new("/proc/nowhere")), &["3", "8", "0"]);
     assert!(good && said.starts_with("0 steps published") && told.contains("not published"), "{said}{told}");
 }
 
-/// Longitude, latitude and height in two blocks, interleaved doubles, from the shared and from the static library.
+/// Longitude, latitude and height in two blocks of interleaved doubles, with the shared and with the static library.
 #[test]
 fn a_globe_in_blocks_arrives_from_either_library() {
     let build = tempfile("globe");
@@ -149,7 +149,7 @@ fn a_globe_in_blocks_arrives_from_either_library() {
             assert_eq!(reader.read(&mut values).unwrap(), Read::Ended);
         }
         drop(following);
-        assert!(!ring.0.exists(), "nothing stays behind");
+        assert!(!ring.0.exists(), "nothing is left behind");
     }
 }
 
@@ -185,7 +185,7 @@ int main(int argc, char **argv) {
 }
 "#;
 
-/// Faults that C can make, in one program: each has its status, none ends it.
+/// Errors that a C program can make: each returns its status, and none ends the program.
 #[test]
 fn faults_of_the_caller_are_statuses() {
     let build = tempfile("faults");
@@ -215,7 +215,7 @@ const FAULTS: &str = r#"
 
 #define WANT_WORDS(x, words) WANT((x) == RW_ARGUMENT && !strcmp(rw_error(), words))
 
-/* Every request for memory of this process, the library's with them. */
+/* Counts all allocations of this process, including the library's. */
 static atomic_ulong requests;
 extern void *__libc_malloc(size_t), *__libc_calloc(size_t, size_t), *__libc_realloc(void *, size_t), *__libc_memalign(size_t, size_t);
 void *malloc(size_t n) { atomic_fetch_add(&requests, 1); return __libc_malloc(n); }
@@ -240,7 +240,7 @@ int main(int argc, char **argv) {
     rw_description *d = rw_describe(2);
     WANT(d);
     const uint64_t ones[2] = {1, 1};
-    WANT_WORDS(rw_describe_uniform(NULL, 0, 0, 1, 8, 0), "`description` is null; accepted: what rw_describe returned");
+    WANT_WORDS(rw_describe_uniform(NULL, 0, 0, 1, 8, 0), "`description` is null; accepted: a result of rw_describe");
     WANT_WORDS(rw_describe_uniform(d, 2, 0, 1, 8, 0), "`axis` is 2; accepted: 0 to 1, in 2 dimensions");
     WANT_WORDS(rw_describe_rectilinear(d, 0, NULL, 8, 0), "`coordinates` is null; accepted: the address of 8 numbers");
     WANT_WORDS(rw_describe_rectilinear(d, 0, &(double){0}, 1 << 21, 0), "`nodes` is 2097152; accepted: 2 to 1048576");
@@ -253,7 +253,7 @@ int main(int argc, char **argv) {
     WANT_WORDS(rw_describe_block(d, 0, 1, NULL, ones), "`offset` is null; accepted: the address of 2 numbers");
     WANT_WORDS(rw_describe_block(d, 0, 1, ones, NULL), "`extent` is null; accepted: the address of 2 numbers");
     WANT_WORDS(rw_open(argv[1], d, &field), "`description` is without axis 0; accepted: all of its 2 axes");
-    WANT_WORDS(rw_open(argv[1], NULL, &field), "`description` is null; accepted: what rw_describe returned");
+    WANT_WORDS(rw_open(argv[1], NULL, &field), "`description` is null; accepted: a result of rw_describe");
     WANT_WORDS(rw_open(argv[1], d, NULL), "`field` is null; accepted: the address of a pointer");
     WANT_WORDS(rw_open(long_text, d, &field), "`ring` is a path of 4999 bytes; accepted: at most 4095 bytes");
     WANT(!field);
@@ -279,7 +279,7 @@ int main(int argc, char **argv) {
     WANT(rw_publish_strided_f32(field, 0, 0, plane, plane, NULL, NULL) == RW_ARGUMENT);
     uint64_t published = 9, overwrote = 9;
     WANT(rw_statistics(field, &published, &overwrote) == RW_OK && published == 0 && overwrote == 0);
-    /* No memory is taken after open, not even for a moment. That the library's requests are counted shows the second ring. */
+    /* Nothing is allocated after open, not even temporarily. The second ring shows that the library's allocations are counted. */
     unsigned long before = atomic_load(&requests);
     for (int n = 0; n < 1000; n++) WANT(rw_publish_f32(field, n, n, plane, plane, NULL) == RW_OK);
     WANT(rw_statistics(field, &published, NULL) == RW_OK);
@@ -303,7 +303,7 @@ int main(int argc, char **argv) {
     }
     int status;
     WANT(waitpid(child, &status, 0) == child && status == 0);
-    /* A file that the process may not make: no SIGXFSZ, and nothing stays of it. */
+    /* A file above the process limit: no SIGXFSZ, and nothing is left of it. */
     child = fork();
     if (!child) {
         const struct rlimit most = {10000, 10000};
@@ -323,7 +323,7 @@ int main(int argc, char **argv) {
 }
 "#;
 
-/// Whatever memory is left, each call ends in a status. In children, so that a limit holds for one of them and a signal is seen.
+/// With any amount of memory, each call returns a status. In child processes, so that a limit holds for one of them and a signal is noticed.
 #[test]
 fn where_memory_is_out_calls_fail_and_nothing_is_aborted() {
     let build = tempfile("memory");
@@ -336,7 +336,7 @@ fn where_memory_is_out_calls_fail_and_nothing_is_aborted() {
     let (said, told) = (String::from_utf8_lossy(&out.stdout), String::from_utf8_lossy(&out.stderr));
     assert!(out.status.success(), "{said}{told}");
     println!("{said}");
-    assert!(!ring.0.exists(), "nothing stays behind");
+    assert!(!ring.0.exists(), "nothing is left behind");
 }
 
 const OUT_OF_MEMORY: &str = r#"
@@ -365,13 +365,13 @@ static void limit_to(long room) {
     if (setrlimit(RLIMIT_AS, &limit)) _exit(ODD);
 }
 
-/* All of the memory is taken, in pieces and crumbs. */
+/* Allocates all of the memory, in large and small pieces. */
 static void fill(void) {
     for (int i = 0; i < PIECES; i++) pieces[i] = malloc(8000);
     for (int crumb = 4096; crumb >= 16; crumb /= 2) while (malloc(crumb)) {}
 }
 
-/* A step that cannot be, published where no memory is left at all. */
+/* Publishes an invalid step without any memory left. */
 static int refused(const char *ring) {
     static float plane[9];
     rw_description *d = rw_describe(2);
@@ -387,7 +387,7 @@ static int refused(const char *ring) {
     return rw_close(field) == RW_OK ? 0 : ODD + 5;
 }
 
-/* A ring for which there is no room, where producers of so many blocks have left their names: all of them are looked at. */
+/* Opens a ring without room in a folder with the locks of many ended producers, all of which are examined. */
 static int huge(const char *ring, int others) {
     char path[300];
     snprintf(path, sizeof path, "%s", ring);
@@ -400,7 +400,7 @@ static int huge(const char *ring, int others) {
     rw_description *d = rw_describe(3);
     rw_field *field;
     for (int axis = 0; axis < 3; axis++) if (!d || rw_describe_uniform(d, axis, 0, 1, 1 << 13, 0)) return ODD + 2;
-    /* Then so much is given back, in pieces and one after another. */
+    /* Then some pieces are freed. */
     limit_to(32 << 20);
     fill();
     for (int i = 0; i < 160; i++) free(pieces[i]);
@@ -453,7 +453,7 @@ int main(int argc, char **argv) {
             if (!child) {
                 limit_to(filled ? 32 << 20 : room);
                 if (filled) {
-                    /* So much is given back. */
+                    /* Frees `room` bytes. */
                     fill();
                     for (long i = 0; i < room / 8000; i++) free(pieces[i]);
                 }

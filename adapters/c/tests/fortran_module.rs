@@ -1,4 +1,4 @@
-//! The Fortran module, compiled with gfortran and run: what arrives is what column-major arrays hold.
+//! Test of the Fortran module, compiled with gfortran: the values that arrive are those of the column-major arrays.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 

@@ -1,10 +1,10 @@
-!> A small solver that publishes: decaying Taylor-Green vortices, carried along by a mean flow, in their exact solution
-!> on a periodic box.
+!> A small solver that publishes: decaying Taylor-Green vortices in a mean flow, an exact solution of the Navier-Stokes
+!> equations on a periodic box.
 !>
 !>     gfortran solver.f90 -I PREFIX/include -L PREFIX/lib -lridgewatch_fortran -lridgewatch_adapter -o solver
 !>     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/demo ./solver 200
 !>
-!> Arguments: steps (100), nodes along each axis (64), milliseconds a step (20).
+!> Arguments: steps (100), nodes along each axis (64), milliseconds per step (20).
 program solver
   use, intrinsic :: iso_fortran_env, only: real64, error_unit
   use, intrinsic :: iso_c_binding, only: c_int
@@ -19,7 +19,7 @@ program solver
   end interface
   real(real64), parameter :: box = 6.283185307179586d0, dt = 0.05d0, viscosity = 0.01d0
   type(rw_publisher) :: publisher
-  ! With ghost cells, as solvers have them: a section is published, and no copy is made of it here.
+  ! With ghost cells, as solvers have them. Publishing a section makes no copy of it.
   real(real64), allocatable :: u(:, :), v(:, :)
   real(real64) :: t, x, y, decay
   integer :: steps, n, pause, step, i, j, status, ignored

@@ -1,12 +1,12 @@
-//! The Python module over [`ridgewatch_wire::Producer`]: arrays come in by the buffer protocol, without a copy.
+//! Python module of [`ridgewatch_wire::Producer`]. Arrays are read through the buffer protocol, without a copy.
 //!
-//! What the wire refuses (a name in use, no room, another user's folder, a time that is not finite) must not end the solver: it is a warning, and
-//! an exception only where that was asked for (`strict`). A call that cannot be right whatever the system says (a wrong shape or type) is one always.
+//! Errors of the ring (a name in use, no room, another user's folder, a time that is not finite) must not end the solver: they are warnings, and exceptions only
+//! with `strict`. Wrong shapes and types are always exceptions.
 
 use pyo3::buffer::{Element as BufferElement, PyBuffer};
 use pyo3::exceptions::{PyException, PyRuntimeWarning, PyTypeError, PyValueError};
 use pyo3::prelude::*;
-use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, RING_VARIABLE};
+use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, ring_from_environment};
 use std::ffi::CString;
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -15,21 +15,21 @@ use std::time::Duration;
 
 pyo3::create_exception!(_core, RidgewatchError, PyException, "The ring could not be opened, or a step was refused.");
 
-/// What the wire refused: an exception where `strict`, a `RuntimeWarning` otherwise (which the program's own filters may make an exception).
+/// Reports an error of the ring: an exception if `strict`, otherwise a `RuntimeWarning` (which the program's filters may turn into an exception).
 fn refused<T>(py: Python<'_>, strict: bool, what: &str, error: &ridgewatch_wire::WireError) -> PyResult<Option<T>> {
     if strict {
         return Err(RidgewatchError::new_err(error.to_string()));
     }
-    // No zero byte in it: paths that are opened have none.
+    // A C string has no zero byte.
     let words = CString::new(format!("ridgewatch: {what}: {error}").replace('\0', "?"))?;
     PyErr::warn(py, &py.get_type::<PyRuntimeWarning>(), &words, 1)?;
     Ok(None)
 }
 
-/// Publishes into a ring. Frozen: while one thread copies a step, others may call anything here.
+/// Publishes into a ring. Frozen, so that other threads may call any method while one copies a step.
 #[pyclass(frozen)]
 struct Publisher {
-    /// None where publishing is off or closed; the ring ends with the last call that still publishes.
+    /// `None` if publishing is off or closed. The ring ends with the last call that still publishes.
     producer: Mutex<Option<Arc<Producer>>>,
     dimensions: usize,
     reversed: bool,
@@ -44,16 +44,16 @@ impl Publisher {
     }
 }
 
-/// One component as it lies in memory.
+/// Memory layout of one component.
 struct Array {
-    /// As a number, so that other threads may run while it is read.
+    /// Address as a number, which is `Send`: other threads may run while the array is read.
     address: usize,
     element: Element,
-    /// In elements, along x, y, z.
+    /// Strides in elements along x, y, z.
     strides: [isize; 3],
     /// Nodes along x, y, z.
     shape: [u64; 3],
-    /// Keeps the array where it is.
+    /// Keeps the array at its address.
     _buffer: Held,
 }
 
@@ -118,6 +118,7 @@ fn coordinates(given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
 impl Publisher {
     #[new]
     #[pyo3(signature = (x, y, z=None, *, ring=None, periods=None, radius=None, block=None, start=0, slots=4, wait_ms=0, time_unit="s", order="zyx", strict=false))]
+    // The arguments are Python's keyword arguments.
     #[allow(clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,
@@ -147,7 +148,7 @@ impl Publisher {
         }
         if let Some(periods) = periods {
             if periods.len() != axes.len() {
-                return Err(PyValueError::new_err(format!("{} periods; accepted: {}, one an axis", periods.len(), axes.len())));
+                return Err(PyValueError::new_err(format!("{} periods; accepted: {}, one per axis", periods.len(), axes.len())));
             }
             axes.iter_mut().zip(periods).for_each(|(axis, period)| axis.period = period);
         }
@@ -157,15 +158,14 @@ impl Publisher {
         if let Some((index, count, offset, extent)) = block {
             if offset.len() != dimensions || extent.len() != dimensions {
                 let found = format!("a block of {} offsets and {} extents", offset.len(), extent.len());
-                return Err(PyValueError::new_err(format!("{found}; accepted: {dimensions} of both, one an axis")));
+                return Err(PyValueError::new_err(format!("{found}; accepted: {dimensions} of both, one per axis")));
             }
             let of = |numbers: &[u64], beyond| std::array::from_fn(|k| numbers.get(k).copied().unwrap_or(beyond));
             description.block = BlockExtent { index, count, offset: of(&offset, 0), extent: of(&extent, 1) };
         }
-        let named = || std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from);
         let policy = if wait_ms == 0 { Policy::NewestWins } else { Policy::Wait(Duration::from_millis(wait_ms)) };
-        let producer = match ring.or_else(named) {
-            // Which may wait, for a name or for room.
+        let producer = match ring.or_else(ring_from_environment) {
+            // Opening may wait for a name.
             Some(ring) => match py.detach(|| Producer::open(&ring, description, slots, policy)) {
                 Ok(producer) => Some(Arc::new(producer)),
                 Err(error) => refused(py, strict, "nothing will be published", &error)?,
@@ -189,7 +189,7 @@ impl Publisher {
         let Some(producer) = self.producer().clone() else { return Ok(false) };
         let given: Vec<&Bound<'_, PyAny>> = [Some(u), Some(v), w].into_iter().flatten().collect();
         if given.len() != self.dimensions {
-            return Err(PyValueError::new_err(format!("{} components; accepted: {}, one an axis", given.len(), self.dimensions)));
+            return Err(PyValueError::new_err(format!("{} components; accepted: {}, one per axis", given.len(), self.dimensions)));
         }
         let arrays = given.into_iter().map(|array| Array::new(array, self.reversed)).collect::<PyResult<Vec<_>>>()?;
         let (extent, first) = (producer.description().block.extent, &arrays[0]);
@@ -205,12 +205,12 @@ impl Publisher {
             }
         }
         let (addresses, element, strides): (Vec<usize>, _, _) = (arrays.iter().map(|a| a.address).collect(), first.element, first.strides);
-        // The buffers are held, so the arrays stay where they are; other threads of Python go on.
+        // The buffers are held, so the arrays keep their addresses while other Python threads run.
         let published = py.detach(|| {
             let components: Vec<*const u8> = addresses.iter().map(|address| *address as *const u8).collect();
             // SAFETY: the buffers' shapes and strides were checked against the block's extent.
             let published = unsafe { producer.publish(step, time, &Field { components: &components, element, strides }) };
-            // Where `close` came meanwhile, the ring ends here, with Python's other threads running.
+            // If `close` was called meanwhile, the ring ends here, while other Python threads run.
             drop(producer);
             published
         });
@@ -225,7 +225,7 @@ impl Publisher {
 
     fn close(&self, py: Python<'_>) {
         let producer = self.producer().take();
-        // Which may wait for a follower that leaves.
+        // Closing may wait for a follower that leaves.
         py.detach(|| drop(producer));
     }
 

@@ -1,4 +1,4 @@
-"""The Python package, through the ring's bytes."""
+"""Tests of the Python package through the bytes of the ring."""
 
 import fcntl
 import os
@@ -25,7 +25,7 @@ def ring(monkeypatch):
 
 
 def newest(folder, shape):
-    """Number, time and components of the newest step, as docs/live.md lays the ring out."""
+    """Number, time and components of the newest step; docs/live.md has the layout."""
     data = open(os.path.join(folder, "block-00000.ring"), "rb").read()
     assert data[:8] == b"RIDGERNG"
     slots, components, stride, first = struct.unpack_from("<IIQQ", data, 24)
@@ -79,7 +79,7 @@ def test_longitude_and_latitude(ring):
         assert publisher.publish(4, 2.5, *field)
         data = open(os.path.join(ring, "block-00000.ring"), "rb").read()
         assert struct.unpack_from("<IId", data, 8192) == (1, 2, 6.371e6)
-        # Behind index and count, offset and extent: the time's unit, then the first axis, its name, unit, period, nodes, coordinates.
+        # After index, count, offset and extent: the time unit, then name, unit, period, nodes and coordinates of the first axis.
         assert data[8192 + 80 : 8192 + 85] == b"\x01\0\0\0h"
         assert struct.unpack_from("<I1sIdQ4d", data, 8192 + 85) == (1, b"x", 0, 360.0, 4, *longitude)
         step, time, values = newest(ring, (3, 4))
@@ -115,7 +115,7 @@ def test_other_threads_run_and_publish_meanwhile(ring):
 
 
 def test_closing_while_another_thread_publishes(ring):
-    """A thread that waits for ridgewatch (which never comes) keeps the ring, and `close` does not wait for that thread."""
+    """A thread that waits for a follower keeps the ring, and `close` does not wait for that thread."""
     x = np.arange(4.0)
     good = np.zeros((4, 4), np.float32)
     publisher = Publisher(x, x, slots=2, wait_ms=6000)
@@ -141,11 +141,11 @@ def test_closing_while_another_thread_publishes(ring):
 
 
 def test_opening_and_closing_let_other_threads_run(ring):
-    """Each waits a second: for a name that is taken, and for a follower that was stopped while it left."""
+    """Opening waits a second for a name that is taken, and closing for a follower that was stopped while it left."""
     x = np.arange(4.0)
 
     def turns(call):
-        """Turns a second of a thread that naps while another calls."""
+        """Wake-ups per second of a thread that sleeps while another thread calls."""
         worker = threading.Thread(target=call)
         begin = time.monotonic()
         worker.start()
@@ -157,7 +157,7 @@ def test_opening_and_closing_let_other_threads_run(ring):
         assert took > 0.9
         return count / took
 
-    # Beside one that holds up nobody. Who is held up has one turn or two.
+    # The reference blocks no thread. A blocked thread wakes once or twice.
     enough = turns(lambda: time.sleep(1)) / 5
     publisher = Publisher(x, x)
     with pytest.warns(RuntimeWarning, match="another producer"):
@@ -194,7 +194,7 @@ def test_refusals(ring):
 
 
 def test_a_ring_that_cannot_be_had_is_a_warning(ring):
-    """The solver goes on: what is refused warns once, and the publisher is closed and inert."""
+    """An error warns once, the publisher is closed, and the solver goes on."""
     x = np.arange(4.0)
     good = np.zeros((4, 4), np.float32)
 
@@ -207,11 +207,11 @@ def test_a_ring_that_cannot_be_had_is_a_warning(ring):
 
     with Publisher(x, x) as publisher:
         inert("nothing will be published: .*another producer", x, x)
-        # A step that cannot be is left out, and the next one is taken.
+        # An invalid step is skipped, and the next one is published.
         with pytest.warns(RuntimeWarning, match="a step was not published: .*finite"):
             assert publisher.publish(0, float("nan"), good, good) is False
         assert publisher.publish(1, 1.0, good, good) and publisher.published == 1
-        # Misuse is not the system's doing.
+        # Misuse always raises.
         with pytest.raises(ValueError, match="accepted"):
             publisher.publish(2, 2.0, good[:3], good[:3])
     # 5 TB.
@@ -222,7 +222,7 @@ def test_a_ring_that_cannot_be_had_is_a_warning(ring):
     os.mkdir(ring)
     os.chmod(ring, 0o777)
     inert("others may write into", x, x)
-    # Whoever wants it otherwise says so to Python.
+    # Python's filters may turn the warning into an exception.
     with warnings.catch_warnings(), pytest.raises(RuntimeWarning):
         warnings.simplefilter("error")
         Publisher(x, x)

@@ -1,15 +1,15 @@
-//! Little-endian values, one after another; and a step's values, piece by piece.
+//! Little-endian encoding, and the transfer of a step's values in pieces.
 
 use crate::WireError;
 
-/// Values are moved in pieces of so many bytes; between two of them it is looked whether to go on, and whoever waits is told.
+/// Bytes of a piece of values. Between two pieces, heartbeats are sent and a stop request is noticed.
 pub(crate) const PIECE: usize = 1 << 20;
 
-/// Fills `values` with so many, piece by piece: the first touch of fresh memory, which can take longer than the filling, comes piece by piece too.
-/// False: `next` broke off.
+/// Fills `values` with `count` values, piece by piece. The first touch of fresh memory, which may take longer than the transfer, happens piece by piece too.
+/// Returns false if `next` did: the transfer was stopped.
 ///
 /// # Errors
-/// No memory for all of them, and those of `next`.
+/// There is no memory for all values; and those of `next`.
 pub(crate) fn fill(
     values: &mut Vec<f32>,
     count: usize,
@@ -24,7 +24,7 @@ pub(crate) fn fill(
             values.resize(end, 0.0);
         }
         let piece = &mut values[start..end];
-        // SAFETY: any bytes are f32s, and the length is that of the values.
+        // SAFETY: any bytes are valid f32 values, and the length is theirs.
         let bytes = unsafe { std::slice::from_raw_parts_mut(piece.as_mut_ptr().cast::<u8>(), size_of_val(piece)) };
         if !next(bytes)? {
             return Ok(false);
@@ -33,7 +33,7 @@ pub(crate) fn fill(
     Ok(true)
 }
 
-/// Takes values from the front of some bytes.
+/// Reads values from the front of some bytes.
 pub(crate) struct Parser<'a> {
     what: &'static str,
     bytes: &'a [u8],
@@ -75,7 +75,7 @@ impl<'a> Parser<'a> {
         Ok([self.u64()?, self.u64()?, self.u64()?])
     }
 
-    /// A short text: its length in bytes, then UTF-8.
+    /// Reads a text: its length in bytes, then UTF-8.
     pub fn text(&mut self, field: &'static str, longest: usize) -> Result<String, WireError> {
         let length = self.u32()? as usize;
         if length > longest {
@@ -88,7 +88,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// A version, of which one is known.
+    /// Reads a version and compares it with the supported one.
     pub fn version(&mut self, known: u32) -> Result<(), WireError> {
         match self.u32()? {
             found if found == known => Ok(()),
@@ -96,7 +96,7 @@ impl<'a> Parser<'a> {
         }
     }
 
-    /// Nothing may be left.
+    /// Checks that no bytes are left.
     pub fn end(&self) -> Result<(), WireError> {
         if self.at == self.bytes.len() {
             return Ok(());
@@ -105,7 +105,7 @@ impl<'a> Parser<'a> {
     }
 }
 
-/// Puts values one after another.
+/// Writes values one after another.
 #[derive(Default)]
 pub(crate) struct Writer(pub Vec<u8>);
 
@@ -132,7 +132,9 @@ impl Writer {
     }
 }
 
-/// FNV-1a, 64 bits: tells a torn header from a whole one. It is no protection against intent; owner and mode are.
+/// FNV-1a, 64 bits: distinguishes a torn header from a complete one. Owner and mode of the file protect against intent.
+///
+/// Not BLAKE3: the field is 64 bits of layout version 2, which solvers of earlier builds write, and the libraries that solvers link contain no cryptography.
 pub(crate) fn checksum(parts: &[&[u8]]) -> u64 {
     let mix = |sum: u64, byte: &u8| (sum ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
     parts.iter().flat_map(|part| part.iter()).fold(0xcbf2_9ce4_8422_2325, mix)

@@ -1,73 +1,74 @@
-//! Which step is read next where a node has the rings of several blocks, so that what is read of them belongs together.
+//! Selects the next step to read if a node has rings of several blocks, so that the blocks that are read belong together.
 //!
-//! The heads of a ring's slots are looked at before any values are read. Steps are read in the order of their places, and no ring runs further than
-//! [`LEAD`] ahead of the slowest. Where a ring has lost steps the solver is faster than the reading: then the newest step that all rings hold comes
-//! next, since it will be there for longest, and what is before it is passed over in all of them.
+//! The heads of the slots are read before any values. Steps are read in the order of their places, and no ring is read more than [`LEAD`] steps ahead of the
+//! slowest. A ring that has lost steps shows that the solver is faster than the reader: then the newest step that all rings hold is read next, because it
+//! stays longest, and earlier steps are skipped in all rings.
 
 use crate::place::{Place, Rounds};
-use crate::reader::Found;
+use crate::reader::SlotContent;
 use crate::{ReadAt, RingReader, WireError};
 use std::collections::VecDeque;
 
-/// Steps of a ring that are read before the slowest ring has published them. Whoever puts blocks together lets one more wait at least.
+/// Most steps of a ring that are read before the slowest ring has published them. An assembler must hold at least one more.
 pub const LEAD: usize = 2;
 
-/// Steps of a ring that were looked at and not read.
+/// Steps of a ring whose heads were read and whose values were not.
 #[derive(Debug, Default)]
 pub(crate) struct Unread {
-    /// Their numbers in the ring, and their places, which rise.
-    there: VecDeque<(u64, Place)>,
-    /// The first number that was not looked at.
+    /// Numbers in the ring, and places; both ascend.
+    available: VecDeque<(u64, Place)>,
+    /// The first number whose head was not read.
     next: u64,
-    /// Once one was looked at.
+    /// Set with the first head.
     rounds: Option<Rounds>,
-    /// Places of those that were read last.
+    /// Places of the steps that were read last.
     read: VecDeque<Place>,
-    /// Some were overwritten unread.
+    /// True if steps were overwritten unread.
     lost: bool,
 }
 
 impl Unread {
-    /// Looks for steps that were published, and for those that were overwritten unread, which the reader passes over. `newest` is the round that the
-    /// rings have come to.
+    /// Reads the heads of new steps, and skips steps that were overwritten unread. `newest` is the newest round of all rings.
     pub fn look<F: ReadAt>(&mut self, reader: &mut RingReader<F>, newest: u64) -> Result<(), WireError> {
-        let there = reader.there()?;
-        self.overwritten(reader, there.start);
-        for number in self.next.max(there.start)..there.end {
-            match reader.look_at(number)? {
-                Found::Step(step) => self.there.push_back((number, self.rounds.get_or_insert(Rounds::begin(newest)).next(step, newest))),
-                Found::Overwritten => self.overwritten(reader, number + 1),
-                // It comes with the next look.
-                Found::Unseen => break,
+        let available = reader.available()?;
+        self.overwritten(reader, available.start);
+        for number in self.next.max(available.start)..available.end {
+            match reader.peek(number)? {
+                SlotContent::Step(step) => {
+                    self.available.push_back((number, self.rounds.get_or_insert(Rounds::begin(newest)).next(step, newest)))
+                }
+                SlotContent::Overwritten => self.overwritten(reader, number + 1),
+                // The next look finds it.
+                SlotContent::NotVisible => break,
             }
             self.next = number + 1;
         }
         Ok(())
     }
 
-    /// What is before a number is not there any more.
+    /// Drops the steps before a number, which were overwritten.
     pub fn overwritten<F: ReadAt>(&mut self, reader: &mut RingReader<F>, number: u64) {
-        self.there.drain(..self.there.partition_point(|(one, _)| *one < number));
-        self.lost |= reader.pass(number);
+        self.available.drain(..self.available.partition_point(|(one, _)| *one < number));
+        self.lost |= reader.skip_to(number);
     }
 
-    /// Number and place of the oldest.
+    /// Number and place of the oldest step.
     pub fn first(&self) -> Option<(u64, Place)> {
-        self.there.front().copied()
+        self.available.front().copied()
     }
 
-    /// Place of the one that was read last.
+    /// Place of the step that was read last.
     pub fn last(&self) -> Option<Place> {
         self.read.back().copied()
     }
 
     pub fn is_empty(&self) -> bool {
-        self.there.is_empty()
+        self.available.is_empty()
     }
 
-    /// The oldest was read.
+    /// Records that the oldest step was read.
     pub fn took(&mut self) {
-        if let Some((_, place)) = self.there.pop_front() {
+        if let Some((_, place)) = self.available.pop_front() {
             self.read.push_back(place);
             if self.read.len() > LEAD {
                 self.read.pop_front();
@@ -75,35 +76,35 @@ impl Unread {
         }
     }
 
-    /// Whether so many were read that a ring whose last one is `slowest` has not had yet, that no more of them are to be.
-    fn is_far_from(&self, slowest: Option<Place>) -> bool {
+    /// Returns true if [`LEAD`] steps were read that a ring whose last step is `slowest` has not delivered yet.
+    fn is_ahead_of(&self, slowest: Option<Place>) -> bool {
         self.read.len() == LEAD && self.read.front().copied() > slowest
     }
 
     fn has(&self, place: Place) -> bool {
-        self.there.binary_search_by_key(&place, |(_, one)| *one).is_ok()
+        self.available.binary_search_by_key(&place, |(_, one)| *one).is_ok()
     }
 
-    /// Passes over what is before a place; whether anything was.
-    pub fn pass<F: ReadAt>(&mut self, reader: &mut RingReader<F>, place: Place) -> bool {
-        self.there.drain(..self.there.partition_point(|(_, one)| *one < place));
-        reader.pass(self.first().map_or(self.next, |(number, _)| number))
+    /// Skips the steps before a place; returns true if there were any.
+    pub fn skip_to<F: ReadAt>(&mut self, reader: &mut RingReader<F>, place: Place) -> bool {
+        self.available.drain(..self.available.partition_point(|(_, one)| *one < place));
+        reader.skip_to(self.first().map_or(self.next, |(number, _)| number))
     }
 }
 
-/// Of rings of one simulation, those that are waited for: the one whose oldest step is read next.
+/// Among the rings of one simulation that are not too far ahead, the one whose oldest step comes first.
 pub(crate) fn next<'a, K: Ord>(rings: impl Iterator<Item = (K, &'a Unread)> + Clone) -> Option<(K, Place)> {
     let slowest = rings.clone().map(|(_, ring)| ring.last()).min()?;
-    let near = rings.filter(|(_, ring)| !ring.is_far_from(slowest));
+    let near = rings.filter(|(_, ring)| !ring.is_ahead_of(slowest));
     near.filter_map(|(key, ring)| ring.first().map(|(_, place)| (place, key))).min().map(|(place, key)| (key, place))
 }
 
-/// Where one of the rings has lost steps: the place from which reading goes on in all of them.
+/// The place at which reading continues in all rings, if one of them has lost steps; `None` if none has.
 pub(crate) fn catch_up(mut rings: Vec<&mut Unread>) -> Option<Place> {
     let lost = || rings.iter().filter(|ring| ring.lost);
-    let newest_first = lost().next()?.there.iter().rev().map(|(_, place)| *place);
+    let newest_first = lost().next()?.available.iter().rev().map(|(_, place)| *place);
     let common = newest_first.into_iter().find(|place| rings.iter().all(|ring| ring.has(*place)));
-    // Where they have none in common, what the ring that lost most has left: before that nothing will be whole.
+    // If they share no step: the oldest step of the ring that lost most, since no earlier step can become complete.
     let place = common.or_else(|| lost().filter_map(|ring| ring.first()).map(|(_, place)| place).max())?;
     rings.iter_mut().for_each(|ring| ring.lost = false);
     Some(place)
@@ -150,7 +151,7 @@ mod tests {
         };
         let now: Vec<Vec<u8>> = (0..4).map(publish).collect();
         drop(producer);
-        // As it was when so many steps were there, but for their count.
+        // The ring after `steps` steps, with another count.
         let seen = |steps: usize, published: u64| {
             let mut bytes = now[steps - 1].clone();
             bytes[PUBLISHED..PUBLISHED + 8].copy_from_slice(&published.to_ne_bytes());
@@ -162,15 +163,15 @@ mod tests {
         let mut steps = |bytes: Vec<u8>| {
             *memory.borrow_mut() = bytes;
             unread.look(&mut reader, 0).unwrap();
-            unread.there.iter().map(|(number, _)| *number).collect::<Vec<_>>()
+            unread.available.iter().map(|(number, _)| *number).collect::<Vec<_>>()
         };
         assert_eq!(steps(seen(1, 1)), [0]);
-        // The second slot was never written, the first still holds the first step.
+        // The second slot was never written, and the first still holds the first step.
         assert_eq!(steps(seen(1, 2)), [0]);
         assert_eq!(steps(seen(2, 2)), [0, 1]);
         assert_eq!(steps(seen(2, 3)), [1]);
         assert_eq!(steps(seen(3, 3)), [1, 2]);
-        // The other way about a step was overwritten.
+        // With a count that lags behind, a step was overwritten.
         assert_eq!(steps(seen(4, 3)), [1, 2], "what was looked at stays until it is read");
         assert_eq!(steps(seen(4, 4)), [2, 3]);
     }

@@ -1,13 +1,13 @@
-//! From a solver's arrays into a slot: components apart or interleaved, any strides, f32 or f64.
+//! Copies a solver's arrays into a slot: separate or interleaved components, any strides, f32 or f64.
 
 use crate::WireError;
 
-/// What the solver's arrays hold.
+/// Element type of the solver's arrays.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Element {
     /// 4 bytes.
     F32,
-    /// 8 bytes; rounded to f32 on the way.
+    /// 8 bytes; rounded to f32.
     F64,
 }
 
@@ -20,24 +20,24 @@ impl Element {
     }
 }
 
-/// Where a step lies in the solver's memory. Value (i, j, k) of component c is `components[c][i * strides[0] + j * strides[1] + k * strides[2]]`.
+/// A step in the solver's memory. Value (i, j, k) of component c is `components[c][i * strides[0] + j * strides[1] + k * strides[2]]`.
 #[derive(Debug, Clone, Copy)]
 pub struct Field<'a> {
-    /// u, v and, in three dimensions, w: each from its first value on.
+    /// Addresses of the first values of u, v and, in three dimensions, w.
     pub components: &'a [*const u8],
-    /// Of all components.
+    /// Element type of all components.
     pub element: Element,
-    /// In elements, along x, y, z; may be negative.
+    /// Strides in elements along x, y, z; may be negative.
     pub strides: [isize; 3],
 }
 
 impl<'a> Field<'a> {
-    /// Components one behind the other in x-fastest order: C's `u[k][j][i]`, Fortran's `u(i, j, k)`.
+    /// Packed components, x fastest: C's `u[k][j][i]`, Fortran's `u(i, j, k)`.
     pub fn packed(components: &'a [*const u8], element: Element, extent: [u64; 3]) -> Self {
         Self { components, element, strides: [1, extent[0] as isize, (extent[0] * extent[1]) as isize] }
     }
 
-    /// What can be checked of pointers.
+    /// Checks the number of components, null pointers and alignment.
     pub(crate) fn check(&self, components: usize) -> Result<(), WireError> {
         if self.components.len() != components {
             return Err(WireError::Components { found: self.components.len(), accepted: components });
@@ -49,16 +49,15 @@ impl<'a> Field<'a> {
         }
     }
 
-    /// Copies all components to `to`, one behind the other, x fastest.
+    /// Copies all components to `to`, one after another, x fastest.
     ///
     /// # Safety
-    /// Every value that components, strides and `extent` speak of can be read; `to` has room for them, 4 bytes each, aligned, and
-    /// overlaps none of them.
+    /// Every value that components, strides and `extent` describe is readable. `to` is aligned, has 4 bytes for each, and overlaps none of them.
     pub(crate) unsafe fn copy_to(&self, extent: [u64; 3], to: *mut f32) {
         let extent = extent.map(|n| n as usize);
         let nodes: usize = extent.iter().product();
         for (c, from) in self.components.iter().enumerate() {
-            // SAFETY: the caller's promise, component by component.
+            // SAFETY: guaranteed by the caller, component by component.
             unsafe {
                 let to = to.add(c * nodes);
                 match self.element {
@@ -71,19 +70,19 @@ impl<'a> Field<'a> {
 }
 
 /// # Safety
-/// That of [`Field::copy_to`], for one component.
+/// As for [`Field::copy_to`], for one component.
 unsafe fn copy<T: Copy + 'static>(from: *const T, strides: [isize; 3], [nx, ny, nz]: [usize; 3], to: *mut f32, convert: impl Fn(T) -> f32) {
     let packed = strides[0] == 1 && (ny == 1 || strides[1] == nx as isize) && (nz == 1 || strides[2] == (nx * ny) as isize);
-    // One run where the arrays allow it.
+    // Packed arrays are one row.
     let (nx, ny, nz) = if packed { (nx * ny * nz, 1, 1) } else { (nx, ny, nz) };
     let mut to = to;
     for k in 0..nz {
         for j in 0..ny {
-            // SAFETY: (0, j, k) is one of the values that the caller promised, and so are those along x.
+            // SAFETY: the caller guarantees (0, j, k) and the values along x.
             unsafe {
                 let row = from.offset(j as isize * strides[1] + k as isize * strides[2]);
                 if strides[0] == 1 && size_of::<T>() == 4 {
-                    // f32: the only element of four bytes.
+                    // f32 is the only element type of four bytes.
                     stream(row.cast::<f32>(), to, nx);
                 } else if strides[0] == 1 {
                     for i in 0..nx {
@@ -100,28 +99,28 @@ unsafe fn copy<T: Copy + 'static>(from: *const T, strides: [isize; 3], [nx, ny, 
     }
 }
 
-/// From so many values on, a copy goes past the caches: what it would push out of them is the solver's, and lines that are overwritten whole need
-/// not be read first.
+/// Number of values from which a copy bypasses the caches: it would evict the solver's data, and overwritten lines need not be read first.
 #[cfg(any(test, target_arch = "x86_64"))]
 const STREAMED: usize = 1 << 18;
 
 /// Copies `count` values.
 ///
 /// # Safety
-/// They can be read, there is room for them, and the two do not overlap.
+/// The values are readable, the target has room for them, and the two do not overlap.
 #[cfg(target_arch = "x86_64")]
 unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
     use std::arch::x86_64::{__m128i, _mm_loadu_si128, _mm_sfence, _mm_stream_si128};
     if count < STREAMED {
-        // SAFETY: the caller's promise.
+        // SAFETY: guaranteed by the caller.
         return unsafe { std::ptr::copy_nonoverlapping(from, to, count) };
     }
-    // Whole lines of the target, 16 values each; what lies before and behind them is copied as usual.
+    // Cache lines of the target, 16 values each, are streamed; the values before and after them are copied normally.
     let before = (to as usize).wrapping_neg() % 64 / 4;
     let lines = (count - before) / 16;
-    // SAFETY: all of it lies inside the `count` values; the target of the streaming stores is a multiple of 64.
+    // SAFETY: all addresses are inside the `count` values, and the target of the streaming stores is a multiple of 64.
     unsafe {
-        // Nor are they ordered by what came before: the odd sequence number is seen before any of them (x86 has no instruction for a fence of release).
+        // Streaming stores are not ordered after earlier stores either, and a release fence compiles to no instruction on x86: the odd sequence number must be
+        // visible before any of them.
         _mm_sfence();
         std::ptr::copy_nonoverlapping(from, to, before);
         let (mut source, mut target) = (from.add(before).cast::<__m128i>(), to.add(before).cast::<__m128i>());
@@ -133,7 +132,7 @@ unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
             }
             (source, target) = (source.add(4), target.add(4));
         }
-        // Streaming stores are not ordered by what follows: all of them before the sequence number.
+        // Streaming stores are not ordered before later stores: all of them must be visible before the even sequence number.
         _mm_sfence();
         let done = before + 16 * lines;
         std::ptr::copy_nonoverlapping(from.add(done), to.add(done), count - done);
@@ -143,10 +142,10 @@ unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
 /// Copies `count` values.
 ///
 /// # Safety
-/// They can be read, there is room for them, and the two do not overlap.
+/// The values are readable, the target has room for them, and the two do not overlap.
 #[cfg(not(target_arch = "x86_64"))]
 unsafe fn stream(from: *const f32, to: *mut f32, count: usize) {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     unsafe { std::ptr::copy_nonoverlapping(from, to, count) }
 }
 
@@ -162,7 +161,7 @@ mod tests {
             // SAFETY: both ranges lie inside their vectors.
             unsafe { stream(from[skip..].as_ptr(), to[start..].as_mut_ptr(), count) };
             assert_eq!(to[start..start + count], from[skip..skip + count]);
-            assert!(to[..start].iter().chain(&to[start + count..]).all(|v| *v == -1.0), "nothing beside it");
+            assert!(to[..start].iter().chain(&to[start + count..]).all(|v| *v == -1.0), "no other value changes");
         }
     }
 }

@@ -1,23 +1,23 @@
-//! What a producer says of its field: the global grid, and which block of it the producer has.
+//! Description of a published field: the global grid, and the producer's block of it.
 
 use crate::WireError;
 use crate::bytes::{Parser, Writer};
 
-/// Longest axis, in nodes.
+/// Most nodes of an axis.
 pub const AXIS_NODES: u64 = 1 << 20;
-/// Longest name or unit, in bytes.
+/// Most bytes of a name or unit.
 pub const TEXT: usize = 64;
 /// Most blocks of a decomposed domain.
 pub(crate) const BLOCKS: u32 = 1 << 16;
 
-/// How coordinates become lengths.
+/// Metric of the coordinates.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Geometry {
     /// Coordinates are lengths; velocities are along the axes, in coordinate units per time unit.
     Cartesian,
     /// Axes 0 and 1 are longitude and latitude in degrees, velocities are eastward, northward and upward, in the radius's unit per time unit.
     Sphere {
-        /// Radius.
+        /// Radius, in a length unit.
         radius: f64,
     },
 }
@@ -31,7 +31,7 @@ pub struct AxisDescription {
     pub unit: String,
     /// Strictly ascending.
     pub coordinates: Vec<f64>,
-    /// After which length it repeats; the last node is not the first one's image.
+    /// Period of the axis; the last node is not the periodic image of the first.
     pub period: Option<f64>,
 }
 
@@ -57,9 +57,9 @@ impl AxisDescription {
         }
         let reach = self.coordinates[self.coordinates.len() - 1] - self.coordinates[0];
         match self.period {
-            // A hair's breadth for coordinates that were rounded.
+            // The tolerance covers rounded coordinates.
             Some(period) if !(period.is_finite() && period >= reach * (1.0 + 1e-9)) => {
-                Err(WireError::field("axis.period", period, format!("a length above {reach}, from first to last node")))
+                Err(WireError::field("axis.period", period, format!("a length above {reach}, the distance from first to last node")))
             }
             _ => Ok(()),
         }
@@ -80,7 +80,7 @@ impl AxisDescription {
         if !(2..=AXIS_NODES).contains(&nodes) {
             return Err(WireError::field("axis.nodes", nodes, format!("2 to {AXIS_NODES}")));
         }
-        // What is taken is there: memory follows the bytes that came.
+        // The memory is bounded by the bytes received.
         let bytes = input.take(nodes as usize * 8)?;
         let coordinates = bytes.as_chunks::<8>().0.iter().map(|c| f64::from_le_bytes(*c)).collect();
         let axis = Self { name, unit, coordinates, period: (period != 0.0).then_some(period) };
@@ -89,7 +89,7 @@ impl AxisDescription {
     }
 }
 
-/// Names and units. One that is too long is not repeated.
+/// Checks a name or unit. The error does not repeat one that is too long.
 fn check_text(field: &'static str, text: &str) -> Result<(), WireError> {
     let accepted = || format!("at most {TEXT} bytes without control characters");
     if text.len() > TEXT {
@@ -101,57 +101,57 @@ fn check_text(field: &'static str, text: &str) -> Result<(), WireError> {
     }
 }
 
-/// Coordinates of `nodes` nodes from `first` to `last`, evenly spaced; for those who must ask for their memory.
+/// Coordinates of `nodes` nodes from `first` to `last`, evenly spaced. An iterator, so that the caller can reserve memory that may fail.
 pub fn even(first: f64, last: f64, nodes: u64) -> impl ExactSizeIterator<Item = f64> {
     let step = (last - first) / nodes.saturating_sub(1).max(1) as f64;
-    // No more than an axis may have, whatever is asked for: the check refuses it by its length.
+    // At most one more than an axis may have, so that the check refuses it.
     (0..nodes.min(AXIS_NODES + 1) as usize).map(move |i| if i as u64 + 1 == nodes { last } else { first + step * i as f64 })
 }
 
-/// Which part of the global grid a producer has.
+/// A producer's part of the global grid.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BlockExtent {
-    /// From 0.
+    /// Index, from 0.
     pub index: u32,
-    /// Blocks in all.
+    /// Number of blocks.
     pub count: u32,
     /// First node along x, y, z.
     pub offset: [u64; 3],
-    /// Nodes along x, y, z (1 where there is no z).
+    /// Nodes along x, y, z (1 in z if the grid is two-dimensional).
     pub extent: [u64; 3],
 }
 
 impl BlockExtent {
-    /// Whether two blocks share a node.
+    /// Returns true if two blocks share a node.
     pub fn overlaps(&self, other: &Self) -> bool {
         (0..3).all(|k| self.offset[k] < other.offset[k] + other.extent[k] && other.offset[k] < self.offset[k] + self.extent[k])
     }
 }
 
-/// What a producer says of its field.
+/// Description of a published field.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Description {
-    /// Metric.
+    /// Metric of the coordinates.
     pub geometry: Geometry,
-    /// A number that the blocks of one start of the simulation share, and those of another start do not; 0: none was given.
+    /// A number that all blocks of one start of the simulation share, and another start does not; 0 if none was given.
     pub start: u64,
-    /// Two or three axes of the global grid; as many components has the velocity.
+    /// Two or three axes of the global grid. The velocity has as many components.
     pub axes: Vec<AxisDescription>,
     /// This producer's block.
     pub block: BlockExtent,
-    /// Unit of the steps' times, for people; `s` lets tau be given in words.
+    /// Unit of the steps' times, for display. With `s`, tau may be given in words.
     pub time_unit: String,
 }
 
-/// What a reader is ready to take.
+/// Memory limits of a reader.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Limits {
-    /// Most bytes of one step of the global field (4 bytes a component and node).
+    /// Most bytes of one step of the global field (4 bytes per component and node).
     pub step_bytes: u64,
 }
 
 impl Default for Limits {
-    /// 16 GiB a step.
+    /// 16 GiB per step.
     fn default() -> Self {
         Self { step_bytes: 16 << 30 }
     }
@@ -165,17 +165,17 @@ impl Description {
         Self { geometry, start: 0, axes, block, time_unit: time_unit.into() }
     }
 
-    /// Components of the velocity: as many as axes.
+    /// Number of components of the velocity, which is the number of axes.
     pub fn components(&self) -> usize {
         self.axes.len()
     }
 
-    /// Nodes of the global grid along x, y, z (1 where there is no z).
+    /// Nodes of the global grid along x, y, z (1 in z if the grid is two-dimensional).
     pub fn shape(&self) -> [u64; 3] {
         std::array::from_fn(|k| self.axes.get(k).map_or(1, |a| a.coordinates.len() as u64))
     }
 
-    /// Nodes of this block; exact once [`Description::check`] has passed.
+    /// Number of nodes of this block; exact after [`Description::check`].
     pub fn block_nodes(&self) -> u64 {
         self.block.extent.iter().fold(1, |n, e| n.saturating_mul(*e))
     }
@@ -185,15 +185,15 @@ impl Description {
         self.block_nodes().saturating_mul(4 * self.components() as u64)
     }
 
-    /// Whether two producers speak of the same global grid and unit of time.
+    /// Returns true if two descriptions have the same global grid and unit of time.
     pub fn same_grid(&self, other: &Self) -> bool {
         (self.geometry, &self.axes, &self.time_unit) == (other.geometry, &other.axes, &other.time_unit)
     }
 
-    /// Checks everything.
+    /// Checks all values.
     ///
     /// # Errors
-    /// The first value that cannot be, or a field larger than `limits`.
+    /// The first invalid value, or a field larger than `limits`.
     pub fn check(&self, limits: &Limits) -> Result<(), WireError> {
         if !(2..=3).contains(&self.axes.len()) {
             return Err(WireError::field("axes", self.axes.len(), "2 or 3"));
@@ -214,7 +214,7 @@ impl Description {
         }
         check_text("time_unit", &self.time_unit)?;
         let shape = self.shape();
-        // 2^20 nodes an axis at most: no overflow.
+        // At most 2^20 nodes per axis, so there is no overflow.
         let bytes = shape.iter().product::<u64>() as u128 * 4 * self.components() as u128;
         if bytes > u128::from(limits.step_bytes) {
             let needed = bytes.min(u128::from(u64::MAX)) as u64;
@@ -238,14 +238,14 @@ impl Description {
         Ok(())
     }
 
-    /// The bytes of its parts.
+    /// Bytes of the encoded description.
     fn encoded_bytes(&self) -> usize {
         let axis = |a: &AxisDescription| 24 + a.name.len() + a.unit.len() + 8 * a.coordinates.len();
         84 + self.time_unit.len() + self.axes.iter().map(axis).sum::<usize>()
     }
 
     /// # Errors
-    /// No memory.
+    /// There is no memory.
     pub(crate) fn encode(&self) -> Result<Vec<u8>, WireError> {
         let mut out = Writer::default();
         let bytes = self.encoded_bytes();

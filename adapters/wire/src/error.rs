@@ -1,18 +1,18 @@
-//! What can be wrong with a ring, a message or a description.
+//! Errors of rings, messages and descriptions.
 
 use std::path::PathBuf;
 
-/// Why something was refused. Nothing was changed, unless said.
+/// Error of a ring, a message or a description. Nothing was changed, unless stated otherwise.
 #[derive(Debug, thiserror::Error)]
 pub enum WireError {
-    /// The system refused.
+    /// A system call failed.
     #[error("{}: {what}: {source}", path.display())]
     Io {
-        /// Which file.
+        /// The file.
         path: PathBuf,
-        /// What was tried.
+        /// The failed action.
         what: &'static str,
-        /// What the system says.
+        /// Error of the system.
         source: std::io::Error,
     },
     /// The file system is full.
@@ -20,160 +20,160 @@ pub enum WireError {
     NoSpace {
         /// The ring.
         path: PathBuf,
-        /// Its bytes.
+        /// Bytes of the ring.
         needed: u64,
     },
-    /// The process may not have a file so long.
-    #[error("{}: a ring of {needed} bytes is longer than this process may make a file ({limit} bytes: ulimit -f, RLIMIT_FSIZE)", path.display())]
+    /// The ring exceeds the process limit of a file's length.
+    #[error("{}: a ring of {needed} bytes exceeds the longest file that this process may create ({limit} bytes: ulimit -f, RLIMIT_FSIZE)", path.display())]
     FileSize {
         /// The ring.
         path: PathBuf,
-        /// Its bytes.
+        /// Bytes of the ring.
         needed: u64,
-        /// The process's limit.
+        /// Limit of the process.
         limit: u64,
     },
-    /// What is written there may have to wait for a disk or a server.
-    #[error("{}: the file system (type {found:#x}) is none that lies in memory, so that a simulation could wait for it; accepted: a folder in tmpfs or ramfs, such as /dev/shm", path.display())]
+    /// The ring lies on a disk or a server, for which a write may have to wait.
+    #[error("{}: the file system (type {found:#x}) is not in memory, and the simulation would have to wait for it; accepted: a folder in tmpfs or ramfs, such as /dev/shm", path.display())]
     NotInMemory {
         /// The ring.
         path: PathBuf,
-        /// The file system's type, as `statfs` says it.
+        /// Type of the file system, as in `statfs`.
         found: u64,
     },
-    /// Another producer has it.
+    /// Another producer has the ring's name.
     #[error("{}: another producer publishes under this name (process {pid})", path.display())]
     InUse {
         /// The ring.
         path: PathBuf,
-        /// Whose process, as its ring says; 0 where it does not.
+        /// Process of that producer; 0 if its ring cannot be read.
         pid: u64,
     },
-    /// The file belongs to somebody else, or others may write it.
+    /// The file belongs to another user, or others have rights to it.
     #[error("{}: {found}; accepted: a regular file of user {user} that nobody else may open (mode 0600)", path.display())]
     Foreign {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The problem.
         found: String,
-        /// Who asks.
+        /// User of this process.
         user: u32,
     },
-    /// No ring, or another kind of file.
+    /// The file is no ring.
     #[error("not a ring: it begins with {found:02x?}")]
     NotARing {
-        /// First bytes.
+        /// First bytes of the file.
         found: [u8; 8],
     },
-    /// Written by another version.
-    #[error("{what} has version {found}; this is version {known} and knows no other")]
+    /// The format has another version.
+    #[error("{what} has version {found}; only version {known} is supported")]
     Version {
-        /// What of it.
+        /// The object.
         what: &'static str,
-        /// What it says.
+        /// Its version.
         found: u32,
-        /// What is known.
+        /// The supported version.
         known: u32,
     },
     /// The header is torn or was changed.
-    #[error("the header's checksum is {found:016x}, its bytes give {computed:016x}")]
+    #[error("the header's checksum is {found:016x}, but that of its bytes is {computed:016x}")]
     Checksum {
-        /// What it says.
+        /// Checksum in the header.
         found: u64,
-        /// What its bytes give.
+        /// Checksum of its bytes.
         computed: u64,
     },
-    /// A value that cannot be.
+    /// A value is invalid.
     #[error("`{field}` is {found}; accepted: {accepted}")]
     Field {
-        /// Which.
+        /// Name of the value.
         field: &'static str,
-        /// What was found.
+        /// The value found.
         found: String,
-        /// What is accepted.
+        /// The accepted values.
         accepted: String,
     },
-    /// A step's time. These three are told apart from [`WireError::Field`] since publishing takes no memory, not even for its errors.
+    /// A step's time is not finite. This and the next two errors are not [`WireError::Field`], because publishing allocates nothing, not even for errors.
     #[error("`time` is {time}; accepted: a finite number")]
     Time {
-        /// What was given.
+        /// The given time.
         time: f64,
     },
-    /// Another number of components than axes.
+    /// The number of components differs from the number of axes.
     #[error("`components` is {found}; accepted: {accepted}, as many as axes")]
     Components {
-        /// How many were given.
+        /// Number of given components.
         found: usize,
-        /// How many there are.
+        /// Number of axes.
         accepted: usize,
     },
-    /// A component's address, null with them.
+    /// A component's address is null or misaligned.
     #[error("`component` is at {address:#x}; accepted: an address divisible by {divisor}, not null")]
     Address {
-        /// What was given.
+        /// The given address.
         address: usize,
         /// Bytes of a value.
         divisor: usize,
     },
-    /// It ends before it should.
+    /// The data end too early.
     #[error("{what} ends after {found} bytes; {needed} are needed")]
     Short {
-        /// What.
+        /// The object.
         what: &'static str,
-        /// Bytes there.
+        /// Number of bytes.
         found: u64,
         /// Bytes needed.
         needed: u64,
     },
-    /// More memory than the reader allows.
+    /// The object exceeds the reader's memory limit.
     #[error("{what} would take {needed} bytes; at most {limit} are allowed")]
     TooLarge {
-        /// What.
+        /// The object.
         what: &'static str,
-        /// Bytes asked for.
+        /// Requested bytes.
         needed: u64,
         /// The limit.
         limit: u64,
     },
-    /// No memory.
+    /// An allocation failed.
     #[error("no memory for {bytes} bytes")]
     NoMemory {
-        /// Bytes asked for.
+        /// Requested bytes.
         bytes: usize,
     },
     /// The process is a fork of the one that opened the ring.
-    #[error("the ring was opened by process {opened}, this is its fork {here}: open one under another name here")]
+    #[error("process {opened} opened the ring, and this is its fork {here}: open another ring under another name here")]
     Forked {
-        /// Who opened it.
+        /// Process that opened the ring.
         opened: u32,
-        /// Who asks.
+        /// This process.
         here: u32,
     },
-    /// The relay hung up when it had seen what this follower signed.
-    #[error("the relay sent this follower away: another key, or more followers than it takes")]
-    SentAway,
-    /// The signature is not that of the key.
-    #[error("the signature does not fit: another key, or the message was changed on the way")]
+    /// The relay closed the connection after this follower's signature.
+    #[error("the relay rejected this follower: another key, or too many followers")]
+    Rejected,
+    /// A signature is wrong.
+    #[error("the signature does not verify: another key, or the message was changed on the way")]
     Signature,
-    /// What came with a message is not what was signed.
-    #[error("the signature of a message's payload does not fit: it was changed on the way")]
+    /// The signature of a message's payload is wrong.
+    #[error("the signature of a message's payload does not verify: it was changed on the way")]
     Payload,
-    /// A message that came before.
-    #[error("message {found} is a replay: {newest} came already")]
+    /// A message was received before.
+    #[error("message {found} is a replay: the newest is {newest}")]
     Replayed {
-        /// Its number.
+        /// Number of the message.
         found: u64,
-        /// Newest seen.
+        /// Newest number received.
         newest: u64,
     },
-    /// Blocks that do not make one field.
+    /// A block does not fit the field.
     #[error("block {block}: {found}; accepted: {accepted}")]
     Block {
-        /// Which.
+        /// Index of the block.
         block: u32,
-        /// What was found.
+        /// The problem.
         found: String,
-        /// What is accepted.
+        /// The accepted blocks.
         accepted: String,
     },
 }
@@ -181,6 +181,11 @@ pub enum WireError {
 impl WireError {
     pub(crate) fn io(path: &std::path::Path, what: &'static str, source: std::io::Error) -> Self {
         Self::Io { path: path.to_owned(), what, source }
+    }
+
+    #[cfg(feature = "messages")]
+    pub(crate) fn connection(source: std::io::Error) -> Self {
+        Self::io(std::path::Path::new("connection"), "broke", source)
     }
 
     pub(crate) fn no_memory(bytes: usize) -> Self {

@@ -1,9 +1,9 @@
-//! Following blocks, wherever they come from: rings of this node, or relays of others.
+//! Follows the rings of all blocks in a folder, across restarts and kills of their producers.
 
 use crate::choice::{self, Unread};
 use crate::lock::{Following, blocks, producer_lives};
 use crate::place::Place;
-use crate::reader::{Read, RingReader, StepInfo, Tried};
+use crate::reader::{Read, RingReader, SlotRead, StepInfo};
 use crate::{Description, Limits, WireError};
 use std::collections::{BTreeMap, BTreeSet};
 use std::io::ErrorKind;
@@ -11,94 +11,103 @@ use std::ops::Bound;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-/// Steps that are begun to be read in one look, if a producer overtakes each of them.
+/// Most steps that one poll starts to read, if a producer overtakes each of them.
 const ATTEMPTS: usize = 4;
-/// How often new rings are looked for.
-const LOOK: Duration = Duration::from_millis(100);
-/// How often producers are told that somebody follows, at least: while [`RingFollower::poll`] or [`RingFollower::beat`] is called again and again, and
-/// while a step is read.
-const BEAT: Duration = Duration::from_secs(1);
+/// Interval between two searches for new rings, and between two checks of a producer.
+const SCAN_INTERVAL: Duration = Duration::from_millis(100);
+/// Interval between two heartbeats to a producer, while [`RingFollower::poll`] or [`RingFollower::beat`] is called and while a step is read.
+const HEARTBEAT_INTERVAL: Duration = Duration::from_secs(1);
 
-/// What happened to a block.
+/// Event of a block.
 #[derive(Debug)]
 pub enum Event {
-    /// A producer was found, or took over from one that ended. Its description is checked.
+    /// A producer was found, or replaced one that ended. Its description is checked.
     Opened {
-        /// What it publishes.
+        /// The published field.
         description: Box<Description>,
-        /// When it was opened, nanoseconds since 1970.
+        /// Time of the opening, nanoseconds since 1970.
         generation: u64,
     },
     /// A step; its values are in the buffer.
     Step {
-        /// Which block.
+        /// Index of the block.
         block: u32,
-        /// When its producer opened it.
+        /// Time of the opening, nanoseconds since 1970.
         generation: u64,
         /// The solver's number.
         step: u64,
-        /// Its time.
+        /// The solver's time.
         time: f64,
-        /// When it was published, nanoseconds since 1970.
+        /// Time of publication, nanoseconds since 1970.
         published: u64,
-        /// Steps of the block before this one that were overwritten before they could be read, or passed over since that had happened to another block.
+        /// Earlier steps of the block that were overwritten unread, or skipped because another block had lost them.
         missed: u64,
     },
-    /// The producer closed the block, or its process ended; all that it left was read.
+    /// The producer closed the block or its process ended, and all remaining steps were read.
     Ended {
-        /// Which block.
+        /// Index of the block.
         block: u32,
-        /// When its producer opened it.
+        /// Time of the opening, nanoseconds since 1970.
         generation: u64,
-        /// Whether it was closed; else its process ended without that, or the relay is gone.
+        /// True if the block was closed; false if its process ended without that, or the relay is gone.
         closed: bool,
     },
-    /// Something was refused; following goes on.
+    /// A ring was refused; the others are still followed.
     Refused(WireError),
 }
 
-/// Rings of one start of a simulation name the same start and the same number of blocks.
+/// Start and number of blocks, which all rings of one start of a simulation share.
 type Simulation = (u64, u32);
+
+/// Writes this follower's mark to a ring.
+struct Heartbeat {
+    mark: u32,
+    sent: Instant,
+}
+
+impl Heartbeat {
+    /// Tells the producer which steps were taken. A ring that cannot be written to has no producer that waits.
+    fn send(&mut self, reader: &RingReader) {
+        self.sent = Instant::now();
+        let _ = reader.acknowledge(self.mark);
+    }
+
+    fn send_if_due(&mut self, reader: &RingReader) {
+        if self.sent.elapsed() > HEARTBEAT_INTERVAL {
+            self.send(reader);
+        }
+    }
+}
 
 /// One block's ring.
 struct Followed {
     reader: RingReader,
-    /// Of one block among several: what is there.
+    heartbeat: Heartbeat,
+    /// Available steps, if the simulation has several blocks.
     unread: Unread,
-    /// Nothing more is read, since what was read could not be: until a new producer takes its place.
+    /// True after an error: nothing more is read until a new producer replaces the ring.
     refused: bool,
-    /// There was nothing to be read when it was last looked at.
+    /// True if the last look found no unread step.
     drained: bool,
-    /// The producer has closed it, as was seen before that look.
+    /// True if the producer had closed the ring before that look.
     closed: bool,
-    /// The producer's process has ended, or another ring is in its place.
+    /// True if the producer's process has ended or the ring was replaced.
     gone: bool,
-    /// Another ring is in its place.
+    /// True if another ring has this one's path.
     replaced: bool,
-    /// Its end was told.
+    /// True once the end was reported.
     ended: bool,
-    looked: Instant,
-    /// When its producer was last told that somebody follows.
-    told: Instant,
+    /// Time of the last check of the producer.
+    checked: Instant,
 }
 
 impl Followed {
-    fn begin(reader: RingReader) -> Self {
+    fn begin(reader: RingReader, mark: u32) -> Self {
         let (unread, now) = (Unread::default(), Instant::now());
         let (refused, drained, closed, gone, replaced, ended) = (false, false, false, false, false, false);
-        Self { reader, unread, refused, drained, closed, gone, replaced, ended, looked: now, told: now }
-    }
-
-    /// Tells the producer how far its steps were taken.
-    fn acknowledge(&mut self, mark: u32) {
-        acknowledge(&self.reader, &mut self.told, mark);
-    }
-
-    /// [`Self::acknowledge`], where the producer has heard nothing for a second.
-    fn beat(&mut self, mark: u32) {
-        if !self.refused {
-            beat(&self.reader, &mut self.told, mark);
-        }
+        let mut heartbeat = Heartbeat { mark, sent: now };
+        heartbeat.send(&reader);
+        Self { reader, heartbeat, unread, refused, drained, closed, gone, replaced, ended, checked: now }
     }
 
     fn simulation(&self) -> Simulation {
@@ -106,19 +115,22 @@ impl Followed {
         (description.start, description.block.count)
     }
 
-    /// Looks whether the producer is still there. What it left is looked for once more then.
-    fn look_for_producer(&mut self, ring: &Path, block: u32) {
-        if self.gone || self.ended || !(self.drained || self.refused) || self.looked.elapsed() <= LOOK {
+    fn is_read(&self) -> bool {
+        !self.refused && !self.ended
+    }
+
+    /// Checks whether the producer is still there. If it is gone, its remaining steps are looked for once more.
+    fn check_producer(&mut self, ring: &Path, block: u32) {
+        if self.gone || self.ended || !(self.drained || self.refused) || self.checked.elapsed() <= SCAN_INTERVAL {
             return;
         }
-        self.looked = Instant::now();
-        // The lock may already be that of a producer that took the place of this one.
-        // Where it cannot be told, the ring is left as it is.
+        self.checked = Instant::now();
+        // The lock may already belong to a new producer, and an error of the check leaves the ring as it is.
         self.gone = !self.reader.is_current() || producer_lives(ring, block).is_ok_and(|lives| !lives);
         self.drained &= !self.gone;
     }
 
-    /// Its end, once: all that it left was read.
+    /// Reports the end once, after all remaining steps were read.
     fn end(&mut self, block: u32) -> Option<Event> {
         let over = if self.refused { self.gone } else { self.drained && (self.closed || self.gone) };
         if !over || std::mem::replace(&mut self.ended, true) {
@@ -132,22 +144,10 @@ impl Followed {
         Event::Refused(error)
     }
 
-    fn step(&mut self, block: u32, info: StepInfo, mark: u32) -> Event {
-        self.acknowledge(mark);
+    fn step(&mut self, block: u32, info: StepInfo) -> Event {
+        self.heartbeat.send(&self.reader);
         let StepInfo { step, time, published, missed, .. } = info;
         Event::Step { block, generation: self.reader.header().generation, step, time, published, missed }
-    }
-}
-
-/// A ring that cannot be written to is one that nobody waits for.
-fn acknowledge(reader: &RingReader, told: &mut Instant, mark: u32) {
-    *told = Instant::now();
-    let _ = reader.acknowledge(mark);
-}
-
-fn beat(reader: &RingReader, told: &mut Instant, mark: u32) {
-    if told.elapsed() > BEAT {
-        acknowledge(reader, told, mark);
     }
 }
 
@@ -156,60 +156,48 @@ pub struct RingFollower {
     ring: PathBuf,
     limits: Limits,
     rings: BTreeMap<u32, Followed>,
-    /// Rings that were refused, with their words, so that each is told once.
-    refused: BTreeMap<u32, String>,
-    /// Why the folder could not be looked at last time, told once.
-    unseen: Option<String>,
-    looked: Option<Instant>,
-    /// The simulation that was asked last, so that none is starved.
+    /// Last refusal of each block, and of the folder (`None`), so that each is reported once.
+    reported: BTreeMap<Option<u32>, String>,
+    scanned: Option<Instant>,
+    /// The simulation that was polled last; they take turns.
     turn: Simulation,
-    /// Of a simulation in several blocks, the step that is being read.
+    /// The step that is being read, if the simulation has several blocks.
     current: Option<(Simulation, Place)>,
-    /// Which of the rings' marks is this follower's.
+    /// Number of this follower's marks in the rings.
     mark: u32,
     #[allow(dead_code)]
     following: Following,
 }
 
 impl RingFollower {
-    /// Begins; the folder is made where it is not there.
+    /// Begins to follow; the folder is created if it does not exist.
     ///
     /// # Errors
-    /// The folder is not this user's alone, or has too many followers.
+    /// The folder does not belong to this user alone, or has too many followers.
     pub fn begin(ring: &Path, limits: Limits) -> Result<Self, WireError> {
         let following = Following::begin(ring)?;
         let mark = following.mark()?;
-        Ok(Self {
-            ring: ring.into(),
-            limits,
-            rings: BTreeMap::new(),
-            refused: BTreeMap::new(),
-            unseen: None,
-            looked: None,
-            turn: (0, 0),
-            current: None,
-            mark,
-            following,
-        })
+        let (rings, reported, turn) = (BTreeMap::new(), BTreeMap::new(), (0, 0));
+        Ok(Self { ring: ring.into(), limits, rings, reported, scanned: None, turn, current: None, mark, following })
     }
 
-    /// The next thing that happened; none: nothing new. A step's values are in `values`, and its producer may go on.
+    /// Returns the next event, or `None` if there is none. A step's values are in `values`, and its producer may overwrite the step.
     pub fn poll(&mut self, values: &mut Vec<f32>) -> Option<Event> {
-        self.poll_beside(values, &mut || true)
+        self.poll_while(values, &mut || true)
     }
 
-    /// The same, with `beside` asked after each MiB of a step whether to go on; where it says no, nothing is taken. A step whose producer does not wait may be
+    /// [`Self::poll`] that calls `go_on` after each MiB of a step. If it returns false, the step stays unread. A step whose producer does not wait may be
     /// overwritten meanwhile.
-    pub fn poll_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
+    pub fn poll_while(&mut self, values: &mut Vec<f32>, go_on: &mut dyn FnMut() -> bool) -> Option<Event> {
         self.beat();
-        if self.looked.is_none_or(|looked| looked.elapsed() > LOOK) {
-            if let Some(event) = self.look() {
+        if self.scanned.is_none_or(|scanned| scanned.elapsed() > SCAN_INTERVAL) {
+            if let Some(event) = self.scan() {
                 return Some(event);
             }
-            self.looked = Some(Instant::now());
+            self.scanned = Some(Instant::now());
         }
         for (block, followed) in &mut self.rings {
-            followed.look_for_producer(&self.ring, *block);
+            followed.check_producer(&self.ring, *block);
             if let Some(event) = followed.end(*block) {
                 return Some(event);
             }
@@ -219,8 +207,8 @@ impl RingFollower {
         for simulation in simulations.range(later).chain(simulations.range(..=self.turn)) {
             self.turn = *simulation;
             let event = match simulation.1 {
-                1 => self.read_field(*simulation, values, beside),
-                _ => self.read_block(*simulation, values, beside),
+                1 => self.read_field(*simulation, values, go_on),
+                _ => self.read_block(*simulation, values, go_on),
             };
             if event.is_some() {
                 return event;
@@ -229,16 +217,16 @@ impl RingFollower {
         None
     }
 
-    /// Of a simulation in one block, its next step.
-    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
+    /// Reads the next step of a simulation in one block.
+    fn read_field(&mut self, simulation: Simulation, values: &mut Vec<f32>, go_on: &mut dyn FnMut() -> bool) -> Option<Event> {
         let block = *self.rings.iter().find(|(_, followed)| followed.simulation() == simulation && !followed.refused)?.0;
-        let found = self.read_ring(block, beside, |reader, beside| reader.read_beside(values, beside))?;
+        let read = self.read_ring(block, go_on, |reader, go_on| reader.read_while(values, go_on))?;
         let followed = self.rings.get_mut(&block)?;
-        match found {
+        match read {
             Ok(None) => None,
             Ok(Some(Read::Step(info))) => {
                 followed.drained = false;
-                Some(followed.step(block, info, self.mark))
+                Some(followed.step(block, info))
             }
             Ok(Some(end)) => {
                 (followed.drained, followed.closed) = (true, followed.closed || end == Read::Ended);
@@ -248,10 +236,10 @@ impl RingFollower {
         }
     }
 
-    /// Of a simulation in several blocks, the next block of the step that is being read, or the first one of another step.
-    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>, beside: &mut dyn FnMut() -> bool) -> Option<Event> {
+    /// Reads the next block of the current step of a simulation in several blocks, or the first block of its next step.
+    fn read_block(&mut self, simulation: Simulation, values: &mut Vec<f32>, go_on: &mut dyn FnMut() -> bool) -> Option<Event> {
         for _ in 0..ATTEMPTS {
-            // The step goes on from what is known. Before another is begun all rings are looked at.
+            // All rings are examined before a new step is begun, not between the blocks of a step.
             let block = match self.next(simulation).filter(|(_, place)| self.current == Some((simulation, *place))) {
                 Some((block, _)) => block,
                 None => {
@@ -264,15 +252,15 @@ impl RingFollower {
                 }
             };
             let (number, _) = self.rings.get(&block)?.unread.first()?;
-            let found = self.read_ring(block, beside, |reader, beside| reader.take(number, values, beside))?;
+            let read = self.read_ring(block, go_on, |reader, go_on| reader.take(number, values, go_on))?;
             let followed = self.rings.get_mut(&block)?;
-            match found {
-                Ok(Tried::Step(info)) => {
+            match read {
+                Ok(SlotRead::Step(info)) => {
                     followed.unread.took();
-                    return Some(followed.step(block, info, self.mark));
+                    return Some(followed.step(block, info));
                 }
-                Ok(Tried::BrokenOff) => return None,
-                Ok(Tried::Overwritten) => {
+                Ok(SlotRead::Stopped) => return None,
+                Ok(SlotRead::Overwritten) => {
                     followed.unread.overwritten(&mut followed.reader, number + 1);
                     self.current = None;
                 }
@@ -282,17 +270,16 @@ impl RingFollower {
         None
     }
 
-    /// The ring to be read next, and the place of its oldest step. What is in a ring that was replaced comes first: its block is not opened anew before.
+    /// The ring to read next, and the place of its oldest step. Replaced rings come first: their blocks are not opened anew before they are read.
     fn next(&self, simulation: Simulation) -> Option<(u32, Place)> {
-        let rings = self.rings.iter().filter(|(_, f)| f.simulation() == simulation && !f.refused && !f.ended);
+        let rings = self.rings.iter().filter(|(_, f)| f.simulation() == simulation && f.is_read());
         let of = |replaced: bool| rings.clone().filter(move |(_, f)| f.replaced == replaced).map(|(block, f)| (*block, &f.unread));
         choice::next(of(true)).or_else(|| choice::next(of(false)))
     }
 
-    /// Looks at all rings of a simulation in several blocks, and passes over what will not be whole.
+    /// Examines all rings of a simulation in several blocks, and skips steps that cannot become complete.
     fn look_ahead(&mut self, simulation: Simulation) -> Option<Event> {
-        let mut rings: Vec<&mut Followed> =
-            self.rings.values_mut().filter(|f| f.simulation() == simulation && !f.refused && !f.ended).collect();
+        let mut rings: Vec<&mut Followed> = self.rings.values_mut().filter(|f| f.simulation() == simulation && f.is_read()).collect();
         let newest = rings.iter().filter_map(|followed| followed.unread.last()).map(|(round, _)| round).max().unwrap_or(0);
         for followed in &mut rings {
             let looked = followed.reader.is_closed().and_then(|closed| {
@@ -307,65 +294,69 @@ impl RingFollower {
         rings.retain(|followed| !followed.replaced);
         let place = choice::catch_up(rings.iter_mut().map(|followed| &mut followed.unread).collect())?;
         for followed in rings {
-            if followed.unread.pass(&mut followed.reader, place) {
-                followed.acknowledge(self.mark);
+            if followed.unread.skip_to(&mut followed.reader, place) {
+                followed.heartbeat.send(&followed.reader);
             }
         }
         None
     }
 
-    /// Tells producers that somebody follows, without taking anything: they wait as long as their policy lets them.
+    /// Sends a heartbeat to all producers without taking a step: they wait as long as their policy allows.
     pub fn hold(&mut self) {
-        let mark = self.mark;
-        self.rings.values_mut().filter(|followed| !followed.refused).for_each(|followed| followed.acknowledge(mark));
+        self.rings.values_mut().filter(|f| !f.refused).for_each(|f| f.heartbeat.send(&f.reader));
     }
 
-    /// [`Self::hold`] for those producers that have heard nothing for a second: costs nothing in between.
+    /// [`Self::hold`] at most once a second; cheap in between.
     pub fn beat(&mut self) {
-        self.rings.values_mut().for_each(|followed| followed.beat(self.mark));
+        self.rings.values_mut().filter(|f| !f.refused).for_each(|f| f.heartbeat.send_if_due(&f.reader));
     }
 
-    /// Reads a ring; after each piece of the values all producers are told, where it is time, and `beside` is called.
+    /// Reads a ring. After each piece of the values, heartbeats that are due are sent and `go_on` is called.
     fn read_ring<T>(
         &mut self,
         block: u32,
-        beside: &mut dyn FnMut() -> bool,
+        go_on: &mut dyn FnMut() -> bool,
         read: impl FnOnce(&mut RingReader, &mut dyn FnMut(&RingReader) -> bool) -> T,
     ) -> Option<T> {
-        // Apart from the others, which are told of meanwhile.
+        // Out of the map, so that the others can be borrowed for their heartbeats.
         let mut followed = self.rings.remove(&block)?;
-        let Followed { reader, told, .. } = &mut followed;
-        let found = read(reader, &mut |reader| {
-            beat(reader, told, self.mark);
+        let Followed { reader, heartbeat, .. } = &mut followed;
+        let result = read(reader, &mut |reader| {
+            heartbeat.send_if_due(reader);
             self.beat();
-            beside()
+            go_on()
         });
         self.rings.insert(block, followed);
-        Some(found)
+        Some(result)
     }
 
-    /// Looks for rings that are new, or that a new producer put in the place of an old one.
-    fn look(&mut self) -> Option<Event> {
-        // What cannot be looked at, for want of a descriptor for instance, looks empty below.
+    /// Reports a refusal unless it was the last one of its block or of the folder.
+    fn refuse_once(&mut self, block: Option<u32>, error: WireError) -> Option<Event> {
+        let text = error.to_string();
+        let is_new = self.reported.get(&block) != Some(&text);
+        self.reported.insert(block, text);
+        is_new.then_some(Event::Refused(error))
+    }
+
+    /// Looks for rings that are new, or that replaced an old one.
+    fn scan(&mut self) -> Option<Event> {
+        // Otherwise a folder that cannot be read, for instance because no descriptor is left, would seem empty.
         if let Err(error) = std::fs::read_dir(&self.ring)
             && error.kind() != ErrorKind::NotFound
         {
-            let error = WireError::io(&self.ring, "cannot be looked at", error);
-            let words = Some(error.to_string());
-            let is_news = self.unseen != words;
-            self.unseen = words;
-            return is_news.then_some(Event::Refused(error));
+            let error = WireError::io(&self.ring, "cannot be examined", error);
+            return self.refuse_once(None, error);
         }
-        self.unseen = None;
+        self.reported.remove(&None);
         for block in blocks(&self.ring) {
-            // What the old one left is read first.
+            // The rest of an old ring is read first.
             if let Some(followed) = self.rings.get_mut(&block) {
                 followed.replaced = !followed.reader.is_current();
                 if !followed.replaced || !followed.ended {
                     continue;
                 }
             }
-            // A ring without a producer that was never followed is what a killed run left.
+            // A ring without a producer that was never followed is left from a killed run.
             let opened = match producer_lives(&self.ring, block) {
                 Ok(false) if !self.closed_in_order(block) => continue,
                 Ok(_) => RingReader::open(&self.ring, block, &self.limits),
@@ -373,25 +364,20 @@ impl RingFollower {
             };
             match opened {
                 Ok(reader) => {
-                    let known = self.rings.get(&block).map(|f| f.reader.header().producer);
-                    if known == Some(reader.header().producer) {
+                    let header = reader.header();
+                    if self.rings.get(&block).is_some_and(|known| known.reader.header().producer == header.producer) {
                         continue;
                     }
-                    self.refused.remove(&block);
-                    let header = reader.header();
+                    self.reported.remove(&Some(block));
                     let event = Event::Opened { description: Box::new(header.description.clone()), generation: header.generation };
-                    let mut followed = Followed::begin(reader);
-                    followed.acknowledge(self.mark);
-                    self.rings.insert(block, followed);
+                    self.rings.insert(block, Followed::begin(reader, self.mark));
                     return Some(event);
                 }
-                // It went meanwhile.
+                // It was removed meanwhile.
                 Err(WireError::Io { source, .. }) if source.kind() == ErrorKind::NotFound => {}
                 Err(error) => {
-                    let words = error.to_string();
-                    if self.refused.get(&block) != Some(&words) {
-                        self.refused.insert(block, words);
-                        return Some(Event::Refused(error));
+                    if let Some(event) = self.refuse_once(Some(block), error) {
+                        return Some(event);
                     }
                 }
             }
@@ -399,7 +385,7 @@ impl RingFollower {
         None
     }
 
-    /// Whether a ring without a producer was closed and not killed: its last steps count.
+    /// Returns true if a ring without a producer was closed, not killed: its last steps count.
     fn closed_in_order(&self, block: u32) -> bool {
         !self.rings.contains_key(&block)
             && RingReader::open(&self.ring, block, &self.limits).and_then(|reader| reader.is_closed()).unwrap_or(false)

@@ -1,14 +1,14 @@
-//! The layout of a ring file, and its checks. Little-endian; offsets in bytes.
+//! Layout of a ring file, and its checks. Little-endian; offsets in bytes.
 //!
 //! | offset | content |
 //! |---|---|
 //! | 0 | magic `RIDGERNG`, version u32, bytes of the description u32 |
 //! | 16 | bytes of the file u64, slots u32, components u32, bytes from slot to slot u64, offset of the first slot u64 |
-//! | 48 | producer id u64 (random), generation u64 (nanoseconds since 1970 when it was opened), process id u64, checksum u64 of 0..72 and the description |
-//! | 1024 | steps published u64, state u64 (1 open, 2 ended), steps that overwrote one that no follower had taken u64 |
-//! | 4096 | 64 marks, each written by one follower: steps taken u64, heartbeat u64 (nanoseconds, CLOCK_MONOTONIC; 0: nobody) |
+//! | 48 | producer id u64 (random), generation u64 (time of the opening, nanoseconds since 1970), process id u64, checksum u64 of 0..72 and the description |
+//! | 1024 | steps published u64, state u64 (1 open, 2 ended), steps that overwrote an untaken one u64 |
+//! | 4096 | 64 marks, each written by one follower: steps taken u64, heartbeat u64 (nanoseconds, CLOCK_MONOTONIC; 0: no follower) |
 //! | 8192 | the description |
-//! | slots | sequence u64 (2n + 1 while step n is written, 2n + 2 when it is whole), step number u64, time f64, published at u64 (nanoseconds since 1970); from 64 on the components as f32, one after another, x fastest |
+//! | slots | sequence u64 (2n + 1 while step n is written, 2n + 2 when it is complete), step number u64, time f64, published at u64 (nanoseconds since 1970); from 64 on the components as f32, one after another, x fastest |
 
 use crate::bytes::{Parser, Writer, checksum};
 use crate::{Description, Limits, WireError};
@@ -17,8 +17,8 @@ use crate::{Description, Limits, WireError};
 pub const MAGIC: [u8; 8] = *b"RIDGERNG";
 /// Version of the layout.
 pub const VERSION: u32 = 2;
-/// Most slots.
-pub(crate) const SLOTS: u32 = 4096;
+/// Most slots of a ring.
+pub(crate) const MAX_SLOTS: u32 = 4096;
 /// Bytes before the checksum.
 const SUMMED: usize = 72;
 /// Bytes of the fixed part.
@@ -26,11 +26,11 @@ pub(crate) const FIXED: usize = 80;
 pub(crate) const PUBLISHED: usize = 1024;
 pub(crate) const STATE: usize = 1032;
 pub(crate) const OVERWRITTEN: usize = 1040;
-/// The first follower's mark: steps taken, heartbeat.
+/// Offset of the first follower's mark: steps taken, heartbeat.
 pub(crate) const MARK: usize = 4096;
 /// Bytes from mark to mark.
 pub(crate) const MARK_BYTES: usize = 16;
-/// Followers of one ring at once.
+/// Most followers of one ring.
 pub(crate) const MARKS: u32 = 64;
 pub(crate) const DESCRIPTION: usize = 8192;
 /// Bytes of a slot before its values.
@@ -38,21 +38,21 @@ pub(crate) const SLOT_HEADER: usize = 64;
 pub(crate) const OPEN: u64 = 1;
 pub(crate) const ENDED: u64 = 2;
 const PAGE: u64 = 4096;
-/// Longest description: three axes and their texts.
+/// Most bytes of a description: three axes and their texts.
 pub(crate) const DESCRIPTION_BYTES: u32 = 25 << 20;
 
-/// What stands at the head of a ring.
+/// Header of a ring.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Header {
-    /// The field.
+    /// The published field.
     pub description: Description,
-    /// Steps that the ring holds.
+    /// Number of steps that the ring holds.
     pub slots: u32,
-    /// Random, of this opening.
+    /// Random number of this opening.
     pub producer: u64,
-    /// Nanoseconds since 1970 when it was opened: a later opening has a larger one.
+    /// Time of the opening, nanoseconds since 1970.
     pub generation: u64,
-    /// Process.
+    /// Process id of the producer.
     pub pid: u64,
 }
 
@@ -68,7 +68,7 @@ impl Header {
         (first.saturating_add(self.stride().saturating_mul(u64::from(self.slots))), first)
     }
 
-    /// The fixed part and the description, with the bytes of the whole file and the offset of the first slot.
+    /// The fixed part, the description, the bytes of the whole file and the offset of the first slot.
     ///
     /// # Errors
     /// No memory.
@@ -91,7 +91,7 @@ impl Header {
         Ok((out.0, description, total, first))
     }
 
-    /// Length of the description that a fixed part announces.
+    /// Bytes of the description, as the fixed part announces them.
     pub(crate) fn description_bytes(fixed: &[u8; FIXED]) -> Result<usize, WireError> {
         let mut input = Parser::new("the ring", fixed);
         let found = input.array()?;
@@ -106,7 +106,7 @@ impl Header {
         Ok(bytes as usize)
     }
 
-    /// Checks both parts against each other and against the bytes that the file has. Returns the header and the first slot's offset.
+    /// Checks both parts against each other and against the length of the file. Returns the header and the offset of the first slot.
     pub(crate) fn decode(fixed: &[u8; FIXED], description: &[u8], file: u64, limits: &Limits) -> Result<(Self, u64), WireError> {
         Self::description_bytes(fixed)?;
         let mut input = Parser::new("the header", &fixed[16..]);
@@ -117,8 +117,8 @@ impl Header {
         if sum != computed {
             return Err(WireError::Checksum { found: sum, computed });
         }
-        if !(2..=SLOTS).contains(&slots) {
-            return Err(WireError::field("slots", slots, format!("2 to {SLOTS}")));
+        if !(2..=MAX_SLOTS).contains(&slots) {
+            return Err(WireError::field("slots", slots, format!("2 to {MAX_SLOTS}")));
         }
         let bytes = description.len();
         let description = Description::decode(description, limits)?;

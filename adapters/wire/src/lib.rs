@@ -1,12 +1,13 @@
-//! How a simulation's velocity travels to ridgewatch.
+//! Transport of a simulation's velocity to ridgewatch.
 //!
-//! On one node: a ring of steps in a file under `/dev/shm`, one a block of the domain. The [`Producer`] copies a step into the next slot
-//! and goes on; the [`RingReader`] reads what is there and checks all of it. Between nodes: signed [`message`]s over TCP. Blocks of
-//! a decomposed domain are put together by the [`Assembler`].
+//! On one node, each block of the domain has a ring of steps in a file under `/dev/shm`. The [`Producer`] copies a step into the next slot, and the
+//! [`RingReader`] reads and checks it. Between nodes, a [`relay`] sends signed [`message`]s over TCP. The [`Assembler`] joins the blocks of a decomposed
+//! domain.
 //!
-//! What comes from outside is never believed: every length is checked before memory is taken for it, every fault is a [`WireError`].
+//! All input is untrusted: each length is checked before memory is allocated for it, and each fault is a [`WireError`].
 
 mod assemble;
+mod byte_lock;
 mod bytes;
 mod choice;
 mod copy;
@@ -18,10 +19,15 @@ mod error;
 mod follow;
 mod header;
 mod lock;
+mod map;
 #[cfg(feature = "messages")]
 pub mod message;
 mod place;
+mod private;
 mod producer;
+#[cfg(all(test, feature = "messages"))]
+#[path = "../tests/support/random.rs"]
+mod random;
 mod reader;
 #[cfg(feature = "messages")]
 pub mod relay;
@@ -43,22 +49,27 @@ use std::path::{Path, PathBuf};
 /// The environment variable that names the ring's folder.
 pub const RING_VARIABLE: &str = "RIDGEWATCH_RING";
 
-/// The file of one block in a ring's folder.
+/// The ring's folder that the environment names; `None` if [`RING_VARIABLE`] is not set or empty.
+pub fn ring_from_environment() -> Option<PathBuf> {
+    std::env::var_os(RING_VARIABLE).filter(|name| !name.is_empty()).map(PathBuf::from)
+}
+
+/// Path of a block's ring in the ring's folder.
 pub fn block_path(ring: &Path, block: u32) -> PathBuf {
     ring.join(format!("block-{block:05}.ring"))
 }
 
-/// A block's file until it is whole.
+/// Path of a block's ring until its header is complete.
 fn part_path(ring: &Path, block: u32) -> PathBuf {
     ring.join(format!(".block-{block:05}.part"))
 }
 
-/// Who follows the ring holds this file's lock.
+/// Path of the file whose lock each follower holds.
 fn followers_path(ring: &Path) -> PathBuf {
     ring.join("followers.lock")
 }
 
-/// The lock of a block's file; whoever holds it is its producer.
+/// Path of the file whose lock the block's producer holds.
 fn lock_path(ring: &Path, block: u32) -> PathBuf {
     ring.join(format!("block-{block:05}.lock"))
 }

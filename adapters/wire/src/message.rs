@@ -1,19 +1,18 @@
 //! Signed messages between nodes, over TCP.
 //!
-//! Both sides know the key of a [`ConnectionFile`]. They greet each other with random numbers, prove the key, and derive a session key from both:
-//! a message of another session never fits. Each message is a head of fixed length with its signature (HMAC-SHA256), then the
-//! description (of a block that was opened) and the values, and a signature of the head with the BLAKE3 hash of both, which comes last so that
-//! nothing waits until all was hashed. Its number rises strictly within the session. So no memory is taken before the head's signature has been
-//! checked, and nothing counts before the last. A follower asks for each message but pulses (signed and numbered as well), so that nothing
-//! is on its way to one that does not take it.
+//! Both sides know the key of a [`ConnectionFile`]. They exchange random numbers, prove the key, and derive a session key from the numbers and the key, so that
+//! a message of another session never verifies. A message is a head of fixed length with its signature (HMAC-SHA256), the description of an opened block, the
+//! values, and a signature of the head and the BLAKE3 hash of description and values. The second signature comes last, so that hashing overlaps sending.
+//! Message numbers rise strictly within a session. No memory is allocated before the head is verified, and no content is used before the second signature is.
+//! The follower requests each message except pulses (also signed and numbered), so that nothing is sent to a follower that does not read.
 //!
-//! TCP with these frames and not ZeroMQ: the `zeromq` crate takes memory for any length that a peer announces, before a signature could be
-//! looked at, and is half as fast with steps of 340 MB (`benches/relay.rs`).
+//! The transport is TCP, not ZeroMQ: the `zeromq` crate allocates any length that a peer announces, before a signature can be checked, and is half as fast
+//! with steps of 340 MB (`benches/relay.rs`).
 
 use crate::bytes::{PIECE, Parser, Writer, fill};
 use crate::header::DESCRIPTION_BYTES;
-use crate::system::{self, create_private, open_private};
-use crate::{Description, Limits, WireError};
+use crate::private::{create_private, open_private};
+use crate::{Description, Limits, WireError, system};
 use hmac::{Hmac, Mac};
 use sha2::Sha256;
 use std::io::{ErrorKind, Read, Write};
@@ -27,18 +26,18 @@ compile_error!("rings and messages are little-endian and are not converted");
 const GREETING: [u8; 12] = *b"RIDGEWIRE\0\0\0";
 /// First bytes of a message.
 const MAGIC: [u8; 4] = *b"RWMS";
-/// First bytes of what a follower asks.
+/// First bytes of a request.
 const ASK_MAGIC: [u8; 4] = *b"RWAS";
 const VERSION: u32 = 4;
-/// Bytes of what a follower asks, with its signature.
+/// Bytes of a request, with its signature.
 pub const ASK_BYTES: usize = 20 + SIGNATURE;
-/// Bytes of a message's head, and of its signature.
+/// Bytes of a message's head, and of a signature.
 const HEAD: usize = 76;
 const SIGNATURE: usize = 32;
-/// Longest connection file.
-const FILE_BYTES: u64 = 4096;
+/// Most bytes of a connection file.
+const MAX_FILE_BYTES: u64 = 4096;
 
-/// What both sides know.
+/// Secret that both sides share.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Key([u8; 32]);
 
@@ -49,10 +48,10 @@ impl std::fmt::Debug for Key {
 }
 
 impl Key {
-    /// A new one.
+    /// A new random key.
     ///
     /// # Errors
-    /// The system has no random numbers.
+    /// The system returns no random numbers.
     pub fn random() -> Result<Self, WireError> {
         system::random().map(Self).map_err(|e| WireError::io(Path::new("getrandom"), "no random numbers", e))
     }
@@ -68,22 +67,22 @@ impl Key {
     }
 
     fn verify(&self, parts: &[&[u8]], signature: &[u8; SIGNATURE]) -> Result<(), WireError> {
-        // In constant time.
+        // Compares in constant time.
         self.sign(parts).verify_slice(signature).map_err(|_| WireError::Signature)
     }
 }
 
-/// Where a relay listens, and its key.
+/// Address of a relay, and its key.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ConnectionFile {
     /// `HOST:PORT`.
     pub address: String,
-    /// The key.
+    /// The shared key.
     pub key: Key,
 }
 
 impl ConnectionFile {
-    /// Writes it, readable for this user alone; one that is there is replaced.
+    /// Writes the file with mode 0600, and replaces an existing one.
     ///
     /// # Errors
     /// The file cannot be written.
@@ -94,26 +93,26 @@ impl ConnectionFile {
         let _ = std::fs::remove_file(part);
         let hex: String = self.key.0.iter().map(|byte| format!("{byte:02x}")).collect();
         let text = format!("ridgewatch-connection = 1\naddress = {}\nkey = {hex}\n", self.address);
-        let mut file = create_private(part, true).map_err(|e| WireError::io(part, "cannot be made", e))?;
+        let mut file = create_private(part, true).map_err(|e| WireError::io(part, "cannot be created", e))?;
         file.write_all(text.as_bytes()).map_err(|e| WireError::io(part, "cannot be written", e))?;
-        std::fs::rename(part, path).map_err(|e| WireError::io(path, "cannot be put in its place", e))
+        std::fs::rename(part, path).map_err(|e| WireError::io(path, "cannot be renamed into place", e))
     }
 
-    /// Removes the file where it is still this one: another relay may have put its own in its place.
+    /// Removes the file if it is still this one: another relay may have replaced it.
     pub fn remove(&self, path: &Path) {
-        if Self::read(path).is_ok_and(|there| there == *self) {
+        if Self::read(path).is_ok_and(|found| found == *self) {
             let _ = std::fs::remove_file(path);
         }
     }
 
-    /// Reads it.
+    /// Reads the file.
     ///
     /// # Errors
-    /// Not this user's alone, or not such a file.
+    /// The file does not belong to this user alone, or is no connection file.
     pub fn read(path: &Path) -> Result<Self, WireError> {
         let file = open_private(path, false)?;
         let mut text = String::new();
-        file.take(FILE_BYTES).read_to_string(&mut text).map_err(|e| WireError::io(path, "cannot be read", e))?;
+        file.take(MAX_FILE_BYTES).read_to_string(&mut text).map_err(|e| WireError::io(path, "cannot be read", e))?;
         text.parse()
     }
 }
@@ -145,64 +144,69 @@ impl FromStr for ConnectionFile {
     }
 }
 
-/// What a message is about.
+/// Kind of a message.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// A step of one block.
-    Step,
+    Step = 1,
     /// The producer of a block has closed it.
     Ended,
-    /// Nothing new; the relay lives.
+    /// Heartbeat of the relay.
     Pulse,
-    /// A producer has opened a block, or had before the session began; its description comes with it.
+    /// A producer has opened a block, perhaps before the session began. The message contains its description.
     Opened,
     /// The process of a block's producer has ended without closing it.
     Lost,
 }
 
-/// What a follower says.
+impl Kind {
+    const ALL: [Self; 5] = [Self::Step, Self::Ended, Self::Pulse, Self::Opened, Self::Lost];
+}
+
+/// Request of a follower.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Ask {
-    /// The next message, please.
-    Next,
-    /// The follower lives. What it asked before stands; where nothing stands it will ask again.
+    /// Asks for the next message.
+    Next = 1,
+    /// Heartbeat of the follower. An open request stays open.
     Hold,
 }
 
-/// A message's facts; a step's values come with it.
+/// Content of a message's head. A step's values follow it.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Facts {
-    /// What about.
+    /// Kind of the message.
     pub kind: Kind,
-    /// Which block.
+    /// Index of the block.
     pub block: u32,
-    /// When its producer opened it.
+    /// Time of the opening, nanoseconds since 1970.
     pub generation: u64,
-    /// The solver's number of the step.
+    /// The solver's number.
     pub step: u64,
-    /// Its time.
+    /// The solver's time.
     pub time: f64,
-    /// When it was published, nanoseconds since 1970.
+    /// Time of publication, nanoseconds since 1970.
     pub published: u64,
-    /// Steps of the block that were overwritten before the relay read them, since the last.
+    /// Steps of the block since the last one that were overwritten before the relay read them.
     pub missed: u64,
 }
 
 /// One side's end of a session.
 pub struct Session {
     key: Key,
-    /// Of the newest message that was sent or received.
+    /// Number of the newest message that was sent or received.
     number: u64,
-    /// The same for what was asked.
+    /// Number of the newest request.
     asked: u64,
 }
 
-fn failed(e: std::io::Error) -> WireError {
-    WireError::io(Path::new("connection"), "broke", e)
-}
-
 impl Session {
-    /// Greets as the relay.
+    /// `nonces`: the relay's and the follower's.
+    fn begin(key: &Key, nonces: [&[u8; 32]; 2]) -> Self {
+        Self { key: Key(key.signature(&[b"session", nonces[0], nonces[1]])), number: 0, asked: 0 }
+    }
+
+    /// Accepts a follower, as the relay.
     ///
     /// # Errors
     /// The peer has another key or speaks another protocol, or the connection broke.
@@ -210,45 +214,43 @@ impl Session {
         Self::accept_if(stream, key, || Ok(()))
     }
 
-    /// The same, where a follower that has proved the key may still be sent away: `admit` is asked before the relay signs, so that the follower learns it.
+    /// [`Self::accept`] that may reject a follower with the right key: `admit` is called before the relay signs, so that the follower notices.
     ///
     /// # Errors
-    /// Those of [`Session::accept`], and that of `admit`.
+    /// Those of [`Session::accept`], and those of `admit`.
     pub fn accept_if(
         stream: &mut (impl Read + Write),
         key: &Key,
         admit: impl FnOnce() -> Result<(), WireError>,
     ) -> Result<Self, WireError> {
-        let mine: [u8; 32] = system::random().map_err(failed)?;
-        stream.write_all(&greeting(&mine)).map_err(failed)?;
+        let mine = system::random().map_err(WireError::connection)?;
+        write(stream, &greeting(&mine))?;
         let theirs = read_greeting(stream)?;
-        let mut signature = [0; SIGNATURE];
-        stream.read_exact(&mut signature).map_err(failed)?;
-        key.verify(&[b"follower", &mine, &theirs], &signature)?;
+        key.verify(&[b"follower", &mine, &theirs], &read(stream)?)?;
         admit()?;
-        stream.write_all(&key.signature(&[b"relay", &mine, &theirs])).map_err(failed)?;
-        Ok(Self { key: Key(key.signature(&[b"session", &mine, &theirs])), number: 0, asked: 0 })
+        write(stream, &key.signature(&[b"relay", &mine, &theirs]))?;
+        Ok(Self::begin(key, [&mine, &theirs]))
     }
 
-    /// Greets as the follower.
+    /// Connects to a relay, as the follower.
     ///
     /// # Errors
     /// Those of [`Session::accept`].
     pub fn connect(stream: &mut (impl Read + Write), key: &Key) -> Result<Self, WireError> {
-        let mine: [u8; 32] = system::random().map_err(failed)?;
+        let mine = system::random().map_err(WireError::connection)?;
         let theirs = read_greeting(stream)?;
-        stream.write_all(&greeting(&mine)).map_err(failed)?;
-        stream.write_all(&key.signature(&[b"follower", &theirs, &mine])).map_err(failed)?;
+        write(stream, &greeting(&mine))?;
+        write(stream, &key.signature(&[b"follower", &theirs, &mine]))?;
         let mut signature = [0; SIGNATURE];
         stream.read_exact(&mut signature).map_err(|e| match e.kind() {
-            ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => WireError::SentAway,
-            _ => failed(e),
+            ErrorKind::UnexpectedEof | ErrorKind::ConnectionReset => WireError::Rejected,
+            _ => WireError::connection(e),
         })?;
         key.verify(&[b"relay", &theirs, &mine], &signature)?;
-        Ok(Self { key: Key(key.signature(&[b"session", &theirs, &mine])), number: 0, asked: 0 })
+        Ok(Self::begin(key, [&theirs, &mine]))
     }
 
-    /// Asks, as the follower.
+    /// Sends a request, as the follower.
     ///
     /// # Errors
     /// The connection broke.
@@ -257,28 +259,23 @@ impl Session {
         let mut out = Writer(ASK_MAGIC.to_vec());
         out.u32(VERSION);
         out.u64(self.asked);
-        out.u32(match ask {
-            Ask::Next => 1,
-            Ask::Hold => 2,
-        });
+        out.u32(ask as u32);
         let signature = self.key.signature(&[&out.0]);
         out.0.extend_from_slice(&signature);
-        to.write_all(&out.0).map_err(failed)
+        write(to, &out.0)
     }
 
-    /// What the follower asks, to the relay.
+    /// Verifies a request, as the relay.
     ///
     /// # Errors
-    /// Wrong key, a changed or replayed message: the session is over.
+    /// A wrong key, or a changed or replayed request. The session is over then.
     pub fn check_ask(&mut self, bytes: &[u8; ASK_BYTES]) -> Result<Ask, WireError> {
-        let (head, rest) = bytes.split_at(ASK_BYTES - SIGNATURE);
-        let mut signature = [0; SIGNATURE];
-        signature.copy_from_slice(rest);
-        self.key.verify(&[head], &signature)?;
-        let mut input = Parser::new("what a follower asks", head);
+        let Some((head, signature)) = bytes.split_last_chunk() else { unreachable!("a request is longer than its signature") };
+        self.key.verify(&[head], signature)?;
+        let mut input = Parser::new("a request", head);
         let magic: [u8; 4] = input.array()?;
         if magic != ASK_MAGIC {
-            return Err(WireError::field("magic", format_args!("{magic:02x?}"), "what a follower asks"));
+            return Err(WireError::field("magic", format_args!("{magic:02x?}"), "a request of a follower"));
         }
         input.version(VERSION)?;
         let number = input.u64()?;
@@ -294,25 +291,19 @@ impl Session {
         Ok(ask)
     }
 
-    /// Sends a message; `description` when a block was opened, `values` with a step.
+    /// Sends a message, with a `description` if a block was opened and `values` if it is a step.
     ///
     /// # Errors
-    /// The connection broke, the peer takes nothing any more, or no memory.
+    /// The connection broke, the peer does not read, or there is no memory.
     pub fn send(&mut self, to: &mut impl Write, facts: &Facts, description: Option<&Description>, values: &[f32]) -> Result<(), WireError> {
         let description = description.map(Description::encode).transpose()?.unwrap_or_default();
-        // SAFETY: floats without padding are bytes.
+        // SAFETY: f32 values have no padding.
         let values = unsafe { std::slice::from_raw_parts(values.as_ptr().cast::<u8>(), size_of_val(values)) };
         self.number += 1;
         let mut head = Writer(MAGIC.to_vec());
         head.u32(VERSION);
         head.u64(self.number);
-        head.u32(match facts.kind {
-            Kind::Step => 1,
-            Kind::Ended => 2,
-            Kind::Pulse => 3,
-            Kind::Opened => 4,
-            Kind::Lost => 5,
-        });
+        head.u32(facts.kind as u32);
         head.u32(facts.block);
         head.u64(facts.generation);
         head.u64(facts.step);
@@ -321,22 +312,22 @@ impl Session {
         head.u64(facts.missed);
         head.u32(description.len() as u32);
         head.u64(values.len() as u64);
-        to.write_all(&head.0).map_err(failed)?;
-        to.write_all(&self.key.signature(&[&head.0])).map_err(failed)?;
+        write(to, &head.0)?;
+        write(to, &self.key.signature(&[&head.0]))?;
         let mut hasher = blake3::Hasher::new();
         for piece in std::iter::once(description.as_slice()).chain(values.chunks(PIECE)) {
             hasher.update(piece);
-            to.write_all(piece).map_err(failed)?;
+            write(to, piece)?;
         }
         let signature = self.key.signature(&[&head.0, hasher.finalize().as_bytes()]);
-        to.write_all(&signature).and_then(|()| to.flush()).map_err(failed)
+        to.write_all(&signature).and_then(|()| to.flush()).map_err(WireError::connection)
     }
 
-    /// Receives a message. `known` hears of its block and of the description that it brings, if any, and says how many bytes a step of that block has;
-    /// what it heard counts only when this returns without an error. A step's values are in `values` then, which keeps its memory from call to call.
+    /// Receives a message. `known` gets its block and its description, if any, and returns the bytes of a step of that block; its arguments are valid only
+    /// if this function succeeds. A step's values are in `values`, which keeps its memory from call to call.
     ///
     /// # Errors
-    /// Wrong key, a changed or replayed message, lengths that lie, a field larger than `limits`, no memory: the session is over.
+    /// A wrong key, a changed or replayed message, wrong lengths, a field larger than `limits`, or no memory. The session is over then.
     pub fn receive(
         &mut self,
         from: &mut impl Read,
@@ -344,16 +335,14 @@ impl Session {
         known: &mut dyn FnMut(u32, Option<Description>) -> Option<u64>,
         values: &mut Vec<f32>,
     ) -> Result<Facts, WireError> {
-        let (mut head, mut signature) = ([0; HEAD], [0; SIGNATURE]);
-        from.read_exact(&mut head).map_err(failed)?;
-        from.read_exact(&mut signature).map_err(failed)?;
-        self.key.verify(&[&head], &signature)?;
+        let head: [u8; HEAD] = read(from)?;
+        self.key.verify(&[&head], &read(from)?)?;
         let (facts, description_bytes, payload) = self.check_head(&head)?;
         let mut hasher = blake3::Hasher::new();
         let mut description = vec![0; description_bytes as usize];
-        from.read_exact(&mut description).map_err(failed)?;
+        from.read_exact(&mut description).map_err(WireError::connection)?;
         hasher.update(&description);
-        let announced = if description_bytes > 0 { Some(Description::decode(&description, limits)?) } else { None };
+        let announced = (description_bytes > 0).then(|| Description::decode(&description, limits)).transpose()?;
         if let Some(announced) = &announced
             && announced.block.index != facts.block
         {
@@ -368,16 +357,15 @@ impl Session {
         }
         let count = payload as usize / 4;
         fill(values, count, |piece| {
-            from.read_exact(piece).map_err(failed)?;
+            from.read_exact(piece).map_err(WireError::connection)?;
             hasher.update(piece);
             Ok(true)
         })?;
-        from.read_exact(&mut signature).map_err(failed)?;
-        self.key.verify(&[&head, hasher.finalize().as_bytes()], &signature).map_err(|_| WireError::Payload)?;
+        self.key.verify(&[&head, hasher.finalize().as_bytes()], &read(from)?).map_err(|_| WireError::Payload)?;
         Ok(facts)
     }
 
-    /// A head whose signature fits.
+    /// Decodes a head whose signature is verified.
     fn check_head(&mut self, head: &[u8; HEAD]) -> Result<(Facts, u32, u64), WireError> {
         let mut input = Parser::new("a message", head);
         let magic: [u8; 4] = input.array()?;
@@ -389,13 +377,9 @@ impl Session {
         if number <= self.number {
             return Err(WireError::Replayed { found: number, newest: self.number });
         }
-        let kind = match input.u32()? {
-            1 => Kind::Step,
-            2 => Kind::Ended,
-            3 => Kind::Pulse,
-            4 => Kind::Opened,
-            5 => Kind::Lost,
-            other => return Err(WireError::field("kind", other, "1 (step), 2 (ended), 3 (pulse), 4 (opened) or 5 (lost)")),
+        let number_of_kind = input.u32()?;
+        let Some(kind) = Kind::ALL.into_iter().find(|kind| *kind as u32 == number_of_kind) else {
+            return Err(WireError::field("kind", number_of_kind, "1 (step), 2 (ended), 3 (pulse), 4 (opened) or 5 (lost)"));
         };
         let (block, generation, step, time) = (input.u32()?, input.u64()?, input.u64()?, input.f64()?);
         let (published, missed) = (input.u64()?, input.u64()?);
@@ -412,6 +396,16 @@ impl Session {
     }
 }
 
+fn write(to: &mut impl Write, bytes: &[u8]) -> Result<(), WireError> {
+    to.write_all(bytes).map_err(WireError::connection)
+}
+
+fn read<const N: usize>(from: &mut impl Read) -> Result<[u8; N], WireError> {
+    let mut bytes = [0; N];
+    from.read_exact(&mut bytes).map_err(WireError::connection)?;
+    Ok(bytes)
+}
+
 fn greeting(nonce: &[u8; 32]) -> Vec<u8> {
     let mut out = Writer(GREETING.to_vec());
     out.u32(VERSION);
@@ -420,8 +414,7 @@ fn greeting(nonce: &[u8; 32]) -> Vec<u8> {
 }
 
 fn read_greeting(from: &mut impl Read) -> Result<[u8; 32], WireError> {
-    let mut bytes = [0; 48];
-    from.read_exact(&mut bytes).map_err(failed)?;
+    let bytes: [u8; 48] = read(from)?;
     let mut input = Parser::new("the greeting", &bytes);
     let found: [u8; 12] = input.array()?;
     if found != GREETING {
@@ -435,10 +428,11 @@ fn read_greeting(from: &mut impl Read) -> Result<[u8; 32], WireError> {
 mod tests {
     use super::*;
     use crate::counting::{HELD, PEAK};
+    use crate::random::{Random, cases};
     use crate::{AxisDescription, Geometry};
     use std::io::Cursor;
 
-    /// What a peer says, and what it is told.
+    /// Bytes that a peer sends, and bytes that it receives.
     struct Peer(Cursor<Vec<u8>>, Vec<u8>);
 
     impl Read for Peer {
@@ -461,7 +455,7 @@ mod tests {
     fn another_version_is_refused_by_name_in_greeting_message_and_ask() {
         let key = Key([1; 32]);
         let session = || Session { key: key.clone(), number: 0, asked: 0 };
-        // Under the session's own signature, so that the version alone is wrong.
+        // Signed with the session's key, so that only the version is wrong.
         let older = |mut bytes: Vec<u8>, head: usize| {
             bytes[4..8].copy_from_slice(&1u32.to_le_bytes());
             let signature = key.signature(&[&bytes[..head]]);
@@ -482,42 +476,35 @@ mod tests {
             (Session::accept(&mut peer(), &key).err(), "the greeting"),
             (Session::connect(&mut peer(), &key).err(), "the greeting"),
             (received.err(), "a message"),
-            (session().check_ask(&ask).err(), "what a follower asks"),
+            (session().check_ask(&ask).err(), "a request"),
         ] {
             let error = found.unwrap();
             assert!(matches!(error, WireError::Version { what: w, found: 1, known: VERSION } if w == what), "{what}: {error}");
-            assert_eq!(error.to_string(), format!("{what} has version 1; this is version 4 and knows no other"));
+            assert_eq!(error.to_string(), format!("{what} has version 1; only version 4 is supported"));
         }
     }
 
-    /// A peer that has the key and lies: heads and descriptions are changed, then hashed and signed as if they were meant so. Memory: that of the
-    /// description as announced, which the limit on descriptions bounds, of a step, of the description's parts and of an error's words.
+    /// A malicious peer that has the key: changed heads and descriptions with valid hashes and signatures. The memory is bounded by the announced description
+    /// (which has a limit), a step, the parts of the description and the text of an error.
     #[test]
     #[allow(clippy::print_stdout)]
     fn lies_under_a_good_signature_are_refused_too() {
-        let cases: u64 = std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(20_000);
+        let cases = cases();
         let axis = |name, n| AxisDescription::uniform(name, "m", 0.0, 1.0, n);
         let description = Description::whole(Geometry::Cartesian, vec![axis("x", 5), axis("y", 4)], "s");
         let facts = Facts { kind: Kind::Step, block: 0, generation: 1, step: 2, time: 3.0, published: 4, missed: 0 };
         let limits = Limits { step_bytes: 1 << 16 };
-        let mut state = 1u64;
-        let mut random = |n: usize| {
-            // SplitMix64.
-            state = state.wrapping_add(0x9e37_79b9_7f4a_7c15);
-            let z = (state ^ (state >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-            let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-            ((z ^ (z >> 31)) % n as u64) as usize
-        };
+        let mut numbers = Random(1);
+        let mut random = |n: usize| numbers.below(n);
         let (mut taken, mut refused) = (0u64, [0u64; 4]);
-        let mut most = 0;
+        let mut max_took = 0;
         for case in 0..cases {
-            let (mut from, mut to) =
-                (Session { key: Key([1; 32]), number: 7, asked: 0 }, Session { key: Key([1; 32]), number: 7, asked: 0 });
+            let [mut from, mut to] = [(); 2].map(|()| Session { key: Key([1; 32]), number: 7, asked: 0 });
             let mut message = Vec::new();
             from.send(&mut message, &facts, Some(&description), &[0.5; 40]).unwrap();
             let begin = HEAD + SIGNATURE;
             for _ in 0..1 + random(3) {
-                // The head's plain part, or the description.
+                // The head, or the description.
                 let place = if random(2) == 0 { random(HEAD) } else { begin + random(message.len() - begin - 160 - SIGNATURE) };
                 match random(3) {
                     0 => message[place] ^= 1 << random(8),
@@ -531,7 +518,7 @@ mod tests {
             let signature = from.key.signature(&[&message[..HEAD], blake3::hash(&message[begin..end]).as_bytes()]);
             message[end..].copy_from_slice(&signature);
             let mut known = |_, announced: Option<Description>| announced.map(|d| d.block_bytes());
-            // Where the head says how long the description is.
+            // The description's length in the head.
             let announced = u32::from_le_bytes(message[64..68].try_into().unwrap());
             let announced = if announced > DESCRIPTION_BYTES { 0 } else { announced as isize };
             let mut values = Vec::new();
@@ -539,7 +526,7 @@ mod tests {
             PEAK.set(held);
             let received = to.receive(&mut Cursor::new(&message), &limits, &mut known, &mut values);
             let took = PEAK.get() - held;
-            most = most.max(took);
+            max_took = max_took.max(took);
             assert!(took <= announced + (1 << 16) + (1 << 15), "case {case} took {took} bytes, {announced} of them announced");
             match received {
                 Ok(facts) => {
@@ -558,7 +545,7 @@ mod tests {
                 }
             }
         }
-        println!("{cases} lies: {taken} taken, {refused:?} refused, {most} bytes at most");
+        println!("{cases} lies: {taken} taken, {refused:?} refused, {max_took} bytes at most");
         assert!(taken > cases / 20 && refused.iter().all(|n| *n > cases / 1000), "{taken} {refused:?}: the corpus is lopsided");
     }
 }

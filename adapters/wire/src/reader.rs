@@ -1,50 +1,59 @@
-//! The follower's side: what is in the ring, checked.
+//! Follower side: reads steps from the ring and checks them.
 //!
-//! Everything is read through the file, not through a mapping: a ring that is cut short under the reader's hands gives an error and no
-//! signal, and what a producer writes meanwhile is seen by the sequence numbers.
+//! The ring is read through its file, not through a mapping: a ring that is truncated during a read gives an error and no signal. Sequence numbers show
+//! what a producer overwrites during a read (a sequence lock).
 
 use crate::bytes::fill;
 use crate::header::{DESCRIPTION, ENDED, FIXED, Header, MARK, MARK_BYTES, MARKS, PUBLISHED, SLOT_HEADER, STATE};
-use crate::system::{self, open_private};
-use crate::{Limits, WireError, block_path};
+use crate::private::{metadata, open_private};
+use crate::{Limits, WireError, block_path, system};
 use std::fs::File;
 use std::os::unix::fs::{FileExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{Ordering, fence};
 
-/// Steps that are begun to be read in one look, if the producer overtakes each of them.
+/// Most steps that one call starts to read, if the producer overtakes each of them.
 const ATTEMPTS: usize = 4;
 
-const CUT_SHORT: &str = "cannot be read (was it cut short?)";
+const TRUNCATED: &str = "cannot be read (was it truncated?)";
 
-/// What stands in the slot of a step that was published.
+/// Content of a published step's slot.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Found {
+pub(crate) enum SlotContent {
     /// The step, with the solver's number.
     Step(u64),
     /// A later one.
     Overwritten,
-    /// What was there before it: the step is not seen yet.
-    Unseen,
+    /// An earlier one: the step is not visible yet.
+    NotVisible,
 }
 
-/// What came of reading one step.
-pub(crate) enum Tried {
+/// Result of reading one slot.
+pub(crate) enum SlotRead {
     /// The step; its values are in the buffer.
     Step(StepInfo),
-    /// A later one stands in its slot, or is being written.
+    /// The slot holds a later step, or one is being written.
     Overwritten,
-    /// Whoever reads did not want to go on.
-    BrokenOff,
+    /// The caller stopped the read.
+    Stopped,
 }
 
-/// Bytes that can be read anywhere: a file, or memory in tests.
+/// Bytes with random access: a file, or memory in tests.
 pub trait ReadAt {
-    /// Bytes there.
+    /// Number of bytes.
+    ///
+    /// # Errors
+    /// Those of the system.
     fn length(&self) -> std::io::Result<u64>;
     /// Fills `to` from `offset` on.
+    ///
+    /// # Errors
+    /// Those of the system; `UnexpectedEof` if there are fewer bytes.
     fn read_at(&self, to: &mut [u8], offset: u64) -> std::io::Result<()>;
-    /// Writes the follower's words.
+    /// Writes the follower's mark.
+    ///
+    /// # Errors
+    /// Those of the system.
     fn write_at(&self, from: &[u8], offset: u64) -> std::io::Result<()>;
 }
 
@@ -62,55 +71,55 @@ impl ReadAt for File {
     }
 }
 
-/// What is known of a step besides its values.
+/// A step without its values.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StepInfo {
-    /// Its number among those published, from 0.
+    /// Its number among the published steps, from 0.
     pub number: u64,
     /// The solver's number.
     pub step: u64,
     /// The solver's time.
     pub time: f64,
-    /// When it was published, nanoseconds since 1970.
+    /// Time of publication, nanoseconds since 1970.
     pub published: u64,
-    /// Steps before it that were overwritten before they could be read.
+    /// Steps before it that were overwritten before they were read.
     pub missed: u64,
 }
 
-/// What a reader found.
+/// Result of [`RingReader::read`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Read {
     /// A step; its values are in the buffer.
     Step(StepInfo),
     /// Nothing new yet.
     Nothing,
-    /// All was read, and the producer has closed the ring.
+    /// All steps were read, and the producer has closed the ring.
     Ended,
 }
 
-/// Follows the ring of one block.
+/// Reads the ring of one block.
 #[derive(Debug)]
 pub struct RingReader<F = File> {
     path: PathBuf,
     file: F,
     header: Header,
     first_slot: u64,
-    /// The next step wanted.
+    /// Number of the next step.
     next: u64,
-    /// Steps before it that were passed over since the last that was read.
-    passed: u64,
+    /// Steps skipped since the last one that was read.
+    skipped: u64,
     device_and_inode: (u64, u64),
 }
 
 impl RingReader<File> {
-    /// Opens a block's ring; reading begins with the oldest step that is there.
+    /// Opens a block's ring. Reading begins with the oldest step.
     ///
     /// # Errors
-    /// No ring, somebody else's, of another version, torn, larger than `limits`.
+    /// There is no ring; it belongs to another user, has another version, is torn or exceeds `limits`.
     pub fn open(ring: &Path, block: u32, limits: &Limits) -> Result<Self, WireError> {
         let path = block_path(ring, block);
         let file = open_private(&path, true)?;
-        let about = file.metadata().map_err(|e| WireError::io(&path, "cannot be looked at", e))?;
+        let about = metadata(&path, file.metadata())?;
         let mut reader = Self::over(path, file, limits)?;
         reader.device_and_inode = (about.dev(), about.ino());
         let found = reader.header.description.block.index;
@@ -120,17 +129,17 @@ impl RingReader<File> {
         Ok(reader)
     }
 
-    /// Whether the file at the path is still this one: a producer that starts anew puts another in its place.
+    /// Returns true if the path still names this file; a restarted producer replaces it.
     pub fn is_current(&self) -> bool {
         std::fs::symlink_metadata(&self.path).is_ok_and(|now| (now.dev(), now.ino()) == self.device_and_inode)
     }
 }
 
 impl<F: ReadAt> RingReader<F> {
-    /// A ring in any bytes; `path` appears in errors.
+    /// Reads a ring from any bytes; `path` appears in errors.
     ///
     /// # Errors
-    /// Those of [`RingReader::open`], but for owner and mode.
+    /// Those of [`RingReader::open`], except owner and mode.
     pub fn over(path: PathBuf, file: F, limits: &Limits) -> Result<Self, WireError> {
         let failed = |e| WireError::io(&path, "cannot be read", e);
         let length = file.length().map_err(failed)?;
@@ -142,39 +151,39 @@ impl<F: ReadAt> RingReader<F> {
         file.read_at(&mut fixed, 0).map_err(failed)?;
         let bytes = Header::description_bytes(&fixed)?;
         let needed = (DESCRIPTION + bytes) as u64;
-        // Before memory is taken for it.
+        // Before memory is allocated for it.
         if length < needed {
             return Err(WireError::Short { what: "the ring", found: length, needed });
         }
         let mut description = vec![0; bytes];
         file.read_at(&mut description, DESCRIPTION as u64).map_err(failed)?;
         let (header, first_slot) = Header::decode(&fixed, &description, length, limits)?;
-        let mut reader = Self { path, file, header, first_slot, next: 0, passed: 0, device_and_inode: (0, 0) };
+        let mut reader = Self { path, file, header, first_slot, next: 0, skipped: 0, device_and_inode: (0, 0) };
         reader.next = reader.word(PUBLISHED)?.saturating_sub(u64::from(reader.header.slots));
         Ok(reader)
     }
 
-    /// What the ring says of itself.
+    /// The ring's header.
     pub fn header(&self) -> &Header {
         &self.header
     }
 
-    /// Reads the oldest step that was not read yet and is still there: its components, one behind the other, x fastest, in native f32. Where the producer
-    /// overtakes the reading, the newest one instead, which will be there for longest. `values` keeps its memory from call to call.
+    /// Reads the oldest unread step: its components, one after another, x fastest, in native f32. If the producer overtakes the read, the newest step is
+    /// read instead, which stays longest. `values` keeps its memory from call to call.
     ///
     /// # Errors
-    /// The file went away or was cut short; its counts run backwards.
+    /// The file was truncated, or its counts run backwards.
     pub fn read(&mut self, values: &mut Vec<f32>) -> Result<Read, WireError> {
-        self.read_beside(values, &mut |_| true).map(|found| found.unwrap_or(Read::Nothing))
+        self.read_while(values, &mut |_| true).map(|found| found.unwrap_or(Read::Nothing))
     }
 
-    /// The same, with `beside` asked after each piece of the values whether to go on; none: it broke off, and nothing was taken.
-    pub(crate) fn read_beside(&mut self, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Option<Read>, WireError> {
+    /// [`Self::read`] that calls `go_on` after each piece of the values. Returns `None` if `go_on` returned false; the step stays unread then.
+    pub(crate) fn read_while(&mut self, values: &mut Vec<f32>, go_on: &mut dyn FnMut(&Self) -> bool) -> Result<Option<Read>, WireError> {
         let slots = u64::from(self.header.slots);
         let began = self.next;
-        // Not `next` itself, which the producer is told of meanwhile.
+        // Not `next` itself, which heartbeats report to the producer meanwhile.
         let mut number = began;
-        // Before the count is read: no step can come after it.
+        // Before the count is read: no step can follow it.
         let ended = self.is_closed()?;
         for _ in 0..ATTEMPTS {
             let published = self.word(PUBLISHED)?;
@@ -183,25 +192,25 @@ impl<F: ReadAt> RingReader<F> {
             }
             number = number.max(published.saturating_sub(slots));
             if number >= published {
-                // What was overwritten while it was read counts as missed by the step that comes.
+                // Steps that were overwritten during this call count as missed before the next one.
                 return Ok(Some(if number == began && ended { Read::Ended } else { Read::Nothing }));
             }
-            match self.try_slot(number, values, beside)? {
-                Tried::Step(mut info) => {
+            match self.try_slot(number, values, go_on)? {
+                SlotRead::Step(mut info) => {
                     info.missed = number - began;
                     self.next = number + 1;
                     return Ok(Some(Read::Step(info)));
                 }
-                Tried::BrokenOff => return Ok(None),
-                Tried::Overwritten => number = (number + 1).max(self.word(PUBLISHED)?.saturating_sub(1)),
+                SlotRead::Stopped => return Ok(None),
+                SlotRead::Overwritten => number = (number + 1).max(self.word(PUBLISHED)?.saturating_sub(1)),
             }
         }
-        // The producer is faster than any reading; what else is to be done comes first.
+        // The producer is faster than any read; the caller has other work to do.
         Ok(Some(Read::Nothing))
     }
 
-    /// Numbers of the steps that the ring holds; the first may be overwritten at this moment.
-    pub(crate) fn there(&self) -> Result<std::ops::Range<u64>, WireError> {
+    /// Numbers of the steps in the ring; the first may be overwritten at this moment.
+    pub(crate) fn available(&self) -> Result<std::ops::Range<u64>, WireError> {
         let published = self.word(PUBLISHED)?;
         if published < self.next {
             return Err(self.ran_back(published, self.next));
@@ -209,68 +218,67 @@ impl<F: ReadAt> RingReader<F> {
         Ok(published.saturating_sub(u64::from(self.header.slots))..published)
     }
 
-    /// What stands where a step was published.
-    pub(crate) fn look_at(&self, number: u64) -> Result<Found, WireError> {
+    /// Reads the head of a published step's slot.
+    pub(crate) fn peek(&self, number: u64) -> Result<SlotContent, WireError> {
         let head = self.any_head(number)?;
         if head[0] == sequence(number) {
-            return Ok(Found::Step(head[1]));
+            return Ok(SlotContent::Step(head[1]));
         }
-        // The slot's next step has come, or is being written: either is seen, and what was there before the step is no sign of that.
+        // Without a newer head or a newer count, the slot's old content is merely visible for longer than the count.
         let slots = u64::from(self.header.slots);
         let is_over = head[0] > sequence(number) || self.word(PUBLISHED)? >= number.saturating_add(slots);
-        Ok(if is_over { Found::Overwritten } else { Found::Unseen })
+        Ok(if is_over { SlotContent::Overwritten } else { SlotContent::NotVisible })
     }
 
-    /// Reads this step and no other, as [`Self::read_beside`] does. What is before it counts as missed.
-    pub(crate) fn take(&mut self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Tried, WireError> {
-        let mut tried = self.try_slot(number, values, beside)?;
-        if let Tried::Step(info) = &mut tried {
-            self.pass(number);
-            info.missed = std::mem::take(&mut self.passed);
+    /// Reads this step and no other, as [`Self::read_while`] does. Earlier unread steps count as missed.
+    pub(crate) fn take(&mut self, number: u64, values: &mut Vec<f32>, go_on: &mut dyn FnMut(&Self) -> bool) -> Result<SlotRead, WireError> {
+        let mut read = self.try_slot(number, values, go_on)?;
+        if let SlotRead::Step(info) = &mut read {
+            self.skip_to(number);
+            info.missed = std::mem::take(&mut self.skipped);
             self.next = number + 1;
         }
-        Ok(tried)
+        Ok(read)
     }
 
-    /// Wants nothing before a step any more; whether that changes anything.
-    pub(crate) fn pass(&mut self, number: u64) -> bool {
-        let passed = number.saturating_sub(self.next);
-        (self.next, self.passed) = (self.next + passed, self.passed + passed);
-        passed > 0
+    /// Skips all steps before a number; returns true if there were any.
+    pub(crate) fn skip_to(&mut self, number: u64) -> bool {
+        let skipped = number.saturating_sub(self.next);
+        (self.next, self.skipped) = (self.next + skipped, self.skipped + skipped);
+        skipped > 0
     }
 
-    /// Tells the producer that this follower has taken all steps before the next, and lives. Which of the 64 marks is its own says
-    /// [`crate::Following::mark`].
+    /// Writes this follower's progress and heartbeat to its mark, whose number is [`crate::Following::mark`].
     ///
     /// # Errors
-    /// The file cannot be written, or was cut short.
+    /// The file cannot be written, or was truncated.
     pub fn acknowledge(&self, mark: u32) -> Result<(), WireError> {
         self.put_mark(mark, system::monotonic())
     }
 
-    /// Tells the producer that this follower goes: nobody waits for it any more.
+    /// Marks this follower as gone, so that the producer does not wait for it.
     ///
     /// # Errors
-    /// The file cannot be written, or was cut short.
+    /// The file cannot be written, or was truncated.
     pub fn leave(&self, mark: u32) -> Result<(), WireError> {
-        // Long ago.
+        // A heartbeat of long ago.
         self.put_mark(mark, 1)
     }
 
-    /// A ring that was given up is empty. Its length is looked at before anything is written, which would make it long again.
+    /// Checks the length before a write, which would extend a ring that was truncated for its memory.
     ///
     /// # Errors
-    /// It is shorter than its header says.
+    /// The file is shorter than its header says.
     fn check_whole(&self) -> Result<(), WireError> {
         let needed = self.first_slot + self.header.stride() * u64::from(self.header.slots);
-        let length = self.file.length().map_err(|e| WireError::io(&self.path, "cannot be looked at", e))?;
+        let length = self.file.length().map_err(|e| WireError::io(&self.path, "cannot be examined", e))?;
         if length < needed {
-            return Err(WireError::io(&self.path, CUT_SHORT, std::io::ErrorKind::UnexpectedEof.into()));
+            return Err(WireError::io(&self.path, TRUNCATED, std::io::ErrorKind::UnexpectedEof.into()));
         }
         Ok(())
     }
 
-    /// The error of a count below one that was seen; of a ring that was cut short, and made longer by a mark, that.
+    /// Error of a count below an earlier one, or of the truncation that caused it (a mark may have extended the file again).
     fn ran_back(&self, published: u64, seen: u64) -> WireError {
         let ran_back = || WireError::field("published", published, format!("at least {seen}, which was seen before"));
         self.check_whole().err().unwrap_or_else(ran_back)
@@ -285,7 +293,10 @@ impl<F: ReadAt> RingReader<F> {
         self.file.write_at(&words, place as u64).map_err(|e| WireError::io(&self.path, "cannot be written", e))
     }
 
-    /// Whether the producer has closed the ring: what is read of it afterwards is all that it will ever hold.
+    /// Returns true if the producer has closed the ring: no step is added after that.
+    ///
+    /// # Errors
+    /// The file cannot be read, or was truncated.
     pub fn is_closed(&self) -> Result<bool, WireError> {
         Ok(self.word(STATE)? == ENDED)
     }
@@ -294,44 +305,44 @@ impl<F: ReadAt> RingReader<F> {
         self.first_slot + number % u64::from(self.header.slots) * self.header.stride()
     }
 
-    /// The head of a step's slot in words, whatever step it holds.
+    /// The head of a step's slot in words, for whichever step it holds.
     fn any_head(&self, number: u64) -> Result<[u64; 4], WireError> {
         let mut head = [0; 32];
         self.read_bytes(&mut head, self.slot(number))?;
         Ok([0, 1, 2, 3].map(|k| u64::from_ne_bytes(head.as_chunks::<8>().0[k])))
     }
 
-    /// The head of a step's slot; none: it holds another step, or is being written.
+    /// The head of a step's slot; `None` if it holds another step or is being written.
     fn head(&self, number: u64) -> Result<Option<[u64; 4]>, WireError> {
         Ok(Some(self.any_head(number)?).filter(|words| words[0] == sequence(number)))
     }
 
-    fn try_slot(&self, number: u64, values: &mut Vec<f32>, beside: &mut dyn FnMut(&Self) -> bool) -> Result<Tried, WireError> {
+    fn try_slot(&self, number: u64, values: &mut Vec<f32>, go_on: &mut dyn FnMut(&Self) -> bool) -> Result<SlotRead, WireError> {
         let slot = self.slot(number);
-        // At most what the limits allow: the header was checked.
+        // Within the limits, since the header was checked.
         let count = (self.header.description.block_bytes() / 4) as usize;
-        let Some(head) = self.head(number)? else { return Ok(Tried::Overwritten) };
+        let Some(head) = self.head(number)? else { return Ok(SlotRead::Overwritten) };
         fence(Ordering::Acquire);
-        let (mut place, mut broken_off) = (slot + SLOT_HEADER as u64, false);
+        let (mut place, mut stopped) = (slot + SLOT_HEADER as u64, false);
         let is_whole = fill(values, count, |piece| {
             self.read_bytes(piece, place)?;
             place += piece.len() as u64;
-            broken_off = !beside(self);
-            // All values so far before another look at the number.
+            stopped = !go_on(self);
+            // All values so far are read before the number is read again.
             fence(Ordering::Acquire);
-            Ok(!broken_off && self.head(number)?.is_some())
+            Ok(!stopped && self.head(number)?.is_some())
         })?;
         if !is_whole {
-            return Ok(if broken_off { Tried::BrokenOff } else { Tried::Overwritten });
+            return Ok(if stopped { SlotRead::Stopped } else { SlotRead::Overwritten });
         }
         let time = f64::from_bits(head[2]);
         if !time.is_finite() {
             return Err(WireError::field("time", time, "a finite number"));
         }
-        Ok(Tried::Step(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
+        Ok(SlotRead::Step(StepInfo { number, step: head[1], time, published: head[3], missed: 0 }))
     }
 
-    /// A word of the producer's: what it wrote before that is seen by whatever is read after.
+    /// A word of the producer's. Later reads see everything that it wrote before this word.
     fn word(&self, offset: usize) -> Result<u64, WireError> {
         let mut bytes = [0; 8];
         self.read_bytes(&mut bytes, offset as u64)?;
@@ -340,11 +351,11 @@ impl<F: ReadAt> RingReader<F> {
     }
 
     fn read_bytes(&self, to: &mut [u8], offset: u64) -> Result<(), WireError> {
-        self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, CUT_SHORT, e))
+        self.file.read_at(to, offset).map_err(|e| WireError::io(&self.path, TRUNCATED, e))
     }
 }
 
-/// What stands at the head of a slot that holds this step, whole.
+/// Sequence number of a slot that holds this complete step.
 fn sequence(number: u64) -> u64 {
     number.wrapping_mul(2).wrapping_add(2)
 }

@@ -1,11 +1,10 @@
-//! From a node's rings to followers elsewhere.
+//! Relay: sends the steps of a node's rings to followers on other nodes.
 //!
-//! The relay gives each follower a thread and a view of the rings of its own, and sends the next step when the follower asks for it: one that is slow
-//! sees newer steps, or holds a producer that waits, and costs nothing but one step's memory. One that takes nothing and says nothing for
-//! [`PATIENCE`] is cut off.
+//! Each follower has a thread and its own [`RingFollower`], and gets the next step when it requests one. A slow follower sees newer steps or delays a producer
+//! that waits, and costs the memory of one step. A follower that neither reads nor sends anything for [`PEER_TIMEOUT`] is disconnected.
 
-use self::news::News;
-use self::pace::{Paced, greet};
+use self::notices::Notices;
+use self::paced::{IDLE, PULSE, Paced, greet};
 use crate::follow::{Event, RingFollower};
 use crate::message::{ASK_BYTES, Ask, Facts, Key, Kind, Session};
 use crate::{Limits, WireError, system};
@@ -20,31 +19,27 @@ use std::time::{Duration, Instant};
 
 mod follower;
 mod lookup;
-mod news;
-mod pace;
+mod notices;
+mod paced;
 
-pub use follower::{BUFFERS, RelayFollower, Whereabouts};
-pub use pace::PATIENCE;
+pub use follower::{BUFFERS, Locate, RelayFollower};
+pub use paced::PEER_TIMEOUT;
 
-/// How often either side that has nothing to say, or not yet, says that it lives.
-const PULSE: Duration = Duration::from_secs(1);
-/// How often an idle thread looks for new steps.
-const IDLE: Duration = Duration::from_millis(1);
-/// How often a relay whose follower holds tells the producers that somebody follows.
+/// Interval of heartbeats to the producers while a follower has no open request.
 const HOLD: Duration = Duration::from_millis(50);
-/// Followers at once.
-const FOLLOWERS: usize = 16;
-/// Connections at once that have not proved the key yet.
-const STRANGERS: usize = 16;
+/// Most followers.
+const MAX_FOLLOWERS: usize = 16;
+/// Most connections that have not proved the key yet.
+const MAX_UNPROVEN: usize = 16;
 
-/// What a relay has done.
+/// Counters of a relay.
 #[derive(Debug, Default)]
 pub struct RelayCounts {
-    /// Followers there now.
+    /// Current followers.
     pub followers: AtomicUsize,
     /// Connections that proved the key.
     pub accepted: AtomicU64,
-    /// Connections that did not.
+    /// Connections that were rejected.
     pub refused: AtomicU64,
     /// Steps sent.
     pub steps: AtomicU64,
@@ -52,7 +47,7 @@ pub struct RelayCounts {
     pub bytes: AtomicU64,
 }
 
-/// A stream between whose pieces producers are told that somebody follows, however long a step takes on its way.
+/// A stream that sends heartbeats to the producers between its pieces, however long a step takes.
 struct Beating<'a> {
     stream: Paced<'a>,
     rings: &'a mut RingFollower,
@@ -71,63 +66,63 @@ impl Write for Beating<'_> {
 
 /// Connections that have not proved the key yet.
 #[derive(Default)]
-struct Strangers(Mutex<VecDeque<(SocketAddr, TcpStream)>>);
+struct Unproven(Mutex<VecDeque<(SocketAddr, TcpStream)>>);
 
-impl Strangers {
-    /// One more; where there are too many, the oldest is cut off.
-    fn come(&self, peer: SocketAddr, stream: &TcpStream) -> std::io::Result<()> {
-        let mut there = self.0.lock().unwrap_or_else(|broken| broken.into_inner());
-        there.push_back((peer, stream.try_clone()?));
-        if there.len() > STRANGERS
-            && let Some((_, oldest)) = there.pop_front()
+impl Unproven {
+    /// Adds a connection, and closes the oldest if there are too many.
+    fn add(&self, peer: SocketAddr, stream: &TcpStream) -> std::io::Result<()> {
+        let mut open = self.0.lock().unwrap_or_else(|broken| broken.into_inner());
+        open.push_back((peer, stream.try_clone()?));
+        if open.len() > MAX_UNPROVEN
+            && let Some((_, oldest)) = open.pop_front()
         {
-            // It may have gone by itself.
+            // The peer may have closed it.
             let _ = oldest.shutdown(Shutdown::Both);
         }
         Ok(())
     }
 
-    fn go(&self, peer: SocketAddr) {
+    fn remove(&self, peer: SocketAddr) {
         self.0.lock().unwrap_or_else(|broken| broken.into_inner()).retain(|(one, _)| *one != peer);
     }
 }
 
-/// One of the [`FOLLOWERS`] places, which its follower leaves however its thread ends.
-struct Seat<'a> {
+/// One of the [`MAX_FOLLOWERS`] places, freed however the follower's thread ends.
+struct Place<'a> {
     followers: &'a AtomicUsize,
-    /// How many had one before.
+    /// Number of followers before this one.
     before: usize,
 }
 
-impl<'a> Seat<'a> {
+impl<'a> Place<'a> {
     fn take(followers: &'a AtomicUsize) -> Self {
         Self { followers, before: followers.fetch_add(1, Ordering::Relaxed) }
     }
 }
 
-impl Drop for Seat<'_> {
+impl Drop for Place<'_> {
     fn drop(&mut self) {
         self.followers.fetch_sub(1, Ordering::Relaxed);
     }
 }
 
-/// What the connections of a relay share.
+/// State that the connections of a relay share.
 struct Relay {
     ring: PathBuf,
     key: Key,
     counts: Arc<RelayCounts>,
-    strangers: Strangers,
+    unproven: Unproven,
     stop: Arc<AtomicBool>,
     tell: Arc<dyn Fn(String) + Send + Sync>,
-    /// How often it says that it lives, where there is nothing to send or what there is takes long to read.
+    /// Interval of pulses while there is nothing to send or a step is read.
     pulse: Duration,
-    sent_away: News,
-    lost: News,
-    left: News,
-    refused: News,
+    rejected: Notices,
+    lost: Notices,
+    left: Notices,
+    refused: Notices,
 }
 
-/// Serves the rings of a folder until `stop` is set. `tell` hears of followers that come and go, and why.
+/// Serves the rings of a folder until `stop` is set. `tell` gets notices of followers that are rejected or leave.
 ///
 /// # Errors
 /// The folder is not this user's alone, or the listener broke.
@@ -140,17 +135,17 @@ pub fn serve(
     tell: Arc<dyn Fn(String) + Send + Sync>,
 ) -> Result<(), WireError> {
     let broken = |e| WireError::io(Path::new("listener"), "broke", e);
-    // Steps are kept for followers that come later only as long as somebody follows: the relay itself does.
+    // Steps are kept for later followers only while the ring is followed: the relay itself follows it.
     let _following = crate::lock::Following::begin(ring)?;
     listener.set_nonblocking(true).map_err(broken)?;
     let relay = Arc::new(Relay::new(ring, key, counts, stop, tell));
     let mut threads: Vec<JoinHandle<()>> = Vec::new();
     while !stop.load(Ordering::Relaxed) {
         threads.retain(|thread| !thread.is_finished());
-        relay.say_rest();
+        relay.summarise();
         let (stream, peer) = match listener.accept() {
-            // Whoever was cut off is about to end its thread.
-            Ok((_, peer)) if threads.len() > FOLLOWERS + 2 * STRANGERS => {
+            // The threads of closed connections are about to end.
+            Ok((_, peer)) if threads.len() > MAX_FOLLOWERS + 2 * MAX_UNPROVEN => {
                 relay.refuse(peer, "too many come at once".to_owned());
                 continue;
             }
@@ -159,9 +154,9 @@ pub fn serve(
                 std::thread::sleep(Duration::from_millis(20));
                 continue;
             }
-            // A peer that went before it was taken, or no descriptor left: later ones may fare better.
+            // The peer has gone or no descriptor is left; later connections may succeed.
             Err(e) => {
-                relay.say(&relay.lost, || format!("a connection was lost: {e}"));
+                relay.report(&relay.lost, || format!("a connection was lost: {e}"));
                 std::thread::sleep(Duration::from_millis(100));
                 continue;
             }
@@ -180,51 +175,52 @@ impl Relay {
             ring: ring.to_owned(),
             key: key.clone(),
             counts: counts.clone(),
-            strangers: Strangers::default(),
+            unproven: Unproven::default(),
             stop: stop.clone(),
             tell,
             pulse: PULSE,
-            sent_away: News::new("were sent away"),
-            lost: News::new("connections were lost"),
-            left: News::new("follower connections ended"),
-            refused: News::new("rings were refused"),
+            rejected: Notices::new("were rejected"),
+            lost: Notices::new("connections were lost"),
+            left: Notices::new("follower connections ended"),
+            refused: Notices::new("rings were refused"),
         }
     }
 
     fn refuse(&self, peer: SocketAddr, why: String) {
         self.counts.refused.fetch_add(1, Ordering::Relaxed);
-        self.say(&self.sent_away, || format!("{peer} was sent away: {why}"));
+        self.report(&self.rejected, || format!("{peer} was rejected: {why}"));
     }
 
-    fn say(&self, news: &News, words: impl FnOnce() -> String) {
-        if let Some(words) = news.come(words) {
-            (self.tell)(words);
+    fn report(&self, notices: &Notices, text: impl FnOnce() -> String) {
+        if let Some(text) = notices.add(text) {
+            (self.tell)(text);
         }
     }
 
-    /// Says together what came too fast to be said one by one.
-    fn say_rest(&self) {
-        [&self.sent_away, &self.lost, &self.left, &self.refused].into_iter().filter_map(News::due).for_each(|words| (self.tell)(words));
+    /// Reports the summaries of notices that came too fast.
+    fn summarise(&self) {
+        [&self.rejected, &self.lost, &self.left, &self.refused].into_iter().filter_map(Notices::due).for_each(|text| (self.tell)(text));
     }
 
-    /// Gives one that came a thread. Where there is none for it, it is sent away: later ones may fare better.
+    /// Starts a thread for a connection, or rejects it if no thread can be started.
     fn attend(self: &Arc<Self>, stream: TcpStream, peer: SocketAddr, thread: std::thread::Builder) -> Option<JoinHandle<()>> {
         let relay = self.clone();
         let started = thread.name("ridgewatch-relay".into()).spawn(move || relay.connection(&stream, peer));
         started.map_err(|e| self.refuse(peer, format!("no thread could be started for it: {e}"))).ok()
     }
 
-    /// One that came, until it goes.
+    /// Serves one connection until it ends.
     fn connection(&self, stream: &TcpStream, peer: SocketAddr) {
-        let broken = |e| WireError::io(Path::new("connection"), "broke", e);
-        let mut seat = None;
-        let admit = || match seat.insert(Seat::take(&self.counts.followers)).before {
-            FOLLOWERS.. => Err(WireError::field("followers", format_args!("{FOLLOWERS} already"), format!("at most {FOLLOWERS}"))),
+        let mut place = None;
+        let admit = || match place.insert(Place::take(&self.counts.followers)).before {
+            MAX_FOLLOWERS.. => {
+                Err(WireError::field("followers", format_args!("{MAX_FOLLOWERS} already"), format!("at most {MAX_FOLLOWERS}")))
+            }
             _ => Ok(()),
         };
-        let greeted = self.strangers.come(peer, stream).map_err(broken);
+        let greeted = self.unproven.add(peer, stream).map_err(WireError::connection);
         let greeted = greeted.and_then(|()| greet(stream, &self.stop, |paced| Session::accept_if(paced, &self.key, admit)));
-        self.strangers.go(peer);
+        self.unproven.remove(peer);
         let session = match greeted {
             Ok(session) => session,
             Err(error) => return self.refuse(peer, error.to_string()),
@@ -233,11 +229,11 @@ impl Relay {
         if let Err(error) = self.send_steps(stream, session)
             && !self.stop.load(Ordering::Relaxed)
         {
-            self.say(&self.left, || format!("follower {peer}: {error}"));
+            self.report(&self.left, || format!("follower {peer}: {error}"));
         }
     }
 
-    /// Answers each time that the follower asks with the next thing that happens.
+    /// Answers each request of the follower with the next event.
     fn send_steps(&self, stream: &TcpStream, mut session: Session) -> Result<(), WireError> {
         let mut rings = RingFollower::begin(&self.ring, Limits::default())?;
         let (mut values, mut asked) = (Vec::new(), false);
@@ -253,20 +249,20 @@ impl Relay {
                 }
                 pulsed.is_ok() && !self.stop.load(Ordering::Relaxed)
             };
-            let event = if asked { rings.poll_beside(&mut values, &mut pulse) } else { None };
+            let event = if asked { rings.poll_while(&mut values, &mut pulse) } else { None };
             pulsed?;
-            // What the follower said while a step was read is not heard yet.
+            // Messages of the follower were not received while a step was read.
             heard += begin.elapsed();
             if event.is_none() {
                 if !asked {
                     rings.hold();
                 }
-                if let Some(ask) = hear(&mut Paced::new(stream, &self.stop), &mut session, if asked { IDLE } else { HOLD })? {
+                if let Some(ask) = receive_ask(&mut Paced::new(stream, &self.stop), &mut session, if asked { IDLE } else { HOLD })? {
                     asked |= ask == Ask::Next;
                     heard = Instant::now();
                 }
-                if heard.elapsed() > PATIENCE {
-                    return Err(WireError::io(Path::new("connection"), "nothing was heard of it", ErrorKind::TimedOut.into()));
+                if heard.elapsed() > PEER_TIMEOUT {
+                    return Err(WireError::io(Path::new("connection"), "the follower sent nothing", ErrorKind::TimedOut.into()));
                 }
                 if !asked {
                     continue;
@@ -287,7 +283,7 @@ impl Relay {
                     (Facts { kind, block, generation, ..quiet }, None)
                 }
                 Some(Event::Refused(error)) => {
-                    self.say(&self.refused, || format!("refused: {error}"));
+                    self.report(&self.refused, || format!("refused: {error}"));
                     continue;
                 }
                 None if sent.elapsed() > self.pulse => (quiet, None),
@@ -300,7 +296,7 @@ impl Relay {
                 description.as_deref(),
                 step,
             )?;
-            // A pulse is no answer. And what takes long to send is taken.
+            // A pulse is no answer. A completed send shows that the follower reads.
             asked = facts.kind == Kind::Pulse;
             (sent, heard) = (Instant::now(), if asked { heard } else { Instant::now() });
         }
@@ -308,14 +304,13 @@ impl Relay {
     }
 }
 
-/// What the follower asks, if it does so within the limit.
-fn hear(stream: &mut Paced, session: &mut Session, limit: Duration) -> Result<Option<Ask>, WireError> {
-    let broken = |e| WireError::io(Path::new("connection"), "broke", e);
-    if !system::readable(stream.stream, limit).map_err(broken)? {
+/// Receives a request of the follower; `None` if there is none within the limit.
+fn receive_ask(stream: &mut Paced, session: &mut Session, limit: Duration) -> Result<Option<Ask>, WireError> {
+    if !system::readable(stream.stream, limit).map_err(WireError::connection)? {
         return Ok(None);
     }
     let mut bytes = [0; ASK_BYTES];
-    stream.read_exact(&mut bytes).map_err(broken)?;
+    stream.read_exact(&mut bytes).map_err(WireError::connection)?;
     session.check_ask(&bytes).map(Some)
 }
 
@@ -325,7 +320,7 @@ mod tests {
     use crate::Description;
     use std::os::fd::AsRawFd;
 
-    /// Closes a connection by a reset.
+    /// Closes a connection by a TCP reset.
     fn reset(stream: TcpStream) {
         let at_once = libc::linger { l_onoff: 1, l_linger: 0 };
         // SAFETY: an option of a socket that lives, with its own type.
@@ -345,7 +340,7 @@ mod tests {
         let mut rings = RingFollower::begin(&ring, Limits::default()).unwrap();
         let begin = Instant::now();
         assert!(matches!(rings.poll(&mut Vec::new()), Some(Event::Opened { .. })));
-        // The first follower's mark.
+        // Heartbeat in the first follower's mark.
         let heartbeat = || {
             let (file, mut bytes) = (std::fs::File::open(crate::block_path(&ring, 0)).unwrap(), [0; 8]);
             std::os::unix::fs::FileExt::read_exact_at(&file, &mut bytes, crate::header::MARK as u64 + 8).unwrap();
@@ -378,7 +373,7 @@ mod tests {
         let (counts, stop) = (Arc::default(), Arc::new(AtomicBool::new(false)));
         let key = Key::random().unwrap();
         let mut relay = Relay::new(&ring, &key, &counts, &stop, Arc::new(|_| ()));
-        // So that each piece is longer.
+        // Every piece takes longer than this.
         relay.pulse = Duration::ZERO;
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let mut stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
@@ -407,7 +402,7 @@ mod tests {
             assert_eq!(next(&mut session, &mut values).0, Kind::Opened);
             let (kind, pulses) = next(&mut session, &mut values);
             stop.store(true, Ordering::Relaxed);
-            // 8 MiB; others may be said where the step was not looked for yet.
+            // 8 MiB; more pulses may come before the read begins.
             assert!(kind == Kind::Step && pulses >= 8, "{kind:?} after {pulses} pulses");
             assert!(values.len() == 1 << 21 && values.iter().all(|v| *v == 1.0));
         });
@@ -425,10 +420,10 @@ mod tests {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let mut client = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
         let (stream, peer) = listener.accept().unwrap();
-        // No address space has room for such a stack.
+        // No address space has room for this stack.
         assert!(relay.attend(stream, peer, std::thread::Builder::new().stack_size(1 << 60)).is_none());
         let words = hear.try_recv().unwrap();
-        assert!(words.starts_with(&format!("{peer} was sent away: no thread could be started for it: ")), "{words}");
+        assert!(words.starts_with(&format!("{peer} was rejected: no thread could be started for it: ")), "{words}");
         assert_eq!(counts.refused.load(Ordering::Relaxed), 1);
         assert_eq!(client.read(&mut [0]).unwrap(), 0, "hung up");
     }
@@ -437,8 +432,8 @@ mod tests {
     fn a_follower_whose_thread_panics_leaves_its_place() {
         let followers = AtomicUsize::new(3);
         let panicked = std::panic::catch_unwind(|| {
-            let seat = Seat::take(&followers);
-            assert_eq!((seat.before, followers.load(Ordering::Relaxed)), (3, 4));
+            let place = Place::take(&followers);
+            assert_eq!((place.before, followers.load(Ordering::Relaxed)), (3, 4));
             panic!("as a follower's thread may");
         });
         assert!(panicked.is_err());
@@ -449,21 +444,21 @@ mod tests {
     fn a_stranger_that_resets_its_connection_costs_nobody_else_a_place() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap();
-        let strangers = Strangers::default();
-        let mut there = Vec::new();
-        for n in 0..STRANGERS + 2 {
+        let unproven = Unproven::default();
+        let mut clients = Vec::new();
+        for n in 0..MAX_UNPROVEN + 2 {
             let client = TcpStream::connect(address).unwrap();
             let (stream, peer) = listener.accept().unwrap();
             if n == 0 {
                 reset(client);
-                // It has arrived, and nobody has taken the oldest from the list yet.
+                // The reset has arrived, and the connection is still in the list.
                 assert!((&stream).read(&mut [0]).is_err());
                 assert!(stream.shutdown(Shutdown::Both).is_err(), "a reset connection cannot be shut down");
             } else {
-                there.push(client);
+                clients.push(client);
             }
-            strangers.come(peer, &stream).unwrap();
+            unproven.add(peer, &stream).unwrap();
         }
-        assert_eq!(strangers.0.lock().unwrap().len(), STRANGERS);
+        assert_eq!(unproven.0.lock().unwrap().len(), MAX_UNPROVEN);
     }
 }

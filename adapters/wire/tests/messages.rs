@@ -1,9 +1,13 @@
-//! Messages over real sockets: keys, changes on the way, replays, lengths that lie.
+//! Messages over real sockets: keys, changes on the way, replays, wrong lengths.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
+#[path = "support/sessions.rs"]
+mod sessions;
+
 use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::{AxisDescription, Description, Geometry, Limits, WireError};
+use sessions::{session, sessions};
 use std::io::{Cursor, Read, Write};
 use std::net::{TcpListener, TcpStream};
 
@@ -16,17 +20,7 @@ fn facts(step: u64) -> Facts {
     Facts { kind: Kind::Step, block: 0, generation: 5, step, time: step as f64, published: 1, missed: 0 }
 }
 
-/// Sessions of both sides, over a real connection.
-fn pair(relay: &Key, follower: &Key) -> (Result<Session, WireError>, Result<Session, WireError>) {
-    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = listener.local_addr().unwrap();
-    let key = follower.clone();
-    let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &key));
-    let server = Session::accept(&mut listener.accept().unwrap().0, relay);
-    (server, client.join().unwrap())
-}
-
-/// Two whole messages of a session, as bytes.
+/// Two complete messages of a session, as bytes.
 fn two(session: &mut Session) -> (Vec<u8>, Vec<u8>) {
     let values: Vec<f32> = (0..32).map(|v| v as f32).collect();
     let (mut first, mut second) = (Vec::new(), Vec::new());
@@ -50,9 +44,7 @@ fn receive(session: &mut Session, bytes: &[u8], known: &mut Option<Description>)
 
 #[test]
 fn messages_arrive_once_and_in_order() {
-    let key = Key::random().unwrap();
-    let (server, client) = pair(&key, &key);
-    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let (mut server, mut client) = session();
     let (first, second) = two(&mut server);
     let mut known = None;
     let (facts_1, values) = receive(&mut client, &first, &mut known).unwrap();
@@ -61,17 +53,16 @@ fn messages_arrive_once_and_in_order() {
     for replay in [&first, &second] {
         assert!(matches!(receive(&mut client, replay, &mut known), Err(WireError::Replayed { newest: 2, .. })));
     }
-    // In another session of the same key.
-    let (_, other) = pair(&key, &key);
-    assert!(matches!(receive(&mut other.unwrap(), &first, &mut None), Err(WireError::Signature)));
+    // In another session.
+    assert!(matches!(receive(&mut session().1, &first, &mut None), Err(WireError::Signature)));
 }
 
 #[test]
 fn wrong_keys_are_refused_by_either_side() {
-    let (server, client) = pair(&Key::random().unwrap(), &Key::random().unwrap());
+    let (server, client) = sessions(&Key::random().unwrap(), &Key::random().unwrap());
     assert!(matches!(server, Err(WireError::Signature)));
-    assert!(matches!(client, Err(WireError::SentAway)));
-    // A relay that does not know the key cannot prove it, whatever it answers.
+    assert!(matches!(client, Err(WireError::Rejected)));
+    // A relay without the key cannot prove it, whatever it answers.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = listener.local_addr().unwrap();
     let client = std::thread::spawn(move || Session::connect(&mut TcpStream::connect(address).unwrap(), &Key::random().unwrap()));
@@ -86,9 +77,7 @@ fn wrong_keys_are_refused_by_either_side() {
 
 #[test]
 fn every_changed_byte_is_noticed() {
-    let key = Key::random().unwrap();
-    let (server, client) = pair(&key, &key);
-    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let (mut server, mut client) = session();
     let (first, _) = two(&mut server);
     for place in 0..first.len() {
         let mut changed = first.clone();
@@ -96,16 +85,14 @@ fn every_changed_byte_is_noticed() {
         let error = receive(&mut client, &changed, &mut None).map(|_| ()).unwrap_err();
         match place {
             0..108 => assert!(matches!(error, WireError::Signature), "{place}: {error}"),
-            // A message whose head was good has used up its number.
+            // A message with a valid head uses up its number.
             _ => {
-                let (mut fresh_server, mut fresh_client) = (pair(&key, &key), None::<Session>);
-                let session = fresh_server.0.as_mut().unwrap();
-                let (mut message, _) = two(session);
+                let (mut server, mut client) = session();
+                let (mut message, _) = two(&mut server);
                 message[place] ^= 1 << (place % 8);
-                let client = fresh_client.insert(fresh_server.1.unwrap());
-                let error = receive(client, &message, &mut None).map(|_| ()).unwrap_err();
+                let error = receive(&mut client, &message, &mut None).map(|_| ()).unwrap_err();
                 assert!(!matches!(error, WireError::Signature | WireError::Replayed { .. }), "{place}: {error}");
-                // Values and the last signature. What comes before them is looked at first.
+                // Values and the last signature; the description is checked before them.
                 assert!(place < first.len() - 160 || matches!(error, WireError::Payload), "{place}: {error}");
             }
         }
@@ -118,19 +105,16 @@ fn every_changed_byte_is_noticed() {
 
 #[test]
 fn a_head_vouches_for_no_other_payload() {
-    let key = Key::random().unwrap();
-    let (server, client) = pair(&key, &key);
-    let (first, second) = two(&mut server.unwrap());
+    let (mut server, mut client) = session();
+    let (first, second) = two(&mut server);
     assert_eq!(first.len(), second.len());
     let spliced = [&first[..108], &second[108..]].concat();
-    assert!(matches!(receive(&mut client.unwrap(), &spliced, &mut None), Err(WireError::Payload)));
+    assert!(matches!(receive(&mut client, &spliced, &mut None), Err(WireError::Payload)));
 }
 
 #[test]
 fn what_a_follower_asks_is_believed_once_and_unchanged() {
-    let key = Key::random().unwrap();
-    let (server, client) = pair(&key, &key);
-    let (mut server, mut client) = (server.unwrap(), client.unwrap());
+    let (mut server, mut client) = session();
     let mut ask = |ask| -> [u8; ASK_BYTES] {
         let mut bytes = Vec::new();
         client.ask(&mut bytes, ask).unwrap();
@@ -146,9 +130,8 @@ fn what_a_follower_asks_is_believed_once_and_unchanged() {
     for replay in [&first, &second] {
         assert!(matches!(server.check_ask(replay), Err(WireError::Replayed { newest: 2, .. })));
     }
-    // In another session of the same key.
-    let (other, _) = pair(&key, &key);
-    assert!(matches!(other.unwrap().check_ask(&first), Err(WireError::Signature)));
+    // In another session.
+    assert!(matches!(session().0.check_ask(&first), Err(WireError::Signature)));
 }
 
 #[test]
@@ -161,7 +144,7 @@ fn connection_files_are_private_and_checked() {
     file.write(&path).unwrap();
     assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
     assert_eq!(ConnectionFile::read(&path).unwrap(), file);
-    // Another relay's is left where it is.
+    // Another relay's file is not removed.
     ConnectionFile { key: Key::random().unwrap(), ..file.clone() }.remove(&path);
     assert_eq!(ConnectionFile::read(&path).unwrap(), file);
     file.remove(&path);
@@ -169,7 +152,7 @@ fn connection_files_are_private_and_checked() {
     file.write(&path).unwrap();
     let text = std::fs::read_to_string(&path).unwrap();
     for (changed, expected) in [
-        (text.replace("connection = 1", "connection = 2"), "the connection file has version 2; this is version 1"),
+        (text.replace("connection = 1", "connection = 2"), "the connection file has version 2; only version 1 is supported"),
         (text.replace("key = ", "key = zz"), "66 characters"),
         (text.replace("address", "adress"), "`address` is missing"),
         (String::new(), "`ridgewatch-connection` is missing"),

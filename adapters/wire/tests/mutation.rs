@@ -1,43 +1,38 @@
-//! Mutated rings and messages against the parsers: no panic, and no memory beyond the stated limit. A short run by default; the number of cases
-//! is set by `RIDGEWATCH_MUTATIONS` (one million was run for the figures in docs/live.md).
+//! Mutated rings and messages: the parsers do not panic, and their memory stays below the stated limits. `RIDGEWATCH_MUTATIONS` sets the number of cases
+//! (one million for the figures in docs/live.md).
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 #[path = "support/counting.rs"]
 mod counting;
+#[path = "support/random.rs"]
+mod random;
+#[path = "support/sessions.rs"]
+mod sessions;
 
 use counting::{HELD, PEAK};
+use random::{Random, cases};
 use ridgewatch_wire::message::{ASK_BYTES, Ask, ConnectionFile, Facts, Key, Kind, Session};
 use ridgewatch_wire::{
     AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, Read, ReadAt, RingReader, block_path,
 };
+use sessions::session;
 use std::io::Cursor;
 
-/// Most memory of one case: the step, the description and its parts, the words of an error.
+/// Most memory of one case: the step, the description and its parts, the text of an error.
 const STEP_BYTES: u64 = 1 << 16;
 const MEMORY: isize = STEP_BYTES as isize + (1 << 15);
 
-fn cases() -> u64 {
-    std::env::var("RIDGEWATCH_MUTATIONS").ok().and_then(|n| n.parse().ok()).unwrap_or(20_000)
+/// Runs a case, and checks that it takes at most so many bytes.
+fn within<T>(limit: isize, case: u64, run: impl FnOnce() -> T) -> T {
+    let held = HELD.get();
+    PEAK.set(held);
+    let result = run();
+    assert!(PEAK.get() - held <= limit, "case {case} took {} bytes", PEAK.get() - held);
+    result
 }
 
-/// SplitMix64.
-struct Random(u64);
-
-impl Random {
-    fn next(&mut self) -> u64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
-        let z = (self.0 ^ (self.0 >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        let z = (z ^ (z >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        z ^ (z >> 31)
-    }
-
-    fn below(&mut self, n: usize) -> usize {
-        (self.next() % n.max(1) as u64) as usize
-    }
-}
-
-/// Changes bytes as damage and intent do: bits, numbers at the edges, pieces copied about, a cut, a tail.
+/// Changes bytes as damage and intent do: bits, extreme numbers, moved pieces, truncation.
 fn mutate(bytes: &mut Vec<u8>, places: &[std::ops::Range<usize>], random: &mut Random) {
     const EDGES: [u64; 10] = [0, 1, 2, 0x7f, 0xff, 0xffff, 0x7fff_ffff, 0xffff_ffff, 1 << 40, u64::MAX];
     for _ in 0..1 + random.below(4) {
@@ -48,10 +43,10 @@ fn mutate(bytes: &mut Vec<u8>, places: &[std::ops::Range<usize>], random: &mut R
         }
         match random.below(8) {
             0 | 1 => bytes[place] ^= 1 << random.below(8),
-            2 => bytes[place] = random.next() as u8,
+            2 => bytes[place] = random.number() as u8,
             3 => bytes[place..place + 4].copy_from_slice(&(EDGES[random.below(10)] as u32).to_le_bytes()),
             4 => bytes[place..place + 8].copy_from_slice(&EDGES[random.below(10)].to_le_bytes()),
-            5 => bytes[place..place + 8].copy_from_slice(&f64::from_bits(random.next()).to_le_bytes()),
+            5 => bytes[place..place + 8].copy_from_slice(&f64::from_bits(random.number()).to_le_bytes()),
             6 => {
                 let from = (range.start + random.below(range.len().saturating_sub(8))).min(bytes.len());
                 let length = 8.min(range.end.min(bytes.len()).saturating_sub(from));
@@ -64,7 +59,7 @@ fn mutate(bytes: &mut Vec<u8>, places: &[std::ops::Range<usize>], random: &mut R
     }
 }
 
-/// What was done to a ring's checksum: mutations behind it are of no use to anybody if it always catches them.
+/// Corrects a ring's checksum, so that mutations reach the checks behind it.
 fn repair(bytes: &mut [u8]) {
     if bytes.len() < 8192 {
         return;
@@ -118,7 +113,7 @@ fn mutated_rings() {
     let whole = ring();
     let length = u32::from_le_bytes(whole[12..16].try_into().unwrap()) as usize;
     let first = (8192 + length).div_ceil(4096) * 4096;
-    // Where it matters: the header, the counts, the description, the slots' heads.
+    // The header, the counts, the description and the heads of the slots.
     let places = [0..80, 8192..8192 + length, 8192..8192 + length, 1024..1048, first..first + 32, first + 4096..first + 4128];
     let limits = Limits { step_bytes: STEP_BYTES };
     let mut random = Random(1);
@@ -131,9 +126,7 @@ fn mutated_rings() {
         if case % 4 != 0 {
             repair(&mut bytes);
         }
-        let held = HELD.get();
-        PEAK.set(held);
-        match RingReader::over("mutated".into(), Bytes(&bytes), &limits) {
+        within(MEMORY, case, || match RingReader::over("mutated".into(), Bytes(&bytes), &limits) {
             Err(error) => {
                 assert!(!error.to_string().is_empty());
                 refused += 1;
@@ -141,7 +134,7 @@ fn mutated_rings() {
             Ok(mut reader) => {
                 opened += 1;
                 let mut values = Vec::new();
-                // As often as there are slots, and once more.
+                // One read more than there are slots.
                 for _ in 0..4 {
                     match reader.read(&mut values) {
                         Ok(Read::Step(info)) => {
@@ -153,14 +146,13 @@ fn mutated_rings() {
                     }
                 }
             }
-        }
-        assert!(PEAK.get() - held <= MEMORY, "case {case} took {} bytes", PEAK.get() - held);
+        });
     }
     println!("{} mutated rings: {refused} refused, {opened} opened, {read} steps read", cases());
     assert!(refused > cases() / 4 && opened > cases() / 20 && read > opened, "{refused} {opened} {read}: the corpus is lopsided");
 }
 
-/// Ends of one session without a socket.
+/// One end of a session without a socket.
 struct Loop {
     incoming: Cursor<Vec<u8>>,
     outgoing: Vec<u8>,
@@ -185,9 +177,8 @@ impl std::io::Write for Loop {
 
 #[test]
 fn mutated_messages() {
-    // Changed on the way, by somebody without the key: no signature is made anew. Those who have the key and lie are in src/message.rs.
-    let key = Key::random().unwrap();
-    let (mut server, mut client) = sessions(&key);
+    // Changed on the way, without the key. Malicious peers with the key are tested in src/message.rs.
+    let (mut server, mut client) = session();
     let mut known: Option<Description> = None;
     let mut random = Random(2);
     let limits = Limits { step_bytes: STEP_BYTES };
@@ -202,37 +193,25 @@ fn mutated_messages() {
             let length = bytes.len();
             mutate(&mut bytes, &[0..108, 108..length - 700, length - 700..length], &mut random);
         }
-        let held = HELD.get();
-        PEAK.set(held);
         let mut to = Vec::new();
         let mut note = |_, announced: Option<Description>| {
             known = announced.or(known.take());
             known.as_ref().map(Description::block_bytes)
         };
-        match client.receive(&mut Cursor::new(&bytes), &limits, &mut note, &mut to) {
+        match within(MEMORY, case, || client.receive(&mut Cursor::new(&bytes), &limits, &mut note, &mut to)) {
             Ok(_) => taken += 1,
             Err(_) => refused += 1,
         }
-        drop(to);
-        assert!(PEAK.get() - held <= MEMORY, "case {case} took {} bytes", PEAK.get() - held);
     }
     println!("{} mutated messages: {refused} refused, {taken} taken", cases());
-    // A mutation may put back what was there.
+    // A mutation may leave a message as it was.
     assert!(taken >= cases() / 8 && refused > cases() * 3 / 4, "{refused} {taken}");
 }
 
-fn sessions(key: &Key) -> (Session, Session) {
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = listener.local_addr().unwrap();
-    let other = key.clone();
-    let client = std::thread::spawn(move || Session::connect(&mut std::net::TcpStream::connect(address).unwrap(), &other).unwrap());
-    (Session::accept(&mut listener.accept().unwrap().0, key).unwrap(), client.join().unwrap())
-}
-
-/// What a follower asks, changed on the way: only what is as it was sent is taken, and it only once.
+/// Requests that were changed on the way: only unchanged ones are accepted, and only once.
 #[test]
 fn mutated_asks() {
-    let (mut relay, mut follower) = sessions(&Key::random().unwrap());
+    let (mut relay, mut follower) = session();
     let mut random = Random(4);
     let (mut refused, mut taken) = (0u64, 0u64);
     for case in 0..cases() {
@@ -244,10 +223,7 @@ fn mutated_asks() {
             bytes.resize(ASK_BYTES, 0);
         }
         let bytes: [u8; ASK_BYTES] = bytes.try_into().unwrap();
-        let held = HELD.get();
-        PEAK.set(held);
-        let found = relay.check_ask(&bytes);
-        assert!(PEAK.get() - held <= 1 << 12, "case {case} took {} bytes", PEAK.get() - held);
+        let found = within(1 << 12, case, || relay.check_ask(&bytes));
         assert_eq!(found.is_ok(), bytes == *sent, "case {case}: {found:?}");
         if found.is_ok() {
             assert!(relay.check_ask(&bytes).is_err(), "case {case} was taken twice");
@@ -270,11 +246,9 @@ fn mutated_connection_files() {
         let mut bytes = good.clone().into_bytes();
         let length = bytes.len();
         mutate(&mut bytes, &[0..length, 24..length], &mut random);
-        // What is no UTF-8 is refused by the reading of the file.
+        // Reading the file refuses text that is not UTF-8.
         let text = String::from_utf8_lossy(&bytes).into_owned();
-        let held = HELD.get();
-        PEAK.set(held);
-        match text.parse::<ConnectionFile>() {
+        within(1 << 12, case, || match text.parse::<ConnectionFile>() {
             Ok(file) => {
                 taken += 1;
                 assert!(file.address.len() < length);
@@ -283,8 +257,7 @@ fn mutated_connection_files() {
                 refused += 1;
                 assert!(!error.to_string().is_empty());
             }
-        }
-        assert!(PEAK.get() - held <= 1 << 12, "case {case} took {} bytes", PEAK.get() - held);
+        });
     }
     println!("{} mutated connection files: {refused} refused, {taken} taken", cases());
     assert!(refused > cases() / 2 && taken > cases() / 100, "{refused} {taken}");
@@ -293,24 +266,21 @@ fn mutated_connection_files() {
 #[test]
 fn mutated_greetings() {
     let key = Key::random().unwrap();
-    // What a follower would send; it cannot fit the relay's fresh numbers, so nothing of it is ever accepted.
+    // A follower's greeting; it cannot fit the relay's new random numbers, so it is never accepted.
     let mut asked = Loop { incoming: Cursor::new(Vec::new()), outgoing: Vec::new() };
-    assert!(Session::accept(&mut asked, &key).is_err(), "nobody is there");
-    // The first bytes are those of the relay's own.
+    assert!(Session::accept(&mut asked, &key).is_err(), "there is no peer");
+    // The first bytes equal those of the relay's greeting.
     let mut good = asked.outgoing[..16].to_vec();
     good.extend([9; 64]);
     let (mut random, mut unsigned) = (Random(3), 0);
-    for _ in 0..cases().min(100_000) {
+    for case in 0..cases().min(100_000) {
         let mut bytes = good.clone();
         mutate(&mut bytes, &[0..16, 16..80], &mut random);
         let mut stream = Loop { incoming: Cursor::new(bytes), outgoing: Vec::with_capacity(256) };
-        let held = HELD.get();
-        PEAK.set(held);
-        let refused = Session::accept(&mut stream, &key).err().unwrap();
-        assert!(PEAK.get() - held <= 8192);
+        let refused = within(8192, case, || Session::accept(&mut stream, &key)).err().unwrap();
         unsigned += u64::from(matches!(refused, ridgewatch_wire::WireError::Signature));
     }
     println!("{} mutated greetings: all refused, {unsigned} of them for their signature", cases().min(100_000));
-    // The others before that: by what they say they are.
+    // The others are refused earlier, for their first bytes.
     assert!(unsigned > cases().min(100_000) / 10, "{unsigned}");
 }

@@ -1,45 +1,34 @@
-//! What holds for any grid and any decomposition: descriptions arrive as they were given, over a ring and over a session; blocks of any shapes, in
-//! any order, meet in the field exactly, and steps of which some were lost are given up by name. `RIDGEWATCH_PROPERTIES` sets the number of cases.
+//! Properties of any grid and any decomposition: descriptions arrive unchanged over a ring and over a session; blocks of any shapes, in any order, join exactly
+//! to the field; steps with lost blocks are abandoned by number. `RIDGEWATCH_PROPERTIES` sets the number of cases.
 
 #![allow(clippy::unwrap_used)]
 
+#[path = "support/folder.rs"]
+mod folder;
+#[path = "support/sessions.rs"]
+mod sessions;
+
+use folder::Folder;
 use proptest::collection::vec;
 use proptest::prelude::*;
-use ridgewatch_wire::message::{Facts, Key, Kind, Session};
+use ridgewatch_wire::message::{Facts, Kind};
 use ridgewatch_wire::{
     Assembler, AxisDescription, BlockExtent, Description, Element, Event, Field, Geometry, Incomplete, Limits, Policy, Producer,
     RingFollower, RingReader, Step,
 };
+use sessions::session;
 use std::collections::BTreeSet;
 use std::io::Cursor;
-use std::path::PathBuf;
 use std::time::Duration;
 
-/// `usual` cases, or as many for each of them as the environment says.
+/// `usual` cases, times the number in the environment.
 fn config(usual: u32) -> ProptestConfig {
     let times = std::env::var("RIDGEWATCH_PROPERTIES").ok().and_then(|n| n.parse().ok()).unwrap_or(1);
-    // The same cases each time, and no file of those that failed.
+    // The same cases each time, and no file of failures.
     ProptestConfig {
         failure_persistence: None,
         rng_seed: prop::test_runner::RngSeed::Fixed(6),
         ..ProptestConfig::with_cases(usual * times)
-    }
-}
-
-/// A folder in shared memory that goes with its test.
-struct Folder(PathBuf);
-
-impl Folder {
-    fn new(name: &str) -> Self {
-        let folder = Self(PathBuf::from("/dev/shm").join(format!("rw-properties-{name}-{}", std::process::id())));
-        let _ = std::fs::remove_dir_all(&folder.0);
-        folder
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        let _ = std::fs::remove_dir_all(&self.0);
     }
 }
 
@@ -48,7 +37,7 @@ fn text() -> impl Strategy<Value = String> {
     vec(prop_oneof![Just('m'), Just('/'), Just(' '), Just('°'), Just('µ'), prop::char::range('!', '~')], 0..21).prop_map(String::from_iter)
 }
 
-/// From `first`, over at most `reach` where that is given.
+/// Ascending coordinates from `first`, over at most `reach`.
 fn axis(first: impl Strategy<Value = f64>, reach: Option<f64>) -> impl Strategy<Value = AxisDescription> {
     let period = prop::option::of(1e-6..10.0f64);
     (text(), text(), first, vec(1e-3..1e3f64, 1..40), period).prop_map(move |(name, unit, first, gaps, beyond)| {
@@ -65,7 +54,7 @@ fn axis(first: impl Strategy<Value = f64>, reach: Option<f64>) -> impl Strategy<
     })
 }
 
-/// Any description that is accepted: the whole grid, or a part of it.
+/// Any valid description, of the whole grid or a part of it.
 fn description() -> impl Strategy<Value = Description> {
     let wide = || axis(-1e6..1e6f64, None).boxed();
     let cartesian = (Just(Geometry::Cartesian), vec(wide(), 2..=3));
@@ -87,20 +76,9 @@ fn description() -> impl Strategy<Value = Description> {
     )
 }
 
-/// Both ends of a session.
-fn session() -> (Session, Session) {
-    let key = Key::random().unwrap();
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
-    let address = listener.local_addr().unwrap();
-    let other = key.clone();
-    let follower = std::thread::spawn(move || Session::connect(&mut std::net::TcpStream::connect(address).unwrap(), &other).unwrap());
-    (Session::accept(&mut listener.accept().unwrap().0, &key).unwrap(), follower.join().unwrap())
-}
-
 #[test]
 fn a_description_arrives_over_a_session_as_it_was_given() {
-    let (relay, follower) = session();
-    let ends = std::cell::RefCell::new((relay, follower));
+    let ends = std::cell::RefCell::new(session());
     proptest!(config(1000), |(given in description())| {
         prop_assert!(given.check(&Limits::default()).is_ok(), "{:?}", given.check(&Limits::default()));
         let (relay, follower) = &mut *ends.borrow_mut();
@@ -129,20 +107,20 @@ fn a_description_arrives_over_a_ring_as_it_was_given() {
     });
 }
 
-/// Steps of a field in blocks, and how their blocks come.
+/// Steps of a field in blocks, and the order of their blocks.
 #[derive(Debug, Clone)]
 struct Run {
     shape: Vec<u64>,
-    /// Offset and extent of each.
+    /// Offset and extent of each block.
     blocks: Vec<([u64; 3], [u64; 3])>,
     steps: u64,
-    /// Which block comes next, as often as there are steps for each: a rank publishes its steps in order.
+    /// The next block, once for each step of it: a rank publishes its steps in order.
     order: Vec<usize>,
-    /// Blocks of steps that never come.
+    /// Steps and blocks that never arrive.
     lost: BTreeSet<(u64, usize)>,
 }
 
-/// A box cut in two at random, again and again; indices in random order.
+/// A box that is repeatedly cut in two at random, with indices in random order.
 fn run() -> impl Strategy<Value = Run> {
     let cuts = vec((any::<prop::sample::Index>(), 0..3usize, any::<prop::sample::Index>()), 1..12);
     (vec(2..10u64, 2..=3), cuts, 1..5u64)
@@ -180,7 +158,7 @@ impl Run {
         description
     }
 
-    /// The values of a part of the field, each of which stands for its place, component and step.
+    /// Values of a part of the field; each value encodes its place, component and step.
     fn values(&self, step: u64, offset: [u64; 3], extent: [u64; 3]) -> Vec<f32> {
         let mut values = Vec::new();
         for c in 0..self.shape.len() as u64 {
@@ -193,7 +171,7 @@ impl Run {
         values
     }
 
-    /// What must come of it: whole steps, and those given up with how many blocks they had.
+    /// Expected complete steps, and expected abandoned steps with their number of blocks.
     fn expected(&self) -> (Vec<u64>, Vec<(u64, u32)>) {
         let missing = |step: u64| self.lost.iter().filter(|(s, _)| *s == step).count();
         let whole = (0..self.steps).filter(|step| missing(*step) == 0).collect();
@@ -202,7 +180,7 @@ impl Run {
         (whole, given_up)
     }
 
-    /// Holds what came against what must.
+    /// Compares the result with the expected one.
     fn judge(&self, whole: &[Step], mut given_up: Vec<Incomplete>) -> Result<(), TestCaseError> {
         let (steps, incomplete) = self.expected();
         prop_assert_eq!(whole.iter().map(|step| step.step).collect::<Vec<_>>(), steps);
@@ -221,7 +199,7 @@ impl Run {
 #[test]
 fn blocks_of_any_decomposition_meet_exactly() {
     proptest!(config(1000), |(run in run())| {
-        // Nothing waits for long: what is asked for last has waited too long.
+        // The limit is zero: at the end every incomplete step has waited too long.
         let mut assembler = Assembler::new(&run.description(0), Duration::ZERO, 4);
         for block in 0..run.blocks.len() {
             assembler.introduce(&run.description(block), 1 + block as u64).unwrap();
@@ -249,7 +227,7 @@ fn blocks_of_any_decomposition_meet_through_rings() {
     let folder = Folder::new("blocks");
     proptest!(config(50), |(run in run())| {
         let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
-        // No more steps than a ring holds.
+        // At most as many steps as a ring holds.
         let open = |block| Producer::open(&folder.0, run.description(block), 4, Policy::NewestWins).unwrap();
         let producers: Vec<Producer> = (0..run.blocks.len()).map(open).collect();
         let mut next = vec![0; run.blocks.len()];
@@ -286,12 +264,12 @@ fn blocks_of_any_decomposition_meet_through_rings() {
             }
         }
         prop_assert_eq!(open, run.blocks.len());
-        // Those that still wait would have waited too long in a minute; the others are what they must be.
+        // Steps that still wait would be abandoned after a minute; the others are as expected.
         let waiting: BTreeSet<u64> = given_up.iter().map(|one: &Incomplete| one.step).collect();
         let (_, incomplete) = run.expected();
         prop_assert!(incomplete.iter().filter(|(step, _)| !waiting.contains(step)).all(|(step, _)| whole.iter().all(|w| w.step < *step)));
         for (step, blocks) in incomplete.into_iter().filter(|(step, _)| !waiting.contains(step)) {
-            given_up.push(Incomplete { step, time: step as f64, blocks, wanted: run.blocks.len() as u32, why: "not told yet" });
+            given_up.push(Incomplete { step, time: step as f64, blocks, wanted: run.blocks.len() as u32, why: "not reported yet" });
         }
         run.judge(&whole, given_up)?;
     });

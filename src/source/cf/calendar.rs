@@ -1,9 +1,9 @@
-//! Calendars: days since 1970-01-01, each counted in its own calendar.
+//! Calendars of the CF conventions (section 4.4.1): days since 1970-01-01, counted in each calendar.
 
 /// The calendars of the CF conventions.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::source) enum Calendar {
-    /// Julian until 1582-10-04, Gregorian from the next day, 1582-10-15, on.
+pub enum Calendar {
+    /// Julian until 1582-10-04, Gregorian from the next day, 1582-10-15.
     Standard,
     /// Gregorian at all times.
     Proleptic,
@@ -18,8 +18,7 @@ pub(in crate::source) enum Calendar {
 }
 
 /// Names of the calendars, for messages.
-pub(in crate::source) const CALENDARS: &str =
-    "standard (gregorian), proleptic_gregorian, julian, noleap (365_day), all_leap (366_day), 360_day";
+pub const CALENDARS: &str = "standard (gregorian), proleptic_gregorian, julian, noleap (365_day), all_leap (366_day), 360_day";
 
 /// Days between 1970-01-01 of the Gregorian and of the Julian calendar.
 const JULIAN_LAG: i64 = 13;
@@ -27,7 +26,7 @@ const JULIAN_LAG: i64 = 13;
 const REFORM: i64 = -141_427;
 
 impl Calendar {
-    pub(in crate::source) fn parse(name: &str) -> Option<Self> {
+    pub fn parse(name: &str) -> Option<Self> {
         Some(match name.trim().to_ascii_lowercase().as_str() {
             "" | "standard" | "gregorian" => Self::Standard,
             "proleptic_gregorian" => Self::Proleptic,
@@ -39,7 +38,7 @@ impl Calendar {
         })
     }
 
-    pub(in crate::source) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         match self {
             Self::Standard => "standard",
             Self::Proleptic => "proleptic_gregorian",
@@ -50,8 +49,8 @@ impl Calendar {
         }
     }
 
-    /// Days from 1970-01-01 to this date; none where the calendar lacks it. Years are limited to six digits.
-    pub(in crate::source) fn days(self, year: i64, month: i64, day: i64) -> Option<i64> {
+    /// Days from 1970-01-01 to this date; `None` if the calendar lacks it. Years have at most six digits.
+    pub fn days(self, year: i64, month: i64, day: i64) -> Option<i64> {
         if year.abs() > 999_999 || !(1..=12).contains(&month) || !(1..=31).contains(&day) {
             return None;
         }
@@ -69,8 +68,8 @@ impl Calendar {
         (self.date(days) == (year, month, day)).then_some(days)
     }
 
-    /// Year, month and day that lie `days` after 1970-01-01.
-    pub(in crate::source) fn date(self, days: i64) -> (i64, i64, i64) {
+    /// Year, month and day at `days` after 1970-01-01.
+    pub fn date(self, days: i64) -> (i64, i64, i64) {
         match self {
             Self::Standard if days >= REFORM => gregorian_date(days),
             Self::Standard => julian_date(days - JULIAN_LAG),
@@ -82,8 +81,8 @@ impl Calendar {
         }
     }
 
-    /// `2002-01-01T00:00:00Z` for seconds since 1970-01-01, to the nearest second; none beyond six-digit years.
-    pub(in crate::source) fn iso(self, seconds: f64) -> Option<String> {
+    /// `2002-01-01T00:00:00Z` for seconds since 1970-01-01, to the nearest second; `None` beyond six-digit years.
+    pub fn iso(self, seconds: f64) -> Option<String> {
         if seconds.is_nan() || seconds.abs() > 3e13 {
             return None;
         }
@@ -140,7 +139,7 @@ fn month_lengths(february: i64) -> [i64; 12] {
     [31, february, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31]
 }
 
-/// Every year has the same months.
+/// Days of a calendar whose years all have the same months.
 fn fixed_days(year: i64, month: i64, day: i64, february: i64) -> i64 {
     let lengths = month_lengths(february);
     (year - 1970) * (337 + february) + lengths[..(month - 1) as usize].iter().sum::<i64>() + day - 1

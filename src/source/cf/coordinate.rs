@@ -1,12 +1,12 @@
-//! What a coordinate variable measures.
+//! Kind of a coordinate variable.
 
 use super::time::TimeUnit;
 use super::units::Unit;
-use crate::source::container::Variable;
+use crate::source::formats::Variable;
 
-/// What an axis runs along.
+/// Quantity along an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::source) enum Kind {
+pub enum Kind {
     Longitude,
     Latitude,
     X,
@@ -17,16 +17,16 @@ pub(in crate::source) enum Kind {
 }
 
 impl Kind {
-    pub(in crate::source) fn is_horizontal(self) -> bool {
+    pub fn is_horizontal(self) -> bool {
         matches!(self, Self::Longitude | Self::Latitude | Self::X | Self::Y)
     }
 }
 
-/// By `standard_name`, then `units`, then `axis` and `positive`, then the name.
-pub(in crate::source) fn classify(variable: &Variable) -> Kind {
+/// Kind by `standard_name`, then `units`, then `axis` and `positive`, then the name (CF conventions, chapter 4).
+pub fn classify(variable: &Variable) -> Kind {
     let units = variable.units().unwrap_or_default();
     if TimeUnit::has_reference(units) {
-        // The start of a forecast is no time axis.
+        // The start of a forecast is not a time axis.
         return match variable.text("standard_name") {
             None | Some("time" | "") => Kind::Time,
             Some(_) => Kind::Unknown,
@@ -68,8 +68,8 @@ pub(in crate::source) fn classify(variable: &Variable) -> Kind {
     }
 }
 
-/// By usual names alone.
-pub(in crate::source) fn classify_name(name: &str) -> Kind {
+/// Kind by usual names alone.
+pub fn classify_name(name: &str) -> Kind {
     match name.to_ascii_lowercase().as_str() {
         "lon" | "longitude" | "longitudes" | "lons" | "nav_lon" | "rlon" | "xlong" | "grid_longitude" => Kind::Longitude,
         "lat" | "latitude" | "latitudes" | "lats" | "nav_lat" | "rlat" | "xlat" | "grid_latitude" => Kind::Latitude,
@@ -85,13 +85,13 @@ pub(in crate::source) fn classify_name(name: &str) -> Kind {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::container::{Attribute, NumberType};
+    use crate::source::formats::{Attribute, NumberType};
 
     #[test]
     fn attributes_come_before_names() {
         let variable = |name: &str, attributes: &[(&str, &str)]| Variable {
             name: name.into(),
-            number: NumberType::F64,
+            number: NumberType::Float64,
             dimensions: vec![0],
             attributes: attributes.iter().map(|(n, v)| (n.to_string(), Attribute::Text(v.to_string()))).collect(),
         };

@@ -1,26 +1,27 @@
-//! Packed and missing values: `scale_factor`, `add_offset`, `_FillValue`, `missing_value`, `valid_range`, `_Unsigned`.
+//! Packed and missing values: `scale_factor`, `add_offset`, `_FillValue`, `missing_value`, `valid_range`, `_Unsigned`
+//! (CF conventions, section 8.1; NetCDF User's Guide, appendix A).
 
-use crate::source::container::{Attribute, NumberType, Variable};
+use crate::source::formats::{Attribute, NumberType, Variable};
 
-/// How raw numbers become values; missing ones become NaN.
+/// Conversion of raw numbers to values; missing ones become NaN.
 #[derive(Debug, Clone, PartialEq)]
-pub(in crate::source) struct Packing {
+pub struct Packing {
     scale: f64,
     offset: f64,
     missing: Vec<f64>,
-    /// Least and greatest valid raw number.
+    /// Minimum and maximum valid raw number.
     valid: (f64, f64),
     /// Added to negative raw numbers (signed storage of unsigned numbers); 0 otherwise.
     wrap: f64,
 }
 
 impl Packing {
-    /// The packing that a variable's attributes tell.
+    /// Packing by a variable's attributes.
     ///
     /// # Errors
-    /// A `scale_factor` that is 0 or no finite number, an `add_offset` that is none, or one of them as text: what was found and what is
-    /// accepted.
-    pub(in crate::source) fn of(variable: &Variable) -> Result<Self, String> {
+    /// A `scale_factor` that is 0 or not finite, an `add_offset` that is not finite, or one of them as text. The error says what was
+    /// found and what is accepted.
+    pub fn of(variable: &Variable) -> Result<Self, String> {
         let number = |name: &str| variable.numbers(name).first().copied();
         let factor = |name: &str, default: f64, accepted: &str, fits: fn(f64) -> bool| match variable.attribute(name) {
             None => Ok(default),
@@ -35,9 +36,9 @@ impl Packing {
         let offset = factor("add_offset", 0.0, "a finite number", f64::is_finite)?;
         let unsigned = variable.text("_Unsigned").is_some_and(|t| t.eq_ignore_ascii_case("true"));
         let wrap = match variable.number {
-            NumberType::I8 if unsigned => 256.0,
-            NumberType::I16 if unsigned => 65_536.0,
-            NumberType::I32 if unsigned => 4_294_967_296.0,
+            NumberType::Int8 if unsigned => 256.0,
+            NumberType::Int16 if unsigned => 65_536.0,
+            NumberType::Int32 if unsigned => 4_294_967_296.0,
             _ => 0.0,
         };
         let raw = |v: f64| if v < 0.0 { v + wrap } else { v };
@@ -46,7 +47,7 @@ impl Packing {
             Some(fill) => missing.push(raw(fill)),
             None => missing.extend(default_fill(variable.number).map(raw)),
         }
-        // Limits count in packed numbers, unless they are of the unpacked type (NetCDF User's Guide, appendix A).
+        // Limits are packed numbers, unless they have the unpacked type.
         let limit = |name: &str, k: usize| {
             let Some(Attribute::Numbers(of, values)) = variable.attribute(name) else { return None };
             let value = *values.get(k)?;
@@ -57,33 +58,33 @@ impl Packing {
         let high = limit("valid_range", 1).or_else(|| limit("valid_max", 0));
         let (mut low, mut high) = (low.unwrap_or(f64::NEG_INFINITY), high.unwrap_or(f64::INFINITY));
         if low > high {
-            // A negative scale turns unpacked limits round.
+            // A negative scale swaps unpacked limits.
             (low, high) = (high, low);
         }
         Ok(Self { scale, offset, missing, valid: (low, high), wrap })
     }
 
-    /// The value, or NaN where it is missing.
-    pub(in crate::source) fn unpack(&self, raw: f64) -> f64 {
+    /// The value; NaN if it is missing.
+    pub fn unpack(&self, raw: f64) -> f64 {
         let raw = if raw < 0.0 { raw + self.wrap } else { raw };
-        // NaN is inside no range.
+        // NaN lies in no range.
         let valid = raw >= self.valid.0 && raw <= self.valid.1;
         if !valid || self.missing.contains(&raw) { f64::NAN } else { raw * self.scale + self.offset }
     }
 }
 
-/// What the library writes where nothing was written. Bytes have none: all their values are in use.
+/// Default fill values of the NetCDF library. Bytes have none: all their values are in use.
 fn default_fill(number: NumberType) -> Option<f64> {
     match number {
-        NumberType::I16 => Some(-32_767.0),
-        NumberType::U16 => Some(65_535.0),
-        NumberType::I32 => Some(-2_147_483_647.0),
-        NumberType::U32 => Some(4_294_967_295.0),
-        NumberType::I64 => Some(-9_223_372_036_854_775_806.0),
-        NumberType::U64 => Some(18_446_744_073_709_551_614.0),
-        NumberType::F32 => Some(f64::from(9.969_21e36_f32)),
-        NumberType::F64 => Some(9.969_209_968_386_869e36),
-        NumberType::I8 | NumberType::U8 | NumberType::Text | NumberType::Other => None,
+        NumberType::Int16 => Some(-32_767.0),
+        NumberType::Uint16 => Some(65_535.0),
+        NumberType::Int32 => Some(-2_147_483_647.0),
+        NumberType::Uint32 => Some(4_294_967_295.0),
+        NumberType::Int64 => Some(-9_223_372_036_854_775_806.0),
+        NumberType::Uint64 => Some(18_446_744_073_709_551_614.0),
+        NumberType::Float32 => Some(f64::from(9.969_21e36_f32)),
+        NumberType::Float64 => Some(9.969_209_968_386_869e36),
+        NumberType::Int8 | NumberType::Uint8 | NumberType::Text | NumberType::Other => None,
     }
 }
 
@@ -98,7 +99,7 @@ mod tests {
 
     #[test]
     fn integers_are_unpacked_and_fill_values_are_missing() {
-        let (short, double) = (NumberType::I16, NumberType::F64);
+        let (short, double) = (NumberType::Int16, NumberType::Float64);
         let packing = packed(
             short,
             &[
@@ -125,31 +126,32 @@ mod tests {
     fn signed_storage_of_unsigned_bytes() {
         let variable = Variable {
             name: "u".into(),
-            number: NumberType::I8,
+            number: NumberType::Int8,
             dimensions: vec![],
             attributes: vec![
                 ("_Unsigned".into(), Attribute::Text("true".into())),
-                ("_FillValue".into(), Attribute::Numbers(NumberType::I8, vec![-1.0])),
+                ("_FillValue".into(), Attribute::Numbers(NumberType::Int8, vec![-1.0])),
             ],
         };
         let packing = Packing::of(&variable).unwrap();
         assert_eq!(packing.unpack(-56.0), 200.0);
         assert!(packing.unpack(-1.0).is_nan());
     }
+
     #[test]
     fn factors_that_unpack_nothing_are_refused() {
         let with = |name: &str, attribute: Attribute| {
             let attributes = vec![(name.to_owned(), attribute)];
-            Packing::of(&Variable { name: "u".into(), number: NumberType::I16, dimensions: vec![], attributes })
+            Packing::of(&Variable { name: "u".into(), number: NumberType::Int16, dimensions: vec![], attributes })
         };
-        let numbers = |value: f64| Attribute::Numbers(NumberType::F64, vec![value]);
+        let numbers = |value: f64| Attribute::Numbers(NumberType::Float64, vec![value]);
         for (name, attribute, found) in [
             ("scale_factor", numbers(0.0), "is 0;"),
             ("scale_factor", numbers(f64::NAN), "is NaN;"),
             ("scale_factor", numbers(f64::INFINITY), "is inf;"),
             ("scale_factor", Attribute::Text("0.01".into()), "is the text \"0.01\""),
             ("add_offset", numbers(f64::NEG_INFINITY), "is -inf;"),
-            ("add_offset", Attribute::Numbers(NumberType::F64, vec![]), "is empty"),
+            ("add_offset", Attribute::Numbers(NumberType::Float64, vec![]), "is empty"),
         ] {
             let said = with(name, attribute).unwrap_err();
             assert!(said.contains(name) && said.contains(found) && said.contains("accepted is a finite number"), "{said}");

@@ -4,23 +4,23 @@ use super::calendar::Calendar;
 use super::units::Unit;
 
 /// Accepted time units, for messages.
-pub(in crate::source) const TIME_UNITS: &str =
+pub const TIME_UNITS: &str =
     "`seconds|minutes|hours|days|weeks since YEAR-MONTH-DAY [HOUR:MINUTE:SECOND] [ZONE]`, a plain unit of time, or none";
 
-/// How numbers become seconds.
+/// Conversion of numbers to seconds.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::source) struct TimeUnit {
-    /// Seconds of one unit.
-    pub(in crate::source) factor: f64,
+pub struct TimeUnit {
+    /// Seconds per unit.
+    factor: f64,
     /// Seconds from 1970-01-01 in `calendar` to the reference; 0 without a reference.
-    pub(in crate::source) offset: f64,
-    /// None when the unit has no reference: simulation time.
-    pub(in crate::source) calendar: Option<Calendar>,
+    pub offset: f64,
+    /// `None` if the unit has no reference (simulation time).
+    pub calendar: Option<Calendar>,
 }
 
 impl TimeUnit {
-    /// Reads `units` in `calendar`.
-    pub(in crate::source) fn parse(units: &str, calendar: Calendar) -> Option<Self> {
+    /// Parses `units` in `calendar`; `None` if they are not understood.
+    pub fn parse(units: &str, calendar: Calendar) -> Option<Self> {
         let Some((unit, reference)) = split_since(units) else {
             let unit = Unit::parse(units)?;
             return (unit.is_time() || unit.is_dimensionless()).then_some(Self { factor: unit.factor, offset: 0.0, calendar: None });
@@ -35,12 +35,12 @@ impl TimeUnit {
         Some(Self { factor, offset: reference_seconds(reference, calendar)?, calendar: Some(calendar) })
     }
 
-    /// Whether a unit counts from a date.
-    pub(in crate::source) fn has_reference(units: &str) -> bool {
+    /// True if a unit counts from a date.
+    pub fn has_reference(units: &str) -> bool {
         split_since(units).is_some()
     }
 
-    pub(in crate::source) fn seconds(&self, value: f64) -> f64 {
+    pub fn seconds(&self, value: f64) -> f64 {
         self.offset + value * self.factor
     }
 }

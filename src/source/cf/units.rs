@@ -2,26 +2,25 @@
 
 /// A unit as a factor to SI and powers of length, time and pressure.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(in crate::source) struct Unit {
-    pub(in crate::source) factor: f64,
-    length: i32,
-    time: i32,
-    pressure: i32,
+pub struct Unit {
+    pub factor: f64,
+    powers: [i32; 3],
 }
 
-/// What a velocity may be in, for messages.
-pub(in crate::source) const VELOCITY_UNITS: &str =
+/// Accepted units of velocity, for messages.
+pub const VELOCITY_UNITS: &str =
     "m/s (m s-1, m s**-1, cm/s, km/h, m/day, knots and the like) and, along a pressure axis, Pa/s (hPa/s, hPa/h)";
 
-/// What lengths and pressures may be in, for messages.
-pub(in crate::source) const AXIS_UNITS: &str = "degrees_east and degrees_north, m, km, cm, Pa, hPa, mbar, dbar, or none";
+/// Accepted units of axes, for messages.
+pub const AXIS_UNITS: &str = "degrees_east and degrees_north, m, km, cm, Pa, hPa, mbar, dbar, or none";
 
-const NONE: Unit = Unit { factor: 1.0, length: 0, time: 0, pressure: 0 };
+const NONE: Unit = Unit { factor: 1.0, powers: [0, 0, 0] };
 
 fn base(name: &str) -> Option<Unit> {
-    let length = |factor| Unit { factor, length: 1, ..NONE };
-    let time = |factor| Unit { factor, time: 1, ..NONE };
-    let pressure = |factor| Unit { factor, pressure: 1, ..NONE };
+    let length = |factor| Unit { factor, powers: [1, 0, 0] };
+    let time = |factor| Unit { factor, powers: [0, 1, 0] };
+    let pressure = |factor| Unit { factor, powers: [0, 0, 1] };
+    let velocity = |factor| Unit { factor, powers: [1, -1, 0] };
     Some(match name.to_ascii_lowercase().as_str() {
         "m" | "meter" | "meters" | "metre" | "metres" => length(1.0),
         "km" | "kilometer" | "kilometers" | "kilometre" | "kilometres" => length(1e3),
@@ -36,17 +35,17 @@ fn base(name: &str) -> Option<Unit> {
         "kpa" => pressure(1e3),
         "dbar" | "decibar" | "decibars" => pressure(1e4),
         "bar" => pressure(1e5),
-        "kn" | "kt" | "kts" | "knot" | "knots" => Unit { factor: 1852.0 / 3600.0, length: 1, time: -1, pressure: 0 },
-        "ms-1" | "mps" => Unit { factor: 1.0, length: 1, time: -1, pressure: 0 },
-        "cms-1" => Unit { factor: 0.01, length: 1, time: -1, pressure: 0 },
-        "pas-1" => Unit { factor: 1.0, length: 0, time: -1, pressure: 1 },
+        "kn" | "kt" | "kts" | "knot" | "knots" => velocity(1852.0 / 3600.0),
+        "ms-1" | "mps" => velocity(1.0),
+        "cms-1" => velocity(0.01),
+        "pas-1" => Unit { factor: 1.0, powers: [0, -1, 1] },
         _ => return None,
     })
 }
 
 impl Unit {
-    /// Reads a unit; none when a part of it is unknown.
-    pub(in crate::source) fn parse(text: &str) -> Option<Self> {
+    /// Parses a unit; `None` if a part of it is unknown.
+    pub fn parse(text: &str) -> Option<Self> {
         let text = text.trim().replace("**", "").replace('^', "").replace(['·', '*', '(', ')'], " ").replace(" per ", "/");
         let mut unit = NONE;
         for (i, part) in text.split('/').enumerate() {
@@ -58,38 +57,22 @@ impl Unit {
     }
 
     fn times(self, other: Self, power: i32) -> Self {
-        Self {
-            factor: self.factor * other.factor.powi(power),
-            length: self.length + other.length * power,
-            time: self.time + other.time * power,
-            pressure: self.pressure + other.pressure * power,
-        }
-    }
-
-    pub(in crate::source) fn is_velocity(&self) -> bool {
-        (self.length, self.time, self.pressure) == (1, -1, 0)
-    }
-
-    pub(in crate::source) fn is_pressure_tendency(&self) -> bool {
-        (self.length, self.time, self.pressure) == (0, -1, 1)
-    }
-
-    pub(in crate::source) fn is_length(&self) -> bool {
-        (self.length, self.time, self.pressure) == (1, 0, 0)
-    }
-
-    pub(in crate::source) fn is_pressure(&self) -> bool {
-        (self.length, self.time, self.pressure) == (0, 0, 1)
-    }
-
-    pub(in crate::source) fn is_time(&self) -> bool {
-        (self.length, self.time, self.pressure) == (0, 1, 0)
-    }
-
-    pub(in crate::source) fn is_dimensionless(&self) -> bool {
-        (self.length, self.time, self.pressure) == (0, 0, 0)
+        let powers = [0, 1, 2].map(|k| self.powers[k] + other.powers[k] * power);
+        Self { factor: self.factor * other.factor.powi(power), powers }
     }
 }
+
+macro_rules! kinds_of_units {
+    ($($name:ident $powers:expr),*) => {
+        impl Unit {
+            $(pub fn $name(&self) -> bool { self.powers == $powers })*
+        }
+    };
+}
+kinds_of_units!(
+    is_velocity [1, -1, 0], is_pressure_tendency [0, -1, 1], is_length [1, 0, 0], is_pressure [0, 0, 1], is_time [0, 1, 0],
+    is_dimensionless [0, 0, 0]
+);
 
 /// `m.s-1` is a product, `0.01` a number.
 fn split_dots(token: &str) -> Vec<&str> {

@@ -1,22 +1,22 @@
 //! Finding the velocity: by `standard_name`, then by usual names, then by `long_name`; always with a fitting unit.
 
 use super::units::Unit;
-use crate::source::container::{Header, Variable};
+use crate::source::formats::{Listing, Variable};
 
-/// The rule by which one of several candidates is chosen, in words.
-pub(in crate::source) const RULE: &str = "standard names go before usual names before long names, then pairs of one naming family, then more \
+/// The rule that chooses among several candidates.
+pub const RULE: &str = "standard names go before usual names before long names, then pairs of one naming family, then more \
                                           dimensions, then common dimensions, then the order of the list of names, then the order in the file";
 
 /// A velocity component.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::source) enum Component {
+pub enum Component {
     U,
     V,
     W,
 }
 
 impl Component {
-    pub(in crate::source) fn name(self) -> &'static str {
+    pub fn name(self) -> &'static str {
         ["u", "v", "w"][self as usize]
     }
 }
@@ -78,34 +78,31 @@ const VERTICAL_NAMES: [&str; 4] = ["lagrangian_tendency_of_air_pressure", "omega
 
 /// A variable that may be a component.
 #[derive(Debug, Clone)]
-pub(in crate::source) struct Candidate {
-    pub(in crate::source) variable: usize,
-    pub(in crate::source) component: Component,
+pub struct Candidate {
+    pub variable: usize,
+    pub component: Component,
     tier: usize,
     family: usize,
-    /// Why it is one, in words.
-    pub(in crate::source) why: String,
+    /// Why it is a candidate.
+    pub why: String,
 }
 
 /// The chosen components.
 #[derive(Debug, Clone)]
-pub(in crate::source) struct Velocity {
-    pub(in crate::source) u: Candidate,
-    pub(in crate::source) v: Candidate,
-    pub(in crate::source) w: Option<Candidate>,
+pub struct Velocity {
+    pub u: Candidate,
+    pub v: Candidate,
+    pub w: Option<Candidate>,
     /// Candidates that were passed over.
-    pub(in crate::source) others: Vec<Candidate>,
+    pub others: Vec<Candidate>,
 }
 
-/// Why there is no velocity.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(in crate::source) struct Lacking {
-    pub(in crate::source) what: String,
-}
-
-/// Whether a variable may be a component; the error says what it lacks.
-pub(in crate::source) fn judge(header: &Header, index: usize) -> Result<Candidate, String> {
-    let variable = &header.variables[index];
+/// Judges whether a variable may be a component.
+///
+/// # Errors
+/// It may not; the error says what it lacks.
+pub fn judge(listing: &Listing, index: usize) -> Result<Candidate, String> {
+    let variable = &listing.variables[index];
     if !variable.number.is_number() {
         return Err("holds no numbers".into());
     }
@@ -154,7 +151,7 @@ fn by_name(variable: &Variable) -> Option<Named> {
         () if name.starts_with("upward_") || VERTICAL_NAMES.contains(&name.as_str()) => Some((Component::W, USUAL_NAMES.len())),
         () => None,
     };
-    // A standard name that is no velocity of the medium outweighs the name.
+    // A standard name of another quantity outweighs the name.
     if variable.text("standard_name").is_some_and(|s| !s.is_empty() && !s.contains("velocity") && !s.contains("wind")) {
         return None;
     }
@@ -186,9 +183,12 @@ fn look_up<const N: usize>(table: &[[&str; 3]; N], name: &str) -> Option<(Compon
     })
 }
 
-/// Chooses the components; `fixed` are variables that the settings name, `ignore_w` leaves the vertical one out.
-pub(in crate::source) fn choose(header: &Header, fixed: [Option<usize>; 3], ignore_w: bool) -> Result<Velocity, Lacking> {
-    let judged: Vec<Candidate> = (0..header.variables.len()).filter_map(|i| judge(header, i).ok()).collect();
+/// Chooses the components. `fixed` are variables that the settings name; `ignore_w` leaves out the vertical component.
+///
+/// # Errors
+/// A horizontal component is lacking; the error says which.
+pub fn choose(listing: &Listing, fixed: [Option<usize>; 3], ignore_w: bool) -> Result<Velocity, String> {
+    let judged: Vec<Candidate> = (0..listing.variables.len()).filter_map(|i| judge(listing, i).ok()).collect();
     let of = |component: Component| -> Vec<Candidate> {
         match fixed[component as usize] {
             Some(variable) => {
@@ -199,28 +199,23 @@ pub(in crate::source) fn choose(header: &Header, fixed: [Option<usize>; 3], igno
         }
     };
     let (us, vs) = (of(Component::U), of(Component::V));
-    let lacks = |list: &[Candidate], what: &str| if list.is_empty() { what.to_owned() } else { String::new() };
-    if us.is_empty() || vs.is_empty() {
-        let words = [lacks(&us, "no eastward or x component"), lacks(&vs, "no northward or y component")];
-        return Err(Lacking { what: words.iter().filter(|w| !w.is_empty()).map(String::as_str).collect::<Vec<_>>().join(" and ") });
-    }
-    let extent = |c: &Candidate| header.shape(&header.variables[c.variable]).iter().filter(|&&n| n > 1).count();
+    let lacking = [(us.is_empty(), "no eastward or x component"), (vs.is_empty(), "no northward or y component")];
+    let lacking: Vec<&str> = lacking.into_iter().filter(|(lacks, _)| *lacks).map(|(_, what)| what).collect();
+    let extent = |c: &Candidate| listing.shape(&listing.variables[c.variable]).iter().filter(|&&n| n > 1).count();
     let foreign =
         |a: &Candidate, b: &Candidate| a.family != usize::MAX && b.family != usize::MAX && (a.tier, a.family) != (b.tier, b.family);
     let key = |u: &Candidate, v: &Candidate| {
         let dims = extent(u).min(extent(v));
-        let apart = !same_dimensions(header, u.variable, v.variable);
+        let apart = !same_dimensions(listing, u.variable, v.variable);
         (u.tier.max(v.tier), foreign(u, v), usize::MAX - dims, apart, u.family.min(v.family), u.variable, v.variable)
     };
     let pairs = us.iter().flat_map(|u| vs.iter().map(move |v| (u, v)));
-    let Some((u, v)) = pairs.min_by_key(|(u, v)| key(u, v)) else {
-        return Err(Lacking { what: "no pair of components".into() });
-    };
+    let (u, v) = pairs.min_by_key(|(u, v)| key(u, v)).ok_or_else(|| lacking.join(" and "))?;
     let wide = extent(u);
     let w = if ignore_w {
         None
     } else {
-        let apart = |w: &Candidate| !same_dimensions(header, u.variable, w.variable);
+        let apart = |w: &Candidate| !same_dimensions(listing, u.variable, w.variable);
         // A vertical velocity of fewer dimensions belongs to something else.
         let candidates = of(Component::W).into_iter().filter(|w| w.family == usize::MAX || extent(w) == wide);
         candidates.min_by_key(|w| (apart(w), w.tier, foreign(u, w), w.family, w.variable))
@@ -230,10 +225,10 @@ pub(in crate::source) fn choose(header: &Header, fixed: [Option<usize>; 3], igno
     Ok(Velocity { u: u.clone(), v: v.clone(), w, others })
 }
 
-/// Whether two variables lie on the same points, in whatever order their dimensions come; single entries do not count.
-pub(in crate::source) fn same_dimensions(header: &Header, a: usize, b: usize) -> bool {
+/// True if two variables lie on the same points. The order of the dimensions and dimensions of one entry do not count.
+pub fn same_dimensions(listing: &Listing, a: usize, b: usize) -> bool {
     let wide = |i: usize| {
-        let mut dims: Vec<usize> = header.variables[i].dimensions.iter().copied().filter(|&d| header.dimensions[d].len > 1).collect();
+        let mut dims: Vec<usize> = listing.variables[i].dimensions.iter().copied().filter(|&d| listing.dimensions[d].len > 1).collect();
         dims.sort_unstable();
         dims
     };

@@ -1,39 +1,39 @@
-//! From a step's components to a snapshot, by a few threads and in memory that was used before.
+//! Conversion of a step's components to a snapshot, by a few threads and in reused memory.
 
 use crate::field::{Grid, Snapshot};
-use crate::source::SourceError;
+use crate::source::error::SourceError;
 use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::time::Duration;
 
-/// How often whoever waits for work of the pool looks up.
-const LOOK_UP: Duration = Duration::from_millis(100);
+/// Interval between heartbeats while the pool works.
+const BEAT_INTERVAL: Duration = Duration::from_millis(100);
 
-/// Threads that convert, at most: as many as keep the memory busy.
-const CONVERTERS: usize = 4;
+/// Largest number of converting threads: enough to saturate the memory bandwidth.
+const MAX_THREADS: usize = 4;
 
-/// Makes snapshots. One that nobody holds any more lends its memory to a later one, so that a run at its pace takes none from the system.
+/// Makes snapshots. The memory of a released snapshot is reused, so that a steady run allocates none.
 pub(super) struct Conversion {
     grid: Arc<Grid>,
     pool: rayon::ThreadPool,
-    /// Those that were made and may still be held.
+    /// Snapshots that may still be in use.
     made: Vec<Arc<Snapshot>>,
     spare: Option<Vec<[f32; 4]>>,
 }
 
 impl Conversion {
-    /// For snapshots on `grid`. One of four threads that the process may have is taken, [`CONVERTERS`] at most: the others are the frames'.
+    /// For snapshots on `grid`. Uses a quarter of the process's threads, at most [`MAX_THREADS`]; the others make frames.
     ///
     /// # Errors
-    /// The threads could not be started.
+    /// The threads cannot be started.
     pub fn new(grid: Arc<Grid>) -> Result<Self, SourceError> {
-        let threads = (rayon::current_num_threads() / 4).clamp(1, CONVERTERS);
+        let threads = (rayon::current_num_threads() / 4).clamp(1, MAX_THREADS);
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).thread_name(|i| format!("ridgewatch-convert-{i}")).build();
-        let pool = pool.map_err(|e| SourceError::Inconsistent { what: format!("the converting threads could not start: {e}") })?;
+        let pool = pool.map_err(|e| SourceError::Inconsistent(format!("the converting threads could not start: {e}")))?;
         Ok(Self { grid, pool, made: Vec::new(), spare: None })
     }
 
-    /// The snapshot of components, one behind the other. `beat` is called again and again meanwhile.
+    /// Makes a snapshot of u, v and w, stored in this order, and calls `beat` repeatedly meanwhile.
     pub fn snapshot(&mut self, time: f64, values: &[f32], beat: &mut dyn FnMut()) -> Arc<Snapshot> {
         self.reclaim();
         let (u, rest) = values.split_at(self.grid.nodes());
@@ -44,24 +44,24 @@ impl Conversion {
         made
     }
 
-    /// Does `work` in the pool, and calls `beat` on this thread, again and again, until it is done.
+    /// Does `work` in the pool, and calls `beat` repeatedly on this thread until it is done.
     pub fn beside<T: Send>(&self, work: impl FnOnce() -> T + Send, beat: &mut dyn FnMut()) -> T {
         let (done, wait) = sync_channel(1);
         let made = self.pool.in_place_scope(|scope| {
             scope.spawn(move |_| drop(done.send(work())));
             loop {
-                match wait.recv_timeout(LOOK_UP) {
+                match wait.recv_timeout(BEAT_INTERVAL) {
                     Ok(made) => return Some(made),
                     Err(RecvTimeoutError::Timeout) => beat(),
                     Err(RecvTimeoutError::Disconnected) => return None,
                 }
             }
         });
-        let Some(made) = made else { unreachable!("the scope has passed the panic of `work` on") };
+        let Some(made) = made else { unreachable!("the scope resumes a panic of `work`") };
         made
     }
 
-    /// Takes back what nobody else holds: the memory of one is kept, the others' is given back.
+    /// Drops the snapshots without other references, and keeps the memory of one for reuse.
     fn reclaim(&mut self) {
         for made in std::mem::take(&mut self.made) {
             match Arc::try_unwrap(made) {
@@ -74,7 +74,7 @@ impl Conversion {
 
 #[cfg(test)]
 impl Conversion {
-    /// All of its threads have something else to do for so long.
+    /// Keeps all threads busy for `time`.
     pub fn occupy(&self, time: Duration) {
         self.pool.spawn_broadcast(move |_| std::thread::sleep(time));
     }
@@ -85,10 +85,14 @@ mod tests {
     use super::*;
     use crate::field::{Axis, Geometry};
 
+    fn grid() -> Arc<Grid> {
+        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
+        Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) })
+    }
+
     #[test]
     fn memory_goes_round_and_what_is_held_is_left_alone() {
-        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
-        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
+        let grid = grid();
         let values = |step: usize| -> Vec<f32> { (0..18).map(|i| (100 * step + i) as f32).collect() };
         let expected = |step: usize| Snapshot::from_components(0.0, grid.clone(), &values(step)[..9], &values(step)[9..], &[]).nodes;
         let mut conversion = Conversion::new(grid.clone()).unwrap();
@@ -112,9 +116,7 @@ mod tests {
 
     #[test]
     fn a_panic_of_the_work_is_passed_on() {
-        let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();
-        let grid = Arc::new(Grid { axes: vec![axis("x"), axis("y")], geometry: Geometry::Cartesian, slab: (0.0, 1.0) });
-        let conversion = Conversion::new(grid).unwrap();
+        let conversion = Conversion::new(grid()).unwrap();
         let work = || -> u8 { panic!("as no conversion should") };
         let panicked = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| conversion.beside(work, &mut || ())));
         assert_eq!(panicked.unwrap_err().downcast_ref(), Some(&"as no conversion should"));

@@ -4,46 +4,46 @@ use crate::setting::{Refused, require};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 
-/// What happens while a frame is being made.
+/// Handling of steps that arrive while a frame is made.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Follow {
-    /// The window goes on filling; the next frame is of the newest.
+    /// The window continues to fill; the next frame uses the newest steps.
     #[default]
     Newest,
-    /// No step is taken before the slide that it belongs to: a producer whose policy is to wait is slowed to the frames' pace.
+    /// No step is taken before its slide is due: a producer with the waiting policy slows down to the pace of the frames.
     Every,
 }
 
-/// What happens when the simulation has ended.
+/// Action at the end of the simulation.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AtEnd {
-    /// Its restart is waited for.
+    /// Wait for a restart.
     #[default]
     Wait,
-    /// The run ends too.
+    /// End the run.
     Stop,
 }
 
-/// `[live]`: a simulation that runs now.
+/// `[live]`: a running simulation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct LiveSettings {
-    /// Folder of the ring on this node; none: that of the environment variable `RIDGEWATCH_RING`, or a relay.
+    /// Folder of the ring on this node; by default that of the environment variable `RIDGEWATCH_RING`, or a relay.
     pub ring: Option<PathBuf>,
     /// Connection files of relays on other nodes, instead of a ring.
     pub connections: Vec<PathBuf>,
-    /// GiB of memory for the window, the one that the current frame uses, and what is on its way to them: steps that wait for their blocks, and buffers.
+    /// GiB of memory for the window, the window of the current frame, and the data on the way: steps that wait for blocks, and buffers.
     pub memory_gib: f64,
     /// Newest steps or every step.
     pub follow: Follow,
-    /// Wait for a restart or stop.
+    /// Action at the end of the simulation.
     pub at_end: AtEnd,
     /// Seconds that a step waits for its missing blocks.
-    pub incomplete_seconds: f64,
-    /// Seconds that a relay may be out of reach before its blocks count as ended.
-    pub relay_seconds: f64,
+    pub block_timeout_seconds: f64,
+    /// Seconds that a relay may be unreachable before its blocks count as ended.
+    pub relay_timeout_seconds: f64,
 }
 
 impl Default for LiveSettings {
@@ -54,21 +54,35 @@ impl Default for LiveSettings {
             memory_gib: 4.0,
             follow: Follow::default(),
             at_end: AtEnd::default(),
-            incomplete_seconds: 10.0,
-            relay_seconds: 30.0,
+            block_timeout_seconds: 10.0,
+            relay_timeout_seconds: 30.0,
         }
     }
 }
 
 impl LiveSettings {
+    /// Bytes of memory.
+    pub(super) fn memory_bytes(&self) -> u64 {
+        (self.memory_gib * f64::from(1 << 30)) as u64
+    }
+
     /// Checks ranges.
+    ///
+    /// # Errors
+    /// The setting at fault.
     pub fn check(&self) -> Result<(), Refused> {
         if self.ring.is_some() && !self.connections.is_empty() {
-            return Err(Refused::new("live.connections", "are given beside live.ring", "a ring of this node, or connections to relays"));
+            return Err(Refused::new(
+                "live.connections",
+                "is given together with live.ring",
+                "a ring of this node, or connections to relays",
+            ));
         }
         let memory = self.memory_gib;
         require(memory.is_finite() && (1e-3..=65_536.0).contains(&memory), "live.memory_gib", memory, "a number from 0.001 to 65536")?;
-        for (key, seconds) in [("live.incomplete_seconds", self.incomplete_seconds), ("live.relay_seconds", self.relay_seconds)] {
+        for (key, seconds) in
+            [("live.block_timeout_seconds", self.block_timeout_seconds), ("live.relay_timeout_seconds", self.relay_timeout_seconds)]
+        {
             require((0.01..=86_400.0).contains(&seconds), key, seconds, "a number from 0.01 to 86400")?;
         }
         Ok(())

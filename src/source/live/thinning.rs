@@ -1,4 +1,4 @@
-//! Which steps the window keeps when memory does not hold all of them, and what that costs.
+//! Choice of the steps that the window keeps if memory does not hold all, and the interpolation error of this choice.
 
 use crate::field::{Snapshot, Window};
 use std::sync::Arc;
@@ -6,65 +6,65 @@ use std::sync::Arc;
 /// Nodes at which the interpolation is measured.
 const PROBES: usize = 1 << 15;
 
-/// Keeps steps at least a spacing apart, and measures linear interpolation in time on one that was left out of each interval.
+/// Keeps steps at least a spacing apart. Measures the error of linear interpolation in time on one skipped step of each interval.
 #[derive(Debug)]
 pub(super) struct Thinning {
     spacing: f64,
     kept: Option<Arc<Snapshot>>,
-    left_out: Option<Arc<Snapshot>>,
-    /// Of the newest interval.
+    skipped: Option<Arc<Snapshot>>,
+    /// Error of the newest interval, relative to the velocity.
     pub error: Option<f64>,
-    /// Steps left out.
+    /// Number of skipped steps.
     pub count: u64,
 }
 
 impl Thinning {
-    /// For a window over `tau` of at most `snapshots` (at least 3).
+    /// For a window over `tau` of at most `snapshots` snapshots (at least 3).
     pub fn new(tau: f64, snapshots: usize) -> Self {
-        // From one at or before its oldest time to its newest.
+        // The window reaches from a snapshot at or before its oldest time to its newest.
         let intervals = snapshots.saturating_sub(2).max(1);
-        Self { spacing: tau / intervals as f64, kept: None, left_out: None, error: None, count: 0 }
+        Self { spacing: tau / intervals as f64, kept: None, skipped: None, error: None, count: 0 }
     }
 
-    /// Least distance of two steps that are kept.
+    /// Minimum distance in time of two kept steps.
     pub fn spacing(&self) -> f64 {
         self.spacing
     }
 
-    /// Whether a step of this time is kept: the window has none of another time that is too near, before or behind. What repeats a time, or is late, is the
-    /// window's to judge.
+    /// True if a step of this time is to be kept: no step of another time in the window is too near. The window itself judges repeated and late
+    /// times.
     pub fn keeps(&self, time: f64, window: &Window) -> bool {
         window.is_late(time) || window.distance(time).is_none_or(|distance| distance >= self.spacing * (1.0 - 1e-9))
     }
 
-    /// Tells of a step that is not kept; `build` may be called for it.
-    pub fn left_out(&mut self, time: f64, build: impl FnOnce() -> Arc<Snapshot>) {
+    /// Registers a skipped step; may call `build` for its snapshot.
+    pub fn skip(&mut self, time: f64, build: impl FnOnce() -> Arc<Snapshot>) {
         self.count += 1;
         let Some(kept) = self.kept.as_ref().filter(|kept| kept.time < time) else { return };
-        // The first beyond the middle, where the error of the interpolation is largest; until then the newest.
+        // Prefer the first step beyond the middle, where the interpolation error is largest; until then take the newest.
         let middle = kept.time + self.spacing / 2.0;
-        if self.left_out.as_ref().is_none_or(|last| last.time < middle) {
-            self.left_out = Some(build());
+        if self.skipped.as_ref().is_none_or(|last| last.time < middle) {
+            self.skipped = Some(build());
         }
     }
 
-    /// Tells of a step that was kept.
-    pub fn kept(&mut self, snapshot: &Arc<Snapshot>) {
-        if let (Some(before), Some(between)) = (&self.kept, self.left_out.take())
+    /// Registers a kept step.
+    pub fn keep(&mut self, snapshot: &Arc<Snapshot>) {
+        if let (Some(before), Some(between)) = (&self.kept, self.skipped.take())
             && before.time < between.time
             && between.time < snapshot.time
         {
             self.error = interpolation_error(before, &between, snapshot).or(self.error);
         }
-        // One that repeats its time takes its place here as in the window.
+        // A step that repeats a time replaces the earlier one, as in the window.
         if self.kept.as_ref().is_none_or(|kept| kept.time <= snapshot.time) {
             self.kept = Some(snapshot.clone());
         }
     }
 
-    /// Forgets everything but the spacing and the count.
+    /// Resets everything except the spacing and the count.
     pub fn restart(&mut self) {
-        (self.kept, self.left_out, self.error) = (None, None, None);
+        (self.kept, self.skipped, self.error) = (None, None, None);
     }
 }
 
@@ -110,11 +110,11 @@ mod tests {
             let time = f64::from(n) * 0.05;
             if thinning.keeps(time, &window) {
                 let snapshot = Arc::new(at(time));
-                thinning.kept(&snapshot);
+                thinning.keep(&snapshot);
                 window.push(snapshot).unwrap();
                 kept.push(time);
             } else {
-                thinning.left_out(time, || Arc::new(at(time)));
+                thinning.skip(time, || Arc::new(at(time)));
             }
         }
         assert_eq!(kept.len(), 11, "{kept:?}");
@@ -131,7 +131,7 @@ mod tests {
             let time = f64::from(n) * 0.7;
             assert!(thinning.keeps(time, &window));
             let snapshot = Arc::new(at(time));
-            thinning.kept(&snapshot);
+            thinning.keep(&snapshot);
             window.push(snapshot).unwrap();
         }
         assert_eq!((thinning.count, thinning.error), (0, None));
@@ -140,7 +140,7 @@ mod tests {
 
     #[test]
     fn however_times_come_the_window_has_room_for_what_is_kept() {
-        // Falling, to and fro over one place, and at random (a linear congruential generator).
+        // Falling times, times that go back and forth, and random times (a linear congruential generator).
         let mut state = 1u64;
         let mut random = move || {
             state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
@@ -154,11 +154,11 @@ mod tests {
             let mut most = 0;
             for time in times {
                 if !thinning.keeps(time, &window) {
-                    thinning.left_out(time, || Arc::new(at(time)));
+                    thinning.skip(time, || Arc::new(at(time)));
                     continue;
                 }
                 let snapshot = Arc::new(at(time));
-                thinning.kept(&snapshot);
+                thinning.keep(&snapshot);
                 let _ = window.push(snapshot);
                 most = most.max(window.snapshots().len());
             }

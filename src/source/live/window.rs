@@ -1,10 +1,12 @@
-//! The window that a thread of its own keeps.
+//! The window that a thread fills from a simulation.
 
 use super::conversion::Conversion;
+use super::settings::{AtEnd, Follow};
+use super::simulation::Live;
 use super::thinning::Thinning;
-use super::{AtEnd, Follow, Live, memory};
 use crate::field::{Window, WindowFault};
-use crate::source::{Listener, SourceError, StillReading};
+use crate::source::error::SourceError;
+use crate::source::snapshots::{Listener, StillReading};
 use ridgewatch_wire::{Assembler, Event, LEAD, Step};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -12,74 +14,75 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
-/// Steps that may wait for their blocks at once: those by which one ring may lead the slowest, the one that the slowest comes to, and one more.
-const PENDING: usize = LEAD + 2;
-/// Snapshots beside the windows: the one that is being made, and one that was left out, against which interpolation is measured.
-const BESIDE: u64 = 2;
-/// Warnings that are kept for the next frame; the rest is counted.
-const WARNINGS: usize = 16;
-/// Late steps in a row after which the simulation is taken to have been set back.
+/// Largest number of steps that wait for blocks: the steps by which one ring may lead the slowest, the slowest ring's next step, and one
+/// more.
+const MAX_PENDING: usize = LEAD + 2;
+/// Snapshots besides the windows: the one in conversion, and a skipped one against which interpolation is measured.
+const EXTRA_SNAPSHOTS: u64 = 2;
+/// Largest number of warnings that are kept for the next frame; further ones are counted.
+const MAX_WARNINGS: usize = 16;
+/// Number of consecutive late steps after which the simulation counts as set back.
 const SET_BACK: u32 = 3;
-/// Bytes of a step from which on producers are told while one of its blocks is put into it: even memory that is new to the process is written faster than that
-/// in a second. (While a step is converted they always are.)
+/// Bytes of a step above which the heartbeat is renewed while a block is copied into it. Smaller steps are copied in less than a second.
+/// (During conversion the heartbeat is always renewed.)
 const LARGE: usize = 256 << 20;
-/// How often a thread that holds back looks up.
-const LOOK_UP: Duration = Duration::from_millis(50);
+/// Interval at which a waiting thread checks for a stop.
+const CHECK_INTERVAL: Duration = Duration::from_millis(50);
 
-/// What a frame's record says of the simulation.
+/// The simulation in a frame's record.
 #[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
 pub struct LiveRecord {
     /// The simulation's number of the newest step in the window.
     pub step: u64,
     /// When that step was published, seconds since 1970.
     pub published: f64,
-    /// Seconds from its publication until the window had it: read, put together, converted.
+    /// Seconds from its publication until it was in the window: read, assembled, converted.
     pub delay: f64,
     /// Seconds from its publication until the cycle took the window.
     pub age: f64,
-    /// Whole steps that came, in all.
+    /// Total number of complete steps received.
     pub steps: u64,
-    /// Blocks of steps that were overwritten before they were read, or passed over since another block of the step was, in all.
+    /// Total number of blocks that were overwritten before they were read, or ignored because another block of their step was.
     pub missed_blocks: u64,
-    /// Steps left out for want of memory, in all.
-    pub thinned: u64,
-    /// Least distance in time of the steps that are kept.
+    /// Total number of steps skipped to save memory.
+    pub steps_skipped: u64,
+    /// Minimum distance in time of the kept steps.
     pub spacing: f64,
-    /// What leaving steps out costs: difference of one that was left out from linear interpolation, over its size (root mean squares); null where
-    /// none was.
+    /// Error of linear interpolation at a skipped step, relative to its velocity (root mean squares); null if none was skipped.
     pub interpolation_error: Option<f64>,
-    /// Steps given up because blocks were missing, in all.
-    pub incomplete: u64,
-    /// Times that the simulation was started or set back while it was followed.
+    /// Total number of steps given up because blocks were missing.
+    pub steps_incomplete: u64,
+    /// Number of restarts and setbacks of the simulation while it was followed.
     pub restarts: u64,
-    /// Snapshots in the window.
+    /// Number of snapshots in the window.
     pub snapshots: usize,
-    /// Seconds from the window's first snapshot until it covered one tenth, two tenths and so on of tau: ten numbers, since a frame needs all of it.
-    pub filling: Vec<f64>,
+    /// Seconds from the window's first snapshot until it covered one tenth, two tenths and so on of tau: ten numbers, since a frame needs
+    /// the full window.
+    pub fill_seconds: Vec<f64>,
 }
 
 /// The window at one moment.
 #[derive(Debug)]
 pub struct Taken {
-    /// Full.
+    /// A full window.
     pub window: Window,
-    /// What was odd since the last one.
+    /// Warnings since the last one.
     pub warnings: Vec<String>,
-    /// For the record.
+    /// Entry of the frame's record.
     pub live: LiveRecord,
 }
 
-/// What both threads see.
+/// State that both threads share.
 struct State {
     window: Window,
-    /// When the window had its first snapshot.
+    /// Time of the window's first snapshot.
     begun_at: Option<Instant>,
-    /// Snapshots that moved the window since it was last taken.
+    /// Number of snapshots that moved the window since it was last taken.
     moved: usize,
-    /// Whether it was ever taken.
-    begun: bool,
+    /// True if the window was taken before.
+    taken: bool,
     warnings: Vec<String>,
-    more_warnings: u64,
+    warnings_left_out: u64,
     live: LiveRecord,
     /// No more steps will come.
     ended: bool,
@@ -91,9 +94,9 @@ impl State {
             window: Window::new(tau),
             begun_at: None,
             moved: 0,
-            begun: false,
+            taken: false,
             warnings: Vec::new(),
-            more_warnings: 0,
+            warnings_left_out: 0,
             live: LiveRecord::default(),
             ended: false,
         }
@@ -101,14 +104,14 @@ impl State {
 
     fn warn(&mut self, text: String) {
         tracing::info!("{text}");
-        if self.warnings.len() < WARNINGS { self.warnings.push(text) } else { self.more_warnings += 1 }
+        if self.warnings.len() < MAX_WARNINGS { self.warnings.push(text) } else { self.warnings_left_out += 1 }
     }
 
     /// Empties the window.
-    fn begin_anew(&mut self) {
+    fn restart(&mut self) {
         self.window = Window::new(self.window.span());
         self.begun_at = None;
-        self.live.filling.clear();
+        self.live.fill_seconds.clear();
     }
 
     /// Share of tau that the window covers.
@@ -117,18 +120,18 @@ impl State {
         (covered / self.window.span()).min(1.0)
     }
 
-    /// Notes how far the window has come.
+    /// Records how far the window is filled.
     fn note_filling(&mut self) {
         let begun = *self.begun_at.get_or_insert_with(Instant::now);
-        // The hair's breadth by which a sum of steps may miss tau is the window's own.
+        // The window decides whether it is full: a sum of steps may miss tau by rounding.
         let tenths = if self.window.is_full() { 10 } else { (10.0 * self.filled()) as usize };
-        let known = self.live.filling.len().max(tenths);
-        self.live.filling.resize(known, begun.elapsed().as_secs_f64());
+        let known = self.live.fill_seconds.len().max(tenths);
+        self.live.fill_seconds.resize(known, begun.elapsed().as_secs_f64());
     }
 
-    /// Whether a slide is due.
+    /// True if a slide is due.
     fn due(&self, stride: usize) -> bool {
-        self.window.is_full() && (!self.begun || self.moved >= stride)
+        self.window.is_full() && (!self.taken || self.moved >= stride)
     }
 }
 
@@ -136,7 +139,7 @@ struct Shared {
     state: Mutex<State>,
     changed: Condvar,
     stop: AtomicBool,
-    /// Hears of snapshots before the window has them.
+    /// Called with snapshots before they enter the window.
     listener: OnceLock<Listener>,
 }
 
@@ -157,43 +160,47 @@ pub struct LiveWindow {
     thread: Option<JoinHandle<()>>,
 }
 
-impl LiveWindow {
-    pub(super) fn start(live: Live, tau: f64, stride: usize) -> Result<Self, SourceError> {
+impl Live {
+    /// Starts to fill a window over `tau`; with [`Follow::Every`] a slide is `stride` steps.
+    ///
+    /// # Errors
+    /// Too little memory for three snapshots; the thread cannot be started.
+    pub fn follow(self, tau: f64, stride: usize) -> Result<LiveWindow, SourceError> {
+        let live = self;
         let nodes = live.grid.nodes() as u64;
         let (snapshot, step) = (16 * nodes, 4 * nodes * live.description.components() as u64);
-        // Those that wait, the one that is read, and what the way to it holds: the simulation may come back in blocks.
-        let steps = (PENDING as u64 + 1 + live.link.steps_held()) * step;
-        // The window, and the one that the frame in progress still uses.
-        let room = memory(&live.settings).saturating_sub(steps + BESIDE * snapshot) / (2 * snapshot.max(1));
+        // Waiting steps, the step being read, and the buffers of the link: a restarted simulation may have blocks.
+        let steps = (MAX_PENDING as u64 + 1 + live.link.steps_held()) * step;
+        // The window, and the window of the current frame.
+        let room = live.settings.memory_bytes().saturating_sub(steps + EXTRA_SNAPSHOTS * snapshot) / (2 * snapshot.max(1));
         if room < 3 {
-            let least = (steps + (BESIDE + 6) * snapshot) as f64 / f64::from(1 << 30);
-            return Err(SourceError::Setting {
-                key: "live.memory_gib",
-                found: live.settings.memory_gib.to_string(),
-                accepted: format!("at least {least:.3}: three snapshots, twice, and what is on its way to them"),
-            });
+            let least = (steps + (EXTRA_SNAPSHOTS + 6) * snapshot) as f64 / f64::from(1 << 30);
+            let accepted = format!("at least {least:.3}: three snapshots, twice, and the data on the way to them");
+            return Err(SourceError::setting("live.memory_gib", live.settings.memory_gib, accepted));
         }
         let room = room as usize;
         let shared = Arc::new(Shared::new(tau));
         let conversion = Conversion::new(live.grid.clone())?;
         let mut reader = Reader::new(live, shared.clone(), conversion, Thinning::new(tau, room), stride);
         let thread = std::thread::Builder::new().name("ridgewatch-live".into()).spawn(move || reader.run());
-        let thread = thread.map_err(|e| SourceError::Inconsistent { what: format!("the live thread could not start: {e}") })?;
-        Ok(Self { shared, stride, thread: Some(thread) })
+        let thread = thread.map_err(|e| SourceError::Inconsistent(format!("the live thread could not start: {e}")))?;
+        Ok(LiveWindow { shared, stride, thread: Some(thread) })
     }
+}
 
-    /// From now on `listener` hears of snapshots as they come, on the thread that reads, before the window has them. The first one that is set
-    /// stays.
+impl LiveWindow {
+    /// Sets the listener, which is called on the reading thread with each snapshot before it enters the window. A second call has no
+    /// effect.
     pub fn tell(&self, listener: Listener) {
-        // A second one has nothing to add: the first hears of everything.
+        // The first listener receives all snapshots already.
         let _ = self.shared.listener.set(listener);
     }
 
-    /// The window as it is once it is full and has moved by the stride; none when the simulation has ended and it will not; an error when the thread that
-    /// reads has ended.
+    /// The window, once it is full and has moved by the stride. `None` if the simulation ended before that. The inner error says that the
+    /// reading thread has ended.
     ///
     /// # Errors
-    /// Not within the limit: ask again.
+    /// The window is not ready within `limit`: ask again.
     pub fn next_within(&self, limit: Duration) -> Result<Option<Result<Taken, SourceError>>, StillReading> {
         let until = Instant::now() + limit;
         let mut state = self.shared.lock();
@@ -201,7 +208,7 @@ impl LiveWindow {
             if state.due(self.stride) {
                 break;
             }
-            // It ends by itself in no other way.
+            // The thread ends early only by a panic.
             if self.thread.as_ref().is_none_or(JoinHandle::is_finished) {
                 return Ok(Some(Err(SourceError::LiveStopped { steps: state.live.steps, what: "it panicked".into() })));
             }
@@ -214,10 +221,10 @@ impl LiveWindow {
             }
             state = self.shared.changed.wait_timeout(state, until - now).map_or_else(|broken| broken.into_inner().0, |(state, _)| state);
         }
-        (state.moved, state.begun) = (0, true);
+        (state.moved, state.taken) = (0, true);
         let mut warnings = std::mem::take(&mut state.warnings);
-        if std::mem::take(&mut state.more_warnings) > 0 {
-            warnings.push(format!("and more of that kind: only the first {WARNINGS} are named"));
+        if std::mem::take(&mut state.warnings_left_out) > 0 {
+            warnings.push(format!("and more of that kind: only the first {MAX_WARNINGS} are listed"));
         }
         let mut live = state.live.clone();
         live.age = since(live.published);
@@ -228,13 +235,13 @@ impl LiveWindow {
         Ok(Some(Ok(Taken { window, warnings, live })))
     }
 
-    /// Whether [`Self::next_within`] would have to wait: nothing new is there yet, and something may come.
+    /// True if [`Self::next_within`] would wait.
     pub fn is_waited_for(&self) -> bool {
         let state = self.shared.lock();
         !state.due(self.stride) && !state.ended && self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
     }
 
-    /// Share of tau that the window covers so far.
+    /// Share of tau that the window covers.
     pub fn filled(&self) -> f64 {
         self.shared.lock().filled()
     }
@@ -250,7 +257,7 @@ impl Drop for LiveWindow {
     }
 }
 
-/// The thread that reads.
+/// The reading thread.
 struct Reader {
     live: Live,
     shared: Arc<Shared>,
@@ -265,8 +272,8 @@ struct Reader {
 
 impl Reader {
     fn new(live: Live, shared: Arc<Shared>, conversion: Conversion, thinning: Thinning, stride: usize) -> Self {
-        let limit = Duration::from_secs_f64(live.settings.incomplete_seconds);
-        let assembler = Assembler::new(&live.description, limit, PENDING);
+        let limit = Duration::from_secs_f64(live.settings.block_timeout_seconds);
+        let assembler = Assembler::new(&live.description, limit, MAX_PENDING);
         Self { live, shared, assembler, conversion, thinning, stride, late: 0, large: LARGE }
     }
 
@@ -297,14 +304,14 @@ impl Reader {
                 }
                 Some(Event::Ended { block, generation, closed }) => self.ended(block, generation, closed),
                 Some(Event::Refused(error)) => self.shared.lock().warn(format!("the simulation's data were refused: {error}")),
-                // What lies there unread is not late.
+                // Blocks that wait unread in the ring are not late, so time runs only here.
                 None => self.assembler.expire(),
             }
             self.tell_incomplete();
         }
     }
 
-    /// Lets `take` put a block into its step; the step where it is whole.
+    /// Lets `take` put a block into its step.
     fn assemble<T: Send>(&mut self, values: &mut Vec<f32>, take: impl FnOnce(&mut Assembler, &mut Vec<f32>) -> T + Send) -> T {
         let Self { live, assembler, conversion, .. } = self;
         if 4 * live.grid.nodes() * live.description.components() < self.large {
@@ -313,7 +320,7 @@ impl Reader {
         conversion.beside(|| take(assembler, values), &mut || live.link.beat())
     }
 
-    /// Waits while a slide is due that was not taken; whether it did.
+    /// Waits if a slide is due but was not taken. Returns whether it waited.
     fn hold_back(&mut self) -> bool {
         let state = self.shared.lock();
         if !state.due(self.stride) {
@@ -321,7 +328,7 @@ impl Reader {
         }
         let begin = Instant::now();
         self.live.link.hold();
-        drop(self.shared.changed.wait_timeout(state, LOOK_UP));
+        drop(self.shared.changed.wait_timeout(state, CHECK_INTERVAL));
         self.assembler.held(begin.elapsed());
         true
     }
@@ -332,7 +339,7 @@ impl Reader {
         }
     }
 
-    /// Takes a whole step in.
+    /// Puts a complete step into the window.
     fn whole(&mut self, step: Step) {
         let Step { step: number, time, published, anew, values } = step;
         let mut state = self.shared.lock();
@@ -342,28 +349,28 @@ impl Reader {
             state.warn("the simulation was started anew".to_owned());
             if let Some(newest) = state.window.newest().filter(|newest| time <= *newest) {
                 state.warn(format!("the simulation went back from time {newest} to {time}: the window begins anew"));
-                state.begin_anew();
+                state.restart();
                 self.thinning.restart();
             }
         }
         state.live.steps += 1;
         let keep = self.thinning.keeps(time, &state.window);
-        // Conversion and the measurement take their time: frames are made meanwhile, and producers are told that somebody follows.
+        // Conversion and measurement take long: release the lock so that frames are made meanwhile, and renew the heartbeat.
         drop(state);
         let mut convert = || self.conversion.snapshot(time, &values, &mut || self.live.link.beat());
         let kept = keep.then(&mut convert);
         if !keep {
-            self.thinning.left_out(time, convert);
+            self.thinning.skip(time, convert);
         }
         self.assembler.recycle(values);
         if let Some(kept) = &kept {
-            self.thinning.kept(kept);
+            self.thinning.keep(kept);
             if let Some(tell) = self.shared.listener.get() {
                 tell(kept);
             }
         }
         let mut state = self.shared.lock();
-        (state.live.thinned, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
+        (state.live.steps_skipped, state.live.spacing) = (self.thinning.count, self.thinning.spacing());
         state.live.interpolation_error = self.thinning.error;
         let Some(kept) = kept else { return };
         let newest = state.window.newest();
@@ -383,16 +390,16 @@ impl Reader {
                     state.warn(format!(
                         "{SET_BACK} steps in a row were late: the simulation was set back, the window begins anew at time {time}"
                     ));
-                    state.begin_anew();
+                    state.restart();
                     self.thinning.restart();
-                    self.thinning.kept(&kept);
+                    self.thinning.keep(&kept);
                     let _ = state.window.push(kept);
                 }
             }
             Err(fault) => state.warn(fault.to_string()),
         }
         state.note_filling();
-        // Only what moves the window counts toward its stride.
+        // Only steps that move the window count toward the stride.
         if state.window.newest() != newest {
             state.moved += 1;
             (state.live.step, state.live.published) = (number, published as f64 / 1e9);
@@ -420,7 +427,7 @@ impl Reader {
         }
         let mut state = self.shared.lock();
         for one in given_up {
-            state.live.incomplete += 1;
+            state.live.steps_incomplete += 1;
             state.warn(format!(
                 "step {} (time {}) was given up with {} of {} blocks: {}",
                 one.step, one.time, one.blocks, one.wanted, one.why
@@ -429,7 +436,7 @@ impl Reader {
     }
 }
 
-/// Seconds that have gone by since a moment, in seconds since 1970; 0 where it is yet to come.
+/// Seconds since a moment, given in seconds since 1970; 0 if it lies in the future.
 fn since(moment: f64) -> f64 {
     let now = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0.0, |d| d.as_secs_f64());
     (now - moment).max(0.0)
@@ -438,11 +445,11 @@ fn since(moment: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::live::LiveSettings;
+    use crate::source::live::settings::LiveSettings;
     use ridgewatch_wire::{AxisDescription, Description, Geometry, Policy, Producer};
 
     #[test]
-    fn producers_hear_of_the_follower_while_a_step_is_taken_in() {
+    fn the_heartbeat_goes_on_while_a_step_is_taken_in() {
         let ring = std::path::PathBuf::from("/dev/shm").join(format!("rw-converting-{}", std::process::id()));
         let axis = |name| AxisDescription::uniform(name, "m", 0.0, 1.0, 2);
         let description = Description::whole(Geometry::Cartesian, vec![axis("x"), axis("y")], "s");
@@ -451,13 +458,13 @@ mod tests {
         let live = Live::connect(&settings, &AtomicBool::new(false), &mut |_| ()).unwrap().unwrap();
         let conversion = Conversion::new(live.grid().clone()).unwrap();
         let mut reader = Reader::new(live, Arc::new(Shared::new(1.0)), conversion, Thinning::new(1.0, 14), 1);
-        // The first follower's mark.
+        // The first follower's heartbeat.
         let heartbeat = || {
             let (file, mut bytes) = (std::fs::File::open(ridgewatch_wire::block_path(&ring, 0)).unwrap(), [0; 8]);
             std::os::unix::fs::FileExt::read_exact_at(&file, &mut bytes, 4096 + 8).unwrap();
             u64::from_ne_bytes(bytes)
         };
-        // As if the threads that convert had so much to do.
+        // The converting threads are busy for this long.
         let long = Duration::from_millis(1500);
         let opened = heartbeat();
         reader.conversion.occupy(long);

@@ -1,14 +1,20 @@
-//! Adam (Kingma and Ba 2015) on slices, with burn's arithmetic: same order, same f32 rounding up to fused multiply-adds.
+//! Adam (Kingma and Ba 2015, Adam: a method for stochastic optimization, algorithm 1) on slices, in the order of burn's arithmetic, and the
+//! running mean of the parameters (Polyak and Juditsky 1992).
+//!
+//! The lazy variant for sparse gradients updates only the cache lines of a hash table that received a gradient: a batch reaches a few
+//! percent of a fine level's entries, and all of them together are tens of megabytes.
 
-use super::encode::LINE;
-use super::lanes::prefetch;
+use super::memory::{LINE, prefetch};
 
 /// Decay of the first moment.
 pub(super) const BETA_1: f32 = 0.9;
 /// Decay of the second moment.
 pub(super) const BETA_2: f32 = 0.999;
 
-/// The factors of one step.
+/// Lines that are prefetched before the first of them is used: enough to keep the memory busy.
+const PREFETCHED_LINES: usize = 32;
+
+/// Factors of one step, with both bias corrections folded in.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Adam {
     pub(crate) rate: f32,
@@ -17,7 +23,7 @@ pub(crate) struct Adam {
 }
 
 impl Adam {
-    /// The factors of step number `time`, counted from 1.
+    /// Factors of step number `time`, counted from 1.
     pub(crate) fn at(time: usize, rate: f64, epsilon: f32) -> Self {
         // 1 - 0.999^t is 1 in f32 long before i32 runs out.
         let time = time.min(1 << 30) as i32;
@@ -37,14 +43,12 @@ impl Adam {
         }
     }
 
-    /// The same for those cache lines only that are marked; the marks are taken back. The others wait with the moments they have, as in
-    /// the lazy Adam for sparse gradients: of a fine level's entries a batch reaches a few percent, and all of them together are tens of
-    /// megabytes.
+    /// [`Adam::step`] on the marked cache lines; clears the marks. The other lines keep their moments.
     pub(super) fn lazy_step(self, parameters: &mut [f32], gradient: &mut [f32], first: &mut [f32], second: &mut [f32], touched: &mut [u8]) {
         let len = parameters.len();
         assert!(gradient.len() == len && first.len() == len && second.len() == len && touched.len() >= len.div_ceil(LINE));
-        for (group, marks) in touched[..len.div_ceil(LINE)].chunks_mut(AHEAD).enumerate() {
-            let begin = |line: usize| (AHEAD * group + line) * LINE;
+        for (group, marks) in touched[..len.div_ceil(LINE)].chunks_mut(PREFETCHED_LINES).enumerate() {
+            let begin = |line: usize| (PREFETCHED_LINES * group + line) * LINE;
             for (line, _) in marks.iter().enumerate().filter(|(_, mark)| **mark != 0) {
                 for buffer in [&*parameters, &*gradient, &*first, &*second] {
                     prefetch(buffer, begin(line));
@@ -59,10 +63,7 @@ impl Adam {
     }
 }
 
-/// Lines that are asked for together before the first of them is used: enough to have all the memory's answers under way.
-const AHEAD: usize = 32;
-
-/// Moves a mean of the parameters by its share.
+/// Moves the mean of the parameters by `share` of its distance to them.
 pub(super) fn move_average(average: &mut [f32], parameters: &[f32], share: f32) {
     for (a, &p) in average.iter_mut().zip(parameters) {
         *a += (p - *a) * share;
@@ -75,9 +76,9 @@ mod tests {
 
     #[test]
     fn a_lazy_step_is_the_step_where_there_is_a_gradient() {
-        // Not a whole number of lines, and more of them than are asked for at once.
+        // No whole number of lines, and more of them than are prefetched together.
         let len = 40 * LINE + 5;
-        let value = |i: usize, k: u64| super::super::module::uniform(k, i as u64) - 0.5;
+        let value = |i: usize, k: u64| super::super::random::uniform(k, i as u64) - 0.5;
         let mut touched: Vec<u8> = (0..len.div_ceil(LINE)).map(|line| u8::from(line % 3 == 1 || line >= 39)).collect();
         let marked: Vec<bool> = (0..len).map(|i| touched[i / LINE] != 0).collect();
         let gradient: Vec<f32> = (0..len).map(|i| if marked[i] { value(i, 1) } else { 0.0 }).collect();

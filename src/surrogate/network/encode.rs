@@ -1,148 +1,152 @@
-//! Encodings of a tile of positions, with their derivatives along the input axes, and the way back into the tables.
+//! Encodings of the positions of a tile, their derivatives along the axes, and the gradient of the hash tables.
+//!
+//! Hash grid: Müller, Evans, Schied and Keller 2022 (Instant neural graphics primitives with a multiresolution hash encoding, ACM
+//! Transactions on Graphics 41). On every level, the features of a position are interpolated multilinearly between the table entries of the
+//! corners of its cell. Entries of fine levels are found by a spatial hash; collisions are left to the MLP.
+//!
+//! Frequencies: Mildenhall et al. 2020 (NeRF: representing scenes as neural radiance fields for view synthesis, ECCV), equation 4, with
+//! half the base frequency: sin and cos of 2^l (pi / 2) p for p = 2x - 1 in [-1, 1].
 
 use super::architecture::{Architecture, HASH, Level};
-use super::lanes::lanes;
+use super::memory::{LINE, TILE_ROWS, load, row_stride};
 use std::f32::consts::FRAC_PI_2;
 use wide::{f32x8, i32x8};
 
-/// Values of a table that share one mark of having received a gradient: a cache line.
-pub(super) const LINE: usize = 16;
+/// Positions of a tile, and the arrangement of the rows of features that belong to them.
+#[derive(Clone, Copy)]
+pub(super) struct Positions<'a> {
+    /// Unit coordinates, `[input][sample]`.
+    pub(super) coordinates: &'a [[f32; TILE_ROWS]],
+    /// Samples in use.
+    pub(super) count: usize,
+    /// Groups of rows: the features, then their derivatives along each axis of the domain, if any.
+    pub(super) groups: usize,
+    /// Rows of a group.
+    pub(super) group_rows: usize,
+}
 
-/// The corners of the cell around each sample of a tile, for one level. Arrays are `[corner][lane]`, slopes `[input][corner][lane]`.
+/// The corners of the cell around each sample of a tile, for one level.
 pub(super) struct Corners {
-    lanes: usize,
-    index: Vec<u32>,
-    weight: Vec<f32>,
-    slope: Vec<f32>,
+    /// Table entries, `[corner][sample]`.
+    entries: Vec<[u32; TILE_ROWS]>,
+    /// Factors of the entries, `[group][corner][sample]`: the multilinear weights, then their derivatives along each axis.
+    factors: Vec<[f32; TILE_ROWS]>,
+}
+
+/// The features of one level in rows of features.
+#[derive(Clone, Copy)]
+struct Columns {
+    first: usize,
+    stride: usize,
+    rows: usize,
 }
 
 impl Corners {
-    /// Room for `samples` samples (rounded up to vectors); none for the frequency encoding, which has no cells.
-    pub(super) fn new(shape: &Architecture, samples: usize) -> Self {
-        let lanes = samples.next_multiple_of(8);
-        let values = if shape.levels.is_empty() { 0 } else { lanes << shape.inputs() };
-        Self { lanes, index: vec![0; values], weight: vec![0.0; values], slope: vec![0.0; shape.inputs() * values] }
+    /// Memory for one tile; empty for the frequency encoding, which has no cells.
+    pub(super) fn new(shape: &Architecture) -> Self {
+        let corners = if shape.levels.is_empty() { 0 } else { 1 << shape.inputs() };
+        Self { entries: vec![[0; TILE_ROWS]; corners], factors: vec![[0.0; TILE_ROWS]; corners * (1 + shape.dimensions())] }
     }
 
-    /// Finds cells and multilinear weights of the first `count` samples; `coordinates` holds one run of `run` unit coordinates an axis, and
-    /// may be read up to the next multiple of 8. Out-of-range and NaN coordinates are clamped, so every index lies below `level.entries`.
-    fn locate<const D: usize>(&mut self, level: &Level, coordinates: &[f32], run: usize, count: usize, slopes: bool) {
-        let lanes_held = self.lanes;
-        assert!(count <= lanes_held);
+    /// Finds the entries and the factors of all samples. Coordinates out of range and NaN are clamped, so that every entry is below
+    /// `level.entries`.
+    fn locate<const D: usize>(&mut self, level: &Level, positions: Positions<'_>) {
         let (zero, one) = (f32x8::splat(0.0), f32x8::splat(1.0));
         let mask = i32x8::splat((level.entries - 1) as i32);
-        for first in (0..count).step_by(8) {
-            let mut node = [[i32x8::splat(0); 2]; D];
-            let mut share = [[zero; 2]; D];
+        for first in (0..positions.count).step_by(8) {
+            // The lower and the upper node along each axis, as parts of an index, and their weights.
+            let mut nodes = [[i32x8::splat(0); 2]; D];
+            let mut weights = [[zero; 2]; D];
             let mut stride = 1_i32;
             for axis in 0..D {
                 let cells = level.cells[axis];
-                let position = lanes(&coordinates[axis * run + first..]).fast_max(zero).fast_min(one) * f32x8::splat(cells as f32);
+                let position = load(&positions.coordinates[axis][first..]).fast_max(zero).fast_min(one) * f32x8::splat(cells as f32);
                 let cell = position.fast_trunc_int().max(i32x8::splat(0)).min(i32x8::splat(cells as i32 - 1));
                 let fraction = position - f32x8::from_i32x8(cell);
                 let factor = if level.hashed { HASH[axis] as i32 } else { stride };
-                let low = cell * i32x8::splat(factor);
-                node[axis] = [low, low + i32x8::splat(factor)];
-                share[axis] = [one - fraction, fraction];
+                let lower = cell * i32x8::splat(factor);
+                nodes[axis] = [lower, lower + i32x8::splat(factor)];
+                weights[axis] = [one - fraction, fraction];
                 stride = stride.wrapping_mul(cells as i32 + 1);
             }
             for corner in 0..1 << D {
                 let side = |axis: usize| (corner >> axis) & 1;
-                let (mut index, mut weight) = (node[0][side(0)], share[0][side(0)]);
+                let mut entry = nodes[0][side(0)];
                 for axis in 1..D {
-                    let other = node[axis][side(axis)];
-                    index = if level.hashed { index ^ other } else { index + other };
-                    weight *= share[axis][side(axis)];
+                    let node = nodes[axis][side(axis)];
+                    entry = if level.hashed { entry ^ node } else { entry + node };
                 }
                 if level.hashed {
-                    index &= mask;
+                    entry &= mask;
                 }
-                let at = corner * lanes_held + first;
-                for (to, from) in self.index[at..at + 8].iter_mut().zip(index.to_array()) {
-                    *to = from as u32;
-                }
-                self.weight[at..at + 8].copy_from_slice(&weight.to_array());
-                if slopes {
+                self.entries[corner][first..first + 8].copy_from_slice(&entry.to_array().map(|entry| entry as u32));
+                for group in 0..positions.groups {
+                    let mut factor = one;
                     for axis in 0..D {
-                        let cells = level.cells[axis] as f32;
-                        let mut slope = f32x8::splat(if side(axis) == 1 { cells } else { -cells });
-                        for other in (0..D).filter(|&other| other != axis) {
-                            slope *= share[other][side(other)];
-                        }
-                        let at = ((axis << D) + corner) * lanes_held + first;
-                        self.slope[at..at + 8].copy_from_slice(&slope.to_array());
+                        factor *= if group == axis + 1 {
+                            let cells = level.cells[axis] as f32;
+                            f32x8::splat(if side(axis) == 1 { cells } else { -cells })
+                        } else {
+                            weights[axis][side(axis)]
+                        };
                     }
+                    self.factors[(group << D) + corner][first..first + 8].copy_from_slice(&factor.to_array());
                 }
             }
         }
     }
 
-    /// Adds up `factors[corner] * table[index]` into columns `column..column + F` of `out`, one row a sample.
-    fn gather<const D: usize, const F: usize>(
-        &self,
-        factors: &[f32],
-        table: &[f32],
-        out: &mut [f32],
-        stride: usize,
-        column: usize,
-        count: usize,
-    ) {
-        assert!(count <= self.lanes && column + F <= stride && out.len() >= count * stride && factors.len() >= (1 << D) * self.lanes);
-        for (sample, row) in out.chunks_exact_mut(stride).take(count).enumerate() {
+    /// Writes the sum of `factor * entry` over the corners into the level's columns of `out`.
+    fn gather<const D: usize, const F: usize>(&self, group: usize, table: &[[f32; F]], out: &mut [f32], columns: Columns) {
+        let (entries, factors) = (&self.entries[..1 << D], &self.factors[group << D..][..1 << D]);
+        for (sample, row) in out.chunks_exact_mut(columns.stride).take(columns.rows.min(TILE_ROWS)).enumerate() {
             let mut sum = [0.0_f32; F];
-            for corner in 0..1 << D {
-                let at = corner * self.lanes + sample;
-                // SAFETY: at < 2^D * lanes, the length of both arrays; `locate` keeps every index below the level's entries, and the caller
-                // passes that level's table of entries * F values.
-                unsafe {
-                    let entry = *self.index.get_unchecked(at) as usize * F;
-                    let factor = *factors.get_unchecked(at);
-                    for (feature, sum) in sum.iter_mut().enumerate() {
-                        *sum = factor.mul_add(*table.get_unchecked(entry + feature), *sum);
-                    }
+            for (entry, factor) in entries.iter().zip(factors) {
+                // SAFETY: `locate` keeps every entry below the level's, and the caller passes that level's table.
+                let features = unsafe { table.get_unchecked(entry[sample] as usize) };
+                for (sum, feature) in sum.iter_mut().zip(features) {
+                    *sum = factor[sample].mul_add(*feature, *sum);
                 }
             }
-            row[column..column + F].copy_from_slice(&sum);
+            row[columns.first..columns.first + F].copy_from_slice(&sum);
         }
     }
 
-    /// Adds `factors[corner] * gradient[sample]` to the table entries; the gradient's columns `column..column + F`, one row a sample.
+    /// Adds `factor * gradient` to the entries of the corners, for the level's columns of `gradient`, and marks the cache lines of
+    /// the entries in `touched`.
     fn scatter<const D: usize, const F: usize>(
         &self,
-        factors: &[f32],
+        group: usize,
         gradient: &[f32],
-        stride: usize,
-        column: usize,
-        table: &mut [f32],
+        columns: Columns,
+        table: &mut [[f32; F]],
         touched: &mut [u8],
-        count: usize,
     ) {
-        assert!(count <= self.lanes && gradient.len() >= count * stride && factors.len() >= (1 << D) * self.lanes);
-        assert!(touched.len() >= table.len().div_ceil(LINE));
-        for (sample, row) in gradient.chunks_exact(stride).take(count).enumerate() {
+        assert!(touched.len() >= table.as_flattened().len().div_ceil(LINE));
+        let (entries, factors) = (&self.entries[..1 << D], &self.factors[group << D..][..1 << D]);
+        for (sample, row) in gradient.chunks_exact(columns.stride).take(columns.rows.min(TILE_ROWS)).enumerate() {
             let mut gradient = [0.0_f32; F];
-            gradient.copy_from_slice(&row[column..column + F]);
-            for corner in 0..1 << D {
-                let at = corner * self.lanes + sample;
-                // SAFETY: as in `gather`; entry < table.len(), so its line has a mark.
-                unsafe {
-                    let entry = *self.index.get_unchecked(at) as usize * F;
-                    let factor = *factors.get_unchecked(at);
-                    *touched.get_unchecked_mut(entry / LINE) = 1;
-                    for (feature, gradient) in gradient.iter().enumerate() {
-                        let value = table.get_unchecked_mut(entry + feature);
-                        *value = factor.mul_add(*gradient, *value);
-                    }
+            gradient.copy_from_slice(&row[columns.first..columns.first + F]);
+            for (entry, factor) in entries.iter().zip(factors) {
+                // Read before any store, so that the features are updated as one vector.
+                let (entry, factor) = (entry[sample] as usize, factor[sample]);
+                // SAFETY: as in `gather`; the entry's line has a mark.
+                let features = unsafe {
+                    *touched.get_unchecked_mut(entry * F / LINE) = 1;
+                    table.get_unchecked_mut(entry)
+                };
+                for (feature, gradient) in features.iter_mut().zip(&gradient) {
+                    *feature = factor.mul_add(*gradient, *feature);
                 }
             }
         }
     }
 }
 
-/// Chooses the instance for the number of inputs and features.
+/// Calls the instance for the numbers of inputs and features.
 macro_rules! dispatch {
-    ($d:expr, $f:expr, $call:ident) => {
-        match ($d, $f) {
+    ($shape:expr, $call:ident) => {
+        match ($shape.inputs(), $shape.features) {
             (1, 1) => $call!(1, 1),
             (1, 2) => $call!(1, 2),
             (1, 4) => $call!(1, 4),
@@ -163,104 +167,73 @@ macro_rules! dispatch {
     };
 }
 
-/// Encodes `count` samples into rows of `out`; `groups - 1` further groups of rows, `group` rows apart, get the derivatives along the axes.
-pub(super) fn encode(
-    shape: &Architecture,
-    tables: &[f32],
-    coordinates: &[f32],
-    run: usize,
-    count: usize,
-    groups: usize,
-    group: usize,
-    corners: &mut Corners,
-    out: &mut [f32],
-    stride: usize,
-) {
+/// Encodes a tile into rows of `out`, [`row_stride`] apart.
+pub(super) fn encode(shape: &Architecture, tables: &[f32], positions: Positions<'_>, corners: &mut Corners, out: &mut [f32]) {
     if shape.levels.is_empty() {
-        return frequencies(shape, coordinates, run, count, groups, group, out, stride);
+        return frequencies(shape, positions, out);
     }
+    let stride = row_stride(shape.encoded());
     assert!(tables.len() == shape.table_entries() * shape.features);
     for (number, level) in shape.levels.iter().enumerate() {
         let table = &tables[level.offset * shape.features..][..level.entries * shape.features];
-        let column = number * shape.features;
+        let columns = Columns { first: number * shape.features, stride, rows: positions.count };
         macro_rules! level {
             ($d:literal, $f:literal) => {{
-                corners.locate::<$d>(level, coordinates, run, count, groups > 1);
-                corners.gather::<$d, $f>(&corners.weight, table, out, stride, column, count);
-                for axis in 0..groups - 1 {
-                    let slopes = &corners.slope[(axis << $d) * corners.lanes..];
-                    corners.gather::<$d, $f>(slopes, table, &mut out[(axis + 1) * group * stride..], stride, column, count);
+                corners.locate::<$d>(level, positions);
+                for group in 0..positions.groups {
+                    let out = &mut out[group * positions.group_rows * stride..];
+                    corners.gather::<$d, $f>(group, table.as_chunks().0, out, columns);
                 }
             }};
         }
-        dispatch!(shape.inputs(), shape.features, level);
+        dispatch!(shape, level);
     }
 }
 
-/// Adds the gradient of the features of level `number` to its table gradient, for one tile. `gradient` has a row of `stride` values a sample;
-/// further groups of rows are `group` rows apart.
+/// Adds the gradient of level `number` to that of its table, for one tile. The rows of `gradient` lie [`row_stride`] apart.
 pub(super) fn scatter_level(
     shape: &Architecture,
     number: usize,
-    level: &Level,
-    coordinates: &[f32],
-    run: usize,
-    count: usize,
-    groups: usize,
-    group: usize,
+    positions: Positions<'_>,
     gradient: &[f32],
-    stride: usize,
     corners: &mut Corners,
     table: &mut [f32],
     touched: &mut [u8],
 ) {
+    let (level, stride) = (&shape.levels[number], row_stride(shape.encoded()));
     assert!(table.len() == level.entries * shape.features);
-    let column = number * shape.features;
+    let columns = Columns { first: number * shape.features, stride, rows: positions.count };
     macro_rules! level {
         ($d:literal, $f:literal) => {{
-            corners.locate::<$d>(level, coordinates, run, count, groups > 1);
-            corners.scatter::<$d, $f>(&corners.weight, gradient, stride, column, table, touched, count);
-            for axis in 0..groups - 1 {
-                let slopes = &corners.slope[(axis << $d) * corners.lanes..];
-                corners.scatter::<$d, $f>(slopes, &gradient[(axis + 1) * group * stride..], stride, column, table, touched, count);
+            corners.locate::<$d>(level, positions);
+            for group in 0..positions.groups {
+                let gradient = &gradient[group * positions.group_rows * stride..];
+                corners.scatter::<$d, $f>(group, gradient, columns, table.as_chunks_mut().0, touched);
             }
         }};
     }
-    dispatch!(shape.inputs(), shape.features, level);
+    dispatch!(shape, level);
 }
 
-/// sin and cos of 2^l (pi/2) p with p = 2x - 1 in [-1, 1], ordered axis, octave, (sin, cos).
-fn frequencies(
-    shape: &Architecture,
-    coordinates: &[f32],
-    run: usize,
-    count: usize,
-    groups: usize,
-    group: usize,
-    out: &mut [f32],
-    stride: usize,
-) {
-    let (inputs, octaves) = (shape.inputs(), shape.octaves);
-    assert!(stride >= 2 * inputs * octaves);
-    for first in (0..count).step_by(8) {
-        let take = (count - first).min(8);
-        for axis in 0..inputs {
-            let x = lanes(&coordinates[axis * run + first..]).fast_max(f32x8::splat(0.0)).fast_min(f32x8::splat(1.0));
+/// Frequency encoding, ordered by axis, octave, (sin, cos).
+fn frequencies(shape: &Architecture, positions: Positions<'_>, out: &mut [f32]) {
+    let (octaves, stride) = (shape.octaves, row_stride(shape.encoded()));
+    for first in (0..positions.count).step_by(8) {
+        let lanes = (positions.count - first).min(8);
+        for (axis, coordinates) in positions.coordinates.iter().enumerate() {
+            let x = load(&coordinates[first..]).fast_max(f32x8::splat(0.0)).fast_min(f32x8::splat(1.0));
             let position = x + x - f32x8::splat(1.0);
             for octave in 0..octaves {
                 let frequency = FRAC_PI_2 * (1_u32 << octave) as f32;
                 let (sin, cos) = (position * f32x8::splat(frequency)).sin_cos();
                 let (sin, cos) = (sin.to_array(), cos.to_array());
                 let column = 2 * (axis * octaves + octave);
-                for lane in 0..take {
-                    let row = first + lane;
-                    out[row * stride + column] = sin[lane];
-                    out[row * stride + column + 1] = cos[lane];
-                    for along in 0..groups - 1 {
-                        let row = (along + 1) * group + row;
-                        let slope = if along == axis { 2.0 * frequency } else { 0.0 };
-                        out[row * stride + column] = slope * cos[lane];
-                        out[row * stride + column + 1] = -slope * sin[lane];
+                for lane in 0..lanes {
+                    for group in 0..positions.groups {
+                        let slope = if group == axis + 1 { 2.0 * frequency } else { 0.0 };
+                        let pair = if group == 0 { [sin[lane], cos[lane]] } else { [slope * cos[lane], -slope * sin[lane]] };
+                        let row = group * positions.group_rows + first + lane;
+                        out[row * stride + column..][..2].copy_from_slice(&pair);
                     }
                 }
             }

@@ -1,4 +1,4 @@
-//! A network with its optimizer state, and burn's buffers lent to the fused kernels.
+//! A network with its optimizer state, and the loan of burn's buffers to the fused kernels.
 
 use super::architecture::Architecture;
 use super::module::Network;
@@ -10,21 +10,22 @@ use burn::tensor::{Tensor, TensorData, TensorPrimitive};
 /// Parameters, Adam's moments as burn keeps them, and the number of steps taken.
 #[derive(Clone)]
 pub struct Model {
-    /// What is stored where.
+    /// Shape of the network.
     pub shape: Architecture,
     /// Parameters.
     pub module: Network<Flex>,
-    /// Adam's state for the tables; none before the first step and for the frequency encoding.
+    /// Adam's state for the tables; `None` before the first step and for the frequency encoding.
     pub table_moments: Option<AdamState<Flex, 2>>,
-    /// Adam's state for the layers; none before the first step.
+    /// Adam's state for the layers; `None` before the first step.
     pub layer_moments: Option<AdamState<Flex, 1>>,
     /// Adam's epsilon.
     pub epsilon: f32,
 }
 
 impl Model {
-    /// Fresh parameters. The tables' gradients are far below burn's default epsilon of 1e-5, so it is 1e-15 there.
+    /// Fresh parameters (see [`Network::new`]).
     pub fn new(shape: Architecture, seed: u64, zero_output: bool) -> Self {
+        // The gradients of tables are far below burn's default epsilon of 1e-5; 1e-15 is that of Müller et al. 2022.
         let epsilon = if shape.levels.is_empty() { 1e-8 } else { 1e-15 };
         let module = Network::new(&shape, seed, zero_output, &Default::default());
         Self { shape, module, table_moments: None, layer_moments: None, epsilon }
@@ -37,95 +38,73 @@ impl Model {
 
     /// The tables' values; empty for the frequency encoding.
     pub fn tables(&self) -> Vec<f32> {
-        self.module.tables.as_ref().map_or_else(Vec::new, |tables| contents(&tables.val()))
+        self.module.tables.as_ref().map_or_else(Vec::new, |tables| primitive(tables.val()).storage().to_vec())
     }
 
     /// The layers' values.
     pub fn layers(&self) -> Vec<f32> {
-        contents(&self.module.layers.val())
+        primitive(self.module.layers.val()).storage().to_vec()
     }
 
     /// Parameters, first and second moments of tables and layers; moments are 0 before the first step.
     pub(crate) fn state(&self) -> [[Vec<f32>; 3]; 2] {
-        let zeros = |len: usize| vec![0.0; len];
-        let tables = self.tables();
-        let layers = self.layers();
-        let [table_1, table_2] = match &self.table_moments {
-            Some(state) => [contents(&state.momentum.moment_1), contents(&state.momentum.moment_2)],
-            None => [zeros(tables.len()), zeros(tables.len())],
-        };
-        let [layer_1, layer_2] = match &self.layer_moments {
-            Some(state) => [contents(&state.momentum.moment_1), contents(&state.momentum.moment_2)],
-            None => [zeros(layers.len()), zeros(layers.len())],
-        };
-        [[tables, table_1, table_2], [layers, layer_1, layer_2]]
+        let lengths = [self.shape.table_entries() * self.shape.features, self.shape.layer_parameters()];
+        let mut state = lengths.map(|len| [(); 3].map(|()| vec![0.0; len]));
+        self.copy_state(&mut state);
+        state
     }
 
-    /// Copies what [`Model::state`] gives into buffers that it gave before.
+    /// Copies the state into the result of an earlier [`Model::state`].
     pub(crate) fn copy_state(&self, [tables, layers]: &mut [[Vec<f32>; 3]; 2]) {
         if let Some(parameter) = &self.module.tables {
-            copy(&parameter.val(), self.table_moments.as_ref(), tables);
+            copy(parameter.val(), self.table_moments.as_ref(), tables);
         }
-        copy(&self.module.layers.val(), self.layer_moments.as_ref(), layers);
+        copy(self.module.layers.val(), self.layer_moments.as_ref(), layers);
     }
 
-    /// Sets what [`Model::state`] gave, after `steps` steps. Lengths must be those of the shape.
+    /// Sets the result of [`Model::state`] after `steps` steps. Lengths must be those of the shape.
     pub(crate) fn set_state(&mut self, [tables, layers]: [[Vec<f32>; 3]; 2], steps: usize) {
-        let shape = [self.shape.table_entries(), self.shape.features];
         if let Some(parameter) = self.module.tables.take() {
-            let [values, first, second] = tables.map(|values| from_values::<2>(values, shape));
+            let (values, moments) = from_values(tables, [self.shape.table_entries(), self.shape.features], steps);
             self.module.tables = Some(Param::initialized(parameter.id, values));
-            self.table_moments = (steps > 0).then(|| AdamState::new(AdaptiveMomentumState::new(steps, first, second)));
+            self.table_moments = moments;
         }
-        let shape = [self.shape.layer_parameters()];
-        let [values, first, second] = layers.map(|values| from_values::<1>(values, shape));
+        let (values, moments) = from_values(layers, [self.shape.layer_parameters()], steps);
         self.module.layers = Param::initialized(self.module.layers.id, values);
-        self.layer_moments = (steps > 0).then(|| AdamState::new(AdaptiveMomentumState::new(steps, first, second)));
+        self.layer_moments = moments;
     }
 
-    /// Sets the last layer and its moments to 0.
+    /// Sets the output layer and its moments to 0.
     pub fn zero_output(&mut self) {
-        let head = &self.shape.layers[self.shape.layers.len() - 1];
-        let range = head.weights..head.biases + head.outputs;
-        let mut loan = self.lend();
-        for buffer in loan.layers.buffers() {
+        let output = self.shape.output_layer();
+        let range = output.weights..output.biases + output.outputs;
+        let mut buffers = self.lend();
+        for buffer in buffers.layers.slices() {
             buffer[range.clone()].fill(0.0);
         }
-        loan.back(self);
+        buffers.give_back(self);
     }
 
-    /// Takes every buffer out of the module and the moments; [`Loan::back`] returns them. No value is copied, unless a tensor is shared.
-    pub(super) fn lend(&mut self) -> Loan {
-        let tables = self.module.tables.take().map(|parameter| {
-            let moments = self.table_moments.take();
-            Lent::new(parameter, moments)
-        });
-        // burn's module cannot be without layers: while they are lent out it holds a tensor that nothing reads.
+    /// Takes all buffers out of the module and the moments until [`ModelBuffers::give_back`]. Copies only shared tensors.
+    pub(super) fn lend(&mut self) -> ModelBuffers {
+        let tables = self.module.tables.take().map(|parameter| ParameterBuffers::new(parameter, self.table_moments.take()));
+        // burn's module cannot be without layers: a tensor that nothing reads stands in for them.
         let unread = Param::initialized(ParamId::from(0), Tensor::zeros([1], &Default::default()));
         let layers = std::mem::replace(&mut self.module.layers, unread);
-        Loan { tables, layers: Lent::new(layers, self.layer_moments.take()) }
+        ModelBuffers { tables, layers: ParameterBuffers::new(layers, self.layer_moments.take()) }
     }
 }
 
-pub(super) fn contents<const D: usize>(tensor: &Tensor<Flex, D>) -> Vec<f32> {
-    let primitive = tensor.clone().into_primitive().tensor();
-    primitive.to_contiguous().storage::<f32>().to_vec()
-}
-
-fn copy<const D: usize>(parameter: &Tensor<Flex, D>, moments: Option<&AdamState<Flex, D>>, to: &mut [Vec<f32>; 3]) {
-    let mut part = |at: usize, tensor: &Tensor<Flex, D>| {
-        let tensor = primitive(tensor.clone());
-        to[at].copy_from_slice(tensor.storage());
-    };
-    part(0, parameter);
-    if let Some(state) = moments {
-        part(1, &state.momentum.moment_1);
-        part(2, &state.momentum.moment_2);
+fn copy<const D: usize>(parameter: Tensor<Flex, D>, moments: Option<&AdamState<Flex, D>>, to: &mut [Vec<f32>; 3]) {
+    let moments = moments.map(|state| [state.momentum.moment_1.clone(), state.momentum.moment_2.clone()]);
+    for (to, tensor) in to.iter_mut().zip([parameter].into_iter().chain(moments.into_iter().flatten())) {
+        to.copy_from_slice(primitive(tensor).storage());
     }
 }
 
+/// The contiguous tensor of exactly the values.
 fn primitive<const D: usize>(tensor: Tensor<Flex, D>) -> FlexTensor {
-    // Fresh parameters are contiguous; only a view (which burn's own operations may leave) is copied here.
+    // Parameters are contiguous; only a view, which burn's own operations may leave, is copied.
     let tensor = tensor.into_primitive().tensor();
     if tensor.as_slice::<f32>().is_some_and(|values| values.len() == tensor.storage::<f32>().len()) {
         tensor
@@ -134,8 +113,9 @@ fn primitive<const D: usize>(tensor: Tensor<Flex, D>) -> FlexTensor {
     }
 }
 
-fn from_values<const D: usize>(values: Vec<f32>, shape: [usize; D]) -> Tensor<Flex, D> {
-    Tensor::from_data(TensorData::new(values, shape), &Default::default())
+fn from_values<const D: usize>(values: [Vec<f32>; 3], shape: [usize; D], steps: usize) -> (Tensor<Flex, D>, Option<AdamState<Flex, D>>) {
+    let [values, first, second] = values.map(|values| Tensor::from_data(TensorData::new(values, shape), &Default::default()));
+    (values, (steps > 0).then(|| AdamState::new(AdaptiveMomentumState::new(steps, first, second))))
 }
 
 fn tensor<const D: usize>(primitive: FlexTensor) -> Tensor<Flex, D> {
@@ -143,7 +123,7 @@ fn tensor<const D: usize>(primitive: FlexTensor) -> Tensor<Flex, D> {
 }
 
 /// One parameter and its two moments, as raw tensors.
-pub(super) struct Lent<const D: usize> {
+pub(super) struct ParameterBuffers<const D: usize> {
     id: ParamId,
     mapper: ParamMapper<Tensor<Flex, D>>,
     parameter: FlexTensor,
@@ -153,7 +133,7 @@ pub(super) struct Lent<const D: usize> {
     pub(super) time: usize,
 }
 
-impl<const D: usize> Lent<D> {
+impl<const D: usize> ParameterBuffers<D> {
     fn new(parameter: Param<Tensor<Flex, D>>, moments: Option<AdamState<Flex, D>>) -> Self {
         let (id, value, mapper) = parameter.consume();
         let (first, second, time) = match moments {
@@ -164,7 +144,7 @@ impl<const D: usize> Lent<D> {
     }
 
     /// Parameters, first and second moments.
-    pub(super) fn buffers(&mut self) -> [&mut [f32]; 3] {
+    pub(super) fn slices(&mut self) -> [&mut [f32]; 3] {
         [self.parameter.storage_mut(), self.first.storage_mut(), self.second.storage_mut()]
     }
 
@@ -173,7 +153,7 @@ impl<const D: usize> Lent<D> {
         self.parameter.storage()
     }
 
-    fn back(self) -> (Param<Tensor<Flex, D>>, Option<AdamState<Flex, D>>) {
+    fn give_back(self) -> (Param<Tensor<Flex, D>>, Option<AdamState<Flex, D>>) {
         let parameter = Param::from_mapped_value(self.id, tensor(self.parameter), self.mapper);
         let moments = AdaptiveMomentumState::new(self.time, tensor(self.first), tensor(self.second));
         (parameter, (self.time > 0).then(|| AdamState::new(moments)))
@@ -181,19 +161,19 @@ impl<const D: usize> Lent<D> {
 }
 
 /// The buffers of a [`Model`] while the fused kernels work in them.
-pub(super) struct Loan {
-    pub(super) tables: Option<Lent<2>>,
-    pub(super) layers: Lent<1>,
+pub(super) struct ModelBuffers {
+    pub(super) tables: Option<ParameterBuffers<2>>,
+    pub(super) layers: ParameterBuffers<1>,
 }
 
-impl Loan {
-    /// Hands the buffers back to burn.
-    pub(super) fn back(self, model: &mut Model) {
+impl ModelBuffers {
+    /// Returns the buffers to burn.
+    pub(super) fn give_back(self, model: &mut Model) {
         if let Some(tables) = self.tables {
-            let (parameter, moments) = tables.back();
+            let (parameter, moments) = tables.give_back();
             model.module.tables = Some(parameter);
             model.table_moments = moments;
         }
-        (model.module.layers, model.layer_moments) = self.layers.back();
+        (model.module.layers, model.layer_moments) = self.layers.give_back();
     }
 }

@@ -1,6 +1,10 @@
-//! The burn module, and its evaluation with burn's stock operations: the readable reference for the fused paths.
+//! The burn module, and its evaluation by burn's stock operations: the readable reference for the fused kernels.
+//!
+//! Encodings as in `encode` (Müller et al. 2022, Mildenhall et al. 2020); initialisation of weights: He et al. 2015 (Delving deep into
+//! rectifiers), of tables: Müller et al. 2022.
 
 use super::architecture::{Architecture, HASH};
+use super::random::uniform;
 use burn::module::{Module, Param, ParamId};
 use burn::tensor::{Int, Tensor, TensorData, activation::relu, backend::Backend};
 use std::f32::consts::FRAC_PI_2;
@@ -8,33 +12,15 @@ use std::f32::consts::FRAC_PI_2;
 /// Parameters of a network. burn owns them; the fused kernels work in the same buffers.
 #[derive(Module, Debug)]
 pub struct Network<B: Backend> {
-    /// Hash-grid tables, `[entries of all levels, features]`; none for the frequency encoding.
+    /// Hash-grid tables, `[entries of all levels, features]`; `None` for the frequency encoding.
     pub tables: Option<Param<Tensor<B, 2>>>,
     /// Weights and biases of all layers in one vector (see [`super::architecture::Layer`]).
     pub layers: Param<Tensor<B, 1>>,
 }
 
-/// A number in [0, 1) from a seed and a counter (splitmix64).
-pub(crate) fn uniform(seed: u64, counter: u64) -> f32 {
-    (mix(seed, counter) >> 40) as f32 / (1_u64 << 24) as f32
-}
-
-/// 64 random bits from a seed and a counter: the finaliser of splitmix64 (Steele, Lea, Flood 2014) over both.
-fn mix(seed: u64, counter: u64) -> u64 {
-    let mut z = seed.wrapping_mul(0xD134_2543_DE82_EF95).wrapping_add(counter.wrapping_add(1).wrapping_mul(0x9E37_79B9_7F4A_7C15));
-    z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
-    z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
-    z ^ (z >> 31)
-}
-
-/// One of `count` numbers from a seed and a counter.
-pub(crate) fn draw(seed: u64, counter: u64, count: usize) -> usize {
-    // Multiply-shift: the bias of 2^-64 * count is far below anything that training could notice.
-    ((u128::from(mix(seed, counter)) * count as u128) >> 64) as usize
-}
-
 impl<B: Backend> Network<B> {
-    /// Draws the parameters: tables from +-1e-4, weights from He's uniform distribution, biases 0. `zero_output` starts the last layer at 0.
+    /// Draws the parameters: tables from +-1e-4, weights from He's uniform distribution, biases 0. `zero_output` sets the output layer to
+    /// 0.
     pub fn new(shape: &Architecture, seed: u64, zero_output: bool, device: &B::Device) -> Self {
         let entries = shape.table_entries();
         let tables = (entries > 0).then(|| {
@@ -42,10 +28,8 @@ impl<B: Backend> Network<B> {
             parameter(Tensor::from_data(TensorData::new(values, [entries, shape.features]), device))
         });
         let mut values = vec![0.0_f32; shape.layer_parameters()];
-        for (number, layer) in shape.layers.iter().enumerate() {
-            if zero_output && number + 1 == shape.layers.len() {
-                continue;
-            }
+        let drawn = if zero_output { shape.hidden_layers() } else { &shape.layers };
+        for layer in drawn {
             let bound = (6.0 / layer.inputs as f32).sqrt();
             for weight in layer.weights..layer.biases {
                 values[weight] = (2.0 * uniform(seed ^ 0x6c61_7965_7273, weight as u64) - 1.0) * bound;
@@ -57,10 +41,10 @@ impl<B: Backend> Network<B> {
 
     /// Outputs `[samples, outputs]` at unit coordinates `[samples, axes]`.
     pub fn forward(&self, shape: &Architecture, points: Tensor<B, 2>) -> Tensor<B, 2> {
-        self.layers_forward(shape, vec![self.encode(shape, points, false).remove(0)]).remove(0)
+        self.layers_forward(shape, self.encode(shape, points, false)).remove(0)
     }
 
-    /// Outputs, and their derivatives along each input axis by forward differentiation.
+    /// Outputs, then their derivatives along each axis of the domain, by forward differentiation.
     pub fn forward_with_derivatives(&self, shape: &Architecture, points: Tensor<B, 2>) -> Vec<Tensor<B, 2>> {
         self.layers_forward(shape, self.encode(shape, points, true))
     }
@@ -166,7 +150,7 @@ fn hash_grid<B: Backend>(shape: &Architecture, tables: Tensor<B, 2>, points: Ten
     sums.into_iter().flatten().map(|sum| sum.reshape([samples, levels * shape.features])).collect()
 }
 
-/// sin and cos of 2^l (pi/2) (2x - 1), ordered axis, octave, (sin, cos).
+/// sin and cos of 2^l (pi / 2) (2x - 1), ordered by axis, octave, (sin, cos).
 fn frequencies<B: Backend>(shape: &Architecture, points: Tensor<B, 2>, derivatives: bool) -> Vec<Tensor<B, 2>> {
     let device = points.device();
     let (samples, inputs, octaves) = (points.dims()[0], shape.inputs(), shape.octaves);
@@ -185,19 +169,4 @@ fn frequencies<B: Backend>(shape: &Architecture, points: Tensor<B, 2>, derivativ
         rows.push(pairs(cos.clone() * slope.clone(), sin.clone() * slope.neg()));
     }
     rows
-}
-
-#[cfg(test)]
-mod tests {
-    use super::draw;
-
-    #[test]
-    fn draws_are_even_and_of_their_counter_alone() {
-        let drawn = |first: u64| -> Vec<usize> { (first..first + 100_000).map(|counter| draw(7, counter, 1000)).collect() };
-        let (here, further) = (drawn(0), drawn(300));
-        assert!(here[300..] == further[..99_700] && here[..99_700] != further[..99_700] && here.iter().all(|&n| n < 1000));
-        let mean = here.iter().sum::<usize>() as f64 / 1e5;
-        // The mean of 1e5 uniform draws from 0..999 has a deviation of 0.91; five of them.
-        assert!((mean - 499.5).abs() < 4.6, "{mean}");
-    }
 }

@@ -1,17 +1,22 @@
-//! What the outputs mean, and what training minimises.
+//! Meaning of the outputs, and the loss of training.
+//!
+//! Losses: the mean square of standardised outputs; the loss of Xi, Luan and Tao 2023 ([`Loss::Published`]) on signed logarithms; and for
+//! flow maps, optionally, the squared error of their Jacobians (Sobolev training, Czarnecki et al. 2017).
 
-use super::{Field, Loss, NetworkSettings, Target, architecture::Architecture, tile::OUT};
+use super::architecture::Architecture;
+use super::memory::Outputs;
+use super::settings::{Loss, NetworkSettings, Target};
 use crate::flow::log_stretch;
 use crate::surrogate::Samples;
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-/// Outputs are trained as (value - mean) / deviation, so that rates mean the same on every scene. Per output.
+/// Outputs are trained as (value - mean) / deviation, so that learning rates mean the same on every scene. Per output.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Scale {
-    /// Subtracted.
+    /// Mean.
     pub mean: [f32; 3],
-    /// Divided by.
+    /// Standard deviation.
     pub deviation: [f32; 3],
 }
 
@@ -24,23 +29,29 @@ impl Default for Scale {
 /// Target, loss and scale.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Objective {
-    /// What the outputs are.
+    /// Output of the network.
     pub target: Target,
-    /// Loss on them.
+    /// Loss.
     pub loss: Loss,
     /// Weight of the penalty on the difference of the batch means.
     pub mean_penalty: f32,
-    /// Weight of the flow map's derivatives beside its values; 0: not trained on.
+    /// Weight of the flow map's derivatives beside its values; 0 leaves them out.
     pub jacobian_weight: f32,
     /// |tau|, the ratio of log-stretch and FTLE.
     pub tau: f32,
-    /// Edge lengths of the domain along the active axes.
+    /// Edge lengths of the domain along the axes that are inputs.
     pub extent: [f32; 3],
     /// Standardisation.
     pub scale: Scale,
 }
 
-/// sign(y) ln(1 + |y|): a logarithm that divergent data (FTLE below -1) do not break.
+/// Scalar field over the unit domain.
+pub trait Field: Sync {
+    /// Writes the value at each unit point.
+    fn values(&self, points: &[[f32; 3]], out: &mut [f32]);
+}
+
+/// sign(y) ln(1 + |y|), which is defined for FTLE below -1 too.
 pub fn signed_log(y: f32) -> f32 {
     y.abs().ln_1p().copysign(y)
 }
@@ -51,7 +62,7 @@ pub fn signed_exp(y: f32) -> f32 {
 }
 
 impl Objective {
-    /// From the settings; `extent` along x, y, z.
+    /// The objective of these settings; `extent` holds the edge lengths of the domain along x, y and z, `tau` the longest duration.
     pub fn new(settings: &NetworkSettings, shape: &Architecture, extent: [f64; 3], tau: f64) -> Self {
         let mut active = [1.0; 3];
         for (slot, &axis) in shape.space().iter().enumerate() {
@@ -68,54 +79,64 @@ impl Objective {
         }
     }
 
-    /// Whether derivatives along the axes are trained on.
+    /// Derivatives along the axes are part of the loss.
     pub fn derivatives(&self) -> bool {
         self.jacobian_weight > 0.0
     }
 
-    /// The samples that can be trained on; none when all can.
-    pub fn sieve(&self, samples: &Samples) -> Option<Vec<u32>> {
-        let all = (0..samples.len()).into_par_iter().with_min_len(1 << 14).all(|index| self.usable(samples, index));
-        (!all).then(|| (0..samples.len() as u32).into_par_iter().filter(|&index| self.usable(samples, index as usize)).collect())
+    /// The loss of [`Loss::Published`] applies.
+    fn is_published(&self) -> bool {
+        self.target == Target::Ftle && self.loss == Loss::Published
     }
 
-    /// Whether sample `index` can be trained on: everything it is asked for is there and finite.
-    pub fn usable(&self, samples: &Samples, index: usize) -> bool {
+    /// Weight of the penalty on the difference of the batch means; 0 for losses without it.
+    pub(super) fn penalty(&self) -> f32 {
+        if self.is_published() { self.mean_penalty } else { 0.0 }
+    }
+
+    /// Numbers of the samples that can be trained on; `None` if all can.
+    pub fn usable_samples(&self, samples: &Samples) -> Option<Vec<u32>> {
+        let all = (0..samples.len()).into_par_iter().with_min_len(1 << 14).all(|index| self.is_usable(samples, index));
+        (!all).then(|| (0..samples.len() as u32).into_par_iter().filter(|&index| self.is_usable(samples, index as usize)).collect())
+    }
+
+    /// Sample `index` can be trained on: all labels that the loss reads exist and are finite.
+    pub fn is_usable(&self, samples: &Samples, index: usize) -> bool {
         let finite = |values: &[f32]| values.iter().all(|v| v.is_finite());
-        finite(&samples.points[index])
-            && match self.target {
-                Target::Ftle => samples.log_stretch.get(index).is_some_and(|s| s.is_finite()),
-                Target::FlowMap => {
-                    samples.arrival.get(index).is_some_and(|a| finite(a))
-                        && (!self.derivatives() || samples.jacobian.get(index).is_some_and(|j| finite(j)))
-                }
+        let is_labelled = match self.target {
+            Target::Ftle => samples.log_stretch.get(index).is_some_and(|s| s.is_finite()),
+            Target::FlowMap => {
+                samples.arrival.get(index).is_some_and(|a| finite(a))
+                    && (!self.derivatives() || samples.jacobian.get(index).is_some_and(|j| finite(j)))
             }
+        };
+        is_labelled && finite(&samples.points[index])
     }
 
-    /// The values that the outputs of sample `index` stand for, before standardisation.
-    fn raw(&self, shape: &Architecture, samples: &Samples, index: usize) -> [f32; 3] {
+    /// The values of sample `index`, before standardisation.
+    fn raw(&self, shape: &Architecture, samples: &Samples, index: usize) -> Outputs {
         let mut values = [0.0; 3];
         match (self.target, self.loss) {
             (Target::Ftle, Loss::MeanSquare) => values[0] = samples.log_stretch[index],
             (Target::Ftle, Loss::Published) => values[0] = signed_log(samples.log_stretch[index] / self.tau),
             (Target::FlowMap, _) => {
-                for (slot, &axis) in shape.space().iter().enumerate() {
-                    values[slot] = samples.arrival[index][axis] - samples.points[index][axis];
+                for (value, &axis) in values.iter_mut().zip(shape.space()) {
+                    *value = samples.arrival[index][axis] - samples.points[index][axis];
                 }
             }
         }
         values
     }
 
-    /// Sets mean and deviation from about 4096 usable samples, spread over all. The published loss has a scale of its own and keeps it; a `base` below the network leaves
-    /// the mean at 0, so that an output of 0 stays 0.
+    /// Sets mean and deviation from about 4096 usable samples, spread over all. The published loss keeps its own scale. With a `base`,
+    /// targets are relative to it, and the mean stays 0, so that an output of 0 stays 0.
     pub fn standardise(&mut self, shape: &Architecture, samples: &Samples, base: Option<&dyn Field>) {
-        if self.target == Target::Ftle && self.loss == Loss::Published {
+        if self.is_published() {
             return;
         }
         let (mut sum, mut square, mut count) = ([0.0_f64; 3], [0.0_f64; 3], 0_u32);
         let stride = (samples.len() / 4096).max(1);
-        for index in (0..samples.len()).step_by(stride).filter(|&i| self.usable(samples, i)) {
+        for index in (0..samples.len()).step_by(stride).filter(|&i| self.is_usable(samples, i)) {
             let mut raw = self.raw(shape, samples, index);
             if let Some(base) = base {
                 let mut below = [0.0];
@@ -135,36 +156,37 @@ impl Objective {
             let mean = if base.is_some() { 0.0 } else { sum[output] / f64::from(count) };
             let deviation = (square[output] / f64::from(count) - mean * mean).max(0.0).sqrt();
             self.scale.mean[output] = mean as f32;
-            // A constant field has nothing to be scaled by.
+            // The deviation of a constant field is rounding alone.
             self.scale.deviation[output] = if deviation > 1e-6 { deviation as f32 } else { 1.0 };
         }
     }
 
-    /// Targets of one sample: outputs, then (when trained on) their derivatives along each axis. Length [`OUT`] a group.
-    pub(super) fn targets(&self, shape: &Architecture, samples: &Samples, index: usize, group: usize) -> [f32; OUT] {
-        let mut targets = [0.0; OUT];
+    /// Targets of one sample for a group of outputs: group 0 holds the values, group 1 + k their derivatives along axis k.
+    pub(super) fn targets(&self, shape: &Architecture, samples: &Samples, index: usize, group: usize) -> Outputs {
+        let Scale { mean, deviation } = self.scale;
+        let mut targets = [0.0; 3];
         if group == 0 {
             let raw = self.raw(shape, samples, index);
             for output in 0..shape.outputs() {
-                targets[output] = (raw[output] - self.scale.mean[output]) / self.scale.deviation[output];
+                targets[output] = (raw[output] - mean[output]) / deviation[output];
             }
         } else {
             let along = shape.axes[group - 1];
             for (output, &axis) in shape.space().iter().enumerate() {
                 let identity = if axis == along { 1.0 } else { 0.0 };
-                targets[output] = (samples.jacobian[index][3 * axis + along] - identity) / self.scale.deviation[output];
+                targets[output] = (samples.jacobian[index][3 * axis + along] - identity) / deviation[output];
             }
         }
         targets
     }
 
-    /// Weight of the squares of a group of outputs in the loss, for a batch of `count`.
+    /// Weight of the squared errors of a group of outputs in the loss of a batch of `count`.
     pub(super) fn weight(&self, shape: &Architecture, group: usize, count: usize) -> f32 {
         let share = if group == 0 { 1.0 } else { self.jacobian_weight / shape.dimensions() as f32 };
         share / (count * shape.outputs()) as f32
     }
 
-    /// Log-stretch from the outputs of the `ftle` target.
+    /// Log-stretch from the output of the `ftle` target.
     pub(super) fn log_stretch(&self, output: f32) -> f32 {
         match self.loss {
             Loss::MeanSquare => output * self.scale.deviation[0] + self.scale.mean[0],
@@ -172,8 +194,8 @@ impl Objective {
         }
     }
 
-    /// Log-stretch from the derivatives of the `flow_map` target: ln sigma_max of d arrival / d point in domain coordinates.
-    /// `derivative(along, output)` is the network's.
+    /// Log-stretch from the derivatives of the `flow_map` target: ln sigma_max of d arrival / d point in domain coordinates (Shadden,
+    /// Lekien and Marsden 2005). `derivative(along, output)` is that of the network.
     pub(super) fn log_stretch_of_map(&self, dimensions: usize, derivative: impl Fn(usize, usize) -> f32) -> f32 {
         let mut jacobian = [[0.0_f64; 3]; 3];
         for row in 0..dimensions {
@@ -182,11 +204,11 @@ impl Objective {
                 jacobian[row][along] = f64::from(unit * self.extent[row] / self.extent[along]);
             }
         }
-        // The largest of eigenvalues passes NaN over.
+        // The largest of several eigenvalues ignores NaN.
         if jacobian.as_flattened().iter().any(|slope| slope.is_nan()) {
             return f32::NAN;
         }
-        // A map that takes everything to one point has no stretch; what is finite may be averaged.
+        // A map to a single point has a log-stretch of -inf; a finite bound can be averaged.
         log_stretch(&jacobian).max(0.5 * f64::MIN_POSITIVE.ln()) as f32
     }
 }
@@ -213,7 +235,7 @@ mod tests {
         assert!(to_one_point.is_finite() && to_one_point < -300.0, "{to_one_point}");
     }
 
-    /// Of maps that hardly stretch, along two axes nearly alike: a log-stretch near 0 shows what the eigenvalue loses.
+    /// Maps that hardly stretch, nearly alike along two axes: a log-stretch near 0 shows what an eigenvalue would lose.
     #[test]
     fn the_stretch_of_a_map_loses_nothing_where_singular_values_meet() {
         let settings = NetworkSettings { target: Target::FlowMap, ..NetworkSettings::default() };
@@ -221,7 +243,7 @@ mod tests {
         let objective = Objective::new(&settings, &shape, [1.0; 3], 1.0);
         for e in [0.0_f32, 2.0_f32.powi(-20), 2.0_f32.powi(-12)] {
             let edges = [1.0 + e, 1.0, 0.5];
-            // Turned by 3-4-5 triangles about two axes, which f32 rounds: the reference is a library's, of the same numbers.
+            // Rotated by 3-4-5 triangles about two axes, which f32 rounds; the reference library gets the same numbers.
             let turn = |k: usize, along: usize| [[0.6, -0.8, 0.0], [0.48, 0.36, -0.8], [0.64, 0.48, 0.6]][k][along] * edges[along];
             let derivative = |along: usize, row: usize| turn(row, along) - if row == along { 1.0 } else { 0.0 };
             let map = nalgebra::Matrix3::from_fn(|row, along| f64::from(derivative(along, row) + if row == along { 1.0 } else { 0.0 }));

@@ -16,9 +16,11 @@
 //! ```
 
 use super::architecture::Architecture;
-use super::encode::LINE;
+use super::batch::{Batch, predict};
+use super::encode::Corners;
+use super::memory::LINE;
 use super::module::Network;
-use super::tile::{self, Batch, OUT, Weights};
+use super::tile::{Parameters, Tile, Weights};
 use super::times::Row;
 use burn::backend::autodiff::{
     Autodiff,
@@ -28,28 +30,37 @@ use burn::backend::autodiff::{
 };
 use burn::backend::{Flex, flex::FlexTensor};
 use burn::tensor::{Tensor, TensorData, TensorMetadata, TensorPrimitive, backend::Backend, ops::FloatTensor};
+use std::borrow::Cow;
 use std::sync::Arc;
 
-/// A backend with the fused network.
-pub trait FusedNetwork: Backend {
-    /// Outputs `[samples, outputs]` at `points` `[samples, inputs]`. `tables` is `[entries, features]` (any one value for the frequency
-    /// encoding), `layers` the flat vector. The points get no gradient: they are data.
-    fn network(
-        points: FloatTensor<Self>,
-        tables: FloatTensor<Self>,
-        layers: FloatTensor<Self>,
-        shape: &Arc<Architecture>,
-    ) -> FloatTensor<Self>;
+/// Tensors that the fused network reads.
+#[derive(Debug, Clone)]
+pub struct NetworkInputs<T> {
+    /// Unit coordinates `[samples, inputs]`. They are data and get no gradient.
+    pub points: T,
+    /// Tables `[entries, features]`; any value for the frequency encoding.
+    pub tables: T,
+    /// The flat vector of layers.
+    pub layers: T,
+    /// Shape of the network.
+    pub shape: Arc<Architecture>,
+}
 
-    /// Gradients for `tables` and `layers`, from the gradient for the outputs. The forward pass is repeated rather than kept: its activations would
-    /// be hundreds of bytes a sample.
-    fn network_backward(
-        points: FloatTensor<Self>,
-        tables: FloatTensor<Self>,
-        layers: FloatTensor<Self>,
-        gradient: FloatTensor<Self>,
-        shape: &Arc<Architecture>,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>);
+impl<T> NetworkInputs<T> {
+    fn map<'a, U>(&'a self, convert: impl Fn(&'a T) -> U) -> NetworkInputs<U> {
+        let Self { points, tables, layers, shape } = self;
+        NetworkInputs { points: convert(points), tables: convert(tables), layers: convert(layers), shape: Arc::clone(shape) }
+    }
+}
+
+/// Backend with the fused network.
+pub trait FusedNetwork: Backend {
+    /// Outputs `[samples, outputs]`.
+    fn network(inputs: NetworkInputs<FloatTensor<Self>>) -> FloatTensor<Self>;
+
+    /// Gradients for the tables and the layers, from the gradient for the outputs. The forward pass is repeated, since its activations
+    /// would take hundreds of bytes per sample.
+    fn network_backward(inputs: NetworkInputs<FloatTensor<Self>>, gradient: FloatTensor<Self>) -> [FloatTensor<Self>; 2];
 }
 
 impl<B: FusedNetwork> Network<B> {
@@ -57,32 +68,29 @@ impl<B: FusedNetwork> Network<B> {
     pub fn forward_fused(&self, shape: &Arc<Architecture>, points: Tensor<B, 2>) -> Tensor<B, 2> {
         let device = points.device();
         let tables = self.tables.as_ref().map_or_else(|| Tensor::zeros([1, 1], &device), |tables| tables.val());
-        let float = |primitive: TensorPrimitive<B>| primitive.tensor();
-        let outputs =
-            B::network(float(points.into_primitive()), float(tables.into_primitive()), float(self.layers.val().into_primitive()), shape);
+        let (points, tables, layers) = (points.into_primitive(), tables.into_primitive(), self.layers.val().into_primitive());
+        let (points, tables, layers) = (points.tensor(), tables.tensor(), layers.tensor());
+        let outputs = B::network(NetworkInputs { points, tables, layers, shape: Arc::clone(shape) });
         Tensor::from_primitive(TensorPrimitive::Float(outputs))
     }
 }
 
 /// The values of a tensor, in order.
-fn values(tensor: &FlexTensor) -> std::borrow::Cow<'_, [f32]> {
+fn values(tensor: &FlexTensor) -> Cow<'_, [f32]> {
     match tensor.as_slice::<f32>() {
         Some(values) => values.into(),
         None => tensor.to_contiguous().storage::<f32>().to_vec().into(),
     }
 }
 
-fn unpack(points: &[f32], shape: &Architecture) -> Vec<Row> {
-    points
-        .chunks_exact(shape.inputs())
-        .map(|row| {
-            let mut point = Row::default();
-            for (&axis, &value) in shape.axes.iter().zip(row) {
-                point[axis] = value;
-            }
-            point
-        })
-        .collect()
+/// Rows of points `[samples, inputs]`.
+fn rows(points: &[f32], shape: &Architecture) -> Vec<Row> {
+    let row = |point: &[f32]| {
+        let mut row = Row::default();
+        shape.axes.iter().zip(point).for_each(|(&column, &value)| row[column] = value);
+        row
+    };
+    points.chunks_exact(shape.inputs()).map(row).collect()
 }
 
 fn tables_of<'a>(tables: &'a [f32], shape: &Architecture) -> &'a [f32] {
@@ -90,111 +98,84 @@ fn tables_of<'a>(tables: &'a [f32], shape: &Architecture) -> &'a [f32] {
 }
 
 impl FusedNetwork for Flex {
-    fn network(points: FlexTensor, tables: FlexTensor, layers: FlexTensor, shape: &Arc<Architecture>) -> FlexTensor {
-        let (points, tables, layers) = (values(&points), values(&tables), values(&layers));
-        let points = unpack(&points, shape);
-        let weights = Weights::new(shape, &layers, false);
-        let width = shape.outputs();
+    fn network(inputs: NetworkInputs<FlexTensor>) -> FlexTensor {
+        let NetworkInputs { points, tables, layers, shape } = inputs.map(values);
+        let (points, width) = (rows(&points, &shape), shape.outputs());
+        let network = Parameters { shape: &shape, weights: &Weights::new(&shape, &layers, false), tables: tables_of(&tables, &shape) };
         let mut out = vec![0.0; points.len() * width];
-        let row = |sample: usize| points[sample];
-        tile::predict(shape, &weights, tables_of(&tables, shape), points.len(), row, false, width, &mut out, |count, scratch, out| {
-            for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out.chunks_exact_mut(width)).take(count) {
-                out.copy_from_slice(&row[..width]);
-            }
-        });
+        predict(
+            network,
+            |sample| points[sample],
+            false,
+            &mut out,
+            width,
+            |tile, out| {
+                for (out, outputs) in out.chunks_exact_mut(width).zip(&tile.outputs) {
+                    out.copy_from_slice(&outputs[..width]);
+                }
+            },
+        );
         FlexTensor::from_data(TensorData::new(out, [points.len(), width]))
     }
 
-    fn network_backward(
-        points: FlexTensor,
-        tables: FlexTensor,
-        layers: FlexTensor,
-        gradient: FlexTensor,
-        shape: &Arc<Architecture>,
-    ) -> (FlexTensor, FlexTensor) {
-        let (table_shape, layer_shape) = (tables.shape(), layers.shape());
-        let (points, tables, layers, gradient) = (values(&points), values(&tables), values(&layers), values(&gradient));
-        let points = unpack(&points, shape);
-        let weights = Weights::new(shape, &layers, true);
-        let width = shape.outputs();
-        let mut batch = Batch::new(shape, points.len(), false);
-        let given = |first: usize, count: usize, _: usize, _: &[f32], out: &mut [f32]| {
-            for (row, gradient) in out.chunks_exact_mut(OUT).zip(gradient[first * width..].chunks_exact(width)).take(count) {
-                row[..width].copy_from_slice(gradient);
+    fn network_backward(inputs: NetworkInputs<FlexTensor>, gradient: FlexTensor) -> [FlexTensor; 2] {
+        let (table_shape, layer_shape) = (inputs.tables.shape(), inputs.layers.shape());
+        let NetworkInputs { points, tables, layers, shape } = inputs.map(values);
+        let (shape, gradient) = (&*shape, values(&gradient));
+        let (points, width) = (rows(&points, shape), shape.outputs());
+        let network = Parameters { shape, weights: &Weights::new(shape, &layers, true), tables: tables_of(&tables, shape) };
+        let given = |first: usize, tile: &mut Tile| {
+            for (d_outputs, gradient) in tile.d_outputs[..tile.count].iter_mut().zip(gradient[first * width..].chunks_exact(width)) {
+                d_outputs[..width].copy_from_slice(gradient);
             }
             0.0
         };
-        batch.accumulate(shape, &weights, tables_of(&tables, shape), points.len(), |_| {}, |sample| points[sample], given);
+        let mut batch = Batch::new(shape, points.len(), false);
+        batch.accumulate(network, points.len(), |_| {}, |sample| points[sample], given);
         let mut d_layers = vec![0.0; layers.len()];
         batch.layer_gradient(shape, &mut d_layers);
         let mut d_tables = vec![0.0; tables.len()];
-        let mut corners = batch.corners(shape);
+        let mut corners = Corners::new(shape);
         for (number, level) in shape.levels.iter().enumerate() {
             let table = &mut d_tables[level.offset * shape.features..][..level.entries * shape.features];
             let mut touched = vec![0; table.len().div_ceil(LINE)];
-            batch.table_gradient(shape, number, level, &mut corners, table, &mut touched);
+            batch.table_gradient(shape, number, &mut corners, table, &mut touched);
         }
-        (FlexTensor::from_data(TensorData::new(d_tables, table_shape)), FlexTensor::from_data(TensorData::new(d_layers, layer_shape)))
+        [(d_tables, table_shape), (d_layers, layer_shape)].map(|(values, shape)| FlexTensor::from_data(TensorData::new(values, shape)))
     }
-}
-
-/// What the way back needs.
-#[derive(Debug, Clone)]
-struct Inputs<P> {
-    points: P,
-    tables: P,
-    layers: P,
-    shape: Arc<Architecture>,
 }
 
 #[derive(Debug)]
 struct NetworkBackward;
 
 impl<B: FusedNetwork> Backward<B, 2> for NetworkBackward {
-    type State = Inputs<FloatTensor<B>>;
+    type State = NetworkInputs<FloatTensor<B>>;
 
     fn backward(self, ops: Ops<Self::State, 2>, gradients: &mut Gradients, _: &mut Checkpointer) {
-        let [tables, layers] = ops.parents;
         let gradient = gradients.consume::<B>(&ops.node);
-        let Inputs { points, tables: table_values, layers: layer_values, shape } = ops.state;
-        let (d_tables, d_layers) = B::network_backward(points, table_values, layer_values, gradient, &shape);
-        if let Some(node) = tables {
-            gradients.register::<B>(node.id, d_tables);
-        }
-        if let Some(node) = layers {
-            gradients.register::<B>(node.id, d_layers);
+        for (node, gradient) in ops.parents.into_iter().zip(B::network_backward(ops.state, gradient)) {
+            if let Some(node) = node {
+                gradients.register::<B>(node.id, gradient);
+            }
         }
     }
 }
 
 impl<B: FusedNetwork, C: CheckpointStrategy> FusedNetwork for Autodiff<B, C> {
-    fn network(
-        points: FloatTensor<Self>,
-        tables: FloatTensor<Self>,
-        layers: FloatTensor<Self>,
-        shape: &Arc<Architecture>,
-    ) -> FloatTensor<Self> {
-        let outputs = B::network(points.primitive.clone(), tables.primitive.clone(), layers.primitive.clone(), shape);
-        match NetworkBackward.prepare::<C>([tables.node.clone(), layers.node.clone()]).compute_bound().stateful() {
-            OpsKind::Tracked(preparation) => {
-                let state =
-                    Inputs { points: points.primitive, tables: tables.primitive, layers: layers.primitive, shape: Arc::clone(shape) };
-                preparation.finish(state, outputs)
-            }
+    fn network(inputs: NetworkInputs<FloatTensor<Self>>) -> FloatTensor<Self> {
+        let parents = [inputs.tables.node.clone(), inputs.layers.node.clone()];
+        let inputs = inputs.map(|tensor| tensor.primitive.clone());
+        let outputs = B::network(inputs.clone());
+        match NetworkBackward.prepare::<C>(parents).compute_bound().stateful() {
+            OpsKind::Tracked(preparation) => preparation.finish(inputs, outputs),
             OpsKind::UnTracked(preparation) => preparation.finish(outputs),
         }
     }
 
-    fn network_backward(
-        points: FloatTensor<Self>,
-        tables: FloatTensor<Self>,
-        layers: FloatTensor<Self>,
-        gradient: FloatTensor<Self>,
-        shape: &Arc<Architecture>,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>) {
-        // Gradients of gradients are not defined here: the results are constants.
-        let (tables, layers) = B::network_backward(points.primitive, tables.primitive, layers.primitive, gradient.primitive, shape);
-        let constant = |primitive| Tensor::<Self, 1>::from_inner(Tensor::from_primitive(TensorPrimitive::Float(primitive)));
-        (constant(tables).into_primitive().tensor(), constant(layers).into_primitive().tensor())
+    fn network_backward(inputs: NetworkInputs<FloatTensor<Self>>, gradient: FloatTensor<Self>) -> [FloatTensor<Self>; 2] {
+        // The operation has no second derivatives: the results are constants.
+        B::network_backward(inputs.map(|tensor| tensor.primitive.clone()), gradient.primitive).map(|primitive| {
+            Tensor::<Self, 1>::from_inner(Tensor::from_primitive(TensorPrimitive::Float(primitive))).into_primitive().tensor()
+        })
     }
 }

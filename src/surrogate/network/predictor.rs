@@ -1,9 +1,10 @@
-//! Prediction of the log-stretch, fused: encoding and layers tile by tile on all cores.
+//! Prediction of the log-stretch by the fused kernels: encoding and layers tile by tile, on all cores.
 
-use super::Target;
 use super::architecture::Architecture;
+use super::batch::predict;
 use super::objective::Objective;
-use super::tile::{self, OUT, Weights};
+use super::settings::Target;
+use super::tile::{Parameters, Weights};
 use super::times::row;
 
 /// Layers packed for prediction.
@@ -17,7 +18,7 @@ impl Predictor {
         Self { weights: Weights::new(shape, layers, false) }
     }
 
-    /// Log-stretch at each point, at these unit times; from the flow map by differentiating the network forwards.
+    /// Writes the log-stretch at each unit point, at these unit times. A flow map is differentiated forwards.
     pub(crate) fn log_stretch(
         &self,
         shape: &Architecture,
@@ -27,17 +28,17 @@ impl Predictor {
         times: [f32; 2],
         out: &mut [f32],
     ) {
+        assert_eq!(points.len(), out.len());
         let derivatives = objective.target == Target::FlowMap;
-        let dimensions = shape.dimensions();
+        let network = Parameters { shape, weights: &self.weights, tables };
         let rows = |sample: usize| row(points[sample], times);
-        tile::predict(shape, &self.weights, tables, points.len(), rows, derivatives, 1, out, |count, scratch, out| {
-            for sample in 0..count {
-                out[sample] = if derivatives {
-                    objective.log_stretch_of_map(dimensions, |along, output| {
-                        scratch.outputs[((along + 1) * scratch.samples + sample) * OUT + output]
-                    })
+        predict(network, rows, derivatives, out, 1, |tile, out| {
+            for (sample, out) in out.iter_mut().enumerate() {
+                *out = if derivatives {
+                    let derivative = |along: usize, output: usize| tile.outputs[(along + 1) * tile.capacity + sample][output];
+                    objective.log_stretch_of_map(shape.dimensions(), derivative)
                 } else {
-                    objective.log_stretch(scratch.outputs[sample * OUT])
+                    objective.log_stretch(tile.outputs[sample][0])
                 };
             }
         });

@@ -1,16 +1,17 @@
-//! Start time and duration as inputs: their ranges, and the row of numbers that a network is shown.
+//! Start time and duration as inputs: their ranges, and the columns that a network reads.
 
-use super::{Input, NetworkSettings};
+use super::settings::{Input, NetworkSettings};
 
-/// Columns of a [`Row`]: unit coordinates along x, y and z, then start time and duration in the unit interval of their ranges.
-pub(super) const COLUMNS: usize = 5;
-/// The first column behind the coordinates.
+/// Names of the columns of a [`Row`].
+pub(super) const COLUMN_NAMES: [&str; 5] = ["x", "y", "z", "start", "duration"];
+/// First column after the coordinates.
 pub(super) const FIRST_TIME: usize = 3;
 
-/// Everything that a network may be shown of a sample; [`super::Architecture::axes`] says which columns it is shown.
-pub type Row = [f32; COLUMNS];
+/// All possible inputs of one sample: unit coordinates along x, y and z, then start time and duration in the unit intervals of their
+/// ranges. [`super::Architecture::axes`] lists the columns that a network reads.
+pub type Row = [f32; COLUMN_NAMES.len()];
 
-/// Start time and duration of samples that say nothing of time.
+/// Start time and duration of samples without times.
 pub const UNTIMED: [f32; 2] = [0.0, 1.0];
 
 /// The row of a unit point.
@@ -21,43 +22,40 @@ pub fn row([x, y, z]: [f32; 3], [start, duration]: [f32; 2]) -> Row {
 impl Input {
     /// Its column in a [`Row`].
     pub(super) fn column(self) -> usize {
-        match self {
-            Self::Start => FIRST_TIME,
-            Self::Duration => FIRST_TIME + 1,
-        }
+        FIRST_TIME + self as usize
     }
 }
 
-/// Which times a network is shown, and over which ranges they run.
+/// Ranges of the start time and the duration.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Times {
-    /// Seed times that become 0 and 1; none where the start is no input.
+    /// Seed times that become 0 and 1; `None` if the start is no input.
     pub starts: Option<[f64; 2]>,
-    /// The duration that becomes 1: the largest.
+    /// The duration that becomes 1: the longest.
     pub tau: f64,
 }
 
 impl Times {
-    /// Of a network with these settings, for durations up to `tau`.
+    /// Times of a network with these settings, for durations up to `tau`.
     pub fn new(settings: &NetworkSettings, tau: f64) -> Self {
         Self { starts: settings.start_range.filter(|_| settings.inputs.contains(&Input::Start)), tau }
     }
 
-    /// A seed time and a duration in unit intervals. Beyond its range a time is answered as its end is.
+    /// A seed time and a duration in unit intervals, clamped to their ranges.
     pub fn unit(&self, start: f64, duration: f64) -> [f32; 2] {
         let start = self.starts.map_or(0.0, |[first, last]| (start - first) / (last - first));
         [start, duration / self.tau].map(|time| time.clamp(0.0, 1.0) as f32)
     }
 
-    /// Whether labels of a window that begins at `before` stay right beside those of one that begins at `now`: the network tells both starts
-    /// apart. One beyond its range is answered as the end is, which labels of that end contradict.
-    pub fn hold(&self, before: f64, now: f64) -> bool {
-        self.tells(before) && self.tells(now)
+    /// Labels of a window that begins at `before` stay valid beside those of one that begins at `now`: both starts are in range. A start
+    /// out of range is clamped, so its labels contradict those at the end of the range.
+    pub fn labels_stay_valid(&self, before: f64, now: f64) -> bool {
+        self.covers_start(before) && self.covers_start(now)
     }
 
-    /// Whether the network tells this start from others.
-    pub fn tells(&self, start: f64) -> bool {
-        // The last of many slides may end beside the range by rounding.
+    /// The start is an input, and in its range.
+    pub fn covers_start(&self, start: f64) -> bool {
+        // Rounding may put the last of many slides slightly out of the range.
         self.starts.is_some_and(|[first, last]| {
             let slack = 1e-9 * (last - first);
             (first - slack..=last + slack).contains(&start)
@@ -75,10 +73,10 @@ mod tests {
         let times = Times::new(&settings, 4.0);
         assert_eq!(times.unit(0.0, 1.0), [0.25, 0.25]);
         assert_eq!(times.unit(9.0, 4.0), [1.0, 1.0]);
-        assert!(times.tells(-2.0) && times.tells(6.0) && !times.tells(6.1));
-        // A window before the range leaves labels that contradict those of its begin.
-        assert!(times.hold(-2.0, 6.0) && !times.hold(-3.0, -2.0) && !times.hold(6.0, 6.1));
+        assert!(times.covers_start(-2.0) && times.covers_start(6.0) && !times.covers_start(6.1));
+        // A window before the range leaves labels that contradict those at its begin.
+        assert!(times.labels_stay_valid(-2.0, 6.0) && !times.labels_stay_valid(-3.0, -2.0) && !times.labels_stay_valid(6.0, 6.1));
         let blind = Times::new(&NetworkSettings { inputs: Vec::new(), ..settings }, 4.0);
-        assert!(!blind.tells(0.0) && blind.unit(3.0, 4.0) == UNTIMED);
+        assert!(!blind.covers_start(0.0) && blind.unit(3.0, 4.0) == UNTIMED);
     }
 }

@@ -1,62 +1,22 @@
-//! Optimizer steps, three ways over the same model: burn's stock operations ([`stock_step`]), the fused operation inside burn's autodiff
-//! ([`operation_step`]), and the production path ([`Fused::steps`]): forward, backward and Adam in burn's own buffers.
+//! Training by the fused kernels: forward, backward and Adam in burn's own buffers.
 
-use super::adam::{Adam, BETA_1, BETA_2, move_average};
+use super::adam::{Adam, move_average};
 use super::architecture::Architecture;
-use super::encode::LINE;
-use super::lanes::{Aligned, prefetch};
-use super::model::{Loan, Model};
-use super::module::{Network, draw};
-use super::objective::{Objective, signed_exp};
-use super::tile::{self, Batch, MOST_SAMPLES, OUT, Weights};
-use super::{Loss, Target};
+use super::batch::{Batch, predict};
+use super::encode::Corners;
+use super::memory::{Aligned, LINE, TILE_ROWS, prefetch};
+use super::model::{Model, ModelBuffers};
+use super::objective::{Field, Objective, signed_exp};
+use super::random::draw;
+use super::tile::{Parameters, Tile, Weights};
 use crate::surrogate::Samples;
-use burn::backend::{Autodiff, Flex};
-use burn::optim::{AdamConfig, GradientsParams, SimpleOptimizer};
-use burn::tensor::{Tensor, TensorData};
 use rayon::prelude::*;
-use std::sync::Arc;
 
-/// One sample of this many is held out where that is asked for.
+/// Held-out samples are one in this many, if a step holds samples out.
 pub const HELD_OUT: usize = 64;
 
-/// Which samples make up a batch.
-#[derive(Debug, Clone, Copy)]
-pub enum Pick<'a> {
-    /// The first ones, in order.
-    InOrder,
-    /// Drawn with repetition from `among` (all samples, where none), by a generator that is a function of seed and counter only.
-    Random {
-        /// Seed of the run.
-        seed: u64,
-        /// Samples drawn before this batch.
-        counter: u64,
-        /// Numbers of the samples that may be drawn.
-        among: Option<&'a [u32]>,
-        /// Whether samples whose number is a multiple of [`HELD_OUT`] are left for validation.
-        hold_out: bool,
-    },
-}
-
-impl Pick<'_> {
-    fn index(self, position: usize, samples: usize) -> usize {
-        match self {
-            Pick::InOrder => position,
-            Pick::Random { seed, counter, among, hold_out } => {
-                let count = among.map_or(samples, <[u32]>::len);
-                let drawn = draw(seed, counter + position as u64, count);
-                let at = |drawn: usize| among.map_or(drawn, |among| among[drawn] as usize);
-                match at(drawn) {
-                    // The next one stands in; after the last, or in a list with gaps, that may be a held-out one too: one draw of very many.
-                    index if hold_out && index % HELD_OUT == 0 => at((drawn + 1) % count),
-                    index => index,
-                }
-            }
-        }
-    }
-}
-
-/// Running mean of the parameters, used for prediction: it takes the noise of a high rate out of the weights.
+/// Running mean of the parameters (Polyak and Juditsky 1992). Prediction uses it, since it takes the noise of a high learning rate out of
+/// the weights.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Average {
     /// Tables.
@@ -65,7 +25,59 @@ pub struct Average {
     pub layers: Vec<f32>,
 }
 
-/// Memory of the production path.
+/// Description of one optimizer step, independent of the device.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PlannedStep {
+    /// Samples of the batch.
+    pub count: usize,
+    /// Seed, and number of samples drawn before, of samples drawn with repetition; `None`: the first samples, in order.
+    pub drawn: Option<(u64, u64)>,
+    /// Leaves samples whose number is a multiple of [`HELD_OUT`] for validation.
+    pub hold_out: bool,
+    /// Learning rate of Adam.
+    pub rate: f64,
+    /// Share by which the mean of the parameters moves towards them; 0 leaves it.
+    pub average_share: f32,
+    /// Leaves cache lines (16 values) of the tables without a gradient as they are. Otherwise every entry takes part in every step, as with
+    /// burn's Adam.
+    pub lazy: bool,
+}
+
+/// A planned step on samples of the host.
+#[derive(Clone, Copy)]
+pub struct Step<'a> {
+    /// The step; its count is at most the size in [`Fused::new`].
+    pub planned: PlannedStep,
+    /// Samples to draw from.
+    pub samples: &'a Samples,
+    /// Numbers of the samples that may be drawn; `None`: all.
+    pub among: Option<&'a [u32]>,
+    /// Field that is subtracted from the log-stretch of the samples.
+    pub base: Option<&'a dyn Field>,
+}
+
+impl<'a> Step<'a> {
+    /// The planned step on `samples`, of which those numbered `among` may be drawn (`None`: all), relative to `base`.
+    pub fn of(planned: &PlannedStep, samples: &'a Samples, among: Option<&'a [u32]>, base: Option<&'a dyn Field>) -> Self {
+        Self { planned: *planned, samples, among, base }
+    }
+
+    /// The number of the sample at `position` of the batch.
+    fn sample(&self, position: usize) -> usize {
+        let Some((seed, counter)) = self.planned.drawn else { return position };
+        let count = self.among.map_or(self.samples.len(), <[u32]>::len);
+        let drawn = draw(seed, counter + position as u64, count);
+        let at = |drawn: usize| self.among.map_or(drawn, |among| among[drawn] as usize);
+        match at(drawn) {
+            // The next sample replaces a held-out one. After the last sample, or in a list with gaps, it may be held out too: one draw of
+            // very many.
+            index if self.planned.hold_out && index % HELD_OUT == 0 => at((drawn + 1) % count),
+            index => index,
+        }
+    }
+}
+
+/// Memory of the fused kernels for training.
 pub struct Fused {
     batch: Batch,
     weights: Weights,
@@ -74,64 +86,12 @@ pub struct Fused {
     touched: Vec<Vec<u8>>,
     layer_gradient: Vec<f32>,
     /// Numbers of the samples of the present batch.
-    drawn: Vec<u32>,
+    drawn: Vec<usize>,
     size: usize,
 }
 
-/// One step's inputs, apart from the model.
-#[derive(Clone, Copy)]
-pub struct Step<'a> {
-    /// Samples to draw from.
-    pub samples: &'a Samples,
-    /// Which of them.
-    pub pick: Pick<'a>,
-    /// How many; at most the size that [`Fused::new`] was given.
-    pub count: usize,
-    /// Adam's rate.
-    pub rate: f64,
-    /// Share by which the average moves towards the new parameters; 0 leaves it.
-    pub average_share: f32,
-    /// Whether cache lines of the tables that got no gradient wait. Otherwise every entry takes part in every step, as with burn's Adam.
-    pub lazy: bool,
-    /// A field below the network: it is trained on what the log-stretch has beyond it.
-    pub base: Option<&'a dyn Field>,
-}
-
-/// One optimizer step, told to whoever has the samples.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PlannedStep {
-    /// Samples of the batch.
-    pub count: usize,
-    /// Drawn with repetition by this seed, after so many samples drawn before; none: the first ones, in order.
-    pub drawn: Option<(u64, u64)>,
-    /// Whether samples whose number is a multiple of [`HELD_OUT`] are left for validation.
-    pub hold_out: bool,
-    /// Adam's rate.
-    pub rate: f64,
-    /// Share by which the mean of the parameters moves towards them; 0 leaves it.
-    pub average_share: f32,
-    /// Whether lines of 16 values of the tables that got no gradient wait. Otherwise every entry takes part in every step, as with burn's
-    /// Adam.
-    pub lazy: bool,
-}
-
-impl<'a> Step<'a> {
-    /// The planned step on these samples, of which those numbered `among` may be drawn (all, where none).
-    pub fn of(planned: &PlannedStep, samples: &'a Samples, among: Option<&'a [u32]>, base: Option<&'a dyn Field>) -> Self {
-        let &PlannedStep { count, drawn, hold_out, rate, average_share, lazy } = planned;
-        let pick = drawn.map_or(Pick::InOrder, |(seed, counter)| Pick::Random { seed, counter, among, hold_out });
-        Self { samples, pick, count, rate, average_share, lazy, base }
-    }
-}
-
-/// Something with a value at every unit point.
-pub trait Field: Sync {
-    /// Writes the value at each point.
-    fn values(&self, points: &[[f32; 3]], out: &mut [f32]);
-}
-
 impl Fused {
-    /// For batches of at most `size` samples.
+    /// Memory for batches of at most `size` samples.
     pub fn new(model: &Model, objective: &Objective, size: usize) -> Self {
         let shape = &model.shape;
         Self {
@@ -145,8 +105,8 @@ impl Fused {
         }
     }
 
-    /// Takes steps until `next` (called with the number of steps done and the last one's loss) returns none. Between the first and the last
-    /// step the buffers belong to the kernels; nothing is copied.
+    /// Takes steps until `next` returns `None`; it gets the number of steps taken and the loss before the last one. Between the first and
+    /// the last step the buffers belong to the kernels; nothing is copied.
     pub fn steps<'a>(
         &mut self,
         model: &mut Model,
@@ -154,83 +114,83 @@ impl Fused {
         average: &mut Average,
         mut next: impl FnMut(u64, Option<f64>) -> Option<Step<'a>>,
     ) {
-        let mut loan = model.lend();
+        let mut buffers = model.lend();
         let (shape, epsilon) = (&model.shape, model.epsilon);
         let (mut done, mut loss) = (0, None);
         while let Some(step) = next(done, loss) {
-            loss = Some(self.gradient(shape, objective, &loan, &step));
-            self.update(shape, epsilon, &mut loan, average, &step);
+            loss = Some(self.gradient(shape, objective, &buffers, &step));
+            self.update(shape, epsilon, &mut buffers, average, &step.planned);
             done += 1;
         }
-        loan.back(model);
+        buffers.give_back(model);
     }
 
     /// Loss and gradients of one batch at the present parameters.
-    fn gradient(&mut self, shape: &Architecture, objective: &Objective, loan: &Loan, step: &Step<'_>) -> f64 {
-        assert!(step.count <= self.size, "a batch of {} in memory for {}", step.count, self.size);
-        self.weights.fill(shape, loan.layers.parameters());
-        let tables = loan.tables.as_ref().map_or(&[][..], |tables| tables.parameters());
-        let (samples, pick, count) = (step.samples, step.pick, step.count);
+    fn gradient(&mut self, shape: &Architecture, objective: &Objective, buffers: &ModelBuffers, step: &Step<'_>) -> f64 {
+        let (samples, count) = (step.samples, step.planned.count);
+        assert!(count <= self.size, "a batch of {count} in memory for {}", self.size);
+        self.weights.fill(shape, buffers.layers.parameters());
+        let tables = buffers.tables.as_ref().map_or(&[][..], |tables| tables.parameters());
+        let network = Parameters { shape, weights: &self.weights, tables };
         self.drawn.clear();
-        self.drawn.extend((0..count).map(|position| pick.index(position, samples.len()) as u32));
+        self.drawn.extend((0..count).map(|position| step.sample(position)));
         let drawn = &self.drawn[..];
-        let index = |position: usize| drawn[position] as usize;
-        let scale = objective.scale;
-        let (penalty, slope) = mean_penalty(shape, objective, &self.weights, tables, count, samples, index);
-        let outputs = shape.outputs();
+        let (penalty, slope) = mean_penalty(network, objective, samples, drawn);
         let groups = if objective.derivatives() { 1 + shape.dimensions() } else { 1 };
-        let loss = |first: usize, take: usize, group_rows: usize, out: &[f32], gradient: &mut [f32]| {
+        let loss = |first: usize, tile: &mut Tile| {
+            let drawn = &drawn[first..first + tile.count];
             let mut sum = 0.0;
-            let mut below = [0.0; MOST_SAMPLES];
+            let mut below = [0.0; TILE_ROWS];
             if let Some(base) = step.base {
-                let mut points = [[0.0; 3]; MOST_SAMPLES];
-                for (sample, point) in points[..take].iter_mut().enumerate() {
-                    *point = samples.points[index(first + sample)];
+                let mut points = [[0.0; 3]; TILE_ROWS];
+                for (point, &index) in points.iter_mut().zip(drawn) {
+                    *point = samples.points[index];
                 }
-                base.values(&points[..take], &mut below[..take]);
+                base.values(&points[..tile.count], &mut below[..tile.count]);
             }
             for group in 0..groups {
                 let weight = objective.weight(shape, group, count);
-                for sample in 0..take {
-                    let mut targets = objective.targets(shape, samples, index(first + sample), group);
-                    targets[0] -= below[sample] / scale.deviation[0];
-                    let row = (group * group_rows + sample) * OUT;
-                    for output in 0..outputs {
-                        let difference = out[row + output] - targets[output];
+                for (sample, &index) in drawn.iter().enumerate() {
+                    let mut targets = objective.targets(shape, samples, index, group);
+                    targets[0] -= below[sample] / objective.scale.deviation[0];
+                    let row = group * tile.capacity + sample;
+                    let (outputs, gradient) = (&tile.outputs[row], &mut tile.d_outputs[row]);
+                    for output in 0..shape.outputs() {
+                        let difference = outputs[output] - targets[output];
                         sum += f64::from(weight * difference * difference);
-                        gradient[row + output] = 2.0 * weight * difference;
+                        gradient[output] = 2.0 * weight * difference;
                         if slope != 0.0 {
-                            gradient[row + output] += slope * out[row + output].abs().exp();
+                            gradient[output] += slope * outputs[output].abs().exp();
                         }
                     }
                 }
             }
             sum
         };
-        // Drawn samples lie anywhere in a pool far larger than the caches: each would be waited for.
-        let announce = |position: usize| {
-            prefetch(&samples.points, index(position));
-            prefetch(&samples.times, index(position));
-            prefetch(&samples.log_stretch, index(position));
-            prefetch(&samples.arrival, index(position));
-            prefetch(&samples.jacobian, index(position));
+        // Drawn samples lie anywhere in a buffer far larger than the caches: without a prefetch, each is a cache miss.
+        let prefetch_sample = |position: usize| {
+            let index = drawn[position];
+            prefetch(&samples.points, index);
+            prefetch(&samples.times, index);
+            prefetch(&samples.log_stretch, index);
+            prefetch(&samples.arrival, index);
+            prefetch(&samples.jacobian, index);
         };
-        let row = |position: usize| samples.row(index(position));
-        penalty + self.batch.accumulate(shape, &self.weights, tables, count, announce, row, loss)
+        penalty + self.batch.accumulate(network, count, prefetch_sample, |position| samples.row(drawn[position]), loss)
     }
 
-    /// Scatters the gradient into the tables, level by level (each level belongs to one task, so nothing is shared), and applies Adam.
-    fn update(&mut self, shape: &Architecture, epsilon: f32, loan: &mut Loan, average: &mut Average, step: &Step<'_>) {
-        let (share, lazy) = (step.average_share, step.lazy);
+    /// Adds the gradient to the tables, level by level (each level belongs to one task, so nothing is shared), and applies Adam.
+    fn update(&mut self, shape: &Architecture, epsilon: f32, buffers: &mut ModelBuffers, average: &mut Average, step: &PlannedStep) {
+        let &PlannedStep { rate, average_share: share, lazy, .. } = step;
         let Self { batch, table_gradient, touched, layer_gradient, .. } = self;
         let Average { tables: average_tables, layers: average_layers } = average;
-        let Loan { tables, layers } = loan;
+        let ModelBuffers { tables, layers } = buffers;
         let update_layers = || {
             batch.layer_gradient(shape, layer_gradient);
             layers.time += 1;
-            let time = layers.time;
-            let [parameters, first, second] = layers.buffers();
-            Adam::at(time, step.rate, epsilon).step(parameters, layer_gradient, first, second);
+            let adam = Adam::at(layers.time, rate, epsilon);
+            let [parameters, first, second] = layers.slices();
+            adam.step(parameters, layer_gradient, first, second);
             if share > 0.0 {
                 move_average(average_layers, parameters, share);
             }
@@ -238,22 +198,21 @@ impl Fused {
         let update_tables = || {
             let Some(tables) = tables else { return };
             tables.time += 1;
-            let adam = Adam::at(tables.time, step.rate, epsilon);
-            let [mut parameters, mut first, mut second] = tables.buffers();
-            let mut gradient = &mut table_gradient[..];
-            let mut average = &mut average_tables[..];
-            let mut work = Vec::with_capacity(shape.levels.len());
-            for (number, (level, touched)) in shape.levels.iter().zip(touched).enumerate() {
-                let len = level.entries * shape.features;
-                let moments = [split(&mut first, len), split(&mut second, len)];
-                work.push((number, touched, split(&mut gradient, len), split(&mut parameters, len), moments, split(&mut average, len)));
-            }
-            // The largest levels first, so that the small ones fill the gaps at the end.
+            let adam = Adam::at(tables.time, rate, epsilon);
+            let [parameters, first, second] = tables.slices();
+            let mut rest = [parameters, first, second, &mut table_gradient[..], &mut average_tables[..]];
+            let split = |(number, touched): (usize, _)| {
+                let len = shape.levels[number].entries * shape.features;
+                let parts = rest.each_mut().map(|rest| rest.split_off_mut(..len).expect("every buffer holds all levels"));
+                (number, touched, parts)
+            };
+            let mut work: Vec<_> = touched.iter_mut().enumerate().map(split).collect();
+            // The largest levels come first, so that the small ones fill the gaps at the end.
             work.reverse();
             work.into_par_iter().with_max_len(1).for_each_init(
-                || batch.corners(shape),
-                |corners, (number, touched, gradient, parameters, [first, second], average)| {
-                    batch.table_gradient(shape, number, &shape.levels[number], corners, gradient, touched);
+                || Corners::new(shape),
+                |corners, (number, touched, [parameters, first, second, gradient, average])| {
+                    batch.table_gradient(shape, number, corners, gradient, touched);
                     if lazy {
                         adam.lazy_step(parameters, gradient, first, second, touched);
                     } else {
@@ -270,117 +229,28 @@ impl Fused {
     }
 }
 
-/// Cuts `len` values off the front.
-fn split<'a>(rest: &mut &'a mut [f32], len: usize) -> &'a mut [f32] {
-    let (front, back) = std::mem::take(rest).split_at_mut(len);
-    *rest = back;
-    front
-}
-
-/// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`Loss::Published`]), and the factor of exp|output|
-/// in its gradient. It needs the mean over the whole batch before any gradient, hence a forward pass of its own; only this loss pays for it.
-fn mean_penalty(
-    shape: &Architecture,
-    objective: &Objective,
-    weights: &Weights,
-    tables: &[f32],
-    count: usize,
-    samples: &Samples,
-    index: impl Fn(usize) -> usize,
-) -> (f64, f32) {
-    if objective.loss != Loss::Published || objective.target != Target::Ftle || objective.mean_penalty == 0.0 {
+/// The penalty on the difference of the batch means in linear scale (Xi, Luan and Tao 2023, see [`super::Loss::Published`]), and the factor
+/// of exp|output| in its gradient. It needs the mean over the whole batch before any gradient, hence a separate forward pass.
+fn mean_penalty(network: Parameters<'_>, objective: &Objective, samples: &Samples, drawn: &[usize]) -> (f64, f32) {
+    let penalty = f64::from(objective.penalty());
+    if penalty == 0.0 {
         return (0.0, 0.0);
     }
-    let drawn: Vec<usize> = (0..count).map(index).collect();
-    let mut outputs = vec![0.0; count];
-    let rows = |position: usize| samples.row(drawn[position]);
-    tile::predict(shape, weights, tables, count, rows, false, 1, &mut outputs, |count, scratch, out| {
-        for (row, out) in scratch.outputs.chunks_exact(OUT).zip(out).take(count) {
-            *out = row[0];
-        }
-    });
-    let difference = outputs.iter().map(|&p| f64::from(signed_exp(p))).sum::<f64>() / count as f64
-        - drawn.iter().map(|&i| f64::from(samples.log_stretch[i] / objective.tau)).sum::<f64>() / count as f64;
-    let penalty = f64::from(objective.mean_penalty);
-    (penalty * difference * difference, (2.0 * penalty * difference / count as f64) as f32)
-}
-
-type Differentiable = Autodiff<Flex>;
-
-/// One step by burn's stock operations and burn's Adam on the first `count` samples. Returns the loss.
-pub fn stock_step(model: &mut Model, objective: &Objective, samples: &Samples, count: usize, rate: f64) -> f64 {
-    autodiff_step(model, objective, samples, count, rate, |network, shape, points, derivatives| {
-        if derivatives { network.forward_with_derivatives(shape, points) } else { vec![network.forward(shape, points)] }
-    })
-}
-
-/// The same with the fused operation (which has no derivatives along the axes: the flow map is then trained on arrivals alone).
-pub fn operation_step(model: &mut Model, objective: &Objective, samples: &Samples, count: usize, rate: f64) -> f64 {
-    let plain = Objective { jacobian_weight: 0.0, ..objective.clone() };
-    autodiff_step(model, &plain, samples, count, rate, |network, shape, points, _| vec![network.forward_fused(shape, points)])
-}
-
-/// Loss and gradients (tables, layers) by burn's autodiff over `forward`.
-pub fn autodiff_gradient(
-    model: &Model,
-    objective: &Objective,
-    samples: &Samples,
-    count: usize,
-    forward: impl Fn(&Network<Differentiable>, &Arc<Architecture>, Tensor<Differentiable, 2>, bool) -> Vec<Tensor<Differentiable, 2>>,
-) -> (f64, Network<Differentiable>, GradientsParams) {
-    let shape = Arc::new(model.shape.clone());
-    let network = Network::<Differentiable> {
-        tables: model.module.tables.as_ref().map(|tables| track(tables.id, tables.val())),
-        layers: track(model.module.layers.id, model.module.layers.val()),
-    };
-    let device = Default::default();
-    let points = (0..count).flat_map(|i| shape.axes.iter().map(move |&axis| samples.row(i)[axis])).collect::<Vec<_>>();
-    let points = Tensor::from_data(TensorData::new(points, [count, shape.inputs()]), &device);
-    let rows = forward(&network, &shape, points, objective.derivatives());
-    let outputs = shape.outputs();
-    let mut loss = Tensor::<Differentiable, 1>::zeros([1], &device);
-    for (group, row) in rows.iter().enumerate() {
-        let targets = (0..count).flat_map(|i| objective.targets(&shape, samples, i, group).into_iter().take(outputs)).collect::<Vec<_>>();
-        let targets = Tensor::from_data(TensorData::new(targets, [count, outputs]), &device);
-        loss = loss + (row.clone() - targets).powi_scalar(2).sum() * objective.weight(&shape, group, count);
-    }
-    if objective.target == Target::Ftle && objective.loss == Loss::Published {
-        let linear = rows[0].clone().sign() * (rows[0].clone().abs().exp() - 1.0);
-        let mean = samples.log_stretch[..count].iter().map(|&s| f64::from(s / objective.tau)).sum::<f64>() / count as f64;
-        loss = loss + (linear.mean() - mean).powi_scalar(2) * objective.mean_penalty;
-    }
-    let value = f64::from(loss.clone().into_scalar());
-    let gradients = GradientsParams::from_grads(loss.backward(), &network);
-    (value, network, gradients)
-}
-
-fn track<const D: usize>(id: burn::module::ParamId, tensor: Tensor<Flex, D>) -> burn::module::Param<Tensor<Differentiable, D>> {
-    burn::module::Param::initialized(id, Tensor::from_inner(tensor).require_grad())
-}
-
-fn autodiff_step(
-    model: &mut Model,
-    objective: &Objective,
-    samples: &Samples,
-    count: usize,
-    rate: f64,
-    forward: impl Fn(&Network<Differentiable>, &Arc<Architecture>, Tensor<Differentiable, 2>, bool) -> Vec<Tensor<Differentiable, 2>>,
-) -> f64 {
-    let (loss, network, mut gradients) = autodiff_gradient(model, objective, samples, count, forward);
-    drop(network);
-    let adam = AdamConfig::new().with_beta_1(BETA_1).with_beta_2(BETA_2).with_epsilon(model.epsilon).build();
-    if let Some(parameter) = model.module.tables.take() {
-        let (id, value, mapper) = parameter.consume();
-        let gradient = gradients.remove::<Flex, 2>(id).unwrap_or_else(|| value.zeros_like());
-        let (value, state) = SimpleOptimizer::<Flex>::step(&adam, rate, value, gradient, model.table_moments.take());
-        model.module.tables = Some(burn::module::Param::from_mapped_value(id, value, mapper));
-        model.table_moments = state;
-    }
-    let id = model.module.layers.id;
-    let value = model.module.layers.val();
-    let gradient = gradients.remove::<Flex, 1>(id).unwrap_or_else(|| value.zeros_like());
-    let (value, state) = SimpleOptimizer::<Flex>::step(&adam, rate, value, gradient, model.layer_moments.take());
-    model.module.layers = burn::module::Param::initialized(id, value);
-    model.layer_moments = state;
-    loss
+    let mut outputs = vec![0.0; drawn.len()];
+    predict(
+        network,
+        |position| samples.row(drawn[position]),
+        false,
+        &mut outputs,
+        1,
+        |tile, out| {
+            for (out, outputs) in out.iter_mut().zip(&tile.outputs) {
+                *out = outputs[0];
+            }
+        },
+    );
+    let count = drawn.len() as f64;
+    let difference = outputs.iter().map(|&p| f64::from(signed_exp(p))).sum::<f64>() / count
+        - drawn.iter().map(|&i| f64::from(samples.log_stretch[i] / objective.tau)).sum::<f64>() / count;
+    (penalty * difference * difference, (2.0 * penalty * difference / count) as f32)
 }

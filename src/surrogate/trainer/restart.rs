@@ -1,32 +1,38 @@
-//! What a checkpoint has of a network in training.
+//! The part of a checkpoint that holds a network in training.
 
+use super::super::CheckpointError;
 use super::super::checkpoint::{Checkpoint, Entry};
-use super::super::network::{Average, Model};
-use super::super::{CheckpointError, DeviceLost};
-use super::{DeviceCopy, Progress, Sent, Trainer};
+use super::super::device::{HostNetwork, Training};
+use super::super::network::Average;
+use super::copy::Copies;
+use super::{NetworkSource, Progress, Trainer};
+use crate::backend::DeviceError;
 use std::sync::Arc;
 use std::time::Instant;
 
-/// A network in training as it was, to be written.
-pub(in crate::surrogate) struct NetworkDraft {
+/// A network in training at one moment, to be written.
+pub(in crate::surrogate) struct NetworkState {
     notes: Vec<(String, String)>,
-    numbers: Source,
+    source: NetworkSource,
 }
 
-enum Source {
-    Here(Box<Model>, Arc<Average>),
-    DeviceCopy(Arc<DeviceCopy>),
-}
+impl NetworkState {
+    /// Reason why frames had to wait for the copy; `None` if they did not.
+    pub(in crate::surrogate) fn wait_reason(&self) -> Option<&str> {
+        match &self.source {
+            NetworkSource::Here(_, why) => why.as_deref(),
+            NetworkSource::Pending(_) => None,
+        }
+    }
 
-impl NetworkDraft {
-    /// Adds notes and tensors, those on their way back once they are there.
-    pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceLost> {
+    /// Adds notes and tensors to a checkpoint. Waits for downloads in progress.
+    pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceError> {
         for (key, text) in &self.notes {
             checkpoint.note(&format!("network.{key}"), text.clone());
         }
-        let (model, average) = match &self.numbers {
-            Source::Here(model, average) => (&**model, &**average),
-            Source::DeviceCopy(device_copy) => device_copy.fetch().map(|numbers| (&numbers.model, &*numbers.average))?,
+        let HostNetwork { model, average } = match &self.source {
+            NetworkSource::Here(network, _) => network,
+            NetworkSource::Pending(pending) => pending.fetch()?,
         };
         checkpoint.note("network.steps", model.steps().to_string());
         let (entries, features) = (model.shape.table_entries(), model.shape.features);
@@ -40,7 +46,7 @@ impl NetworkDraft {
                 checkpoint.push(Entry::new(&format!("network.{name}{part}"), shape, values));
             }
         }
-        let Average { tables, layers } = average;
+        let Average { tables, layers } = &**average;
         if !tables.is_empty() {
             checkpoint.push(Entry::new("network.tables.average", &shapes[0], tables));
         }
@@ -49,38 +55,31 @@ impl NetworkDraft {
     }
 }
 
-impl Trainer {
-    /// As it is now; what a device has is waited for.
-    pub(in crate::surrogate) fn draft(&self) -> NetworkDraft {
-        let (model, average, progress) = self.present();
-        NetworkDraft { notes: self.notes(progress), numbers: Source::Here(Box::new(model), average) }
+impl<T: Training> Trainer<T> {
+    /// Returns the present network. Waits for the download from a device.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(in crate::surrogate) fn checkpoint(&self) -> Result<NetworkState, DeviceError> {
+        Ok(NetworkState { notes: self.notes(), source: NetworkSource::Here(self.training.download()?, None) })
     }
 
-    /// The same without waiting, where the device has room for a copy; otherwise with the reason. None while an earlier one is on its way.
-    pub(in crate::surrogate) fn draft_behind(&mut self) -> Option<(NetworkDraft, Option<String>)> {
+    /// Returns the present network without waiting, if the device has memory for a copy. `None` while an earlier copy is being downloaded.
+    ///
+    /// # Errors
+    /// The device fails.
+    pub(in crate::surrogate) fn checkpoint_async(&mut self) -> Result<Option<NetworkState>, DeviceError> {
         let begin = Instant::now();
-        if self.on_device.is_none() {
-            return Some((self.draft(), None));
-        }
-        match self.send_for() {
-            Ok(Sent::Before) => None,
-            Ok(Sent::For(device_copy)) => {
-                if let Some(on_device) = &mut self.on_device {
-                    (on_device.fetched_at, on_device.fetch_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
-                }
-                Some((NetworkDraft { notes: self.notes(self.progress), numbers: Source::DeviceCopy(device_copy) }, None))
-            }
-            Ok(Sent::NoRoom(why)) => Some((self.draft(), Some(why))),
-            // What came back last; training goes on from that too.
-            Err(lost) => Some((self.draft(), Some(lost.to_string()))),
-        }
+        let Some(source) = self.copy()? else { return Ok(None) };
+        (self.copies.made, self.copies.wait_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
+        Ok(Some(NetworkState { notes: self.notes(), source }))
     }
 
-    /// What is stated as text.
-    fn notes(&self, progress: Progress) -> Vec<(String, String)> {
+    /// Values that a checkpoint stores as text.
+    fn notes(&self) -> Vec<(String, String)> {
         let mut notes: Vec<(String, String)> = self.fixed().into_iter().map(|(key, text)| (key.into(), text)).collect();
-        notes.push(("inputs".into(), self.model.shape.input_names().join(" ")));
-        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = progress;
+        notes.push(("inputs".into(), self.training.shape().input_names().join(" ")));
+        let Progress { drawn, averaged, stall, caution, first_loss, smooth, looked } = self.progress;
         let rate = self.rate * stall * caution;
         let numbers = [
             ("tau", self.times.tau),
@@ -102,9 +101,9 @@ impl Trainer {
         notes
     }
 
-    /// What must agree to the letter for a checkpoint to fit: the shape and the loss in JSON, the loss without its quotes.
+    /// Notes that must match exactly: the shape and the loss in JSON, the loss without its quotes.
     fn fixed(&self) -> Vec<(&'static str, String)> {
-        let shape = serde_json::to_string(&self.model.shape).unwrap_or_default();
+        let shape = serde_json::to_string(self.training.shape()).unwrap_or_default();
         let loss = serde_json::to_string(&self.objective.loss).unwrap_or_default();
         let [x, y, z] = self.objective.extent;
         let mut fixed = vec![("shape", shape), ("loss", loss.trim_matches('"').to_owned()), ("extent", format!("{x} {y} {z}"))];
@@ -112,13 +111,13 @@ impl Trainer {
         fixed
     }
 
-    /// Reads everything, and only then changes anything.
-    pub(in crate::surrogate) fn restored(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
+    /// Restores the trainer. The whole checkpoint is checked before any state changes.
+    pub(in crate::surrogate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
         for (key, text) in self.fixed() {
             checkpoint.expect_note(&format!("network.{key}"), &text)?;
         }
         let tau: f64 = checkpoint.number("network.tau")?;
-        // As the loss has it: starts of windows round.
+        // Compared in f32, as in the loss, since the start times of windows are rounded.
         if tau as f32 != self.objective.tau {
             return Err(checkpoint.mismatch(format!("network.tau {tau}"), format!("network.tau {}", self.times.tau)));
         }
@@ -138,7 +137,7 @@ impl Trainer {
             scale.mean[output] = checkpoint.number(&format!("network.mean.{output}"))?;
             scale.deviation[output] = checkpoint.number(&format!("network.deviation.{output}"))?;
         }
-        let shape = &self.model.shape;
+        let shape = self.training.shape();
         let read = |name: &str, len: usize| -> Result<[Vec<f32>; 3], CheckpointError> {
             if len == 0 {
                 return Ok(Default::default());
@@ -150,12 +149,11 @@ impl Trainer {
         let state = [read("tables", table_values)?, read("layers", layer_values)?];
         let tables = if table_values == 0 { Vec::new() } else { checkpoint.values("network.tables.average", table_values)? };
         let layers = checkpoint.values("network.layers.average", layer_values)?;
-        self.model.set_state(state, steps);
+        let mut model = self.training.host_copy().model.clone();
+        model.set_state(state, steps);
+        self.training.restore(HostNetwork { model, average: Arc::new(Average { tables, layers }) });
         self.objective.scale = scale;
-        // Where a device trains it, it goes over again with the next step.
-        (self.progress, self.standardised, self.kept, self.on_device) = (progress, standardised, None, None);
-        self.average = Arc::new(Average { tables, layers });
-        self.pack();
+        (self.progress, self.standardised, self.kept, self.copies) = (progress, standardised, None, Copies::new(progress));
         Ok(())
     }
 }

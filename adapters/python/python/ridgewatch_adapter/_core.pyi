@@ -11,7 +11,7 @@ __all__ = ["Publisher", "RidgewatchError"]
 _Field = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 class RidgewatchError(Exception):
-    """The ring could not be opened, or a step was refused; raised with strict=True only."""
+    """The ring could not be opened, or a step was refused; raised only with strict=True."""
 
 @final
 class Publisher:
@@ -32,29 +32,30 @@ class Publisher:
         order: Literal["zyx", "xyz"] = "zyx",
         strict: bool = False,
     ) -> Self:
-        """Opens a ring for the global grid of these coordinates (ascending; uneven ones are welcome).
+        """Opens a ring for the global grid of these coordinates (ascending, evenly spaced or not).
 
-        ring: its folder; without it that of RIDGEWATCH_RING, and nothing is published where that is not set.
-        periods: length after which each axis repeats, None where it does not.
-        radius: x and y are longitude and latitude in degrees on a sphere of this radius.
-        block: (index, count, offset, extent) of this process's part, nodes along x, y, z.
-        start: a number that all blocks of one start of the simulation name, and those of the next do not
+        ring: folder of the ring; by default RIDGEWATCH_RING. If that is not set, nothing is published.
+        periods: period of each axis; None: not periodic.
+        radius: makes x and y longitude and latitude in degrees on a sphere of this radius.
+        block: (index, count, offset, extent) of this process's block, in nodes along x, y, z.
+        start: a number that all blocks of one start of the simulation share, and the next start does not
         (comm.bcast(time.time_ns()) with mpi4py); 0: none.
-        slots: steps that the ring holds. wait_ms: how long to wait for ridgewatch; 0: never.
-        order: of the arrays' axes: "zyx" is [z, y, x], "xyz" is [x, y, z].
-        strict: a ring that cannot be had (in use, no room, another user's folder, a grid that cannot be) raises RidgewatchError, and so
-        does a step with a time that is not finite. Otherwise each of them is a RuntimeWarning and the program goes on: without a ring
-        nothing is published, and such a step is left out. Arguments of a wrong shape or type raise ValueError or TypeError in any case.
+        slots: number of steps that the ring holds. wait_ms: longest wait for ridgewatch; 0: never wait.
+        time_unit: unit of the times, for display.
+        order: order of the arrays' axes: "zyx" is [z, y, x], "xyz" is [x, y, z].
+        strict: raises RidgewatchError if the ring cannot be opened (in use, no room, another user's folder, an invalid grid) or a step's
+        time is not finite. Otherwise each of these errors is a RuntimeWarning: without a ring nothing is published, and the step is
+        skipped. Arguments of a wrong shape or type always raise ValueError or TypeError.
         """
 
     def publish(self, step: int, time: float, u: _Field, v: _Field, w: _Field | None = None) -> bool:
-        """Copies a step into the ring; False where publishing is off or the step was refused. The arrays have one shape, dtype and strides.
+        """Copies a step into the ring; False if publishing is off or the step was refused. The arrays share shape, dtype and strides.
 
-        Threads may publish at once, and other threads of Python run meanwhile: let none of them write into the arrays.
+        Several threads may publish at once, and other Python threads run meanwhile; none of them may write to the arrays.
         """
 
     def close(self) -> None:
-        """Ends the ring, after what other threads are publishing."""
+        """Ends the ring, after other threads have finished publishing."""
 
     @property
     def is_open(self) -> bool: ...
@@ -62,7 +63,7 @@ class Publisher:
     def published(self) -> int: ...
     @property
     def overwrote(self) -> int:
-        """Steps that overwrote one that ridgewatch had not taken."""
+        """Number of steps that overwrote one that no follower had taken."""
 
     def __enter__(self) -> Self: ...
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None: ...

@@ -1,8 +1,7 @@
-//! The other end: what a relay sends.
+//! Follower side of a relay.
 
 use super::lookup::{self, Lookup};
-use super::pace::{PATIENCE, Paced, greet};
-use super::{IDLE, PULSE};
+use super::paced::{IDLE, PEER_TIMEOUT, PULSE, Paced, greet};
 use crate::follow::Event;
 use crate::message::{Ask, ConnectionFile, Facts, Kind, Session};
 use crate::{Description, Limits, WireError};
@@ -15,54 +14,53 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
-/// Pause before a follower tries again to connect.
-const AGAIN: Duration = Duration::from_millis(500);
+/// Pause between two attempts to connect.
+const RECONNECT_PAUSE: Duration = Duration::from_millis(500);
 
-/// Steps of a block that a [`RelayFollower`] holds, at most: one that is received, one that waits, and two on their way back.
+/// Most steps of a block that a [`RelayFollower`] holds: one is received, one waits, and the buffers of two are returned.
 pub const BUFFERS: u64 = 4;
 
-/// Where a relay is; usually what its connection file says now.
-pub type Whereabouts = Box<dyn Fn() -> Result<ConnectionFile, WireError> + Send>;
+/// Returns the address and the key of a relay; usually reads its connection file.
+pub type Locate = Box<dyn Fn() -> Result<ConnectionFile, WireError> + Send>;
 
-/// Follows a relay; connects anew whenever the connection breaks.
+/// Follows a relay, and reconnects whenever the connection breaks.
 pub struct RelayFollower {
     events: Receiver<(Event, Vec<f32>)>,
-    /// Buffers on their way back.
+    /// Returns buffers to the thread.
     spare: SyncSender<Vec<f32>>,
     stop: Arc<AtomicBool>,
-    /// Generations of the blocks that were opened and have not ended.
+    /// Generations of the open blocks.
     open: BTreeMap<u32, u64>,
-    /// The thread is gone, and that was told.
+    /// True once a panic of the thread was reported.
     broken: bool,
 }
 
 impl RelayFollower {
-    /// Starts the thread that receives. `place` is asked before each attempt to connect: a relay that was started anew has another address
-    /// and key. When none could be reached for as long as `gone`, its blocks count as ended.
+    /// Starts the thread that receives. `locate` is called before each attempt to connect, because a restarted relay has another address and key. If no relay
+    /// can be reached for `gone`, its blocks end.
     ///
     /// # Errors
     /// The thread could not be started.
-    pub fn begin(place: Whereabouts, limits: Limits, gone: Duration) -> Result<Self, WireError> {
-        // One step waits, one is being received, and the rest waits at the relay: newest wins there.
+    pub fn begin(locate: Locate, limits: Limits, gone: Duration) -> Result<Self, WireError> {
+        // One step waits, one is received, and the others stay at the relay.
         let ((sender, events), (spare, back)) = (sync_channel(1), sync_channel(2));
         let stop = Arc::new(AtomicBool::new(false));
         let blocks = BTreeMap::new();
-        let told = String::new();
-        let mut receiving = Receiving { place, limits, gone, to: sender, spare: back, stop: stop.clone(), blocks, told };
-        // Whoever listened has left, or there is nothing to say.
+        let reported = String::new();
+        let mut receiving = Receiving { locate, limits, gone, to: sender, spare: back, stop: stop.clone(), blocks, reported };
         let work = move || drop(receiving.run());
         let started = std::thread::Builder::new().name("ridgewatch-relay".into()).spawn(work);
         started.map_err(|e| WireError::io(Path::new("thread"), "could not be started", e))?;
         Ok(Self { events, spare, stop, open: BTreeMap::new(), broken: false })
     }
 
-    /// Blocks that were opened and have not ended, and their generations.
+    /// Open blocks and their generations.
     pub fn blocks(&self) -> impl Iterator<Item = (u32, u64)> {
         self.open.iter().map(|(block, generation)| (*block, *generation))
     }
 
-    /// The next thing that happened, or none within the limit. A step's values are in `values`. Should the thread that receives have panicked, that is
-    /// told once, and all of its blocks end.
+    /// Returns the next event, or `None` if there is none within the limit. A step's values are in `values`. A panic of the receiving thread is reported once,
+    /// and then its blocks end.
     pub fn poll(&mut self, values: &mut Vec<f32>, limit: Duration) -> Option<Event> {
         match self.events.recv_timeout(limit) {
             Ok((event, mut came)) => {
@@ -101,17 +99,17 @@ impl Drop for RelayFollower {
     }
 }
 
-/// A block as a relay announced it.
+/// A block that a relay announced.
 struct Known {
     description: Description,
     generation: u64,
-    /// In the session that is.
+    /// True if it was announced in the current session.
     announced: bool,
 }
 
 /// The thread that receives.
 struct Receiving {
-    place: Whereabouts,
+    locate: Locate,
     limits: Limits,
     gone: Duration,
     to: SyncSender<(Event, Vec<f32>)>,
@@ -119,69 +117,88 @@ struct Receiving {
     stop: Arc<AtomicBool>,
     /// Blocks that have not ended.
     blocks: BTreeMap<u32, Known>,
-    /// Why the last attempt to connect failed; empty: it did not.
-    told: String,
+    /// Text of the last failure to connect; empty if there was none.
+    reported: String,
 }
 
-/// Nobody listens any more.
-struct Left;
+/// The [`RelayFollower`] was dropped.
+struct Dropped;
+
+/// End of a session.
+enum End {
+    Dropped,
+    Broken(WireError),
+}
+
+impl From<Dropped> for End {
+    fn from(_: Dropped) -> Self {
+        Self::Dropped
+    }
+}
+
+impl From<WireError> for End {
+    fn from(error: WireError) -> Self {
+        Self::Broken(error)
+    }
+}
 
 impl Receiving {
-    /// Connects, receives, and does so again until nobody listens.
-    fn run(&mut self) -> Result<(), Left> {
+    /// Connects, receives, and reconnects until the follower is dropped.
+    fn run(&mut self) -> Result<(), Dropped> {
         let (mut reached, mut lookup) = (Instant::now(), Lookup::new(lookup::system));
         while !self.stop.load(Ordering::Relaxed) {
-            let found = (self.place)();
-            let connected = found.and_then(|found| connect(&found, &mut |name| lookup.find(name, PATIENCE), &self.stop));
+            let found = (self.locate)();
+            let connected = found.and_then(|found| connect(&found, &mut |name| lookup.find(name, PEER_TIMEOUT), &self.stop));
             let error = match connected {
                 Ok((stream, session)) => {
-                    self.told.clear();
-                    let Err(error) = self.session(&stream, session)? else { return Ok(()) };
-                    reached = Instant::now();
-                    error
+                    self.reported.clear();
+                    match self.session(&stream, session) {
+                        Err(End::Broken(error)) => {
+                            reached = Instant::now();
+                            error
+                        }
+                        Ok(()) | Err(End::Dropped) => return Ok(()),
+                    }
                 }
                 Err(error) => error,
             };
-            // Once for each reason: a relay that is not there yet is no news every half second.
-            let words = error.to_string();
-            if words != self.told {
-                self.told = words;
+            // Each reason is reported once, not at every attempt.
+            let text = error.to_string();
+            if text != self.reported {
+                self.reported = text;
                 self.pass_on(Event::Refused(error), Vec::new())?;
             }
             if reached.elapsed() > self.gone {
                 self.blocks.values_mut().for_each(|known| known.announced = false);
                 self.end_unannounced()?;
             }
-            std::thread::sleep(AGAIN);
+            std::thread::sleep(RECONNECT_PAUSE);
         }
         Ok(())
     }
 
-    fn pass_on(&self, event: Event, values: Vec<f32>) -> Result<(), Left> {
-        self.to.send((event, values)).map_err(|_| Left)
+    fn pass_on(&self, event: Event, values: Vec<f32>) -> Result<(), Dropped> {
+        self.to.send((event, values)).map_err(|_| Dropped)
     }
 
-    /// Ends blocks that a relay no longer has.
-    fn end_unannounced(&mut self) -> Result<(), Left> {
-        while let Some((block, generation)) =
-            self.blocks.iter().find_map(|(block, known)| (!known.announced).then_some((*block, known.generation)))
-        {
+    /// Ends blocks that the relay does not have any more.
+    fn end_unannounced(&mut self) -> Result<(), Dropped> {
+        let is_gone = |(block, known): (&u32, &Known)| (!known.announced).then_some((*block, known.generation));
+        while let Some((block, generation)) = self.blocks.iter().find_map(is_gone) {
             self.blocks.remove(&block);
             self.pass_on(Event::Ended { block, generation, closed: false }, Vec::new())?;
         }
         Ok(())
     }
 
-    /// Receives until the session breaks.
-    fn session(&mut self, stream: &TcpStream, mut session: Session) -> Result<Result<(), WireError>, Left> {
+    /// Receives until the session breaks or the follower is dropped.
+    fn session(&mut self, stream: &TcpStream, mut session: Session) -> Result<(), End> {
         let stop = self.stop.clone();
         let (mut from, mut to) = (BufReader::with_capacity(1 << 16, Paced::new(stream, &stop)), Paced::new(stream, &stop));
         self.blocks.values_mut().for_each(|known| known.announced = false);
         let mut ask = Ask::Next;
         while !self.stop.load(Ordering::Relaxed) {
-            if let Err(error) = session.ask(to.begin(), ask) {
-                return Ok(Err(error));
-            }
+            session.ask(to.begin(), ask)?;
             from.get_mut().begin();
             let mut values = self.spare.try_recv().unwrap_or_default();
             let mut announced = None;
@@ -189,61 +206,52 @@ impl Receiving {
                 announced = description;
                 announced.as_ref().or(self.blocks.get(&block).map(|known| &known.description)).map(Description::block_bytes)
             };
-            let facts = match session.receive(&mut from, &self.limits, &mut note, &mut values) {
-                Ok(facts) => facts,
-                Err(error) => return Ok(Err(error)),
-            };
-            // A pulse is no answer: what was asked stands.
+            let facts = session.receive(&mut from, &self.limits, &mut note, &mut values)?;
+            // A pulse is no answer: the request stays open.
             ask = if facts.kind == Kind::Pulse { Ask::Hold } else { Ask::Next };
             let Facts { block, generation, step, time, published, missed, .. } = facts;
-            // All that is there is announced before the first step.
+            // The relay announces all its blocks before their first step.
             if facts.kind != Kind::Opened {
                 self.end_unannounced()?;
             }
-            let event = match (facts.kind, announced) {
-                (Kind::Opened, Some(description)) => {
+            let event = match facts.kind {
+                Kind::Opened => {
+                    let accepted = "one with each block that was opened";
+                    let description = announced.ok_or_else(|| WireError::field("description", "missing", accepted))?;
                     let known = Known { description: description.clone(), generation, announced: true };
                     let before = self.blocks.insert(block, known);
-                    // After a mere break of the connection nothing was opened.
+                    // After a reconnection the block is the same.
                     if before.is_some_and(|before| before.generation == generation && before.description == description) {
                         continue;
                     }
                     Event::Opened { description: Box::new(description), generation }
                 }
-                (Kind::Opened, None) => {
-                    let error = WireError::field("description", "missing", "one with each block that was opened");
-                    return Ok(Err(error));
-                }
-                (Kind::Step, _) => Event::Step { block, generation, step, time, published, missed },
-                (kind @ (Kind::Ended | Kind::Lost), _) => {
+                Kind::Step => Event::Step { block, generation, step, time, published, missed },
+                Kind::Ended | Kind::Lost => {
                     self.blocks.remove(&block);
-                    Event::Ended { block, generation, closed: kind == Kind::Ended }
+                    Event::Ended { block, generation, closed: facts.kind == Kind::Ended }
                 }
-                (Kind::Pulse, _) => continue,
+                Kind::Pulse => continue,
             };
-            if let Err(error) = self.hand_over(event, values, &mut to, &mut session)? {
-                return Ok(Err(error));
-            }
+            self.hand_over(event, values, &mut to, &mut session)?;
         }
-        Ok(Ok(()))
+        Ok(())
     }
 
-    /// Waits until the event is taken, and says so to the relay, which would take the silence for an end.
-    fn hand_over(&self, event: Event, values: Vec<f32>, to: &mut Paced, session: &mut Session) -> Result<Result<(), WireError>, Left> {
+    /// Waits until the event is taken. Heartbeats meanwhile keep the relay from closing the connection.
+    fn hand_over(&self, event: Event, values: Vec<f32>, to: &mut Paced, session: &mut Session) -> Result<(), End> {
         let (mut said, mut item) = (Instant::now(), (event, values));
         loop {
             item = match self.to.try_send(item) {
-                Ok(()) => return Ok(Ok(())),
+                Ok(()) => return Ok(()),
                 Err(TrySendError::Full(item)) => item,
-                Err(TrySendError::Disconnected(_)) => return Err(Left),
+                Err(TrySendError::Disconnected(_)) => return Err(End::Dropped),
             };
             if self.stop.load(Ordering::Relaxed) {
-                return Err(Left);
+                return Err(End::Dropped);
             }
             if said.elapsed() > PULSE {
-                if let Err(error) = session.ask(to.begin(), Ask::Hold) {
-                    return Ok(Err(error));
-                }
+                session.ask(to.begin(), Ask::Hold)?;
                 said = Instant::now();
             }
             std::thread::sleep(IDLE);
@@ -251,24 +259,24 @@ impl Receiving {
     }
 }
 
-/// A session with the relay at a place, whose name `find` looks up.
+/// Opens a session with a relay, whose name `find` resolves.
 fn connect(
-    place: &ConnectionFile,
+    relay: &ConnectionFile,
     find: &mut dyn FnMut(&str) -> std::io::Result<Vec<SocketAddr>>,
     stop: &AtomicBool,
 ) -> Result<(TcpStream, Session), WireError> {
-    let address = place.address.as_str();
+    let address = relay.address.as_str();
     let broken = |e| WireError::io(Path::new(address), "cannot be reached", e);
     let stream = find(address).and_then(|found| reach(&found)).map_err(broken)?;
-    let session = greet(&stream, stop, |paced| Session::connect(paced, &place.key))?;
+    let session = greet(&stream, stop, |paced| Session::connect(paced, &relay.key))?;
     Ok((stream, session))
 }
 
-/// The first address of a name that answers. [`PATIENCE`] is for all of them, in equal parts.
+/// Connects to the first address that answers. The addresses share [`PEER_TIMEOUT`] equally.
 fn reach(addresses: &[SocketAddr]) -> std::io::Result<TcpStream> {
     let mut failed = ErrorKind::AddrNotAvailable.into();
     for address in addresses {
-        match TcpStream::connect_timeout(address, PATIENCE / addresses.len() as u32) {
+        match TcpStream::connect_timeout(address, PEER_TIMEOUT / addresses.len() as u32) {
             Ok(stream) => return Ok(stream),
             Err(error) => failed = error,
         }
@@ -285,7 +293,7 @@ mod tests {
     fn all_addresses_of_a_name_are_tried() {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let open = listener.local_addr().unwrap();
-        // Nobody listens there any more.
+        // The port is closed again.
         let closed = TcpListener::bind("127.0.0.2:0").unwrap().local_addr().unwrap();
         assert_eq!(reach(&[closed, open]).unwrap().peer_addr().unwrap(), open);
         assert_eq!(reach(&[closed, closed]).unwrap_err().kind(), ErrorKind::ConnectionRefused);

@@ -1,19 +1,19 @@
-//! The addresses of a name, with a limit: the system's own resolver has none that can be set, and may take minutes where a name server does not answer.
+//! Name lookup with a timeout. The system's resolver has no timeout that can be set, and may take minutes if a name server does not answer.
 
 use std::io::{Error, ErrorKind, Result};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
 use std::time::{Duration, Instant};
 
-/// Asks the system.
+/// Lookup by the system's resolver.
 pub(super) fn system(address: &str) -> Result<Vec<SocketAddr>> {
     address.to_socket_addrs().map(Iterator::collect)
 }
 
-/// Looks names up, one at a time: where one takes longer than it is waited for, its thread is gone on with.
+/// Looks up one name at a time. A lookup that exceeds the timeout continues in its thread, and the next call waits for it.
 pub(super) struct Lookup<R> {
     resolve: R,
-    /// What is being looked up, and where the answer comes.
+    /// The current lookup, and the channel of its result.
     running: Option<(String, Receiver<Result<Vec<SocketAddr>>>)>,
 }
 
@@ -22,12 +22,12 @@ impl<R: Fn(&str) -> Result<Vec<SocketAddr>> + Copy + Send + 'static> Lookup<R> {
         Self { resolve, running: None }
     }
 
-    /// The addresses of `HOST:PORT`. A lookup that was begun before, of another name too, is waited for first.
+    /// The addresses of `HOST:PORT`. An earlier lookup, even of another name, is waited for first.
     ///
     /// # Errors
-    /// None within the limit: it is still being looked up. Those of the system, and that no thread could be started.
+    /// `TimedOut`: the lookup is not complete. Also errors of the system, and of starting a thread.
     pub fn find(&mut self, address: &str, limit: Duration) -> Result<Vec<SocketAddr>> {
-        // Numbers need no lookup.
+        // Numeric addresses need no lookup.
         if let Ok(known) = address.parse() {
             return Ok(vec![known]);
         }
@@ -40,7 +40,7 @@ impl<R: Fn(&str) -> Result<Vec<SocketAddr>> + Copy + Send + 'static> Lookup<R> {
             match answer.recv_timeout(until.saturating_duration_since(Instant::now())) {
                 Err(RecvTimeoutError::Timeout) => {
                     let what = format!(
-                        "the name of `{of}` is still being looked up after {limit:?}; accepted: a name that is resolved by then, or a number"
+                        "the lookup of `{of}` has taken longer than {limit:?}; accepted: a name that is resolved within that time, or a numeric address"
                     );
                     return Err(Error::new(ErrorKind::TimedOut, what));
                 }
@@ -48,7 +48,7 @@ impl<R: Fn(&str) -> Result<Vec<SocketAddr>> + Copy + Send + 'static> Lookup<R> {
                     let wanted = of == address;
                     self.running = None;
                     if wanted {
-                        return ended.unwrap_or_else(|_| Err(Error::other("the thread that looks names up has panicked")));
+                        return ended.unwrap_or_else(|_| Err(Error::other("the thread of the name lookup has panicked")));
                     }
                 }
             }
@@ -76,7 +76,7 @@ mod tests {
     #[test]
     fn a_name_server_that_does_not_answer_costs_the_limit_and_one_thread() {
         static ASKED: AtomicUsize = AtomicUsize::new(0);
-        // Locked: it does not answer.
+        // While locked, the server does not answer.
         static SERVER: Mutex<()> = Mutex::new(());
         let answer: SocketAddr = "127.0.0.3:7".parse().unwrap();
         let resolve = |name: &str| {
@@ -89,14 +89,17 @@ mod tests {
         let begin = Instant::now();
         for name in ["node:7", "node:7", "odd:7"] {
             let error = lookup.find(name, SHORT).unwrap_err();
-            assert!(error.kind() == ErrorKind::TimedOut && error.to_string().starts_with("the name of `node:7` is still"), "{error}");
+            assert!(
+                error.kind() == ErrorKind::TimedOut && error.to_string().starts_with("the lookup of `node:7` has taken longer"),
+                "{error}"
+            );
         }
         assert!(begin.elapsed() < LONG);
-        assert_eq!(lookup.find("127.0.0.9:1", SHORT).unwrap(), ["127.0.0.9:1".parse().unwrap()], "a number needs no server");
+        assert_eq!(lookup.find("127.0.0.9:1", SHORT).unwrap(), ["127.0.0.9:1".parse().unwrap()], "a numeric address needs no server");
         drop(silent);
         assert_eq!(lookup.find("odd:7", LONG).unwrap_err().kind(), ErrorKind::NotFound);
         assert_eq!(lookup.find("node:7", LONG).unwrap(), [answer]);
-        // Those of node, odd and node again.
+        // Lookups of node, odd and node again.
         assert_eq!(ASKED.load(Ordering::Relaxed), 3);
     }
 

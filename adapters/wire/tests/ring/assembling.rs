@@ -1,11 +1,11 @@
-//! Blocks that meet, and starts that take over from one another.
+//! Tests of joining blocks, and of starts that replace one another.
 
 use super::{cube, values};
 use ridgewatch_wire::{Assembler, BlockExtent, Description, Incomplete, Step};
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Columns of a grid of 4 x 3 x 2 nodes, as wide as told.
+/// Columns of a grid of 4 x 3 x 2 nodes, with the given widths.
 fn columns(start: u64, widths: &[u64]) -> Vec<Description> {
     let (mut left, count) = (0, widths.len() as u32);
     let column = |(index, width): (usize, &u64)| {
@@ -16,13 +16,13 @@ fn columns(start: u64, widths: &[u64]) -> Vec<Description> {
     widths.iter().enumerate().map(column).collect()
 }
 
-/// A block of step `n`, whose nodes differ from those of every other step.
+/// A block of step `n`, whose values differ from those of every other step.
 fn cut(block: &Description, n: u64) -> Vec<f32> {
     let [begin, width] = [block.block.offset[0], block.block.extent[0]].map(|n| n as usize);
     values(&cube([4, 3, 2]), n).concat().chunks_exact(4).flat_map(|row| row[begin..begin + width].to_vec()).collect()
 }
 
-/// Gives a block of step `n` at time n / 2, published after all openings.
+/// Adds a block of step `n` at time n / 2, published after all openings.
 fn give(assembler: &mut Assembler, block: &Description, generation: u64, n: u64) -> Option<Step> {
     assembler.block(block.block.index, generation, n, n as f64 / 2.0, 1000 + n, &mut cut(block, n)).unwrap()
 }
@@ -36,7 +36,7 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     let [left, right] = [0, 1].map(|k| columns(0, &[1, 3])[k].clone());
     let mut assembler = Assembler::new(&left, Duration::from_millis(30), 2);
     assembler.introduce(&left, 1).unwrap();
-    assert_eq!(give(&mut assembler, &right, 1, 0), None, "it was not introduced");
+    assert_eq!(give(&mut assembler, &right, 1, 0), None, "the block was not introduced");
     let stranger = Description { axes: cube([4, 3, 3]).axes, ..right.clone() };
     assert!(assembler.introduce(&stranger, 1).unwrap_err().to_string().contains("another grid"));
     let short = Description { block: BlockExtent { offset: [2, 0, 0], extent: [2, 3, 2], ..right.block }, ..right.clone() };
@@ -50,19 +50,19 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     // Another time, another length.
     assert_eq!(give(&mut assembler, &left, 1, 2), None);
     let other = assembler.block(1, 2, 2, 1.5, 1002, &mut cut(&right, 2)).unwrap_err().to_string();
-    assert!(other.contains("the time that its other blocks have"));
+    assert!(other.contains("the time of its other blocks"));
     assert!(assembler.block(1, 2, 2, 1.0, 0, &mut cut(&left, 2)).unwrap_err().to_string().contains("18 values"));
-    // A step that lacks a block goes when a newer one is whole,
+    // A step that lacks a block is abandoned when a newer one is complete,
     assert_eq!(give(&mut assembler, &left, 1, 3), None);
     let whole = give(&mut assembler, &right, 2, 3).unwrap();
     assert_eq!((whole.step, whole.anew), (3, false));
     let given_up = assembler.incomplete();
     assert_eq!((given_up.len(), given_up[0].step, given_up[0].blocks, given_up[0].wanted), (1, 2, 1, 2));
     assert_eq!(give(&mut assembler, &right, 2, 2), None, "too late");
-    // when time is up,
+    // when it has waited too long,
     assert_eq!(give(&mut assembler, &left, 1, 4), None);
     std::thread::sleep(Duration::from_millis(40));
-    // Of which nothing counts in which none was taken.
+    // Times in which no block was taken do not count.
     assembler.held(Duration::from_secs(60));
     assembler.expire();
     assert!(assembler.incomplete().is_empty());
@@ -70,8 +70,8 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     assert_eq!(give(&mut assembler, &left, 1, 5), None);
     std::thread::sleep(Duration::from_millis(40));
     assembler.expire();
-    assert_eq!(assembler.incomplete()[0].why, "blocks did not come in time");
-    // and when too many wait.
+    assert_eq!(assembler.incomplete()[0].why, "blocks did not arrive in time");
+    // and when too many steps wait.
     let ahead = (6..10).map(|n| {
         assert_eq!(give(&mut assembler, &left, 1, n), None);
         assembler.is_ahead(0, 1)
@@ -79,12 +79,12 @@ fn blocks_meet_and_what_does_not_fit_is_told() {
     assert_eq!(ahead.collect::<Vec<_>>(), [true; 4], "one more than this one is all that may wait");
     assert!(!assembler.is_ahead(1, 2) && !assembler.is_ahead(1, 1));
     assert_eq!(numbers(&assembler.incomplete()), [6, 7]);
-    // Those first that will not be whole, since the other block has come to a later one.
+    // Steps that cannot become complete are abandoned first: the other block has reached a later one.
     assert_eq!(give(&mut assembler, &right, 2, 10), None);
     assert_eq!(numbers(&assembler.incomplete()), [8]);
     assert_eq!(give(&mut assembler, &left, 1, 11), None);
-    assert_eq!(numbers(&assembler.incomplete()), [9], "step 10 may still be whole");
-    // Before its time is up a step is waited for.
+    assert_eq!(numbers(&assembler.incomplete()), [9], "step 10 may still become complete");
+    // Before the limit a step is kept.
     let mut patient = Assembler::new(&left, Duration::from_secs(3600), 2);
     patient.introduce(&left, 1).unwrap();
     assert_eq!(give(&mut patient, &left, 1, 1), None);
@@ -104,7 +104,7 @@ fn another_start_takes_over_with_its_first_whole_step() {
         };
         assert_eq!(whole(&mut assembler, &four, 10, 57).unwrap().step, 57);
         assert_eq!(whole(&mut assembler, &four[..3], 10, 58), None);
-        // It was killed in mid-step, and comes back in two blocks, from step 40 on: the first of them alone changes nothing.
+        // It was killed during a step, and returns in two blocks, from step 40 on. The first of them alone changes nothing.
         assembler.introduce(&two[0], 20).unwrap();
         assert_eq!(give(&mut assembler, &two[0], 20, 40), None);
         assert_eq!(whole(&mut assembler, &four[..3], 10, 59), None);
@@ -115,18 +115,18 @@ fn another_start_takes_over_with_its_first_whole_step() {
         assert_eq!(step.values, values(&cube([4, 3, 2]), 40).concat());
         let given_up = assembler.incomplete();
         assert_eq!(numbers(&given_up), [58, 59]);
-        assert!(given_up.iter().all(|g| (g.blocks, g.wanted, g.why) == (3, 4, "the simulation was started anew")));
-        // What the first start left comes too late, its last block with it.
+        assert!(given_up.iter().all(|g| (g.blocks, g.wanted, g.why) == (3, 4, "the simulation was restarted")));
+        // The remainder of the first start is ignored.
         assert_eq!(give(&mut assembler, &four[3], 10, 58), None);
         assert!(!assembler.ended(0, 20));
         assert_eq!(whole(&mut assembler, &two, 20, 41), None, "block 1 was opened at 21");
         assert_eq!(give(&mut assembler, &two[1], 21, 41).map(|s| (s.step, s.anew)), Some((41, false)));
-        // And in one.
+        // Then it returns in one block.
         assert!(assembler.ended(1, 21), "all blocks of the start that is followed");
         assembler.introduce(&one[0], 30).unwrap();
         assert!(!assembler.ended(0, 20));
         assert_eq!(give(&mut assembler, &one[0], 30, 3).map(|s| (s.step, s.anew)), Some((3, true)));
-        // And in four again, under the number that it had.
+        // Then in four again, under its earlier start number.
         four.iter().for_each(|block| assembler.introduce(block, 40).unwrap());
         assert_eq!(whole(&mut assembler, &four, 40, 4).map(|s| (s.step, s.anew)), Some((4, true)));
     }
@@ -138,16 +138,16 @@ fn a_start_in_the_same_blocks_takes_nothing_of_the_one_before() {
     let mut assembler = Assembler::new(&blocks[0], Duration::from_secs(60), 4);
     blocks.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
     assert_eq!(give(&mut assembler, &blocks[0], 1, 5), None);
-    // Both were killed. What the second had published comes between the openings of the two new ones.
+    // Both were killed. A step of the old second block arrives between the openings of the new ones.
     assembler.introduce(&blocks[0], 2).unwrap();
     assert_eq!(numbers(&assembler.incomplete()), [5]);
     assert_eq!(give(&mut assembler, &blocks[1], 1, 9), None);
     assembler.introduce(&blocks[1], 3).unwrap();
     assert_eq!(numbers(&assembler.incomplete()), [9]);
     assert_eq!(give(&mut assembler, &blocks[0], 2, 0), None);
-    assert_eq!(give(&mut assembler, &blocks[1], 1, 0), None, "of the killed one");
+    assert_eq!(give(&mut assembler, &blocks[1], 1, 0), None, "of the killed block");
     assert_eq!(give(&mut assembler, &blocks[1], 3, 0).map(|s| s.anew), Some(true));
-    // A connection that broke and came back is no start.
+    // A restored connection is no start.
     assembler.introduce(&blocks[1], 3).unwrap();
     assert_eq!(give(&mut assembler, &blocks[0], 2, 1), None);
     assert_eq!(give(&mut assembler, &blocks[1], 3, 1).map(|s| s.anew), Some(false));
@@ -161,7 +161,7 @@ fn blocks_of_as_many_in_other_places_displace_those_that_they_overlap() {
     }];
     let mut assembler = Assembler::new(&columns[0], Duration::from_secs(60), 4);
     columns.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
-    // As far as is known the second lives: two blocks of one start would overlap so if ghost cells were not left out.
+    // The second block lives as far as is known: blocks of one start with ghost cells would overlap like this.
     assembler.ended(0, 1);
     let error = assembler.introduce(&rows[0], 2).unwrap_err().to_string();
     assert!(error.contains("overlaps block 1") && error.contains("ghost cells"), "{error}");
@@ -183,7 +183,7 @@ fn starts_that_never_come_whole_are_bounded() {
         assembler.introduce(block, start).unwrap();
         assert_eq!(give(&mut assembler, block, start, 0), None);
     }
-    // The first, which is followed, and the newest three are left.
+    // The followed first start and the newest three are left.
     assert_eq!(assembler.incomplete().len(), 95);
     for (start, whole) in [(1, true), (50, false), (99, true)] {
         let block = &columns(start, &[2, 2])[1];
@@ -204,13 +204,13 @@ fn a_block_that_is_the_whole_field_is_handed_on_and_not_copied() {
     assert_eq!(step.values, expected);
     assert_eq!(step.values.as_ptr(), address);
     assembler.recycle(step.values);
-    // What came already, and what has another length, stays with the caller.
+    // Repeated steps and wrong lengths stay with the caller.
     let mut buffer = values(&grid, 2).concat();
     assert_eq!(assembler.block(0, 1, 1, 0.5, 9, &mut buffer).unwrap(), None);
     assert!(assembler.block(0, 1, 2, 0.5, 9, &mut vec![0.0; 7]).unwrap_err().to_string().contains("7 values"));
     assert_eq!(buffer, values(&grid, 2).concat());
     assembler.block(0, 1, 2, 0.6, 10, &mut buffer).unwrap();
-    assert_eq!(buffer.as_ptr(), address, "the first step's buffer came back");
+    assert_eq!(buffer.as_ptr(), address, "the first step's buffer is used again");
 }
 
 #[test]
@@ -222,11 +222,11 @@ fn a_solver_of_one_block_that_is_set_back_is_followed_by_when_it_published() {
         let mut values = values(&grid, step).concat();
         assembler.block(0, 1, step, step as f64, published, &mut values).unwrap().map(|whole| whole.step)
     };
-    // It counts on, is set back by a checkpoint, and at last names each step alike.
+    // The numbers rise, are set back by a checkpoint, and finally stay the same.
     for (published, step) in (1..).zip([10, 11, 12, 5, 6, 7, 8, 8, 8]) {
         assert_eq!(take(step, published), Some(step), "published at {published}");
     }
-    // A relay that was connected to anew sends again what its ring holds.
+    // After a reconnection a relay sends the steps of its ring again.
     for (published, step) in (6..).zip([7, 8, 8, 8]) {
         assert_eq!(take(step, published), None, "published at {published}");
     }
@@ -241,7 +241,7 @@ fn blocks_that_are_set_back_meet_again() {
         blocks.iter().for_each(|block| assembler.introduce(block, 1).unwrap());
         let mut whole = Vec::new();
         for (published, n) in (1..).zip((10..13).chain(5..=last)) {
-            // After the third step all is set back. The second block's ring may be read too late to see that.
+            // After the third step all blocks are set back. The second block's ring may be read too late to show that.
             for (index, block) in (0..).zip(&blocks) {
                 if unseen && index == 1 && published > 3 && n < 13 {
                     continue;
@@ -257,14 +257,14 @@ fn blocks_that_are_set_back_meet_again() {
     }
 }
 
-/// What a relay has to tell of its block.
+/// Event of a relay's block.
 #[derive(Clone, Copy)]
 enum Told {
     Opened { generation: u64 },
     Step { generation: u64, n: u64, published: u64 },
 }
 
-/// A relay of one block: the first run up to a step, what its ring held besides, the second run.
+/// Events of a relay of one block: the first run up to a step, `left` more steps in its ring, the second run.
 fn relayed(last: u64, left: u64, opened: u64) -> VecDeque<Told> {
     let first = (0..=last + left).map(|n| Told::Step { generation: 1, n, published: 2 + n });
     let second = (0..=120).map(|n| Told::Step { generation: opened, n, published: 2000 + n });
@@ -310,7 +310,7 @@ fn a_restart_that_one_relay_tells_before_another_mixes_no_runs_and_waits_for_no_
         }
         let given_up = assembler.incomplete();
         assert_eq!(numbers(&given_up), [101, 102, 103]);
-        assert!(given_up.iter().all(|g| g.why == "the simulation was started anew"));
+        assert!(given_up.iter().all(|g| g.why == "the simulation was restarted"));
     }
 }
 
@@ -344,7 +344,7 @@ fn a_block_that_is_over_holds_nobody_back() {
         assert!(!assembler.is_ahead(0, 1), "step {n}");
         assert_eq!(give(&mut assembler, &blocks[0], 1, n), None);
     }
-    // Its connection comes back.
+    // Its connection is restored.
     assembler.introduce(&blocks[1], 1).unwrap();
     assert!(assembler.is_ahead(0, 1));
     assert_eq!(give(&mut assembler, &blocks[1], 1, 19).map(|s| s.step), Some(19));

@@ -1,4 +1,4 @@
-//! What a reader sees while the solver goes on, ends, or tears the ring.
+//! Tests of a reader while the solver continues, ends, or tears the ring.
 
 use super::{Folder, cube, overwrite, publish, step, values};
 use ridgewatch_wire::{Element, Field, Following, Limits, Policy, Producer, Read, ReadAt, RingReader, WireError, block_path, blocks};
@@ -19,14 +19,14 @@ fn what_is_published_is_read_in_order_and_the_rest_is_counted() {
         assert_eq!((info.number, info.step, info.time, info.missed), (n, n, n as f64 / 2.0, 0));
         assert_eq!(buffer, values(producer.description(), n).concat());
     }
-    // Ten more into four slots: the oldest six are gone.
+    // Ten more in four slots: the oldest six are overwritten.
     for n in 3..13 {
         publish(&producer, n, n as f64).unwrap();
     }
     let info = step(&mut reader, &mut buffer).unwrap();
     assert_eq!((info.step, info.missed), (9, 6));
     assert_eq!(buffer, values(producer.description(), 9).concat());
-    // A follower that comes late begins with the oldest that is there.
+    // A late follower begins with the oldest step.
     let mut late = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
     assert_eq!(step(&mut late, &mut buffer).unwrap().step, 9);
 }
@@ -38,14 +38,14 @@ fn the_end_is_told_and_the_last_follower_sweeps_up() {
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     publish(&producer, 7, 1.0).unwrap();
     drop(producer);
-    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "its last step waits for the follower");
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "its last step stays for the follower");
     let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
     let mut buffer = Vec::new();
     assert_eq!(step(&mut reader, &mut buffer).unwrap().step, 7);
     assert_eq!(reader.read(&mut buffer).unwrap(), Read::Ended);
     let other = Following::begin(&folder.0).unwrap();
     drop(following);
-    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "another follows still");
+    assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0], "another follower is left");
     drop(other);
     assert!(!folder.0.exists());
     // A living producer keeps its ring when the last follower goes.
@@ -81,7 +81,7 @@ fn a_step_that_is_overwritten_while_it_is_read_is_never_seen() {
         for n in 1..=3000u64 {
             let plane = vec![n as f32; 64 * 32 * 32];
             let pointers = [plane.as_ptr().cast::<u8>(); 3];
-            // SAFETY: the plane holds a value a node.
+            // SAFETY: the plane has one value per node.
             unsafe { producer.publish(n, n as f64, &Field::packed(&pointers, Element::F32, [64, 32, 32])).unwrap() };
         }
         reader.join().unwrap()
@@ -89,7 +89,7 @@ fn a_step_that_is_overwritten_while_it_is_read_is_never_seen() {
     assert_eq!(seen.0 + seen.1, 3000, "each step is seen or counted");
 }
 
-/// A ring into which the producer publishes so many steps while the first values are read.
+/// A ring into which the producer publishes several steps while the first values are read.
 struct Overtaken<'a>(std::fs::File, &'a Producer, std::cell::Cell<u64>);
 
 impl ReadAt for Overtaken<'_> {
@@ -130,7 +130,7 @@ fn a_reader_that_was_overtaken_goes_on_with_the_newest() {
     }
 }
 
-/// A ring whose slots are overwritten by a newer step at the moment that their values are read.
+/// A ring whose slots are overwritten by a newer step while their values are read.
 struct Racing(std::cell::RefCell<Vec<u8>>);
 
 impl ReadAt for Racing {
@@ -195,7 +195,7 @@ fn a_ring_that_was_given_up_is_not_made_long_again() {
     let folder = Folder::new("givenup");
     let producer = Producer::open(&folder.0, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
     publish(&producer, 0, 0.0).unwrap();
-    // The producer's own is mapped, and not to be cut.
+    // A copy, because the producer maps its own file.
     let copy = folder.0.join("copy");
     std::fs::create_dir(&copy).unwrap();
     let (path, mut buffer) = (block_path(&copy, 0), Vec::new());
@@ -205,11 +205,11 @@ fn a_ring_that_was_given_up_is_not_made_long_again() {
     let file = std::fs::OpenOptions::new().write(true).open(&path).unwrap();
     file.set_len(0).unwrap();
     for marked in [reader.acknowledge(3), reader.leave(3)] {
-        assert!(marked.unwrap_err().to_string().contains("was it cut short?"));
+        assert!(marked.unwrap_err().to_string().contains("was it truncated?"));
     }
     assert_eq!(file.metadata().unwrap().len(), 0);
-    // A mark that was on its way.
+    // A delayed mark extends the file.
     overwrite(&path, 4096, &[1; 16]);
     let error = reader.read(&mut buffer).unwrap_err().to_string();
-    assert!(error.contains("was it cut short?"), "{error}");
+    assert!(error.contains("was it truncated?"), "{error}");
 }

@@ -1,4 +1,4 @@
-//! The ring, through its files: what is published is read, and what cannot be is refused by name.
+//! Tests of the ring through its files: published steps are read, and invalid values are refused by name.
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
@@ -29,7 +29,7 @@ fn publish(producer: &Producer, step: u64, time: f64) -> Result<ridgewatch_wire:
     let values = values(producer.description(), step);
     let pointers: Vec<*const u8> = values.iter().map(|v| v.as_ptr().cast()).collect();
     let field = Field::packed(&pointers, Element::F32, producer.description().block.extent);
-    // SAFETY: the vectors hold a value a node.
+    // SAFETY: the vectors have one value per node.
     unsafe { producer.publish(step, time, &field) }
 }
 

@@ -1,4 +1,4 @@
-//! Rings that cannot be opened, and what opening leaves.
+//! Rings that cannot be opened, and files that opening leaves.
 
 use super::{Folder, cube, overwrite, publish, step, values};
 use ridgewatch_wire::{
@@ -19,7 +19,7 @@ fn every_unaligned_value_and_lie_of_the_caller_is_refused() {
     let good = [base; 3];
     let refused = |components: &[*const u8], time: f64| {
         let field = Field::packed(components, Element::F32, [2, 2, 2]);
-        // SAFETY: what is not refused reads 8 of 9 values.
+        // SAFETY: a call that is not refused reads 8 of 9 values.
         unsafe { producer.publish(0, time, &field) }.unwrap_err().to_string()
     };
     assert!(refused(&good[..2], 0.0).contains("3, as many as axes"));
@@ -53,11 +53,11 @@ fn two_producers_of_one_name_and_what_a_killed_one_leaves() {
     let error = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
     assert!(matches!(error, WireError::InUse { pid, .. } if pid == u64::from(std::process::id())), "{error}");
     assert!(producer_lives(&folder.0, 0).unwrap());
-    // As SIGKILL leaves it: the files stay, the lock goes.
+    // As after SIGKILL: the files stay, and the lock is released.
     let reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
     let left = std::fs::read(block_path(&folder.0, 0)).unwrap();
     drop(first);
-    assert!(!producer_lives(&folder.0, 0).unwrap() && !folder.0.exists(), "nobody follows: the folder goes");
+    assert!(!producer_lives(&folder.0, 0).unwrap() && !folder.0.exists(), "without a follower the folder is removed");
     std::fs::create_dir_all(&folder.0).unwrap();
     std::fs::write(block_path(&folder.0, 0), left).unwrap();
     std::fs::write(folder.0.join(".block-00000.part"), "half").unwrap();
@@ -94,10 +94,10 @@ fn open_rings_links_and_odd_files_are_refused() {
     std::fs::set_permissions(&open_to_all, PermissionsExt::from_mode(0o777)).unwrap();
     let error = Producer::open(&open_to_all, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
     assert!(error.contains("others may write into"), "{error}");
-    // Or in one, where whoever may write into it could put another in its place; but not where the sticky bit keeps them from that.
+    // A folder inside one that others may write into, who could replace it; the sticky bit prevents that.
     let within = open_to_all.join("ring");
     let error = Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
-    assert!(error.contains("open: is a folder that all may write into (mode 0777)"), "{error}");
+    assert!(error.contains("open: is a folder that all users may write into (mode 0777)"), "{error}");
     std::fs::set_permissions(&open_to_all, PermissionsExt::from_mode(0o1777)).unwrap();
     drop(Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap());
     std::fs::remove_dir_all(&open_to_all).unwrap();
@@ -116,16 +116,16 @@ fn rings_and_folders_of_another_user_are_refused() {
     std::fs::create_dir_all(&folder.0).unwrap();
     std::os::unix::fs::chown(&folder.0, Some(12345), None).unwrap();
     assert!(theirs(Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err()));
-    // Nor one of this user's in it.
+    // A folder of this user inside one of another user.
     let error = Producer::open(&folder.0.join("ring"), cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
-    assert!(error.contains("is a folder of user 12345, who may put another in the place of"), "{error}");
+    assert!(error.contains("is a folder of user 12345, who may replace"), "{error}");
 }
 
 #[test]
 fn what_a_producer_left_that_was_killed_while_it_opened_goes_with_the_last_follower() {
     let folder = Folder::new("half");
     let following = Following::begin(&folder.0).unwrap();
-    // The lock and the part are this one's; of the other the lock has gone.
+    // Block 3 has a lock and a partial ring, block 4 only a partial ring.
     for name in ["block-00003.lock", ".block-00003.part", ".block-00004.part"] {
         std::fs::write(folder.0.join(name), "half").unwrap();
         std::fs::set_permissions(folder.0.join(name), PermissionsExt::from_mode(0o600)).unwrap();
@@ -135,13 +135,13 @@ fn what_a_producer_left_that_was_killed_while_it_opened_goes_with_the_last_follo
     assert!(!folder.0.exists(), "{:?}", std::fs::read_dir(&folder.0).unwrap().flatten().collect::<Vec<_>>());
 }
 
-/// A ring that is there whole, then changed.
+/// Error of a valid ring after a change.
 fn changed(change: impl Fn(&Path), limits: &Limits) -> WireError {
     static NUMBER: std::sync::atomic::AtomicU32 = std::sync::atomic::AtomicU32::new(0);
     let folder = Folder::new(&format!("changed{}", NUMBER.fetch_add(1, std::sync::atomic::Ordering::Relaxed)));
     let producer = Producer::open(&folder.0, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
     publish(&producer, 1, 1.0).unwrap();
-    // A copy, for a producer whose own file is cut short would be killed with it.
+    // A copy, because a producer whose own file is truncated is killed by a signal.
     let copy = folder.0.join("copy");
     std::fs::create_dir(&copy).unwrap();
     std::fs::copy(block_path(&folder.0, 0), block_path(&copy, 0)).unwrap();
@@ -167,7 +167,7 @@ fn damaged_rings_have_their_own_errors() {
     assert!(matches!(changed(truncate(12288 + 100), &limits), WireError::Short { .. }));
     let small = Limits { step_bytes: 4 * 4 * 4 * 3 * 4 - 1 };
     assert!(matches!(changed(|_| {}, &small), WireError::TooLarge { .. }));
-    // A time that is no number, put there behind the producer's back.
+    // A time that is NaN, written behind the producer's back.
     assert!(matches!(changed(|p| overwrite(p, 12288 + 16, &f64::NAN.to_ne_bytes()), &limits), WireError::Field { field: "time", .. }));
 }
 
@@ -190,7 +190,7 @@ fn what_cannot_be_there_at_all_takes_nothing_from_who_follows() {
         description.block = BlockExtent { index, count: 2, offset: [0, 0, 2 * u64::from(index)], extent: [4, 4, 2] };
         publish(&Producer::open(&folder.0, description, 2, Policy::NewestWins).unwrap(), 7, 0.0).unwrap();
     }
-    // 4096 slots of 2^50 bytes are more than a length can say; a petabyte is more than there is.
+    // The length of 4096 slots of 2^50 bytes overflows; a petabyte exceeds the memory.
     for (nodes, slots) in [([1 << 16, 1 << 16, 1 << 16], 4096), ([1 << 15, 1 << 15, 1 << 14], 16)] {
         let error = Producer::open(&folder.0, cube(nodes), slots, Policy::NewestWins).unwrap_err();
         assert!(matches!(error, WireError::NoSpace { .. }), "{error}");
@@ -218,7 +218,7 @@ fn a_ring_on_a_disk_is_refused() {
     assert!(error.to_string().contains("/dev/shm") && !ring.exists(), "{error}");
 }
 
-/// A small file system that is gone when the test ends.
+/// A small file system, unmounted when the test ends.
 struct SmallDisk(PathBuf);
 
 impl SmallDisk {
@@ -242,20 +242,20 @@ impl Drop for SmallDisk {
 #[test]
 #[ignore = "mounts a small file system, which needs root"]
 fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
-    // Beside no test that forks: its child would hold the ballast open, and with it the room.
+    // Not while another test forks: its child would hold the ballast file open, and with it the memory.
     let _beside = Folder::new("full");
     let disk = SmallDisk::new("full", "1m");
     let (first, second) = (disk.0.join("first"), disk.0.join("second"));
     // 2 slots of 24^3 x 3 f32: 332 kB.
     let producer = Producer::open(&first, cube([24, 24, 24]), 2, Policy::NewestWins).unwrap();
-    // Three times as much does not fit any more, and nothing of the attempt stays.
+    // A ring three times as large has no room, and the attempt leaves nothing.
     let error = Producer::open(&second, cube([24, 24, 24]), 6, Policy::NewestWins).unwrap_err();
     assert!(matches!(error, WireError::NoSpace { needed, .. } if needed > 900_000), "{error}");
     assert!(!second.exists());
-    // Somebody else takes the rest, to the last page.
+    // Another file takes the rest, to the last page.
     let mut ballast = std::fs::File::create(disk.0.join("ballast")).unwrap();
     while std::io::Write::write_all(&mut ballast, &[1; 4096]).is_ok() {}
-    // What was reserved at opening holds: every slot is written, none faults, and a follower reads them.
+    // The memory reserved at opening suffices: every slot is written without a fault, and a follower reads them.
     let mut reader = RingReader::open(&first, 0, &Limits::default()).unwrap();
     let mut buffer = Vec::new();
     for n in 0..6 {
@@ -267,15 +267,15 @@ fn a_full_file_system_refuses_the_next_ring_and_leaves_the_first_alone() {
         Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins),
         Err(WireError::NoSpace { .. } | WireError::Io { .. })
     ));
-    // With room again, the name that was refused is free.
+    // With room again, the refused name is free.
     drop(ballast);
     std::fs::remove_file(disk.0.join("ballast")).unwrap();
     Producer::open(&second, cube([4, 4, 4]), 2, Policy::NewestWins).unwrap();
 }
 
-/// A solver in so many blocks, whose rings of 4 slots take 2.3 MB together, that is killed when it has published one step.
+/// A solver in `count` blocks, whose rings of 4 slots take 2.3 MB together, and that is killed after one step.
 fn killed(ring: &Path, count: u32) {
-    // SAFETY: the child makes producers and is killed; no other thread of it is needed.
+    // SAFETY: the child opens producers and is killed, and needs no other thread.
     let child = unsafe { libc::fork() };
     if child == 0 {
         let producers = (0..count).map(|index| {
@@ -288,11 +288,11 @@ fn killed(ring: &Path, count: u32) {
         for producer in &producers {
             publish(producer, 1, 1.0).unwrap();
         }
-        // SAFETY: as a machine that runs out of memory does it.
+        // SAFETY: as if the machine ran out of memory.
         unsafe { libc::kill(libc::getpid(), libc::SIGKILL) };
     }
     let mut status = 0;
-    // SAFETY: waits for that child.
+    // SAFETY: waits for this child.
     unsafe { libc::waitpid(child, &mut status, 0) };
     assert!(libc::WIFSIGNALED(status) && libc::WTERMSIG(status) == libc::SIGKILL);
 }
@@ -304,13 +304,13 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     let disk = SmallDisk::new("again", "3m");
     let ring = disk.0.join("ring");
     let open = || Producer::open(&ring, cube([24, 24, 84]), 4, Policy::NewestWins);
-    // More than half of what is there, in as many blocks as the next or in more, with nobody who follows.
+    // More than half of the memory, in as many blocks as the next run or in more, without a follower.
     for count in [1, 3] {
         killed(&ring, count);
         assert_eq!(blocks(&ring).count() as u32, count);
         drop(open().unwrap());
     }
-    // And with somebody who has it open, and has not read it, as a sidecar that was stopped.
+    // With a follower that has the ring open and has not read it, like a stopped sidecar.
     let mut follower = RingFollower::begin(&ring, Limits::default()).unwrap();
     let mut told = |enough: &str| {
         let (mut seen, mut values, begin) = (Vec::new(), Vec::new(), Instant::now());
@@ -333,7 +333,7 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     let next = open().unwrap();
     publish(&next, 3, 3.0).unwrap();
     let seen = told("step 3");
-    assert!(seen.len() == 4 && seen[0].contains("was it cut short?"), "{seen:?}");
+    assert!(seen.len() == 4 && seen[0].contains("was it truncated?"), "{seen:?}");
     assert_eq!(seen[1..], ["ended false", "opened", "step 3"]);
 }
 
@@ -343,20 +343,20 @@ fn no_more_of_a_killed_run_goes_than_the_next_needs() {
     let _alone = Folder::alone("least");
     let disk = SmallDisk::new("least", "3m");
     let ring = disk.0.join("ring");
-    // Three rings of 0.79 MB, and 0.7 MB are left.
+    // Three rings of 0.79 MB leave 0.7 MB.
     killed(&ring, 3);
     let there = || [0, 1, 2].map(|block| block_path(&ring, block).exists());
     let open = |slots| {
         let block = BlockExtent { index: 1, count: 3, offset: [0, 0, 28], extent: [24, 24, 28] };
         Producer::open(&ring, Description { block, ..cube([24, 24, 84]) }, slots, Policy::NewestWins).map(drop)
     };
-    // 3.9 MB would not fit into the empty file system.
+    // 3.9 MB exceed even the empty file system.
     assert!(matches!(open(20), Err(WireError::NoSpace { .. })));
     assert_eq!(there(), [true; 3]);
-    // 1.2 MB fit without the one of this name, 2 MB without one more.
+    // 1.2 MB fit without the ring of this name, 2 MB without one more.
     let _following = Following::begin(&ring).unwrap();
     open(6).unwrap();
-    assert_eq!(there(), [true; 3], "its own is in place of the old one");
+    assert_eq!(there(), [true; 3], "the new ring replaces the old one of its name");
     open(10).unwrap();
     assert_eq!(there(), [false, true, true]);
 }

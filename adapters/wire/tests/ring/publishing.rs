@@ -1,4 +1,4 @@
-//! What a solver may do: any strides, several threads, waiting.
+//! Tests of a solver: any strides, several threads, waiting.
 
 use super::{Folder, cube, publish, step, values};
 use ridgewatch_wire::{BlockExtent, Element, Field, Following, Limits, Policy, Producer, Read, RingReader, WireError, producer_lives};
@@ -102,11 +102,11 @@ fn a_sweeper_that_was_stopped_is_not_waited_for_without_end() {
     assert_eq!(locked, 0);
     let error = Following::begin(&folder.0).unwrap_err().to_string();
     assert!(error.contains("followers.lock") && error.contains("follower that leaves"), "{error}");
-    // A producer beside it publishes, and ends.
+    // A producer can still publish and end.
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     publish(&producer, 0, 0.0).unwrap();
     drop(producer);
-    // Whoever was stopped goes on and goes; the next one cleans up.
+    // The stopped follower ends, and the next one cleans up.
     drop(file);
     drop(Following::begin(&folder.0).unwrap());
     assert!(!folder.0.exists());
@@ -125,10 +125,10 @@ fn waiting_is_bounded_and_happens_once() {
     assert!(!timed(0).0 && !timed(1).0);
     let (overwrote, took) = timed(2);
     assert!(overwrote && took >= limit, "{took:?}");
-    // A machine that is busy may hold up one of them.
+    // A busy machine may delay one of them.
     let again = [3, 4, 5, 6].map(timed);
     assert!(again.iter().all(|(overwrote, _)| *overwrote), "{again:?}");
-    assert!(again.iter().any(|(_, took)| *took < limit), "{again:?}: nobody moved, nobody is waited for again");
+    assert!(again.iter().any(|(_, took)| *took < limit), "{again:?}: no follower moved, so the producer does not wait again");
 }
 
 #[test]
@@ -185,14 +185,14 @@ fn threads_may_publish_at_once_and_a_fork_may_not() {
     .collect();
     steps.sort_unstable();
     assert_eq!(steps, (0..40).collect::<Vec<_>>());
-    // SAFETY: the child calls nothing that could wait for a lock of another thread, and leaves by _exit.
+    // SAFETY: the child does not wait for a lock of another thread, and ends by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
         let data = [0.0f32; 512];
         let pointers = [data.as_ptr().cast::<u8>(); 3];
         // SAFETY: 512 values, as described.
         let refused = unsafe { producer.publish(99, 0.0, &Field::packed(&pointers, Element::F32, [8, 8, 8])) };
-        // Closing it here must not end the parent's ring.
+        // Closing it in the child must not end the parent's ring.
         drop(producer);
         // SAFETY: ends the child.
         unsafe { libc::_exit(if matches!(refused, Err(WireError::Forked { .. })) { 0 } else { 1 }) };
@@ -212,33 +212,33 @@ fn a_child_that_another_thread_has_made_keeps_no_lock() {
     let following = Following::begin(&folder.0).unwrap();
     let mark = following.mark().unwrap();
     let producer = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
-    // As between the fork and the exec of `system()`: it holds a copy of every descriptor, until it is told to end.
+    // As between fork and exec of `system()`: the child holds a copy of every descriptor until the pipe ends.
     let (from, to) = std::io::pipe().unwrap();
-    // SAFETY: the child reads from a pipe and leaves by _exit.
+    // SAFETY: the child reads from a pipe and ends by _exit.
     let child = unsafe { libc::fork() };
     if child == 0 {
         drop(to);
         let _ = std::io::Read::read(&mut &from, &mut [0]);
-        // In a fork none of them is freed.
+        // In a fork none of the locks is released.
         drop((following, producer));
         // SAFETY: ends the child.
         unsafe { libc::_exit(0) };
     }
     drop(producer);
-    // The name is free at once, and nobody's mark is taken.
+    // The name is free at once, and no mark is taken.
     let next = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
     drop(following);
     let other = Following::begin(&folder.0).unwrap();
     assert_eq!(other.mark().unwrap(), mark);
-    // The child lets go of its copies: the new locks, which are on the same files, stand.
+    // The child closes its copies: the new locks on the same files remain.
     drop((from, to));
     // SAFETY: waits for the child made above.
     unsafe { libc::waitpid(child, &mut 0, 0) };
     assert!(producer_lives(&folder.0, 0).unwrap());
     drop(next);
-    assert!(folder.0.exists(), "its last steps wait for the follower");
+    assert!(folder.0.exists(), "its last steps stay for the follower");
     drop(other);
-    assert!(!folder.0.exists(), "nothing stays behind");
+    assert!(!folder.0.exists(), "nothing is left behind");
 }
 
 #[test]
@@ -253,7 +253,7 @@ fn the_slowest_of_several_followers_is_waited_for_and_one_that_left_is_not() {
         publish(&producer, n, n as f64).unwrap();
     }
     let mut buffer = Vec::new();
-    // The first has everything, the second nothing.
+    // The first follower has taken all steps, the second none.
     readers[1].acknowledge(marks[1]).unwrap();
     while step(&mut readers[0], &mut buffer).is_some() {}
     readers[0].acknowledge(marks[0]).unwrap();
@@ -266,13 +266,13 @@ fn the_slowest_of_several_followers_is_waited_for_and_one_that_left_is_not() {
         readers[1].acknowledge(marks[1]).unwrap();
         assert!(!publishing.join().unwrap().overwrote);
     });
-    // Its number is free for the next.
+    // Its number is free for the next follower.
     readers[1].leave(marks[1]).unwrap();
     let [first, second] = followers;
     drop(second);
     let next = Following::begin(&folder.0).unwrap();
     assert_eq!(next.mark().unwrap(), 1);
-    // One that has left holds nobody up: the first goes on alone.
+    // A follower that has left delays no step: the first continues alone.
     let mut taking = std::thread::scope(|scope| {
         let taking = scope.spawn(|| {
             let (mut buffer, mut seen) = (Vec::new(), Vec::new());
@@ -285,7 +285,7 @@ fn the_slowest_of_several_followers_is_waited_for_and_one_that_left_is_not() {
         });
         let begin = Instant::now();
         let overwrote = (3..7).filter(|n| publish(&producer, *n, *n as f64).unwrap().overwrote).count();
-        // One that has not left and says nothing is waited for five seconds.
+        // A silent follower that has not left would be waited for five seconds.
         assert!(overwrote == 0 && begin.elapsed() < Duration::from_secs(4), "{overwrote} {:?}", begin.elapsed());
         taking.join().unwrap()
     });

@@ -11,7 +11,7 @@ enum Beside {
     Nobody(RwLockWriteGuard<'static, ()>),
 }
 
-/// A folder of its own on the file system that rings live on, removed at the end. A test has one at a time.
+/// A separate folder in /dev/shm, removed at the end of the test. A test has one at a time.
 pub struct Folder(pub PathBuf, #[allow(dead_code)] Beside);
 
 impl Folder {
@@ -19,7 +19,8 @@ impl Folder {
         Self::of(name, Beside::Others(FORKS.read().unwrap_or_else(|broken| broken.into_inner())))
     }
 
-    /// For a test that forks: no other one runs meanwhile, whose files and connections the child would hold open.
+    /// For a test that forks: no other test runs meanwhile, because the child would hold its files and connections open.
+    #[allow(dead_code)]
     pub fn alone(name: &str) -> Self {
         Self::of(name, Beside::Nobody(FORKS.write().unwrap_or_else(|broken| broken.into_inner())))
     }

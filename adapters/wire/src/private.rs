@@ -1,0 +1,97 @@
+//! Files and folders that belong to this user alone.
+
+use crate::{WireError, system};
+use rustix::fs::OFlags;
+use rustix::io::Errno;
+use std::fs::{DirBuilder, File, Metadata, OpenOptions};
+use std::io;
+use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
+use std::path::Path;
+
+/// Creates a file with mode 0600, or opens it if it exists and `exclusive` is false.
+pub(crate) fn create_private(path: &Path, exclusive: bool) -> io::Result<File> {
+    let mut options = OpenOptions::new();
+    options.read(true).write(true).create(true).truncate(false).mode(0o600).custom_flags(OFlags::NOFOLLOW.bits() as i32);
+    if exclusive {
+        options.create_new(true);
+    }
+    options.open(path)
+}
+
+/// Opens a file of this user that nobody else may open.
+///
+/// # Errors
+/// `Foreign`: the path is a symbolic link or no regular file, or another user owns it or has rights to it.
+pub(crate) fn open_private(path: &Path, write: bool) -> Result<File, WireError> {
+    // O_NONBLOCK: opening a pipe would otherwise block until its other end is opened.
+    let flags = OFlags::NOFOLLOW | OFlags::NONBLOCK;
+    let opened = OpenOptions::new().read(true).write(write).custom_flags(flags.bits() as i32).open(path);
+    let file = opened.map_err(|e| refused(path, "cannot be opened", e))?;
+    check_private(path, &metadata(path, file.metadata())?)?;
+    Ok(file)
+}
+
+/// Error of a file that the system did not open or create.
+pub(crate) fn refused(path: &Path, action: &'static str, error: io::Error) -> WireError {
+    match Errno::from_io_error(&error) {
+        Some(Errno::LOOP) => foreign(path, "is a symbolic link".into()),
+        // In a sticky folder of another user the system itself may refuse.
+        Some(Errno::ACCESS | Errno::PERM) => foreign(path, "may not be opened by this user".into()),
+        _ => WireError::io(path, action, error),
+    }
+}
+
+/// Adds the path to an error of `stat`.
+pub(crate) fn metadata(path: &Path, found: io::Result<Metadata>) -> Result<Metadata, WireError> {
+    found.map_err(|e| WireError::io(path, "cannot be examined", e))
+}
+
+/// Checks that a file is regular and belongs to this user alone.
+pub(crate) fn check_private(path: &Path, about: &Metadata) -> Result<(), WireError> {
+    if !about.is_file() {
+        return Err(foreign(path, "is no regular file".into()));
+    }
+    check_owner(path, about)?;
+    if about.mode() & 0o077 != 0 {
+        return Err(foreign(path, format!("has mode {:04o}", about.mode() & 0o7777)));
+    }
+    Ok(())
+}
+
+fn check_owner(path: &Path, about: &Metadata) -> Result<(), WireError> {
+    if about.uid() == system::user() { Ok(()) } else { Err(foreign(path, format!("belongs to user {}", about.uid()))) }
+}
+
+fn foreign(path: &Path, found: String) -> WireError {
+    WireError::Foreign { path: path.to_owned(), found, user: system::user() }
+}
+
+/// Creates the ring's folder if it does not exist.
+///
+/// # Errors
+/// `Foreign`: others may write into the folder, or may replace it.
+pub(crate) fn make_folder(ring: &Path) -> Result<(), WireError> {
+    let made = DirBuilder::new().mode(0o700).recursive(true).create(ring);
+    made.map_err(|e| WireError::io(ring, "cannot be created", e))?;
+    let parent = ring.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
+    if let Some(parent) = parent {
+        let about = metadata(parent, std::fs::metadata(parent))?;
+        // In a sticky folder nobody may rename files of others.
+        let sticky = about.mode() & 0o1000 != 0;
+        if !sticky && ![0, system::user()].contains(&about.uid()) {
+            return Err(foreign(parent, format!("is a folder of user {}, who may replace {}", about.uid(), ring.display())));
+        }
+        if !sticky && about.mode() & 0o002 != 0 {
+            return Err(foreign(parent, format!("is a folder that all users may write into (mode {:04o})", about.mode() & 0o7777)));
+        }
+    }
+    let about = metadata(ring, std::fs::symlink_metadata(ring))?;
+    if !about.is_dir() {
+        return Err(foreign(ring, "is no folder".into()));
+    }
+    check_owner(ring, &about)?;
+    if about.mode() & 0o022 != 0 {
+        return Err(foreign(ring, format!("is a folder that others may write into (mode {:04o})", about.mode() & 0o7777)));
+    }
+    Ok(())
+}

@@ -1,0 +1,83 @@
+//! Pinned (page-locked) host memory, the target of asynchronous copies from the device.
+
+use crate::backend::cuda::{DeviceError, Gpu};
+use cudarc::driver::{CudaContext, CudaStream, result};
+use std::sync::Arc;
+
+/// Pinned values. The device may write them at any time between [`Self::copy_on`] and the next synchronisation of its stream, so a caller
+/// synchronises before it reads them.
+pub(in crate::backend::cuda) struct Pinned<T: Copy> {
+    values: *mut T,
+    len: usize,
+    context: Arc<CudaContext>,
+}
+
+// SAFETY: the memory is owned, read through `&self` only and written through `&mut self` only.
+unsafe impl<T: Copy + Send> Send for Pinned<T> {}
+// SAFETY: as above; `&self` allows reading only.
+unsafe impl<T: Copy + Sync> Sync for Pinned<T> {}
+
+impl<T: Copy + Default> Pinned<T> {
+    /// Allocates `len` values of `T::default()`.
+    ///
+    /// # Errors
+    /// The driver cannot allocate pinned memory.
+    pub(in crate::backend::cuda) fn new(gpu: &Gpu, len: usize) -> Result<Self, DeviceError> {
+        let doing = DeviceError::driver("allocating pinned host memory");
+        let context = gpu.context().clone();
+        context.bind_to_thread().map_err(&doing)?;
+        // SAFETY: the context is current. Flags 0 select memory that the CPU caches, since the CPU reads it.
+        let values = unsafe { result::malloc_host(len.max(1) * size_of::<T>(), 0) }.map_err(&doing)?.cast::<T>();
+        for i in 0..len.max(1) {
+            // SAFETY: within the allocation, which the driver aligns to a page.
+            unsafe { values.add(i).write(T::default()) };
+        }
+        Ok(Self { values, len, context })
+    }
+
+    /// Number of values.
+    pub(in crate::backend::cuda) fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Enqueues on the work stream a copy of `count` values at the device address `from` to the front of this memory.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Safety
+    /// As for [`Self::copy_on`], with the work stream.
+    pub(in crate::backend::cuda) unsafe fn copy_from(&mut self, gpu: &Gpu, from: u64, count: usize) -> Result<(), DeviceError> {
+        // SAFETY: guaranteed by the caller.
+        unsafe { self.copy_on(gpu.work(), from, count) }
+    }
+
+    /// Enqueues the copy of [`Self::copy_from`] on any stream.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    ///
+    /// # Safety
+    /// The address `from` holds `count` values when the stream executes the copy, and `count` is at most `len`.
+    pub(in crate::backend::cuda) unsafe fn copy_on(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
+        debug_assert!(count <= self.len);
+        // SAFETY: `count` values of `T` lie within the allocation.
+        let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };
+        // SAFETY: guaranteed by the caller; the host memory lives until `drop`, where the driver waits for copies in progress.
+        unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(DeviceError::driver("copying from the device"))
+    }
+
+    /// Returns the values. The caller has synchronised the stream of the last copy.
+    pub(in crate::backend::cuda) fn values(&self) -> &[T] {
+        // SAFETY: initialised in `new`; the caller waits for copies in progress, as the type requires.
+        unsafe { std::slice::from_raw_parts(self.values, self.len) }
+    }
+}
+
+impl<T: Copy> Drop for Pinned<T> {
+    fn drop(&mut self) {
+        // SAFETY: `values` was returned by `malloc_host` and is not used again. The driver waits for a copy in progress before it frees the
+        // memory.
+        let _ = self.context.bind_to_thread().and_then(|()| unsafe { result::free_host(self.values.cast()) });
+    }
+}

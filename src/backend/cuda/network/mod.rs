@@ -1,0 +1,19 @@
+//! Networks on the GPU: prediction, training, and the surrogates that use them.
+
+mod batched;
+#[cfg(test)]
+mod host_parity;
+mod layout;
+#[allow(clippy::module_inception)] // the network itself
+mod network;
+mod resident;
+mod samples;
+mod training;
+
+pub use batched::Tiling;
+pub use network::{DeviceNetwork, NetworkAbove, is_fused, network_defines};
+pub use resident::{CudaTable, CudaTraining, OnGpu};
+pub(super) use resident::{LabelPool, LabelSink, frozen_parts};
+pub use samples::DeviceSamples;
+pub(super) use samples::Filled;
+pub use training::DeviceTraining;

@@ -1,0 +1,226 @@
+//! Audit of a frame on the device, by the method of [`crate::backend::audit`]: stratified random points, drawn with Philox4x32-10.
+//!
+//! The device draws, traces and predicts the points, and sums the residuals of each cell. The host reads back the sums, the optical residual of each
+//! point (for quantiles), and the samples if they are requested for training.
+
+use crate::backend::audit::{AuditFindings, AuditRequest, draws};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
+use crate::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
+use crate::backend::router::unit_arrival;
+use crate::field::Domain;
+use crate::surrogate::Samples;
+use crate::trust::Audited;
+use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
+use std::ops::Range;
+use std::sync::Arc;
+
+/// Limit on the points of a batch, to bound the memory. A batch of a single cell may have more.
+const MOST: usize = 1 << 22;
+/// Threads of a warp. Each warp processes one cell.
+const WARP: usize = 32;
+
+/// Audits frames. It reuses its memory between frames.
+pub struct Audits {
+    gpu: Arc<Gpu>,
+    draw: CudaFunction,
+    measure: CudaFunction,
+    memory: Option<Memory>,
+}
+
+/// Device memory for the points of one batch and for all cells, with pinned memory for the readback.
+struct Memory {
+    unit: Buffer<[f32; 3]>,
+    points: Buffer<[f32; 3]>,
+    land: Buffer<u8>,
+    traced: Buffer<f32>,
+    lived: Buffer<f32>,
+    /// `None` until arrival points are requested.
+    arrivals: Option<Buffer<[f32; 3]>>,
+    predicted: Buffer<f32>,
+    optical: Buffer<f32>,
+    begins: Buffer<u32>,
+    findings: Buffer<CellFindings>,
+    optical_back: Pinned<f32>,
+    findings_back: Pinned<CellFindings>,
+}
+
+impl Memory {
+    fn new(gpu: &Gpu, points: usize, cells: usize) -> Result<Self, DeviceError> {
+        let what = "audit points";
+        Ok(Self {
+            unit: gpu.alloc(what, points)?,
+            points: gpu.alloc(what, points)?,
+            land: gpu.alloc(what, points)?,
+            traced: gpu.alloc(what, points)?,
+            lived: gpu.alloc(what, points)?,
+            arrivals: None,
+            predicted: gpu.alloc(what, points)?,
+            optical: gpu.alloc(what, points)?,
+            begins: gpu.alloc(what, cells + 1)?,
+            findings: gpu.alloc(what, cells)?,
+            optical_back: Pinned::new(gpu, points)?,
+            findings_back: Pinned::new(gpu, cells)?,
+        })
+    }
+
+    fn holds(&self, points: usize, cells: usize) -> bool {
+        self.unit.len() >= points && self.findings.len() >= cells
+    }
+}
+
+/// Groups consecutive cells into batches of at most [`MOST`] points. `begins` holds the first point of each cell, followed by the number of points.
+fn batches(begins: &[u32]) -> Vec<Range<usize>> {
+    let cells = begins.len() - 1;
+    let mut batches = Vec::new();
+    let mut first = 0;
+    while first < cells {
+        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MOST;
+        let end = (first + 2..=cells).take_while(fits).last().unwrap_or(first + 1);
+        batches.push(first..end);
+        first = end;
+    }
+    batches
+}
+
+impl Audits {
+    /// Compiles the kernels or loads them from the cache.
+    ///
+    /// # Errors
+    /// A kernel does not compile, or the device fails.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
+        let kernel = |name| gpu.kernel("audit.cu", &[], name);
+        Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
+    }
+
+    /// Audits a frame. The result is bitwise that of [`crate::backend::audit::audit`] if traced and predicted values are equal. The samples have no
+    /// Jacobians.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        predictor: &dyn DevicePredict,
+    ) -> Result<AuditFindings, DeviceError> {
+        let strata = &request.strata;
+        let cells = strata.drawn.len();
+        let mut begins = vec![0_u32];
+        for &drawn in &strata.drawn {
+            begins.push(begins[begins.len() - 1] + drawn);
+        }
+        let batches = batches(&begins);
+        let in_batch = |batch: &Range<usize>| (begins[batch.end] - begins[batch.start]) as usize;
+        let most = batches.iter().map(in_batch).max().unwrap_or(0);
+        if !self.memory.as_ref().is_some_and(|memory| memory.holds(most, cells)) {
+            // Freed first, so that old and new memory are never allocated together.
+            self.memory = None;
+            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MOST.max(most)), cells)?);
+        }
+        let Some(memory) = &mut self.memory else {
+            return Err(DeviceError::Unsupported { what: "an audit without memory".into() });
+        };
+        memory.begins.write(&begins)?;
+        let gpu = &self.gpu;
+        let arrivals = request.samples.is_some_and(|extras| extras.arrival);
+        if arrivals && memory.arrivals.is_none() {
+            memory.arrivals = Some(gpu.alloc("audit points", memory.unit.len())?);
+        }
+        let arrival = memory.arrivals.as_ref().filter(|_| arrivals).map_or(0, Buffer::address);
+        let stream = gpu.work();
+        let (key, stream_words) = draws(request.seed, request.stream);
+        let domain = tracer.host().domain();
+        let draw = AuditDrawArgument {
+            shape: strata.shape.map(|n| n as i32),
+            key,
+            stream: stream_words,
+            min: domain.min,
+            extent: domain.extent(),
+            missing_cells: tracer.missing_cells().map_or_else(bytemuck::Zeroable::zeroed, DeviceMissingCells::argument),
+        };
+        let points = AuditPointsArgument {
+            unit: memory.unit.address(),
+            points: memory.points.address(),
+            is_missing: memory.land.address(),
+            traced: memory.traced.address(),
+            lived: memory.lived.address(),
+            predicted: memory.predicted.address(),
+            optical: memory.optical.address(),
+        };
+        let (low, per_range, tau) = request.transfer.ramp_parts(tracer.host().tau());
+        let (mut optical, mut samples) = (Vec::with_capacity(strata.total()), Samples::default());
+        for batch in batches {
+            let count = in_batch(&batch);
+            let argument = AuditBatchArgument { begins: memory.begins.address(), first: batch.start as u32, count: batch.len() as u32 };
+            let warps = threads(batch.len() * WARP, 256);
+            let findings = memory.findings.address();
+            // SAFETY: arguments as declared in audit.cu; all arrays hold the points of the batch, and `begins` and `findings` hold every cell.
+            unsafe {
+                launch(stream.launch_builder(&self.draw).arg(&draw).arg(&argument).arg(&points), warps)?;
+                tracer.device().trace(
+                    points.points,
+                    count,
+                    &Outputs { log_stretch: points.traced, lived: points.lived, arrival, ..Outputs::default() },
+                )?;
+                predictor.predict(points.unit, count, points.predicted)?;
+                let mut call = stream.launch_builder(&self.measure);
+                launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
+                memory.optical_back.copy_from(gpu, points.optical, count)?;
+            }
+            if request.samples.is_some() {
+                keep(memory, count, arrivals.then_some(domain), &mut samples)?;
+            }
+            gpu.synchronize()?;
+            optical.extend_from_slice(&memory.optical_back.values()[..count]);
+        }
+        let from = memory.findings.address();
+        // SAFETY: `findings` holds one entry for every cell.
+        unsafe { memory.findings_back.copy_from(gpu, from, cells) }?;
+        gpu.synchronize()?;
+        let findings = &memory.findings_back.values()[..cells];
+        let points: f64 = findings.iter().map(|cell| cell.points).sum();
+        Ok(AuditFindings {
+            drawn: optical.len(),
+            points: points as usize,
+            mean_lifetime_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
+            peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
+            samples,
+            errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),
+        })
+    }
+}
+
+/// Reads back the points of a batch that lie outside missing cells. With `arrivals_in`, also their arrival points in unit coordinates of that
+/// domain.
+fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &mut Samples) -> Result<(), DeviceError> {
+    fn back<T: DeviceRepr + Copy>(from: &Buffer<T>, zero: T, count: usize) -> Result<Vec<T>, DeviceError> {
+        let mut values = vec![zero; count];
+        from.read(&mut values)?;
+        Ok(values)
+    }
+    let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
+    let land = back(&memory.land, 0, count)?;
+    let at_sea = || (0..count).filter(|&i| land[i] == 0);
+    samples.points.extend(at_sea().map(|i| unit[i]));
+    samples.log_stretch.extend(at_sea().map(|i| traced[i]));
+    if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
+        let arrivals = back(buffer, [0.0; 3], count)?;
+        samples.arrival.extend(at_sea().map(|i| unit_arrival(domain, arrivals[i])));
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn batches_hold_whole_cells_and_all_of_them() {
+        let million = 1 << 20;
+        let begins = [0, 3 * million, 4 * million, 4 * million + 1, 4 * million + 2, 10 * million, 10 * million, 11 * million];
+        assert_eq!(batches(&begins), [0..2, 2..4, 4..5, 5..7]);
+        assert_eq!(batches(&[0, 5, 9]).len(), 1);
+        assert!(batches(&[0]).is_empty());
+    }
+}

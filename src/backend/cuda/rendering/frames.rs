@@ -1,0 +1,159 @@
+//! Frames that are rendered and audited entirely on the GPU: connects renderer, query router, predictors and audits.
+
+use super::audit::Audits;
+use super::renderer::GpuRenderer;
+use super::router::{DeviceLearns, DevicePredict, FrameQueries, QueryRouter, TraceAll};
+use crate::backend::cuda::driver::Gpu;
+use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
+use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Tally};
+use crate::render::{RenderStats, Renderer};
+use crate::surrogate::{FrozenHybrid, Samples};
+use std::sync::Arc;
+
+/// Renders and audits frames. It reuses kernels and memory between frames.
+pub struct GpuFrames {
+    renderer: GpuRenderer,
+    router: QueryRouter,
+    audits: Audits,
+}
+
+/// Device-side predictor of one frame.
+pub(in crate::backend::cuda) enum Predictor<'a> {
+    Table(&'a DeviceTable),
+    /// The network, above a table if the surrogate has one, and the sink for labels if the device trains the network.
+    Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
+}
+
+impl<'a> Predictor<'a> {
+    fn of(frozen: &'a FrozenHybrid<OnGpu>, tracer: &'a CudaTracer) -> Result<Self, DeviceError> {
+        Ok(match frozen_parts(frozen)? {
+            (base, Some(network)) => {
+                let sink = network.label_sink(tracer.host().domain(), base, frozen.times);
+                Self::Network(network.network().above(base.map(|base| (base, frozen.shrinkage))).at(frozen.times), sink)
+            }
+            (Some(table), None) => Self::Table(table),
+            (None, None) => return Err(DeviceError::Unsupported { what: "a surrogate without table and network".into() }),
+        })
+    }
+
+    fn label_sink(&self) -> Option<&dyn DeviceLearns> {
+        match self {
+            Self::Network(_, Some(sink)) => Some(sink),
+            _ => None,
+        }
+    }
+}
+
+impl DevicePredict for Predictor<'_> {
+    unsafe fn predict(&self, points: u64, count: usize, out: u64) -> Result<(), DeviceError> {
+        // SAFETY: guaranteed by the caller.
+        unsafe {
+            match self {
+                Self::Table(table) => table.predict(points, count, out),
+                Self::Network(network, _) => network.predict(points, count, out),
+            }
+        }
+    }
+}
+
+/// Labels of a frame: a part on the host, the rest in the label pool on the device. Dropping them without a commit removes them from the pool.
+pub struct CudaSamples {
+    host: Samples,
+    uncommitted: Option<(Arc<LabelPool>, Filled)>,
+}
+
+impl CudaSamples {
+    /// Creates labels that are on the host only.
+    pub(in crate::backend::cuda) fn on_host(host: Samples) -> Self {
+        Self { host, uncommitted: None }
+    }
+}
+
+impl FrameSamples for CudaSamples {
+    fn on_host(&self) -> &Samples {
+        &self.host
+    }
+
+    fn commit(mut self) -> Samples {
+        self.uncommitted = None;
+        std::mem::take(&mut self.host)
+    }
+}
+
+impl Drop for CudaSamples {
+    fn drop(&mut self) {
+        if let Some((pool, before)) = self.uncommitted.take() {
+            pool.go_back(before);
+        }
+    }
+}
+
+impl GpuFrames {
+    /// Compiles the kernels or loads them from the cache.
+    ///
+    /// # Errors
+    /// A kernel does not compile, or the device fails.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
+        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: QueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
+    }
+
+    /// Renders a frame. Every query is traced if `surrogate` is `None`.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory, or the renderer rejects the number of samples.
+    pub fn render<B: Backend<Tracer = CudaTracer>>(
+        &mut self,
+        job: &FrameJob<'_, B>,
+        surrogate: Option<&FrozenHybrid<OnGpu>>,
+        renderer: &mut Renderer,
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let (tracer, routing) = (job.tracer, job.routing);
+        let progress = job.progress.map(|report| report as &dyn Fn(f32));
+        let samples = 0..u32::try_from(job.samples).unwrap_or(u32::MAX);
+        let counts =
+            |stats: &RenderStats| Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, ..Tally::default() };
+        if surrogate.is_none() && tracer.missing_cells().is_none() && routing.keep <= 1 {
+            let mut all = TraceAll(tracer.device());
+            let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut all, progress, job.stop)?;
+            let tally = Tally { trace_seconds: stats.evaluate_seconds, ..counts(&stats) };
+            return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()) });
+        }
+        let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
+        let pool = surrogate.and_then(|frozen| frozen.network.as_ref()?.pool().cloned());
+        let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
+        let mut answers = self.router.begin(FrameQueries {
+            tracer: tracer.device(),
+            domain: tracer.host().domain(),
+            missing_cells: tracer.missing_cells(),
+            surrogate: predictor.as_ref().map(|predictor| predictor as &dyn DevicePredict),
+            label_sink: predictor.as_ref().and_then(Predictor::label_sink),
+            gate: routing.gate,
+            trace_budget: routing.trace_budget,
+            keep: routing.keep,
+            arrivals: routing.extras.arrival,
+        })?;
+        let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut answers, progress, job.stop)?;
+        let tally = Tally {
+            over_budget: self.renderer.over_budget(),
+            trace_seconds: answers.trace_seconds(),
+            predict_seconds: answers.predict_seconds(),
+            ..counts(&stats)
+        };
+        labels.host = answers.labels();
+        Ok(Rendered { film, stats, tally, samples: labels })
+    }
+
+    /// Audits a frame.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    pub fn audit(
+        &mut self,
+        request: &AuditRequest<'_>,
+        tracer: &CudaTracer,
+        surrogate: &FrozenHybrid<OnGpu>,
+    ) -> Result<AuditFindings, DeviceError> {
+        self.audits.audit(request, tracer, &Predictor::of(surrogate, tracer)?)
+    }
+}

@@ -1,0 +1,15 @@
+//! Frames on the GPU: wavefront path tracing, query routing, labels and audits.
+
+mod audit;
+mod frames;
+mod labels;
+mod memory;
+mod renderer;
+mod router;
+
+pub use audit::Audits;
+pub use frames::{CudaSamples, GpuFrames};
+pub(super) use labels::HELD_BACK;
+pub use labels::keeps_label;
+pub use renderer::{GpuRenderer, LookAhead, Timeline};
+pub use router::{DeviceAnswers, DeviceLearns, DevicePredict, FrameQueries, QueryRouter, RoutedQueries, TraceAll};

@@ -1,0 +1,190 @@
+//! Options, checks and output that several commands share.
+
+use super::messages;
+use anyhow::{Context, Result, bail};
+use ridgewatch::backend::{Device, DeviceChoice};
+use ridgewatch::config::{ConfigError, SceneFile};
+use ridgewatch::publish::PublishError;
+use ridgewatch::render::Method;
+use ridgewatch::run::{RunError, Setup};
+use ridgewatch::setting::Refused;
+use ridgewatch::source::SourceError;
+use ridgewatch::surrogate::Kind;
+use std::path::{Path, PathBuf};
+
+/// Options of every command.
+#[derive(Debug, clap::Args)]
+pub struct Common {
+    /// Device that computes: auto (a GPU if one is usable), cpu, or cuda:N.
+    #[arg(long, global = true, default_value_t = DeviceChoice::Auto, value_name = "DEVICE")]
+    pub device: DeviceChoice,
+    /// Number of worker threads, at most 1024; 0: as many as this process may use.
+    #[arg(long, global = true, default_value_t = 0, value_name = "N", value_parser = threads)]
+    pub threads: usize,
+    /// Set one key of the scene, e.g. `--set render.samples=64`; may be repeated.
+    #[arg(long = "set", global = true, value_name = "TABLE.KEY=VALUE")]
+    pub overrides: Vec<String>,
+    /// Seed of every random number; overrides the scene's.
+    #[arg(long, global = true, value_name = "N", value_parser = clap::value_parser!(u64).range(..=i64::MAX as u64))]
+    pub seed: Option<u64>,
+    /// Print a machine-readable result on standard output; everything else is printed on standard error.
+    #[arg(long, global = true)]
+    pub json: bool,
+    /// Print more on standard error; twice for details.
+    #[arg(short, long, global = true, action = clap::ArgAction::Count)]
+    pub verbose: u8,
+}
+
+/// A request that is not accepted: exit status 2.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct Usage(pub String);
+
+/// A command that a signal ended before its work was done. The exit status is that of a process ended by the signal.
+#[derive(Debug, thiserror::Error)]
+#[error("stopped by a signal; {done}")]
+pub struct Interrupted {
+    pub status: u8,
+    pub done: &'static str,
+}
+
+/// Exit status of an error: 2 for usage and settings, 128 plus the signal's number for a signal, else 1.
+pub fn exit_status(error: &anyhow::Error) -> u8 {
+    if let Some(interrupted) = error.downcast_ref::<Interrupted>() {
+        return interrupted.status;
+    }
+    let configuration = error.chain().any(|cause| {
+        let engine = cause.downcast_ref().is_some_and(|error: &RunError| error.refused().is_some());
+        let publish = cause.downcast_ref().is_some_and(|error: &PublishError| error.refused().is_some());
+        let source = cause.downcast_ref().is_some_and(|error: &SourceError| error.refused().is_some());
+        engine || publish || source || cause.is::<ConfigError>() || cause.is::<Usage>()
+    });
+    if configuration { 2 } else { 1 }
+}
+
+/// Opens the device. With `--verbose`, prints why `auto` chose the CPU.
+pub fn device(common: &Common, scene: &SceneFile) -> Result<Device> {
+    let device = Device::open(common.device, &scene.device)?;
+    if let Device::Cpu { why: Some(why) } = &device {
+        tracing::info!("on the CPU: {why}");
+    }
+    Ok(device)
+}
+
+/// Whether a path names a scene file.
+pub fn is_config(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e == "toml")
+}
+
+/// Reads the scene of a command: one TOML file, or data files.
+pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
+    let mut scene = match paths {
+        [] => bail!(Usage("a scene file (.toml) or data files are needed".into())),
+        [one] if is_config(one) => SceneFile::read(one, &common.overrides)?,
+        many => {
+            if let Some(config) = many.iter().find(|p| is_config(p)) {
+                bail!(Usage(format!("{} is a scene file: give one scene file, or data files, not both", config.display())));
+            }
+            SceneFile::for_archive(many.to_vec(), &common.overrides)?
+        }
+    };
+    scene.seed = common.seed.unwrap_or(scene.seed);
+    Ok(scene)
+}
+
+/// Adds the place of the setting at fault, if a setting is at fault.
+pub fn located<E>(scene: &SceneFile, error: E, refused: impl FnOnce(&E) -> Option<Refused>) -> anyhow::Error
+where
+    E: std::error::Error + Send + Sync + 'static,
+{
+    match refused(&error) {
+        Some(refused) => scene.locate(refused).into(),
+        None => error.into(),
+    }
+}
+
+/// Opens the scene's source. First writes its synthetic archive if that does not exist, which may take minutes.
+pub fn open(scene: &SceneFile) -> Result<Setup> {
+    let _spinner = opening(scene);
+    Setup::new(scene.settings()).map_err(|error| located(scene, error, RunError::refused))
+}
+
+/// Spinner shown while a source is opened.
+pub fn opening(scene: &SceneFile) -> indicatif::ProgressBar {
+    let writes = scene.archive.synthetic.is_some() && scene.archive.files.is_empty();
+    messages::spinner(if writes { "opening a synthetic archive, written first if it does not exist" } else { "opening the source" }.into())
+}
+
+/// Ring folder of an option, or of the environment.
+pub fn ring_folder(option: Option<&Path>) -> Result<PathBuf> {
+    let missing = || Usage(format!("no ring: name its folder, or set {}", ridgewatch_wire::RING_VARIABLE));
+    Ok(option.map(Path::to_owned).or_else(ridgewatch_wire::ring_from_environment).ok_or_else(missing)?)
+}
+
+/// Describes a number of steps that was chosen by its error.
+pub fn chosen_steps(steps: u64, difference: f64) -> String {
+    format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many")
+}
+
+/// Refuses a checkpoint option if nothing is trained.
+pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Result<()> {
+    let Some(path) = path else { return Ok(()) };
+    let refuse = |why: &str| bail!(Usage(format!("{option} {}: {why}", path.display())));
+    if scene.render.method == Method::Reference {
+        return refuse("method reference has no surrogate; accepted with methods surrogate and gated");
+    }
+    if scene.surrogate.kind == Kind::Table {
+        return refuse("a table is traced anew for every window and is not trained; accepted with surrogate.kind network and residual");
+    }
+    Ok(())
+}
+
+/// Checks before the work that a file can be written.
+pub fn check_folder(out: &Path) -> Result<()> {
+    // A rename would replace a pipe or a device.
+    if std::fs::metadata(out).is_ok_and(|there| !there.is_file()) {
+        bail!(Usage(format!("{} exists and is not a regular file", out.display())));
+    }
+    let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    std::fs::create_dir_all(folder).with_context(|| format!("cannot make the folder {}", folder.display()))?;
+    tempfile::NamedTempFile::new_in(folder).with_context(|| format!("cannot write into {}", folder.display()))?;
+    Ok(())
+}
+
+/// Parses a word of a scene file.
+pub fn word<T: serde::de::DeserializeOwned>(word: &str, accepted: &str) -> Result<T, String> {
+    let word: serde::de::value::StrDeserializer<serde::de::value::Error> = serde::de::IntoDeserializer::into_deserializer(word);
+    T::deserialize(word).map_err(|_| format!("accepted: {accepted}"))
+}
+
+/// Parses a method.
+pub fn method(text: &str) -> Result<Method, String> {
+    word(text, "reference, surrogate, neural, gated")
+}
+
+/// Parses a number of threads.
+fn threads(word: &str) -> Result<usize, String> {
+    word.parse().ok().filter(|n| *n <= 1024).ok_or_else(|| "accepted: a whole number from 0 to 1024".to_owned())
+}
+
+/// Parses a number of seconds.
+pub fn seconds(word: &str) -> Result<f64, String> {
+    word.parse().ok().filter(|s: &f64| s.is_finite() && *s > 0.0).ok_or_else(|| "accepted: a number above 0".to_owned())
+}
+
+/// Parses `NXxNY` or `NXxNYxNZ`. `None` if a part is not a number.
+pub fn dimensions<T: std::str::FromStr>(text: &str) -> Option<Vec<T>> {
+    text.split(['x', 'X']).map(|n| n.trim().parse().ok()).collect()
+}
+
+/// Prints the machine-readable result.
+pub fn print_json(value: &impl serde::Serialize) -> Result<()> {
+    print_text(serde_json::to_string_pretty(value)?);
+    Ok(())
+}
+
+/// Prints the result for people. Ignores a closed pipe (`| head`).
+pub fn print_text(text: impl std::fmt::Display) {
+    use std::io::Write;
+    let _ = writeln!(std::io::stdout(), "{text}");
+}

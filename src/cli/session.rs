@@ -1,0 +1,279 @@
+//! A run of `replay` or `attach`: from a scene to a run folder and the socket.
+
+use super::common::{
+    Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
+};
+use super::{messages, signals};
+use anyhow::{Context, Result, anyhow, bail};
+use ridgewatch::config::SceneFile;
+use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
+use ridgewatch::render::Method;
+use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+
+/// Options that `replay` and `attach` share.
+#[derive(Debug, clap::Args)]
+pub struct RunArguments {
+    /// Run folder. `replay` refuses one that holds a run; `attach` takes the first of FOLDER, FOLDER-2, FOLDER-3 that does not.
+    #[arg(long, short, value_name = "FOLDER", default_value = "out/run")]
+    pub out: PathBuf,
+    /// Replace an earlier run in that folder.
+    #[arg(long)]
+    pub overwrite: bool,
+    /// Keep only the newest N frames on disk.
+    #[arg(long, value_name = "N")]
+    keep: Option<usize>,
+    /// reference, surrogate (neural) or gated; overrides the scene's.
+    #[arg(long, value_parser = method)]
+    method: Option<Method>,
+    /// Publish frames at this ZeroMQ endpoint (port 0: any free one, which is printed); by default they go to files only.
+    #[arg(long, value_name = "ENDPOINT", num_args = 0..=1, default_missing_value = DEFAULT_ENDPOINT)]
+    publish: Option<String>,
+    /// Check each frame's stated error afterwards on N new points, and record the result.
+    #[arg(long, value_name = "N", default_value_t = 0, value_parser = clap::value_parser!(u64).range(0..=100_000_000))]
+    verify: u64,
+    /// Begin no further frame after N seconds of wall clock.
+    #[arg(long, value_name = "N", value_parser = seconds)]
+    seconds: Option<f64>,
+    /// Write the trained surrogate here at the end. `attach` also writes it every 30 seconds, and resumes from it when it is started again.
+    #[arg(long, value_name = "FILE")]
+    pub checkpoint: Option<PathBuf>,
+    /// Start from a surrogate written by --checkpoint.
+    #[arg(long, value_name = "FILE")]
+    resume: Option<PathBuf>,
+}
+
+impl RunArguments {
+    /// Applies the options to the scene.
+    pub fn apply(&self, scene: &mut SceneFile) -> Result<()> {
+        if let Some(method) = self.method {
+            scene.render.method = method;
+        }
+        if let Some(keep) = self.keep {
+            if keep == 0 {
+                bail!(Usage("--keep 0: accepted: 1 or more".into()));
+            }
+            scene.publish.keep = Some(keep);
+        }
+        if let Some(endpoint) = &self.publish {
+            scene.publish.endpoint = Some(endpoint.clone()).filter(|word| word != "none");
+            scene.set_by("publish.endpoint", format!("--publish {endpoint}"));
+        }
+        check_learns(scene, "--checkpoint", self.checkpoint.as_deref())?;
+        check_learns(scene, "--resume", self.resume.as_deref())?;
+        scene.training.resume = self.resume.clone().or(scene.training.resume.take());
+        Ok(())
+    }
+}
+
+/// A run that is about to start.
+pub struct Session<'a> {
+    pub common: &'a Common,
+    pub options: &'a RunArguments,
+    pub scene: SceneFile,
+    /// Scene as it is kept in the run folder.
+    pub text: String,
+    /// Seconds between two checkpoints of a run that follows a simulation. `None` for replays.
+    pub checkpoint_seconds: Option<f64>,
+}
+
+impl Session<'_> {
+    /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
+    pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
+        signals::runtime(2)?.block_on(self.frames(open))
+    }
+
+    async fn frames(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
+        let Self { common, options, scene, text, checkpoint_seconds } = self;
+        // Before any wait or work. `RunFolder::create` checks again, in case another run takes the folder meanwhile.
+        RunFolder::refuse_occupied(&options.out, options.overwrite)?;
+        let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
+        let watch = || signals::watch(stop.clone(), caught.clone()).map(tokio::spawn);
+        // While `attach` waits for its source, a signal must stop the wait. While `replay` opens its source, a signal ends the process at once.
+        let follows = checkpoint_seconds.is_some();
+        let early = if follows { watch() } else { None };
+        let Some(setup) = open(&scene, &stop)? else {
+            messages::note("stopped before a simulation came");
+            return Ok(());
+        };
+        let device = device(common, &scene)?;
+        if let Some(checkpoint) = &options.checkpoint {
+            check_folder(checkpoint)?;
+        }
+        // Before anything is written: from here on, a signal leaves a complete folder.
+        let signals = early.or_else(watch);
+        // The socket first: a port in use must not cost the previous run in the folder.
+        let publish = scene.publish_settings();
+        let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
+        let mut folder = RunFolder::create(&options.out, options.overwrite)?;
+        if let Err(error) = folder.write_scene(if follows { "attach" } else { "replay" }, &text) {
+            folder.restore_previous().with_context(|| format!("{}: the previous run cannot be restored", options.out.display()))?;
+            return Err(error.into());
+        }
+        output.write_to(folder, &publish)?;
+        if let Some(endpoint) = output.endpoint() {
+            messages::note(format_args!("publishing at {endpoint}"));
+        }
+        let run_options = RunOptions {
+            verify_points: options.verify as usize,
+            seconds: options.seconds,
+            threads: common.threads,
+            checkpoint: options.checkpoint.clone(),
+            checkpoint_seconds,
+            device,
+        };
+        let flag = stop.clone();
+        let worker = tokio::task::spawn_blocking(move || work(setup, &scene, &run_options, output, &flag));
+        let (result, last, summary) = worker.await.context("the cycle stopped unexpectedly")?;
+        if let Some(signals) = signals {
+            signals.abort();
+        }
+        let report = result?;
+        for warning in &report.warnings {
+            messages::note(format_args!("after the last frame: {warning}"));
+        }
+        if common.json {
+            print_json(&summary)?;
+        } else {
+            print_report(&report, last.as_deref());
+        }
+        if let Some(lost) = summary.files.as_ref().and_then(FileStatistics::lost) {
+            bail!("{}: {lost}", options.out.join("frames").display());
+        }
+        if !common.json {
+            print_text(format_args!("frames in {}", options.out.join("frames").display()));
+        }
+        const DONE: &str = "the run folder is complete up to the last finished frame";
+        match (report.interrupted, follows) {
+            (false, _) => Ok(()),
+            // A signal is the normal end of a run that follows a simulation.
+            (true, true) => {
+                messages::note(format_args!("stopped by a signal; {DONE}"));
+                Ok(())
+            }
+            (true, false) => Err(Interrupted { status: caught.load(Ordering::Relaxed), done: DONE }.into()),
+        }
+    }
+}
+
+/// Runs the cycle on the calling thread. Whatever happens, completes the output of the frames made so far.
+fn work(
+    setup: Setup,
+    scene: &SceneFile,
+    options: &RunOptions,
+    mut output: Output,
+    stop: &AtomicBool,
+) -> (Result<RunReport>, Option<Arc<FrameRecord>>, Summary) {
+    let (source, time_unit) = (setup.plan.source.clone(), setup.plan.time_unit.clone());
+    let mut bar = messages::progress(None);
+    let mut last: Option<Arc<FrameRecord>> = None;
+    let run = || run::run(setup, options, &mut |event| show(event, &mut bar, &mut last, &mut output), stop);
+    // A panic must not cost the frames already made.
+    let result = std::panic::catch_unwind(std::panic::AssertUnwindSafe(run)).map_err(|_| anyhow!("the cycle panicked (see above)"));
+    let result = result.and_then(|result| result.map_err(|error| located(scene, error, RunError::refused)));
+    bar.finish_and_clear();
+    let mut run = serde_json::Map::new();
+    run.insert("title".into(), scene.title.as_str().into());
+    run.insert("seed".into(), scene.seed.into());
+    run.insert("version".into(), env!("CARGO_PKG_VERSION").into());
+    run.insert("source".into(), source.into());
+    run.insert("time_unit".into(), time_unit.into());
+    match &result {
+        Ok(report) => run.extend(run_json(report)),
+        Err(error) => drop(run.insert("failed".into(), error.to_string().into())),
+    }
+    (result, last, output.finish(run))
+}
+
+fn print_report(report: &RunReport, last: Option<&FrameRecord>) {
+    let mut text = format!("{} frames of {} slides", report.frames, report.slides);
+    if let Some(last) = last {
+        text += &format!(
+            "; {} Runge-Kutta steps a path; surrogate {:.2} MB after {} optimizer steps\nlast frame: {}",
+            report.integration_steps.map_or("adaptive".to_owned(), |steps| steps.to_string()),
+            report.surrogate_bytes as f64 / 1e6,
+            report.train_steps,
+            line(last)
+        );
+    }
+    print_text(text);
+}
+
+fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<FrameRecord>>, output: &mut Output) {
+    match event {
+        Event::Begin { frames, notes } => {
+            *bar = messages::progress(frames);
+            bar.set_message("filling the first window");
+            for text in notes {
+                bar.suspend(|| messages::note(text));
+            }
+        }
+        Event::Note(text) => bar.suspend(|| messages::note(text)),
+        Event::Progress(share) => bar.set_message(format!("frame {:3.0} %", share * 100.0)),
+        Event::Frame(frame) => {
+            for warning in &frame.record.warnings {
+                bar.suspend(|| messages::note(format_args!("frame {}: {warning}", frame.record.frame)));
+            }
+            if last.is_none()
+                && let (Some(steps), Some(difference)) = (frame.record.integration_steps, frame.record.integration_difference)
+            {
+                bar.suspend(|| messages::note(chosen_steps(steps, difference)));
+            }
+            tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
+            *last = Some(frame.record.clone());
+            output.frame(frame);
+            bar.inc(1);
+        }
+    }
+}
+
+/// Describes a frame in one line.
+pub fn line(record: &FrameRecord) -> String {
+    let mut text = match &record.date {
+        Some(date) => format!("{date}, "),
+        None => format!("t = {}, ", record.time),
+    };
+    text += &format!("traced {:.1} % of {} queries", 100.0 * record.traced_share, record.queries - record.missing);
+    if record.missing > 0 {
+        text += &format!(", {} more on land", record.missing);
+    }
+    if record.audited > 0 && record.mean_lifetime_share < 0.9995 {
+        text += &format!(", particles live {:.1} % of tau", 100.0 * record.mean_lifetime_share);
+    }
+    if let Some(error) = &record.trusted_error {
+        text += &format!(
+            ", error where trusted {:.4} [{:.4}, {:.4}] rms",
+            error.optical_rms, error.optical_rms_interval[0], error.optical_rms_interval[1]
+        );
+    }
+    if let Some(over) = record.tolerance_excess {
+        text += &format!(", OVER TOLERANCE by {over:.4}");
+    }
+    text + &format!(", {:.2} s", record.seconds.total)
+}
+
+fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
+    let serde_json::Value::Object(map) = serde_json::json!({
+        "frames": report.frames,
+        "slides": report.slides,
+        "interrupted": report.interrupted,
+        "waited_seconds": report.waited,
+        // Share of the time for input and work; saving and publishing are not counted.
+        "waited_share": if report.waited > 0.0 { report.waited / (report.waited + report.worked) } else { 0.0 },
+        "optimizer_steps": report.train_steps,
+        "integration_steps": report.integration_steps,
+        "integration_difference": report.integration_difference,
+        "transfer": report.transfer,
+        "surrogate_bytes": report.surrogate_bytes,
+        "sizes": report.sizes,
+        "window_bytes_peak": report.window_bytes,
+        "checkpoints": report.checkpoints,
+        "warnings": report.warnings,
+        "time_resolution": report.time_resolution,
+    }) else {
+        unreachable!("an object literal")
+    };
+    map
+}

@@ -1,0 +1,534 @@
+//! The cycle: slide the window, render with the weights of the previous cycle, test, then train.
+//!
+//! One group of threads renders frame n with frozen weights, while another trains the live weights on the samples of earlier frames. A GPU that
+//! trains alternates between picture and training, which takes `training.share` of the device's time. Samples traced for frame n are compared
+//! with the frozen weights, which were not trained on them, before they go to the replay buffer.
+
+use super::checkpoints::{CheckpointTotals, Checkpoints};
+use super::record::Frame;
+use super::scene::settled_scene;
+use super::setup::{Plan, Setup};
+use super::slides::{Slide, Slides};
+use super::stop::{RunEnd, check_stop};
+use super::training::{Threads, TrainingBudget};
+use super::transaction::{On, Recovering, Session, transaction, with};
+use super::{RunError, Settings, TransferRecord};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
+use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
+use crate::render::{Method, Renderer, Scene};
+use crate::surrogate::network::{Size, Times};
+use crate::surrogate::{Learned, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
+use crate::trust::TrustMap;
+use std::path::PathBuf;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// Options of a run besides its scene.
+#[derive(Debug, Clone, Default)]
+pub struct RunOptions {
+    /// Number of new uniform points on which each frame's stated error is checked afterwards; 0 disables the check.
+    pub verify_points: usize,
+    /// Wall-clock seconds after which no further frame starts.
+    pub seconds: Option<f64>,
+    /// Number of worker threads; 0: as many as the process may use.
+    pub threads: usize,
+    /// File for the trained surrogate, written at the end.
+    pub checkpoint: Option<PathBuf>,
+    /// Seconds between checkpoints during the run. A killed run can resume from the latest one.
+    pub checkpoint_seconds: Option<f64>,
+    /// The device that computes.
+    pub device: Device,
+}
+
+/// Events of a run in progress.
+pub enum Event {
+    /// Before the first frame.
+    Begin {
+        /// Number of frames; `None` if unknown.
+        frames: Option<u64>,
+        /// Remarks on the settings and the source.
+        notes: Vec<String>,
+    },
+    /// A remark after [`Event::Begin`] and before the first frame.
+    Note(String),
+    /// A finished frame.
+    Frame(Frame),
+    /// Share of the current frame that is rendered.
+    Progress(f32),
+}
+
+/// Summary of a run.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct RunReport {
+    /// Number of frames.
+    pub frames: u64,
+    /// Number of slides.
+    pub slides: u64,
+    /// True if the caller stopped the run.
+    pub interrupted: bool,
+    /// Seconds spent waiting for input.
+    pub waited: f64,
+    /// Seconds spent on frames and on adding available snapshots to the window.
+    pub worked: f64,
+    /// Optimizer steps.
+    pub train_steps: u64,
+    /// Runge-Kutta steps per path; `None` if each path chooses its own steps, or if there was no tracer yet.
+    pub integration_steps: Option<usize>,
+    /// Difference of the log-stretch from that of twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
+    pub integration_difference: Option<f64>,
+    /// Transfer function; `None` if the run ended before it was chosen.
+    pub transfer: Option<TransferRecord>,
+    /// Size of the surrogate, bytes.
+    pub surrogate_bytes: usize,
+    /// Changes of its size with `size = "auto"`, with reasons; a few dozen at most, since no rejected size is tried twice.
+    pub sizes: Vec<String>,
+    /// Resolution of the snapshots in time; `None` for closed forms.
+    pub time_resolution: Option<TimeResolution>,
+    /// Largest size of the window, bytes.
+    pub window_bytes: usize,
+    /// Totals of the checkpoints; `None` if the run writes none.
+    pub checkpoints: Option<CheckpointTotals>,
+    /// Warnings since the last frame; earlier ones are in the records.
+    pub warnings: Vec<String>,
+}
+
+/// Change of the FTLE without every second snapshot, as a share of its root mean square, above which a warning calls the scene coarse in time.
+const COARSE_IN_TIME: f64 = 0.25;
+/// Maximum number of residuals of rendered samples that go to the trust map each frame. More would not improve the estimates of their cells.
+pub(super) const MAX_RENDER_RESIDUALS: usize = 1 << 16;
+
+/// The receiver of a run's events.
+pub(super) type Sink<'a> = dyn FnMut(Event) + Send + 'a;
+
+/// State of a run on the host, independent of the backend.
+pub(super) struct Run<'a> {
+    pub(super) plan: &'a Plan,
+    pub(super) options: &'a RunOptions,
+    pub(super) threads: Threads,
+    pub(super) stop: &'a AtomicBool,
+    pub(super) began: Instant,
+    pub(super) report: &'a mut RunReport,
+    pub(super) renderer: Renderer,
+    pub(super) transfer: TransferRecord,
+    pub(super) learning: Learning,
+    pub(super) progress: RunProgress,
+    /// `None` if the run writes no checkpoints.
+    pub(super) checkpoints: Option<Checkpoints>,
+}
+
+/// State of learning, apart from the surrogate itself.
+pub(super) struct Learning {
+    pub(super) trust: TrustMap,
+    pub(super) buffer: ReplayBuffer,
+    /// Times that are inputs of the network, and the start time of the buffer's labels.
+    pub(super) times: Times,
+    pub(super) start: f64,
+    /// Settings of the surrogate, with the nodes of the data if a table has no others.
+    pub(super) settings: SurrogateSettings,
+    /// Search for the size, with `size = "auto"`.
+    pub(super) sizing: Option<Sizing>,
+    /// Size for the next frame; `None` to keep the present one.
+    pub(super) resize: Option<Resize>,
+    /// Device time due to training beside a live simulation.
+    pub(super) budget: TrainingBudget,
+    /// Training after the last frame went out, or in a frame that failed. It goes into the next record.
+    pub(super) unreported: Learned,
+    /// Largest log-stretch on the audit points of this slide.
+    pub(super) peak: f32,
+}
+
+impl Learning {
+    /// Adds training to the next record.
+    pub(super) fn report(&mut self, learned: Learned) {
+        self.unreported = std::mem::take(&mut self.unreported).and(learned);
+    }
+
+    /// Training since the last frame; `None` if nothing was trained.
+    pub(super) fn unreported_since_last_frame(&mut self) -> Option<Learned> {
+        Some(std::mem::take(&mut self.unreported)).filter(|learned| *learned != Learned::default())
+    }
+}
+
+/// Progress of a run, and the contents of its next record.
+#[derive(Default)]
+pub(super) struct RunProgress {
+    pub(super) frame: u64,
+    /// Number of frames without the warm-up frames.
+    pub(super) pictures: u64,
+    /// Points traced since the last frame to prepare the next one.
+    pub(super) preparation_traces: u64,
+    /// True once the warning about short particle lifetimes was given.
+    pub(super) has_warned_of_deaths: bool,
+    pub(super) warnings: Vec<String>,
+    /// Seconds that the loop paused since the last frame for a checkpoint.
+    pub(super) checkpoint_pause: f64,
+}
+
+impl Recovering for Run<'_> {
+    fn warn(&mut self, warning: String) {
+        self.progress.warnings.push(warning);
+    }
+    fn pool(&self) -> &rayon::ThreadPool {
+        self.threads.render()
+    }
+    fn stop(&self) -> &AtomicBool {
+        self.stop
+    }
+}
+
+/// A run and the session that computes.
+pub(super) struct Cycle<'a, B: Backend> {
+    pub(super) run: Run<'a>,
+    pub(super) session: Session<B>,
+    /// Flow map with the number of steps of the first slide, so that frames are comparable.
+    pub(super) map: FlowMap,
+}
+
+/// Place of a frame in its slide.
+#[derive(Clone, Copy)]
+pub(super) struct FramePlace {
+    pub(super) is_warmup: bool,
+    /// Seconds of preparing the slide, for its first frame; 0 for the others.
+    pub(super) preparing: f64,
+}
+
+/// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame. Between frames (while the window
+/// fills, tables are traced, or cells are probed) the run ends within about a second.
+///
+/// # Errors
+/// A setting, the source, the device or the last checkpoint fails.
+pub fn run(setup: Setup, options: &RunOptions, sink: &mut Sink<'_>, stop: &AtomicBool) -> Result<RunReport, RunError> {
+    match &options.device {
+        Device::Cpu { .. } => run_on(Cpu, setup, options, sink, stop),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => run_on(Cuda::new(device), setup, options, sink, stop),
+    }
+}
+
+/// Runs the whole scene as [`run`] does, on a given backend. The device of the options is not used.
+///
+/// # Errors
+/// As for [`run`].
+pub fn run_on<B: Backend>(
+    backend: B,
+    setup: Setup,
+    options: &RunOptions,
+    sink: &mut Sink<'_>,
+    stop: &AtomicBool,
+) -> Result<RunReport, RunError> {
+    let mut report = RunReport::default();
+    match drive(backend, setup, options, sink, stop, &mut report) {
+        Ok(()) | Err(RunEnd::TimeIsUp) => {}
+        Err(RunEnd::Stopped) => report.interrupted = true,
+        Err(RunEnd::Device(error)) => return Err(RunError::Device(Box::new(error))),
+        Err(RunEnd::Failed(error)) => return Err(error),
+    }
+    Ok(report)
+}
+
+fn drive<B: Backend>(
+    backend: B,
+    setup: Setup,
+    options: &RunOptions,
+    sink: &mut Sink<'_>,
+    stop: &AtomicBool,
+    report: &mut RunReport,
+) -> Result<(), RunEnd> {
+    let began = Instant::now();
+    let Setup { plan, mut slides, notes } = setup;
+    let time = &plan.scene.time;
+    let frames = slides.expected().map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    sink(Event::Begin { frames, notes });
+    let threads = Threads::new(options.threads, &plan.scene)?;
+    if let Some(listener) = backend.prefetch() {
+        slides.listen(listener);
+    }
+    let first = slides.next_slide(stop)?;
+    check_stop(stop)?;
+    let mut slide = first.ok_or(RunError::EndedEarly)?;
+    let begun = Instant::now();
+    let mut beginning = Beginning { threads: &threads, stop, warnings: Vec::new() };
+    let mut session = begin(backend, &plan, &slide, &mut beginning)?;
+    check_stop(stop)?;
+    let map = match with!(&session, on => fixed_steps(on.tracer().flow())) {
+        Some(steps) => FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() },
+        None => plan.map.clone(),
+    };
+    let settled = loop {
+        let settled = with!(&session, on => {
+            let tracer = on.tracer();
+            threads.render().install(|| settled_scene(&plan, tracer, &slide, stop))
+        });
+        match settled {
+            Err(RunEnd::Device(error)) => session.recover(error, &slide, &map, &mut beginning)?,
+            settled => break settled?,
+        }
+    };
+    slide.warnings.append(&mut beginning.warnings);
+    let from = RunGiven { plan: &plan, options, threads, stop, began, report };
+    let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
+    sink(Event::Note(run.colours()));
+    let mut cycle = Cycle { run, session, map };
+    let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
+    // The checkpoint is written even if the run was stopped.
+    match ended {
+        Err(RunEnd::Failed(error)) => Err(RunEnd::Failed(error)),
+        ended => cycle.finish().map_err(RunEnd::Failed).and(ended),
+    }
+}
+
+/// What a run is given before its first slide.
+struct RunGiven<'a> {
+    plan: &'a Plan,
+    options: &'a RunOptions,
+    threads: Threads,
+    stop: &'a AtomicBool,
+    began: Instant,
+    report: &'a mut RunReport,
+}
+
+/// State that a recovery needs before [`Run`] exists.
+struct Beginning<'a> {
+    threads: &'a Threads,
+    stop: &'a AtomicBool,
+    warnings: Vec<String>,
+}
+
+impl Recovering for Beginning<'_> {
+    fn warn(&mut self, warning: String) {
+        self.warnings.push(warning);
+    }
+    fn pool(&self) -> &rayon::ThreadPool {
+        self.threads.render()
+    }
+    fn stop(&self) -> &AtomicBool {
+        self.stop
+    }
+}
+
+/// Prepares the first slide on the backend, or on the CPU if the device fails and the options allow the fallback.
+fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut Beginning<'_>) -> Result<Session<B>, RunEnd> {
+    let pool = beginning.threads.render();
+    let error = match pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time)) {
+        Ok(tracer) => return Ok(Session::Device(On { backend, tracer: Some(tracer), surrogate: None })),
+        Err(BackendError::Device(error)) => error,
+        Err(error) => return Err(error.into()),
+    };
+    let goes_on = if error.is_fault() { backend.when_lost() == WhenLost::Cpu } else { backend.may_fall_back() };
+    if !goes_on {
+        return Err(RunError::Device(Box::new(error)).into());
+    }
+    let mut backend = Cpu;
+    let tracer = pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time))?;
+    beginning.warnings.push(format!("traced on the CPU: {error}"));
+    Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None }))
+}
+
+impl<'a> Run<'a> {
+    fn new(frame: RunGiven<'a>, settled: Scene, flow: &dyn Tracer, first: &Slide) -> Result<Self, RunEnd> {
+        let RunGiven { plan, options, threads, stop, began, report } = frame;
+        let scene = &plan.scene;
+        let range = (settled.transfer.low.unwrap_or_default(), settled.transfer.high.unwrap_or_default());
+        let renderer = Renderer::new(settled, &plan.domain, plan.map.tau)?;
+        let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
+        let settings = match &first.velocity {
+            VelocitySource::Window(window) => {
+                let most = if first.live.is_some() { max_live_nodes(scene, &options.device) } else { usize::MAX };
+                window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape(), most))
+            }
+            VelocitySource::Analytic(..) => None,
+        };
+        let settings = settings.unwrap_or_else(|| scene.surrogate.clone());
+        let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
+        let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
+        let times = Times::new(&scene.network, flow.tau());
+        let mut buffer = ReplayBuffer::new(scene.training.replay_buffer);
+        if !scene.network.inputs.is_empty() {
+            buffer.set_now(times.unit(flow.start(), flow.tau()));
+        }
+        report.transfer = Some(transfer);
+        report.integration_steps = fixed_steps(flow);
+        report.integration_difference = flow.step_choice().map(|c| c.difference).filter(|difference| difference.is_finite());
+        let learning = Learning {
+            trust: TrustMap::new(&scene.trust, &plan.domain),
+            buffer,
+            times,
+            start: flow.start(),
+            settings,
+            sizing,
+            resize: None,
+            budget: TrainingBudget::new(scene.training.share),
+            unreported: Learned::default(),
+            peak: f32::NEG_INFINITY,
+        };
+        let checkpoints = options.checkpoint.clone().map(|path| Checkpoints::new(path, options.checkpoint_seconds));
+        let progress = RunProgress::default();
+        Ok(Self { plan, options, threads, stop, began, report, renderer, transfer, learning, progress, checkpoints })
+    }
+}
+
+impl<B: Backend> Cycle<'_, B> {
+    /// Renders all slides. The preparation of the first one began at `begun`.
+    fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+        self.prepare_first(&mut slide)?;
+        loop {
+            self.frames(&mut slide, begun, sink)?;
+            transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
+            // Tracer and slide both hold the window, on the host and on the device.
+            with!(&mut self.session, on => on.tracer = None);
+            drop(slide);
+            let next = slides.next_slide(self.run.stop)?;
+            check_stop(self.run.stop)?;
+            let Some(next) = next else { return Ok(()) };
+            (slide, begun) = (next, Instant::now());
+            self.begin_slide(&slide)?;
+            slide.warnings.extend(self.run.beyond_the_range(slide.time));
+            transaction!(self, &slide, run, on => run.probe(on, slide.index));
+        }
+    }
+
+    fn prepare_first(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
+        if self.run.plan.scene.render.method != Method::Reference {
+            transaction!(self, slide, run, on => run.build_surrogate(on));
+        }
+        if let Some(path) = &self.run.plan.scene.training.resume {
+            let loaded = with!(&mut self.session, on => match &mut on.surrogate {
+                Some(surrogate) if surrogate.learns() => surrogate.load(path).map(|()| true),
+                _ => Ok(false),
+            })?;
+            if loaded {
+                // The checkpoint's table may be of another window.
+                transaction!(self, slide, run, on => run.slide_surrogate(on));
+            }
+        }
+        let flow_warnings = with!(&self.session, on => self.run.flow_warnings(on.tracer().flow()));
+        slide.warnings.extend(flow_warnings);
+        if let VelocitySource::Window(window) = &slide.velocity {
+            let resolution = self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?;
+            if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {
+                slide.warnings.push(format!(
+                    "coarse in time: without every second snapshot the FTLE changes by {:.0} % of its root mean square",
+                    100.0 * change / resolution.ftle_rms
+                ));
+            }
+            self.run.report.time_resolution = Some(resolution);
+        }
+        slide.warnings.extend(self.run.beyond_the_range(slide.time));
+        transaction!(self, slide, run, on => run.pilot(on));
+        transaction!(self, slide, run, on => run.probe(on, slide.index));
+        Ok(())
+    }
+
+    /// Moves the session to the next window: tables are traced again, weights are kept, and trust starts again from nothing. Old labels are tested
+    /// (unless the network has the start time as an input).
+    fn begin_slide(&mut self, slide: &Slide) -> Result<(), RunEnd> {
+        transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        self.run.learning.peak = f32::NEG_INFINITY;
+        let rebuilds = self.run.learning.resize.is_some();
+        transaction!(self, slide, run, on => if rebuilds { run.rebuild_surrogate(on) } else { run.slide_surrogate(on) });
+        self.run.resized();
+        if with!(&self.session, on => on.surrogate.is_some()) {
+            transaction!(self, slide, run, on => run.slide_labels(on));
+        }
+        let Run { renderer, threads, .. } = &mut self.run;
+        threads.render().install(|| renderer.window_slid());
+        Ok(())
+    }
+
+    /// The frames of one slide.
+    fn frames(&mut self, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+        let time = &self.run.plan.scene.time;
+        let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
+        for number in 0..warmups + time.frames_per_slide {
+            let place =
+                FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
+            if self.run.learning.resize.is_some() {
+                transaction!(self, slide, run, on => run.rebuild_surrogate(on));
+                self.run.resized();
+                self.run.learning.trust.reset();
+                transaction!(self, slide, run, on => run.probe(on, slide.index));
+            }
+            let start = Instant::now();
+            transaction!(self, slide, run, on => run.learn_shorter(on, slide));
+            let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
+            slide.warnings.clear();
+            slide.waited = 0.0;
+            sink(Event::Frame(frame));
+            transaction!(self, slide, run, on => run.checkpoint_if_due(on));
+            check_stop(self.run.stop)?;
+            if self.run.options.seconds.is_some_and(|seconds| self.run.began.elapsed().as_secs_f64() >= seconds) {
+                return Err(RunEnd::TimeIsUp);
+            }
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), RunError> {
+        let run = &mut self.run;
+        let learned = std::mem::take(&mut run.learning.unreported);
+        run.report.train_steps += learned.steps;
+        run.report.surrogate_bytes = with!(&self.session, on => on.surrogate.as_ref().map_or(0, |surrogate| surrogate.bytes()));
+        let last_frame = run.progress.frame.checked_sub(1);
+        let last = match &mut run.checkpoints {
+            Some(checkpoints) => {
+                let last = with!(&self.session, on => match &on.surrogate {
+                    Some(surrogate) => checkpoints.finish(last_frame, surrogate),
+                    None => Ok(()),
+                });
+                run.report.checkpoints = Some(checkpoints.totals().clone());
+                last
+            }
+            None => Ok(()),
+        };
+        run.report.warnings = [learned.warnings, std::mem::take(&mut run.progress.warnings)].concat();
+        Ok(last?)
+    }
+}
+
+impl Run<'_> {
+    /// Starts a checkpoint if one is due. A disk error fails the checkpoint, not the run.
+    fn checkpoint_if_due<B: Backend>(&mut self, on: &mut On<B>) -> Result<(), RunEnd> {
+        if let (Some(checkpoints), Some(surrogate)) = (&mut self.checkpoints, &mut on.surrogate) {
+            let (pause, warning) = checkpoints.after_frame(self.progress.frame - 1, surrogate)?;
+            self.progress.checkpoint_pause = pause;
+            self.progress.warnings.extend(warning);
+        }
+        Ok(())
+    }
+
+    /// Warnings about the flow map of the first slide.
+    fn flow_warnings(&self, flow: &dyn Tracer) -> Vec<String> {
+        let mut warnings: Vec<String> = self.uniform(flow).into_iter().collect();
+        if let Some(chosen) = flow.step_choice().filter(|chosen| chosen.not_finite > 0) {
+            warnings.push(format!(
+                "{} of {} paths of the step choice have no finite log-stretch: the integration overflowed there",
+                chosen.not_finite,
+                StepChoice::POINTS
+            ));
+        }
+        if let Some(chosen) = flow.step_choice().filter(|chosen| !chosen.within_tolerance) {
+            warnings.push(format!(
+                "{} steps a path, the maximum, still differ from twice as many by {:.3} (log-stretch, root mean square of the better 98 %)",
+                chosen.steps, chosen.difference
+            ));
+        }
+        warnings
+    }
+}
+
+/// Maximum number of table nodes for a live simulation, since every slide traces the table again. On the CPU it is the number of camera paths of
+/// the slide's frames: with more nodes, the table costs more than tracing every query.
+fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
+    if device.is_gpu() {
+        return usize::MAX;
+    }
+    let frames = [scene.render.width, scene.render.height, scene.render.samples, scene.time.frames_per_slide];
+    frames.into_iter().fold(1, usize::saturating_mul)
+}
+
+/// Steps per path; `None` if each path chooses its own.
+pub(super) fn fixed_steps(tracer: &dyn Tracer) -> Option<usize> {
+    Some(tracer.steps()).filter(|steps| *steps > 0)
+}

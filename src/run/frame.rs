@@ -1,0 +1,319 @@
+//! One frame: rendering with frozen weights while the live ones train, comparison with the traced samples, and the record.
+
+use super::assess::{Work, assess};
+use super::checkpoints::Checkpoints;
+use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
+use super::record::Frame;
+use super::slides::{Slide, Slides};
+use super::stop::RunEnd;
+use super::training::{Until, train};
+use super::transaction::{On, present};
+use super::{FrameRecord, StageSeconds};
+use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Surrogate};
+use crate::flow::VelocitySource;
+use crate::render::Method;
+use crate::surrogate::{Learned, Predict, Trace};
+use crate::trust::{Gate, Strata};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+/// Mean lifetime share of the particles below which a warning is given.
+const SHORT_LIVED: f64 = 0.75;
+
+/// Picture number of the first warm-up frame, larger than all other picture numbers.
+const WARMUP_PICTURES: u64 = 1 << 40;
+
+/// Seconds of training between two checks for the next window.
+const TURN: f64 = 0.05;
+/// Interval between such checks while the device is idle.
+const GLANCE: Duration = Duration::from_millis(2);
+
+/// Inputs of rendering and audit besides the session.
+struct Picture<'a> {
+    gate: &'a Gate,
+    place: FramePlace,
+    is_live: bool,
+}
+
+impl Run<'_> {
+    /// Makes one frame, whose preparation began at `start`. Its results take effect only when all of it is computed.
+    pub(super) fn frame<B: Backend>(
+        &mut self,
+        on: &mut On<B>,
+        slide: &Slide,
+        place: FramePlace,
+        start: Instant,
+        sink: &mut Sink<'_>,
+    ) -> Result<Frame, RunEnd> {
+        let preparation_seconds = start.elapsed().as_secs_f64();
+        let scene = &self.plan.scene;
+        let gate = match scene.render.method {
+            Method::Gated => self.learning.trust.gate(),
+            Method::Reference => Gate::uniform(false),
+            Method::Surrogate => Gate::uniform(true),
+        };
+        // The frame is rendered with frozen weights, which were not trained on its samples.
+        let frozen = on.surrogate.as_ref().map(Surrogate::freeze).transpose()?;
+        let renderer = self.renderer.clone();
+        let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
+        let computed = self.picture(on, frozen.as_ref(), &picture, sink).map_err(RunEnd::from).and_then(|work| {
+            let assessing = Instant::now();
+            let assessment = match &frozen {
+                Some(frozen) => assess(self, frozen, on.tracer(), &gate, &work)?,
+                None => None,
+            };
+            let seconds = assessing.elapsed().as_secs_f64();
+            let total = self.progress.checkpoint_pause + start.elapsed().as_secs_f64();
+            let verified = match &frozen {
+                // Not part of the frame's time.
+                Some(frozen) => self.verify(frozen, on.tracer(), &gate)?,
+                None => None,
+            };
+            Ok((work, assessment, seconds, total, verified))
+        });
+        let (work, assessment, assess_seconds, total, verified) = match computed {
+            Ok(computed) => computed,
+            Err(error) => {
+                // A repetition of the frame starts with the same majorants.
+                self.renderer = renderer;
+                return Err(error);
+            }
+        };
+        // The steps below cannot fail.
+        let mut record = self.record(on, slide, &work);
+        record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
+        record.verified_error = verified;
+        let samples = work.rendered.samples.commit();
+        if let Some(assessment) = assessment {
+            self.take_in(on, assessment, &work.audit, samples, &mut record);
+        }
+        let learned = self.learning.unreported_since_last_frame();
+        let train_seconds = learned.as_ref().map_or(0.0, |learned| learned.seconds);
+        if let Some(learned) = &learned {
+            self.report.train_steps += learned.steps;
+            record.warnings.extend_from_slice(&learned.warnings);
+            if learned.rollbacks > 0 {
+                record
+                    .warnings
+                    .push(format!("training diverged {} time(s): rolled back to the last good weights at a lower rate", learned.rollbacks));
+            }
+        }
+        record.training = learned;
+        record.replay_samples = self.learning.buffer.len() as u64;
+        record.checkpoint = self.checkpoints.as_mut().and_then(Checkpoints::look);
+        if let Some(failed) = record.checkpoint.as_ref().and_then(|checkpoint| checkpoint.failed.as_ref()) {
+            record.warnings.push(failed.clone());
+        }
+        let (tally, stats) = (&work.rendered.tally, &work.rendered.stats);
+        record.seconds = StageSeconds {
+            slide: place.preparing,
+            waiting: slide.waited,
+            render: work.render_seconds - tally.trace_seconds - tally.predict_seconds,
+            trace: tally.trace_seconds,
+            predict: tally.predict_seconds,
+            audit: preparation_seconds + work.audit_seconds + assess_seconds,
+            train: train_seconds,
+            device: stats.device_seconds,
+            checkpoint: std::mem::take(&mut self.progress.checkpoint_pause),
+            total,
+            elapsed: self.began.elapsed().as_secs_f64(),
+        };
+        if let VelocitySource::Window(window) = &slide.velocity {
+            self.report.window_bytes = self.report.window_bytes.max(window.bytes());
+        }
+        self.report.frames += 1;
+        self.report.waited += record.seconds.waiting;
+        self.report.worked += record.seconds.slide + record.seconds.total;
+        self.report.slides = slide.index + 1;
+        self.progress.frame += 1;
+        self.progress.pictures += u64::from(!place.is_warmup);
+        Ok(Frame { record: Arc::new(record), film: Arc::new(work.rendered.film), tone_map: scene.render.tone_map })
+    }
+
+    /// Renders and audits while other threads train. After the picture, training continues for the rest of its seconds. In a live run the frame
+    /// goes out first (see [`Run::train_meanwhile`]).
+    fn picture<B: Backend>(
+        &mut self,
+        on: &mut On<B>,
+        frozen: Option<&FrozenOf<B>>,
+        picture: &Picture<'_>,
+        sink: &mut Sink<'_>,
+    ) -> Result<Work<B::Samples>, DeviceError> {
+        self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
+        let (extras, keep) = (self.label_extras(), self.labels_per_frame(on));
+        let On { backend, tracer, surrogate } = on;
+        let tracer = present(tracer);
+        let scene = &self.plan.scene;
+        let settings = &scene.training;
+        let waits = !picture.is_live || settings.steps_per_frame.is_some();
+        let learns = surrogate.as_ref().is_some_and(Surrogate::learns);
+        // Warm-up frames use separate random numbers, so that the first frame after them does not depend on their number.
+        let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
+        let samples_per_pixel = scene.time.warmup_samples.filter(|_| picture.place.is_warmup).unwrap_or(scene.render.samples);
+        let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
+        let rendered = AtomicBool::new(false);
+        let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
+        let (renderer, frame, stop) = (&mut self.renderer, self.progress.frame, self.stop);
+        let mut render = || -> Result<Work<B::Samples>, DeviceError> {
+            let progress = Mutex::new(&mut *sink);
+            let report = |share: f32| {
+                if let Ok(mut sink) = progress.lock() {
+                    (*sink)(Event::Progress(share));
+                }
+            };
+            let begin = Instant::now();
+            let job = FrameJob {
+                tracer,
+                surrogate: frozen,
+                routing,
+                picture: number,
+                samples: samples_per_pixel,
+                progress: Some(&report),
+                stop: &AtomicBool::new(false),
+            };
+            let rendered = backend.render(&job, renderer)?;
+            let render_seconds = begin.elapsed().as_secs_f64();
+            let auditing = Instant::now();
+            let cells = trust.shape();
+            let strata = match frozen {
+                Some(_) => {
+                    let wanted = (scene.trust.audit_share * rendered.tally.queries as f64).ceil() as usize;
+                    trust.audit_strata(picture.gate, scene.trust.audit_min_per_cell.max(wanted.div_ceil(cells.iter().product())))
+                }
+                None => Strata::even(cells, 1),
+            };
+            let (seed, transfer, samples) = (scene.seed, renderer.transfer(), learns.then_some(extras));
+            let audit = backend.audit(&AuditRequest { strata, seed, stream: 2 * frame, transfer, samples }, tracer, frozen)?;
+            Ok(Work { rendered, audit, samples_per_pixel, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() })
+        };
+        let mut learned = Learned::default();
+        let (work, trained) = match (surrogate.as_mut().filter(|_| learns && !buffer.is_empty()), threads.beside()) {
+            (Some(surrogate), Some([beside, all])) => std::thread::scope(|scope| {
+                let (rendered, learned) = (&rendered, &mut learned);
+                let training = scope.spawn(move || {
+                    let mut learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+                    beside.install(|| train(&mut learn, settings, Until::Rendered(rendered), stop, learned))?;
+                    let left = settings.seconds() - learned.seconds;
+                    if settings.steps_per_frame.is_some() || left <= 0.0 || !waits {
+                        return Ok(());
+                    }
+                    // The picture is complete and its threads are idle.
+                    all.install(|| train(&mut learn, settings, Until::Seconds(left), stop, learned))
+                });
+                let work = threads.render().install(&mut render);
+                rendered.store(true, Ordering::Release);
+                (work, training.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+            }),
+            (Some(surrogate), None) => {
+                let work = threads.render().install(&mut render);
+                let mut trained = Ok(());
+                if let (true, Ok(work)) = (waits, &work) {
+                    let seconds = if threads.device_trains { settings.turn(work.device_share()) } else { settings.seconds() };
+                    let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+                    trained = threads.render().install(|| train(learn, settings, Until::Seconds(seconds), stop, &mut learned));
+                }
+                (work, trained)
+            }
+            (None, _) => (threads.render().install(&mut render), Ok(())),
+        };
+        // Reported even if the frame fails, since the weights have changed.
+        self.learning.report(learned);
+        trained?;
+        work
+    }
+
+    /// Trains in a live run after the frame has gone out, until the next window is complete. The CPU trains for at least `training.share` of the
+    /// `seconds` that the frame took, so that a fast simulation does not prevent training. A device trains for at most `training.share` of the
+    /// time, since a solver may use it too.
+    pub(super) fn train_meanwhile<B: Backend>(&mut self, on: &mut On<B>, slides: &dyn Slides, seconds: f64) -> Result<(), RunEnd> {
+        let settings = &self.plan.scene.training;
+        let (Some(_), None) = (slides.is_awaited(), settings.steps_per_frame) else { return Ok(()) };
+        let is_awaited = || slides.is_awaited() == Some(true);
+        let Some(surrogate) = on.surrogate.as_mut().filter(|surrogate| surrogate.learns() && !self.learning.buffer.is_empty()) else {
+            return Ok(());
+        };
+        let begin = Instant::now();
+        let (mut trained, mut was_idle) = (0.0, false);
+        while trained < settings.seconds() && !self.stop.load(Ordering::Relaxed) {
+            let mut slice = (settings.seconds() - trained).min(TURN);
+            if surrogate.trains_on_device() {
+                match self.learning.budget.due(self.began.elapsed().as_secs_f64()) {
+                    Some(due) => slice = slice.min(due),
+                    None if is_awaited() => {
+                        std::thread::sleep(GLANCE);
+                        continue;
+                    }
+                    None => break,
+                }
+            } else if begin.elapsed().as_secs_f64() >= settings.share * seconds && !is_awaited() {
+                break;
+            }
+            let (mut learned, buffer, stop) = (Learned::default(), &self.learning.buffer, self.stop);
+            let learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
+            let result = self.threads.all().install(|| train(learn, settings, Until::Seconds(slice), stop, &mut learned));
+            trained += learned.seconds;
+            self.learning.budget.took(learned.device_seconds.unwrap_or(learned.seconds));
+            let is_idle = learned.steps == 0;
+            self.learning.report(learned);
+            result?;
+            // A turn may only upload samples; after two turns without a step there is nothing to learn.
+            if was_idle && is_idle {
+                break;
+            }
+            was_idle = is_idle;
+        }
+        Ok(())
+    }
+
+    /// Record with the values that follow from rendering.
+    fn record<B: Backend>(&mut self, on: &On<B>, slide: &Slide, work: &Work<B::Samples>) -> FrameRecord {
+        let (flow, tally, film) = (on.tracer().flow(), &work.rendered.tally, &work.rendered.film);
+        let mut warnings = slide.warnings.clone();
+        warnings.append(&mut self.progress.warnings);
+        if work.audit.drawn > 0 && work.audit.points == 0 {
+            warnings.push("no velocity anywhere: every audit point lies on missing cells".into());
+        }
+        let dying = work.audit.points > 0 && work.audit.mean_lifetime_share < SHORT_LIVED;
+        if dying && !std::mem::replace(&mut self.progress.has_warned_of_deaths, true) {
+            warnings.push(format!(
+                "particles live {:.2} % of tau on average: they meet land, leave the domain, or are too fast (unknown fill value or wrong unit?), and their FTLE covers only the path until then",
+                100.0 * work.audit.mean_lifetime_share
+            ));
+        }
+        FrameRecord {
+            frame: self.progress.frame,
+            slide: slide.index,
+            time: slide.time,
+            date: slide.date.clone(),
+            live: slide.live.clone(),
+            tau: flow.tau(),
+            time_unit: self.plan.time_unit.clone(),
+            source: self.plan.source.clone(),
+            transfer: self.transfer,
+            direction: self.plan.map.direction.name().into(),
+            method: match self.plan.scene.render.method {
+                Method::Reference => "reference".into(),
+                Method::Surrogate => "surrogate".into(),
+                Method::Gated => "gated".into(),
+            },
+            device: on.backend.name(),
+            size: [film.width, film.height],
+            samples_per_pixel: work.samples_per_pixel,
+            queries: tally.queries,
+            traced: tally.traced,
+            missing: tally.missing,
+            over_budget: tally.over_budget,
+            traced_share: tally.traced as f64 / (tally.queries - tally.missing).max(1) as f64,
+            integration_steps: fixed_steps(flow).map(|steps| steps as u64),
+            integration_difference: self.report.integration_difference,
+            preparation_traces: std::mem::take(&mut self.progress.preparation_traces),
+            audited: work.audit.points as u64,
+            mean_lifetime_share: work.audit.mean_lifetime_share,
+            majorant_exceeded: work.rendered.stats.majorant_exceeded,
+            speculative_traces: work.rendered.stats.speculative_queries,
+            warnings,
+            ..FrameRecord::default()
+        }
+    }
+}

@@ -1,0 +1,29 @@
+//! The cycle: slides of the window, frames, training, error estimates, checkpoints and records.
+//!
+//! In: [`Settings`]. Out: frames with their records. Calls `source`, `backend` and the rooms below it. Each frame is a transaction on one backend:
+//! its results take effect when it is complete. If the device fails, the frame is discarded and rendered again on the CPU.
+
+mod assess;
+mod checkpoints;
+mod cycle;
+mod error;
+mod frame;
+mod memory;
+mod prepare;
+mod record;
+mod scene;
+mod settings;
+mod setup;
+mod slides;
+mod stop;
+mod training;
+mod transaction;
+
+pub use crate::trust::TrustedError;
+pub use checkpoints::CheckpointTotals;
+pub use cycle::{Event, RunOptions, RunReport, run, run_on};
+pub use error::RunError;
+pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
+pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
+pub use setup::{Plan, Setup};
+pub use slides::{Slide, Slides, open_snapshots};

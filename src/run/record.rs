@@ -1,0 +1,166 @@
+//! Record of a frame: a line of `records.jsonl`, and part of the header of a published frame.
+
+use crate::trust::TrustedError;
+use serde::{Deserialize, Serialize};
+
+/// Figures of one frame. All values are finite; unknown ones are `None` (`null`). Shares are in [0, 1]; residuals have no unit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+pub struct FrameRecord {
+    /// Frame number in this run, from 0.
+    pub frame: u64,
+    /// Slide of the window, from 0.
+    pub slide: u64,
+    /// Seed time t0 of the FTLE, in time units of the source.
+    pub time: f64,
+    /// `time` as a date. `None` if the source has no calendar.
+    pub date: Option<String>,
+    /// Values of a running simulation. `None` for other sources.
+    #[serde(default)]
+    pub live: Option<crate::source::live::LiveRecord>,
+    /// |tau|.
+    pub tau: f64,
+    /// Unit of `time`, `tau` and 1/FTLE: `s`, `snapshots`, or the simulation's; empty if they have none.
+    #[serde(default)]
+    pub time_unit: String,
+    /// Description of the velocity; names synthetic data as such.
+    #[serde(default)]
+    pub source: String,
+    /// Transfer function of the picture.
+    #[serde(default)]
+    pub transfer: TransferRecord,
+    /// `forward` or `backward`.
+    pub direction: String,
+    /// `reference`, `surrogate` or `gated`.
+    pub method: String,
+    /// Device that traces: `cpu`, or `cuda:N` with its name.
+    #[serde(default)]
+    pub device: String,
+    /// `table`, `network` or `residual`. `None` for `reference`.
+    pub surrogate: Option<String>,
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// Samples a pixel.
+    pub samples_per_pixel: usize,
+    /// Log-stretch queries of the renderer.
+    pub queries: u64,
+    /// Queries answered by RK4.
+    pub traced: u64,
+    /// Queries without a value, at missing cells.
+    pub missing: u64,
+    /// Queries in untrusted cells answered by the surrogate, since the tracing budget was spent.
+    pub over_budget: u64,
+    /// `traced / (queries - missing)`.
+    pub traced_share: f64,
+    /// Estimated optical residual of the picture above the tolerance. `None` if within it. With a spent tracing budget it is measured on the
+    /// untrusted points, and 0 if they are within the tolerance.
+    pub tolerance_excess: Option<f64>,
+    /// Error of the surrogate on audit points of the trusted region. `None` if nothing is trusted.
+    pub trusted_error: Option<TrustedError>,
+    /// PSNR in decibels of the surrogate over the whole domain, on the audit points; peak: their largest traced log-stretch. `None` for
+    /// `reference`.
+    #[serde(default)]
+    pub surrogate_psnr: Option<f64>,
+    /// Share of the domain's volume that is trusted.
+    pub trusted_volume: f64,
+    /// `trusted_error` on new points with the same weights, measured after the frame (`--verify`).
+    pub verified_error: Option<TrustedError>,
+    /// Runge-Kutta steps a path. `None` for Dormand-Prince.
+    pub integration_steps: Option<u64>,
+    /// Difference of the log-stretch from twice as many steps: the error of the truth itself. `None` if the steps were given.
+    pub integration_difference: Option<f64>,
+    /// Points traced before the frame, to open the gate and tighten the majorants (first frame of a slide).
+    pub preparation_traces: u64,
+    /// Audit points traced for the frame, except at missing cells.
+    pub audited: u64,
+    /// Mean lifetime of the audit particles as a share of tau.
+    pub mean_lifetime_share: f64,
+    /// Queries whose extinction exceeded the majorant.
+    pub majorant_exceeded: u64,
+    /// Training since the last frame.
+    pub training: Option<crate::surrogate::Learned>,
+    /// Samples in the replay buffer (`training.replay_buffer`).
+    pub replay_samples: u64,
+    /// Points that a GPU traced for flights that ended before they reached them; not queries, and not among `traced`.
+    #[serde(default)]
+    pub speculative_traces: u64,
+    /// Checkpoint in progress since the last frame. `None` without one.
+    #[serde(default)]
+    pub checkpoint: Option<CheckpointRecord>,
+    /// Wall-clock seconds of each stage.
+    pub seconds: StageSeconds,
+    /// Warnings since the last frame.
+    pub warnings: Vec<String>,
+}
+
+/// Transfer function. By default `low` and `high` are the median and the 99.5th percentile of the FTLE on stratified points of the domain at the
+/// first slide.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
+pub struct TransferRecord {
+    /// FTLE (1/time) at which extinction begins.
+    pub low: f64,
+    /// FTLE (1/time) from which extinction is full.
+    pub high: f64,
+    /// Full extinction, per unit of length of the scene.
+    pub extinction: f64,
+}
+
+/// A checkpoint, in the record of every frame during which it is in progress.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Default)]
+pub struct CheckpointRecord {
+    /// Last frame before the copy. `None` before the first frame.
+    pub frame: Option<u64>,
+    /// Pause of the loop for the copy, in seconds.
+    pub copy_seconds: f64,
+    /// True if frames continued during the readback.
+    pub asynchronous: bool,
+    /// Seconds from the start of the copy until the file was written, or until now.
+    pub seconds: f64,
+    /// Bytes of the file. `None` until it is written.
+    pub bytes: Option<u64>,
+    /// Why it was not written. The previous file remains.
+    pub failed: Option<String>,
+    /// Further checkpoints that became due meanwhile.
+    pub postponed: u64,
+}
+
+/// Wall-clock seconds of the stages of a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, Default)]
+pub struct StageSeconds {
+    /// Preparing the slide before its first frame: steps, tables, preparation traces.
+    pub slide: f64,
+    /// Waiting for snapshots.
+    pub waiting: f64,
+    /// Rendering without its traces.
+    pub render: f64,
+    /// Tracing inside rendering.
+    pub trace: f64,
+    /// Prediction inside rendering.
+    pub predict: f64,
+    /// Audit points and trust.
+    pub audit: f64,
+    /// Training.
+    pub train: f64,
+    /// GPU time of rendering, tracing and predicting; 0 on the CPU. The GPU time of training is
+    /// [`crate::surrogate::Learned::device_seconds`].
+    #[serde(default)]
+    pub device: f64,
+    /// Pause for a checkpoint's copy before the frame.
+    #[serde(default)]
+    pub checkpoint: f64,
+    /// The frame without `waiting` and `slide`, with `checkpoint`.
+    pub total: f64,
+    /// Since the run began, including reading and preparation.
+    #[serde(default)]
+    pub elapsed: f64,
+}
+
+/// A finished frame on its way out.
+#[derive(Debug, Clone)]
+pub struct Frame {
+    /// Its figures.
+    pub record: std::sync::Arc<FrameRecord>,
+    /// Its picture.
+    pub film: std::sync::Arc<crate::render::Film>,
+    /// `[contrast, brightness, gamma]` for previews.
+    pub tone_map: [f64; 3],
+}

@@ -1,0 +1,36 @@
+//! The picture's scene of a run.
+
+use super::RunError;
+use super::setup::{Plan, assemble};
+use super::slides::Slide;
+use super::stop::{RunEnd, check_stop};
+use crate::backend::{Interruptible, audit, stratified_points};
+use crate::flow::Extras;
+use crate::render::Scene;
+use crate::surrogate::Trace;
+use crate::trust::Strata;
+use std::sync::atomic::AtomicBool;
+
+/// Scene of the picture. Values of the transfer function that the scene file leaves open are scaled to the FTLE of the first slide and kept
+/// for the whole run, so that colours are comparable.
+pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<Scene, RunEnd> {
+    let file = &plan.scene;
+    let mut scene = assemble(file, &plan.domain);
+    if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
+        const PROBES: usize = 64;
+        let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
+        let unit = stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
+        let labels = audit::trace(&Interruptible::new(tracer, stop), &unit, Extras::default())?.samples.log_stretch;
+        check_stop(stop)?;
+        let tau = tracer.flow().tau() as f32;
+        let ftle: Vec<f32> = labels.iter().map(|s| s / tau).filter(|f| f.is_finite()).collect();
+        if ftle.is_empty() {
+            return Err(RunEnd::Failed(RunError::AllMissing {
+                points: unit.len(),
+                when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
+            }));
+        }
+        scene.transfer = scene.transfer.scaled_to(&ftle);
+    }
+    Ok(scene)
+}

@@ -1,0 +1,230 @@
+//! Setup of a run from its settings: opens the source, chooses open settings, and checks everything before work starts.
+
+use super::slides::{Slides, closed_form, live_slides, no_domain, open_slides, open_snapshots};
+use super::{RunError, Settings, TimeSettings, memory};
+use crate::field::Domain;
+use crate::flow::{Boundary, Direction, FlowMap, Interpolation, Steps, StepsSetting};
+use crate::render::{Method, Renderer, Scene};
+use crate::setting::{Refused, require, shown, word};
+use crate::source::live::Live;
+use crate::source::{DEFAULT_READ_AHEAD, Metric, SnapshotSource, SourceKind, Steady, VelocityUnit, window_snapshots};
+use crate::surrogate::Kind;
+use crate::surrogate::network::Input;
+
+/// A scene with all open settings (tau, direction, boundary, domain) chosen.
+#[derive(Debug, Clone)]
+pub struct Plan {
+    /// Settings of the scene.
+    pub scene: Settings,
+    /// Settings of the flow map; the start time is that of a slide.
+    pub map: FlowMap,
+    /// Domain of the seeds.
+    pub domain: Domain,
+    /// Description of the velocity; names synthetic data as such.
+    pub source: String,
+    /// Unit of times: `s`, `snapshots`, or the simulation's; empty if they have none.
+    pub time_unit: String,
+}
+
+/// A plan and its opened source.
+pub struct Setup {
+    /// The complete scene.
+    pub plan: Plan,
+    /// The slides of the window.
+    pub slides: Box<dyn Slides>,
+    /// Remarks for the user before work starts.
+    pub notes: Vec<String>,
+}
+
+impl Setup {
+    /// Opens the source and chooses the settings that the scene leaves open.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the source cannot be opened.
+    pub fn new(scene: Settings) -> Result<Self, RunError> {
+        scene.check()?;
+        let snapshots = if closed_form(&scene.source).is_some() { None } else { Some(open_snapshots(&scene)?) };
+        Self::settle(scene, snapshots, None)
+    }
+
+    /// Sets up a run over the caller's snapshots instead of those that the scene describes; `None` for closed forms.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the snapshots do not span tau.
+    pub fn over(scene: Settings, snapshots: Option<Box<dyn SnapshotSource>>) -> Result<Self, RunError> {
+        scene.check()?;
+        Self::settle(scene, snapshots, None)
+    }
+
+    /// Sets up a run on a connected simulation, and starts to fill its window.
+    ///
+    /// # Errors
+    /// A setting is not accepted, or the simulation cannot be followed.
+    pub fn live(scene: Settings, live: Live) -> Result<Self, RunError> {
+        scene.check()?;
+        Self::settle(scene, None, Some(live))
+    }
+
+    fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, RunError> {
+        let mut notes = Vec::new();
+        let closed = closed_form(&scene.source);
+        let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));
+        let unit = snapshots.as_ref().map(|s| s.describe().time_unit).or(live.as_ref().map(|l| l.time_unit().to_owned()));
+        let source = match (&snapshots, &live) {
+            (Some(snapshots), _) => snapshots.describe().line(),
+            (None, Some(live)) => format!("a running simulation, {}", live.describe()),
+            (None, None) => format!("closed form: {}", word(scene.source.kind)),
+        };
+        let flat = grid.as_ref().is_some_and(|grid| grid.dimensions() == 2);
+        let archive = matches!(scene.source.kind, SourceKind::Archive | SourceKind::Live);
+        let direction = scene.time.direction.unwrap_or(if archive { Direction::Backward } else { Direction::Forward });
+        let tau = match (&scene.time.tau, &snapshots) {
+            (Some(tau), _) => {
+                if tau.has_unit() && unit.as_ref().is_some_and(|unit| unit != "s") {
+                    let found = "has a unit, but the source's time is not in seconds (with the index metric it counts snapshots)";
+                    return Err(Refused::new("time.tau", found, "a plain number").into());
+                }
+                tau.value()
+                    .ok_or_else(|| Refused::new("time.tau", format_args!("is {}", shown(tau)), "a number, or words such as \"30 days\""))?
+            }
+            (None, Some(_)) if archive && scene.archive.steady => {
+                return Err(Refused::new("time.tau", "is missing", "a duration: a steady flow gives none (archive.steady is true)").into());
+            }
+            (None, Some(source)) => {
+                let tau = source.default_tau()?;
+                notes.push(format!("time.tau is not given: {tau} {}, half of the archive's span", source.describe().time_unit));
+                tau
+            }
+            (None, None) if scene.source.kind == SourceKind::Live => {
+                return Err(Refused::new("time.tau", "is missing", "a duration in the simulation's time (attach --tau TIME)").into());
+            }
+            (None, None) => return Err(Refused::new("time.tau", "is missing", "a number above 0").into()),
+        };
+        if archive
+            && scene.archive.steady
+            && let Some(source) = snapshots
+        {
+            let counted = source.describe().metric == Metric::Index && scene.archive.velocity_unit == VelocityUnit::Si;
+            if counted {
+                let found = "is true, but the metric is index, which counts snapshots";
+                return Err(
+                    Refused::new("archive.steady", found, "metric = \"sphere\" or \"cartesian\", or velocity_unit = \"cells\"").into()
+                );
+            }
+            snapshots = Some(Box::new(Steady::new(source, direction.sign() * tau)?));
+        }
+        // After `Steady` is in place, which adds its own note.
+        notes.extend(snapshots.iter().flat_map(|source| source.describe().notes));
+        let boundary = scene.flow.boundary.unwrap_or(match scene.source.kind {
+            SourceKind::Archive | SourceKind::Live => Boundary::Stop,
+            SourceKind::Turbulence => Boundary::Clamp,
+            _ => Boundary::Unbounded,
+        });
+        let map = FlowMap {
+            tau,
+            direction,
+            integrator: scene.flow.integrator,
+            precision: scene.flow.precision,
+            steps: match scene.flow.steps {
+                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
+                StepsSetting::Fixed(n) => Steps::Fixed(n),
+            },
+            difference_step: scene.flow.difference_step,
+            boundary,
+            normalisation: scene.flow.normalisation,
+            interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
+        };
+        let domain = match (&closed, &scene.domain, &grid) {
+            (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },
+            (_, _, Some(grid)) => grid.domain(),
+            _ => return Err(no_domain()),
+        };
+        if closed.is_some() {
+            check_start(&scene.time, tau, direction.sign())?;
+        }
+        // Open settings follow from the grid, so the message names the source.
+        check_picture(&scene, &domain, tau).map_err(|refused| match &snapshots {
+            Some(source) => refused.over(&source.name()),
+            None => refused,
+        })?;
+        scene.surrogate.check_nodes(domain.dimensions)?;
+        if scene.training.resume.is_some() && (scene.render.method == Method::Reference || scene.surrogate.kind == Kind::Table) {
+            notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
+        }
+        let times = snapshots.as_ref().map(|s| s.times().to_vec());
+        let slides = match live {
+            Some(live) => live_slides(&scene, live.follow(tau, scene.time.snapshots_per_slide)?, direction),
+            None => open_slides(&scene, snapshots, tau, direction)?,
+        };
+        if let (Some(times), Some(grid)) = (&times, &grid) {
+            notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), memory::available()));
+        }
+        notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
+        let time_unit = unit.unwrap_or_default();
+        Ok(Self { plan: Plan { scene, map, domain, source, time_unit }, slides, notes })
+    }
+}
+
+/// Bytes of the window, of the snapshots read ahead, and of the snapshot that is being read.
+fn window_bytes(times: &[f64], tau: f64, nodes: usize) -> u64 {
+    let snapshots = (window_snapshots(times, tau) + DEFAULT_READ_AHEAD + 1).min(times.len());
+    (snapshots as u64).saturating_mul(nodes as u64).saturating_mul(size_of::<[f32; 4]>() as u64)
+}
+
+/// Chooses the range of the network's start-time input, if it has one and the scene leaves the range open: all seed times that the source covers.
+/// Removes the input and returns a note if there is only one seed time.
+fn settle_starts(scene: &mut Settings, times: Option<&[f64]>, tau: f64, direction: Direction) -> Result<Option<String>, Refused> {
+    if !scene.network.inputs.contains(&Input::Start) || scene.network.start_range.is_some() {
+        return Ok(None);
+    }
+    let ends = match (times, scene.source.kind) {
+        (_, SourceKind::Live) => {
+            let found = "is missing, and a running simulation does not say when it will end";
+            return Err(Refused::new("network.start_range", found, "two times, ascending").beside(&["network.inputs"]));
+        }
+        (Some(times), _) => {
+            let (first, last) = (times.first().copied().unwrap_or(0.0), times.last().copied().unwrap_or(0.0));
+            match direction {
+                Direction::Forward => [first, last - tau],
+                Direction::Backward => [first + tau, last],
+            }
+        }
+        (None, _) => {
+            let TimeSettings { start, seed_step: step, slides, .. } = scene.time;
+            let last = start + step * slides.unwrap_or(1).saturating_sub(1) as f64;
+            [start.min(last), start.max(last)]
+        }
+    };
+    if ends[0] < ends[1] {
+        scene.network.start_range = Some(ends);
+        return Ok(None);
+    }
+    scene.network.inputs.retain(|input| *input != Input::Start);
+    Ok(Some(format!("network.inputs: \"start\" is left out, since all frames have the same start time, {}", ends[0])))
+}
+
+/// Rejects start times so large that adding tau is lost to rounding: particles would not move, and the FTLE would be 0.
+fn check_start(time: &TimeSettings, tau: f64, sign: f64) -> Result<(), Refused> {
+    let last = time.start + time.seed_step * time.slides.unwrap_or(1).saturating_sub(1) as f64;
+    for start in [time.start, last] {
+        let moved = ((start + sign * tau) - start).abs();
+        // A millionth of tau is far below the length of a step.
+        require((moved - tau).abs() <= 1e-6 * tau, "time.start", start, "a time from which tau can be told apart in double precision")
+            .map_err(|refused| refused.beside(&["time.seed_step", "time.slides", "time.tau"]))?;
+    }
+    Ok(())
+}
+
+/// Rejects invalid cameras, lights and transfer functions before any data is read.
+fn check_picture(scene: &Settings, domain: &Domain, tau: f64) -> Result<(), Refused> {
+    let mut picture = assemble(scene, domain);
+    // Open values are scaled later, to accepted values.
+    picture.transfer = picture.transfer.scaled_to(&[0.0, 1.0]);
+    Renderer::new(picture, domain, tau)?;
+    Ok(())
+}
+
+/// Scene of the picture, with the transfer function as far as the scene file sets it.
+pub(super) fn assemble(scene: &Settings, domain: &Domain) -> Scene {
+    Scene::assemble(domain, scene.camera.clone(), scene.light.clone(), scene.transfer.clone(), scene.render.clone(), scene.seed)
+}

@@ -1,0 +1,321 @@
+//! Slides of the window: a sequence of velocities, from a closed form, an archive or a running simulation.
+
+use super::{RunError, Settings};
+use crate::field::analytic::Analytic;
+use crate::field::turbulence::Turbulence;
+use crate::field::{Domain, Window};
+use crate::flow::{Direction, VelocitySource};
+use crate::setting::{Refused, shown};
+use crate::source::live::{LiveRecord, LiveWindow};
+use crate::source::{
+    Archive, DEFAULT_READ_AHEAD, Listener, MemorySource, ReadAhead, SnapshotSource, SourceKind, SourceSettings, StillReading, read_ahead,
+};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Interval at which a wait for a snapshot checks for a request to stop.
+const LOOK_UP: Duration = Duration::from_millis(100);
+
+/// A position of the window in time, with the velocity to integrate.
+pub struct Slide {
+    /// Number of the slide, from 0.
+    pub index: u64,
+    /// Seed time t0.
+    pub time: f64,
+    /// `time` as a date; `None` if the source has no calendar.
+    pub date: Option<String>,
+    /// Figures of a running simulation; `None` for other sources.
+    pub live: Option<LiveRecord>,
+    /// Velocity to integrate.
+    pub velocity: VelocitySource,
+    /// Warnings since the previous slide.
+    pub warnings: Vec<String>,
+    /// Seconds spent waiting for snapshots.
+    pub waited: f64,
+}
+
+/// A source of slides.
+pub trait Slides: Send {
+    /// Returns the next slide; `None` if the source has ended or `stop` is set. A wait for snapshots checks `stop` as well.
+    ///
+    /// # Errors
+    /// The source fails.
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError>;
+
+    /// Sets a listener that receives each snapshot as it is read. An archive is read some slides ahead; a simulation is read as it publishes.
+    fn listen(&self, _listener: Listener) {}
+
+    /// Total number of slides; `None` if unknown.
+    fn expected(&self) -> Option<u64>;
+
+    /// For a running simulation, true until the next window is complete. `None` for other sources.
+    fn is_awaited(&self) -> Option<bool> {
+        None
+    }
+}
+
+/// Counts slides up to a limit.
+struct Count {
+    given: u64,
+    most: u64,
+}
+
+impl Count {
+    fn new(scene: &Settings, default: u64) -> Self {
+        Self { given: 0, most: scene.time.slides.map_or(default, |n| n as u64) }
+    }
+
+    /// The number of the next slide.
+    fn next(&mut self) -> u64 {
+        self.given += 1;
+        self.given - 1
+    }
+
+    fn is_over(&self) -> bool {
+        self.given == self.most
+    }
+}
+
+/// Returns the next item of a source that another thread reads; `None` if the source has ended or `stop` is set.
+fn wait_for<T>(stop: &AtomicBool, mut next: impl FnMut(Duration) -> Result<Option<T>, StillReading>) -> Option<T> {
+    while !stop.load(Ordering::Relaxed) {
+        if let Ok(item) = next(LOOK_UP) {
+            return item;
+        }
+    }
+    None
+}
+
+/// Seed time of a window: its oldest time for forward integration, its newest for backward integration.
+fn seed_time(window: &Window, direction: Direction) -> Result<f64, RunError> {
+    let end = match direction {
+        Direction::Forward => window.oldest(),
+        Direction::Backward => window.newest(),
+    };
+    end.ok_or(RunError::EndedEarly)
+}
+
+/// Slides of a closed form: only the seed time changes.
+struct ClosedForm {
+    flow: Analytic,
+    domain: Domain,
+    start: f64,
+    step: f64,
+    count: Count,
+}
+
+impl Slides for ClosedForm {
+    fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let index = self.count.next();
+        Ok(Some(Slide {
+            index,
+            time: self.start + self.step * index as f64,
+            date: None,
+            live: None,
+            velocity: VelocitySource::Analytic(self.flow.clone(), self.domain.clone()),
+            warnings: Vec::new(),
+            waited: 0.0,
+        }))
+    }
+
+    fn expected(&self) -> Option<u64> {
+        Some(self.count.most)
+    }
+}
+
+/// Slides of an archive: the window moves over its snapshots.
+struct ArchiveSlides {
+    /// Read ahead by one I/O thread.
+    reader: ReadAhead,
+    /// Dates by time.
+    dates: Vec<(f64, Option<String>)>,
+    window: Window,
+    direction: Direction,
+    /// Snapshots per slide.
+    stride: usize,
+    count: Count,
+    /// Snapshots that moved the window since the last slide.
+    taken: usize,
+}
+
+impl Slides for ArchiveSlides {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let mut warnings = Vec::new();
+        let Self { reader, window, taken, .. } = self;
+        while !(window.is_full() && (self.count.given == 0 || *taken >= self.stride)) {
+            let Some(snapshot) = wait_for(stop, |limit| reader.next_within(limit)) else { return Ok(None) };
+            let newest = window.newest();
+            match window.push(snapshot?) {
+                Ok(pushed) => warnings.extend(pushed.warning.map(|w| w.to_string())),
+                Err(fault) => warnings.push(fault.to_string()),
+            }
+            *taken += usize::from(window.newest() != newest);
+        }
+        *taken = 0;
+        let time = seed_time(window, self.direction)?;
+        Ok(Some(Slide {
+            index: self.count.next(),
+            time,
+            date: self.dates.iter().find(|(t, _)| *t == time).and_then(|(_, date)| date.clone()),
+            live: None,
+            velocity: VelocitySource::Window(Arc::new(window.clone())),
+            warnings,
+            waited: start.elapsed().as_secs_f64(),
+        }))
+    }
+
+    fn listen(&self, listener: Listener) {
+        self.reader.tell(listener);
+    }
+
+    fn expected(&self) -> Option<u64> {
+        let times = &self.dates;
+        let first = times.iter().position(|(t, _)| t - times[0].0 >= self.window.span() * (1.0 - 1e-9))?;
+        Some(self.count.most.min(((times.len() - 1 - first) / self.stride + 1) as u64))
+    }
+}
+
+/// Slides of a running simulation, whose window moves by itself.
+struct LiveSlides {
+    window: LiveWindow,
+    direction: Direction,
+    count: Count,
+}
+
+impl Slides for LiveSlides {
+    fn next_slide(&mut self, stop: &AtomicBool) -> Result<Option<Slide>, RunError> {
+        if self.count.is_over() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let Some(taken) = wait_for(stop, |limit| self.window.next_within(limit)) else { return Ok(None) };
+        let taken = taken?;
+        Ok(Some(Slide {
+            index: self.count.next(),
+            time: seed_time(&taken.window, self.direction)?,
+            date: None,
+            live: Some(taken.live),
+            velocity: VelocitySource::Window(Arc::new(taken.window)),
+            warnings: taken.warnings,
+            waited: start.elapsed().as_secs_f64(),
+        }))
+    }
+
+    fn listen(&self, listener: Listener) {
+        self.window.tell(listener);
+    }
+
+    fn expected(&self) -> Option<u64> {
+        Some(self.count.most).filter(|n| *n < u64::MAX)
+    }
+
+    fn is_awaited(&self) -> Option<bool> {
+        Some(self.window.is_waited_for())
+    }
+}
+
+/// Opens the slides of a scene whose |tau| is known.
+///
+/// # Errors
+/// A closed form without a domain, or a source that does not span tau.
+pub(super) fn open_slides(
+    scene: &Settings,
+    snapshots: Option<Box<dyn SnapshotSource>>,
+    tau: f64,
+    direction: Direction,
+) -> Result<Box<dyn Slides>, RunError> {
+    match (closed_form(&scene.source), snapshots) {
+        (Some(flow), _) => {
+            let box_ = scene.domain.as_ref().ok_or_else(no_domain)?;
+            let domain = Domain { dimensions: flow.dimensions(), ..Domain::cuboid(box_.min, box_.max) };
+            Ok(Box::new(ClosedForm { flow, domain, start: scene.time.start, step: scene.time.seed_step, count: Count::new(scene, 1) }))
+        }
+        (None, Some(source)) => {
+            source.check_tau(tau)?;
+            let dates: Vec<_> = source.times().iter().map(|&t| (t, source.date(t))).collect();
+            let range = 0..dates.len();
+            Ok(Box::new(ArchiveSlides {
+                reader: read_ahead(source, range, DEFAULT_READ_AHEAD),
+                dates,
+                window: Window::new(tau),
+                direction,
+                stride: scene.time.snapshots_per_slide,
+                count: Count::new(scene, u64::MAX),
+                taken: 0,
+            }))
+        }
+        (None, None) => Err(no_domain()),
+    }
+}
+
+/// The slides of a running simulation.
+pub(super) fn live_slides(scene: &Settings, window: LiveWindow, direction: Direction) -> Box<dyn Slides> {
+    Box::new(LiveSlides { window, direction, count: Count::new(scene, u64::MAX) })
+}
+
+/// Closed form that `[source]` describes; `None` for gridded kinds.
+pub fn closed_form(source: &SourceSettings) -> Option<Analytic> {
+    let or = |given: Option<f64>, default: f64| given.unwrap_or(default);
+    Some(match source.kind {
+        SourceKind::DoubleGyre => Analytic::DoubleGyre {
+            amplitude: or(source.amplitude, 0.1),
+            epsilon: or(source.epsilon, 0.25),
+            omega: or(source.omega, std::f64::consts::TAU / 10.0),
+        },
+        SourceKind::Abc => Analytic::Abc {
+            a: or(source.a, 3f64.sqrt()),
+            b: or(source.b, 2f64.sqrt()),
+            c: or(source.c, 1.0),
+            growth: or(source.growth, 0.0),
+        },
+        SourceKind::Saddle => Analytic::Saddle { rate: or(source.rate, 1.0) },
+        SourceKind::Rotation => Analytic::Rotation { omega: or(source.omega, 1.0) },
+        SourceKind::Shear => Analytic::Shear { rate: or(source.rate, 1.0) },
+        SourceKind::Turbulence | SourceKind::Archive | SourceKind::Live => return None,
+    })
+}
+
+/// Opens a gridded source.
+///
+/// # Errors
+/// The source is live or a closed form, or the archive cannot be opened.
+pub fn open_snapshots(scene: &Settings) -> Result<Box<dyn SnapshotSource>, RunError> {
+    let source = &scene.source;
+    match source.kind {
+        SourceKind::Archive => return Ok(Box::new(Archive::open(&scene.archive.files, &scene.archive)?)),
+        SourceKind::Live => {
+            let accepted = "with `ridgewatch attach`: this command needs a source that it can read again";
+            return Err(Refused::new("source.kind", "is \"live\"", accepted).into());
+        }
+        SourceKind::Turbulence => {}
+        SourceKind::DoubleGyre | SourceKind::Abc | SourceKind::Saddle | SourceKind::Rotation | SourceKind::Shear => {
+            let found = format_args!("is {}, a closed form, which has no snapshots", shown(source.kind));
+            return Err(Refused::new("source.kind", found, "\"archive\" or \"turbulence\"").into());
+        }
+    }
+    let nodes = source.nodes.unwrap_or([96, 48, 48]);
+    let (modes, k_max, amplitude) = (source.modes.unwrap_or(48), source.k_max.unwrap_or(14.0), source.amplitude.unwrap_or(3.0));
+    // The field belongs to the scene: --seed changes only the sampling of the picture.
+    let turbulence = Turbulence::new(nodes, modes, k_max, amplitude, TURBULENCE_SEED);
+    let grid = Turbulence::grid(nodes)?;
+    let times = (0..source.snapshots.unwrap_or(12)).map(|t| t as f64).collect();
+    let [x, y, z] = nodes;
+    let source = MemorySource::new(format!("{x} x {y} x {z} nodes"), grid.clone(), times, move |_, time| turbulence.snapshot(time, &grid))?;
+    Ok(Box::new(source.synthetic(Turbulence::described(modes, k_max, amplitude, TURBULENCE_SEED))))
+}
+
+/// Error of a closed form without `[domain]`.
+pub(super) fn no_domain() -> RunError {
+    Refused::new("domain", "is missing", "[domain] with min and max, since a closed form has no grid").into()
+}
+
+/// Seed of the standard turbulence.
+const TURBULENCE_SEED: u64 = 0;

@@ -1,0 +1,429 @@
+//! Many files as one sequence of snapshots.
+
+use super::check::{check, check_fit};
+use super::files::expand;
+use super::synthetic::{declared, synthesized};
+use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
+use crate::source::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
+use crate::source::cf::calendar::Calendar;
+use crate::source::cf::coordinate::Kind;
+use crate::source::error::SourceError;
+use crate::source::formats::{DataFile, Format, Listing};
+use crate::source::grids::{
+    AxisPlan, ComponentPlan, Layout, Orders, Poles, Resampling, VelocityScale, difference, plan, read_component, slab_of,
+};
+use crate::source::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// Names of the components, in order.
+const COMPONENTS: [&str; 3] = ["u", "v", "w"];
+
+/// A file of the archive; closed until it is read.
+struct ArchiveFile {
+    path: PathBuf,
+    frames: Vec<Vec<ComponentPlan>>,
+}
+
+/// Place of a snapshot in the files.
+#[derive(Debug, Clone, Copy)]
+struct Place {
+    file: usize,
+    frame: usize,
+    entry: usize,
+}
+
+/// Velocity in NetCDF files with CF conventions, in WRF output, on curvilinear grids, or in HDF5 files. Opening reads headers,
+/// coordinates and times; velocities are read one snapshot at a time. One file is open at any moment.
+pub struct Archive {
+    files: Vec<ArchiveFile>,
+    /// In time order.
+    places: Vec<Place>,
+    seconds: Vec<f64>,
+    times: Vec<f64>,
+    calendar: Option<Calendar>,
+    axes: Vec<AxisPlan>,
+    grid: Arc<Grid>,
+    scale: Option<VelocityScale>,
+    /// See [`Layout::vertical`].
+    vertical: Vec<f64>,
+    poles: Poles,
+    resampling: Option<Resampling>,
+    metric: Metric,
+    in_cells: bool,
+    description: SourceDescription,
+    open: Option<(usize, DataFile)>,
+    /// Listing of the velocities, if it suffices to open files.
+    expected: Option<Listing>,
+}
+
+impl Archive {
+    /// Opens files, folders and patterns; without any, those of the settings. Snapshots are sorted by time.
+    ///
+    /// # Errors
+    /// A file that cannot be read, that lacks a velocity, axes or times that are understood, or that differs from the first one
+    /// in grid, variables or calendar; two snapshots of one time; settings that do not fit. Each error names the file.
+    pub fn open(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Self, SourceError> {
+        let mut archive = Self::open_files(files_of(paths, settings)?, settings)?;
+        let synthetic = settings.synthetic.as_ref().filter(|_| paths.is_empty() && settings.files.is_empty());
+        // Synthetic files of earlier versions do not declare themselves.
+        if let Some(synthetic) = synthetic.filter(|_| archive.description.synthetic.is_none()) {
+            archive.declare_synthetic(synthetic.described());
+        }
+        Ok(archive)
+    }
+
+    fn declare_synthetic(&mut self, what: String) {
+        self.description.notes.push(format!("the velocities are {what}"));
+        self.description.synthetic = Some(what);
+    }
+
+    /// Opens a list of files. See [`Archive::open`].
+    pub(super) fn open_files(paths: Vec<PathBuf>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
+        check(settings)?;
+        let mut first: Option<Layout> = None;
+        let mut format = Format::Hdf5;
+        let mut entries: Vec<(f64, Place)> = Vec::new();
+        let mut files: Vec<ArchiveFile> = Vec::with_capacity(paths.len());
+        let mut open = None;
+        let mut expected: Option<Listing> = None;
+        let mut synthetic = None;
+        for path in paths {
+            let (file, layout) = open_next(&path, settings, first.as_ref(), expected.as_ref())?;
+            if expected.is_none() && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
+                expected = Some(file.listing.part(&layout.used(&file.listing)));
+            }
+            let index = files.len();
+            let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
+            entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
+            files.push(ArchiveFile { path: path.clone(), frames: layout.frames.clone() });
+            match &mut first {
+                Some(reference) => {
+                    reference.widen(&layout).map_err(|fault| SourceError::file(&path, fault))?;
+                    if let Some(what) = difference(reference, &layout) {
+                        return Err(SourceError::Mixed { first: files[0].path.clone(), second: path, what });
+                    }
+                }
+                None => {
+                    synthetic = declared(&file.listing).map(str::to_owned);
+                    format = file.listing.format;
+                    first = Some(layout);
+                }
+            }
+            open = Some((index, file));
+        }
+        let Some(layout) = first else { return Err(SourceError::NoFiles) };
+        entries.sort_by(|a, b| a.0.total_cmp(&b.0));
+        let calendar = layout.time.calendar;
+        check_duplicates(&entries, &files, calendar)?;
+        let seconds: Vec<f64> = entries.iter().map(|e| e.0).collect();
+        let times = match layout.metric {
+            Metric::Index => (0..seconds.len()).map(|i| i as f64).collect(),
+            Metric::Sphere | Metric::Cartesian => seconds.clone(),
+        };
+        check_fit(settings, &layout, format)?;
+        let on_sphere = layout.axes[0].kind == Kind::Longitude && layout.axes[1].kind == Kind::Latitude;
+        let scale = match (layout.metric, settings.velocity_unit) {
+            (Metric::Index, VelocityUnit::Si) => Some(VelocityScale::to_cells(&layout.axes)),
+            (Metric::Cartesian, VelocityUnit::Si) if on_sphere => Some(VelocityScale::to_degrees(&layout.axes)),
+            _ => None,
+        };
+        let grid = Arc::new(build_grid(&files[0].path, &layout, settings)?);
+        let description = describe(&layout, format, files.len(), &seconds);
+        let names: Vec<String> = layout.frames.iter().flatten().map(|c| c.name.clone()).collect();
+        let mut archive = Self {
+            places: entries.iter().map(|e| e.1).collect(),
+            vertical: layout.vertical,
+            poles: layout.poles,
+            resampling: layout.resampling,
+            seconds,
+            times,
+            calendar,
+            axes: layout.axes,
+            grid,
+            scale,
+            metric: layout.metric,
+            in_cells: settings.velocity_unit == VelocityUnit::Cells,
+            description,
+            open,
+            expected: expected.map(|listing| listing.part(&names)),
+            files,
+        };
+        if let Some(what) = synthetic {
+            archive.declare_synthetic(what);
+        }
+        if let Some([error, size]) = archive.resampling_error()? {
+            archive.description.notes.push(format!(
+                "resampling error, measured on the first snapshot at the file's own points: {error:.3} m/s of {size:.3} m/s ({:.1} %), root mean square",
+                100.0 * error / size.max(f64::MIN_POSITIVE)
+            ));
+        }
+        Ok(archive)
+    }
+
+    /// The files, in the order of their names in the arguments.
+    pub fn files(&self) -> impl ExactSizeIterator<Item = &Path> {
+        self.files.iter().map(|f| f.path.as_path())
+    }
+
+    /// Seconds of each snapshot since 1970-01-01 in the archive's calendar (or since the simulation's start), ascending. Equal to
+    /// [`SnapshotSource::times`] except in the index metric.
+    pub fn seconds(&self) -> &[f64] {
+        &self.seconds
+    }
+
+    /// Metric in force.
+    pub fn metric(&self) -> Metric {
+        self.metric
+    }
+
+    /// Intervals of more than one and a half times the median, in [`Self::seconds`].
+    pub fn gaps(&self) -> Vec<TimeGap> {
+        time_gaps(&self.seconds)
+    }
+
+    /// Axes of the files, before the index metric replaces them.
+    pub(super) fn axis_plans(&self) -> &[AxisPlan] {
+        &self.axes
+    }
+
+    /// Variable, component and reason of the choice.
+    pub(super) fn chosen(&self) -> impl Iterator<Item = (&str, &'static str, &str)> {
+        self.files[0].frames[0].iter().zip(COMPONENTS).map(|(c, role)| (c.name.as_str(), role, c.why.as_str()))
+    }
+
+    /// Measures one snapshot's velocities in SI and in cells per interval.
+    pub(super) fn displacement(&mut self, index: usize) -> Result<Displacement, SourceError> {
+        let raw = self.components(index)?;
+        let mut cells = raw.clone();
+        if !self.in_cells {
+            VelocityScale::to_cells(&self.axes).apply(&mut cells, self.grid.shape(), self.interval(index));
+        }
+        let mut sum = Displacement::default();
+        for i in 0..self.grid.nodes() {
+            if raw.iter().any(|c| !c[i].is_finite()) {
+                sum.missing += 1;
+                continue;
+            }
+            sum.known += 1;
+            for (total, component) in sum.squared_velocity.iter_mut().zip(&raw) {
+                *total += f64::from(component[i]).powi(2);
+            }
+            let squared = cells.iter().map(|c| f64::from(c[i]).powi(2)).sum::<f64>();
+            sum.squared_cells += squared;
+            sum.max_cells = sum.max_cells.max(squared.sqrt());
+        }
+        Ok(sum)
+    }
+
+    /// Seconds that snapshot `index` represents: half the way to its neighbours on both sides.
+    fn interval(&self, index: usize) -> f64 {
+        let last = self.seconds.len() - 1;
+        let (low, high) = (index.saturating_sub(1), (index + 1).min(last));
+        if high > low { (self.seconds[high] - self.seconds[low]) / (high - low) as f64 } else { 1.0 }
+    }
+
+    /// Opens the file of a snapshot and returns the place of the snapshot.
+    fn open_at(&mut self, index: usize) -> Result<Place, SourceError> {
+        let missing = SourceError::NoSuchSnapshot { index, count: self.places.len() };
+        let place = *self.places.get(index).ok_or(missing)?;
+        let file = match self.open.take() {
+            Some((open, file)) if open == place.file => file,
+            other => {
+                // Closed before the next file opens.
+                drop(other);
+                let ArchiveFile { path, frames } = &self.files[place.file];
+                let file = DataFile::open(path, self.expected.as_ref())?;
+                for component in frames.iter().flatten() {
+                    let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
+                    if shape.ok().as_ref() != Some(&component.shape) {
+                        return Err(file.listing.read_error(&component.name, "it changed since the archive was opened").into());
+                    }
+                }
+                file
+            }
+        };
+        self.open = Some((place.file, file));
+        Ok(place)
+    }
+
+    /// The components of a snapshot in SI (or unchanged, in cells), the third along the grid's third axis; x fastest; missing values
+    /// are NaN.
+    fn components(&mut self, index: usize) -> Result<Vec<Vec<f32>>, SourceError> {
+        let orders: Orders = std::array::from_fn(|k| self.axes.get(k).map_or_else(|| vec![0], |a| a.order.clone()));
+        let resampling = self.resampling.clone();
+        let place = self.open_at(index)?;
+        let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+        let plans = &self.files[place.file].frames[place.frame];
+        let mut components = match resampling {
+            Some(resampling) => resampling.read(file, plans, place.entry, &orders[2])?,
+            None => plans.iter().map(|plan| read_component(file, plan, &orders, place.entry)).collect::<Result<_, _>>()?,
+        };
+        if !self.vertical.is_empty()
+            && let Some(w) = components.get_mut(2)
+        {
+            let plane = w.len() / self.vertical.len();
+            for (values, &factor) in w.chunks_exact_mut(plane).zip(&self.vertical) {
+                values.iter_mut().for_each(|v| *v = (f64::from(*v) * factor) as f32);
+            }
+        }
+        self.poles.extend(&mut components, self.axes[0].axis.coordinates(), self.axes[1].order.len());
+        Ok(components)
+    }
+
+    /// Description of the resampling, if any.
+    pub(super) fn resampled(&self) -> Option<&str> {
+        self.resampling.as_ref().map(Resampling::what)
+    }
+
+    /// Error of the resampling on the first snapshot, if anything is resampled. See [`Resampling::error`].
+    pub(super) fn resampling_error(&mut self) -> Result<Option<[f64; 2]>, SourceError> {
+        let Some(resampling) = self.resampling.clone() else { return Ok(None) };
+        let Place { file: index, frame, entry } = self.open_at(0)?;
+        let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+        resampling.error(file, &self.files[index].frames[frame], entry).map(Some)
+    }
+}
+
+impl SnapshotSource for Archive {
+    fn grid(&self) -> &Arc<Grid> {
+        &self.grid
+    }
+
+    fn times(&self) -> &[f64] {
+        &self.times
+    }
+
+    fn read(&mut self, index: usize) -> Result<Snapshot, SourceError> {
+        let mut components = self.components(index)?;
+        if let Some(scale) = &self.scale {
+            let interval = if self.metric == Metric::Index { self.interval(index) } else { 1.0 };
+            scale.apply(&mut components, self.grid.shape(), interval);
+        }
+        let w: &[f32] = components.get(2).map_or(&[], Vec::as_slice);
+        Ok(Snapshot::from_components(self.times[index], self.grid.clone(), &components[0], &components[1], w))
+    }
+
+    fn date(&self, time: f64) -> Option<String> {
+        let calendar = self.calendar?;
+        if self.metric != Metric::Index {
+            return calendar.iso(time);
+        }
+        if !(time >= 0.0 && time <= (self.seconds.len() - 1) as f64) {
+            return None;
+        }
+        let (low, high) = (time.floor() as usize, time.ceil() as usize);
+        calendar.iso(self.seconds[low] + (self.seconds[high] - self.seconds[low]) * time.fract())
+    }
+
+    fn describe(&self) -> SourceDescription {
+        self.description.clone()
+    }
+
+    fn name(&self) -> String {
+        match &self.files[..] {
+            [file] => file.path.display().to_string(),
+            files => format!("{} and {} other file(s)", files[0].path.display(), files.len() - 1),
+        }
+    }
+}
+
+/// Sums over the nodes of one or more snapshots.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Displacement {
+    pub(super) known: usize,
+    pub(super) missing: usize,
+    pub(super) squared_velocity: [f64; 3],
+    pub(super) squared_cells: f64,
+    pub(super) max_cells: f64,
+}
+
+impl Displacement {
+    pub(super) fn add(&mut self, other: &Self) {
+        self.known += other.known;
+        self.missing += other.missing;
+        self.squared_velocity.iter_mut().zip(other.squared_velocity).for_each(|(a, b)| *a += b);
+        self.squared_cells += other.squared_cells;
+        self.max_cells = self.max_cells.max(other.max_cells);
+    }
+}
+
+/// The files in question: those given, else those of the settings, else a synthetic archive.
+pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<Vec<PathBuf>, SourceError> {
+    let paths = if paths.is_empty() { &settings.files } else { paths };
+    match &settings.synthetic {
+        Some(synthetic) if paths.is_empty() => expand(&[synthesized(synthetic)?]),
+        _ => expand(paths),
+    }
+}
+
+/// Opens and plans the next file of an archive whose first file has the layout `first`.
+fn open_next(
+    path: &Path,
+    settings: &ArchiveSettings,
+    first: Option<&Layout>,
+    expected: Option<&Listing>,
+) -> Result<(DataFile, Layout), SourceError> {
+    let mut file = DataFile::open(path, expected)?;
+    let mut planned = plan(&file, settings, first);
+    let fits = planned.as_ref().is_ok_and(|layout| first.is_none_or(|first| difference(first, layout).is_none()));
+    if expected.is_some() && !fits {
+        // The part of the listing that suffices for the first file may not suffice for this one.
+        file = DataFile::open(path, None)?;
+        planned = plan(&file, settings, first);
+    }
+    Ok((file, planned?))
+}
+
+fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {
+    let (Some(first), Some(last)) = (entries.first(), entries.last()) else { return Ok(()) };
+    // Times in different units may differ in their last digits.
+    let slack = (last.0 - first.0) * 1e-9;
+    match entries.windows(2).find(|w| w[1].0 - w[0].0 <= slack) {
+        None => Ok(()),
+        Some(pair) => Err(SourceError::DuplicateTime {
+            time: calendar.and_then(|c| c.iso(pair[0].0)).unwrap_or_else(|| format!("time {}", pair[0].0)),
+            first: files[pair[0].1.file].path.clone(),
+            second: files[pair[1].1.file].path.clone(),
+        }),
+    }
+}
+
+fn build_grid(path: &Path, layout: &Layout, settings: &ArchiveSettings) -> Result<Grid, SourceError> {
+    let index_axis = |plan: &AxisPlan| {
+        let n = plan.axis.len();
+        let axis = Axis::uniform(plan.axis.name(), "cells", 0.0, (n - 1) as f64, n).map_err(|fault| SourceError::file(path, fault))?;
+        Ok(if plan.axis.period().is_some() { axis.with_period(n as f64) } else { axis })
+    };
+    let axes: Vec<Axis> = match layout.metric {
+        Metric::Index => layout.axes.iter().map(index_axis).collect::<Result<_, SourceError>>()?,
+        Metric::Sphere | Metric::Cartesian => layout.axes.iter().map(|p| p.axis.clone()).collect(),
+    };
+    let slab = settings.slab.map_or_else(|| slab_of(&axes), |[low, high]| (low, high));
+    let geometry = if layout.metric == Metric::Sphere { Geometry::Sphere { radius: EARTH_RADIUS } } else { Geometry::Cartesian };
+    Ok(Grid { axes, geometry, slab })
+}
+
+fn describe(layout: &Layout, format: Format, files: usize, seconds: &[f64]) -> SourceDescription {
+    let variables = layout.frames[0].iter().zip(COMPONENTS).map(|(c, k)| format!("{k} = `{}`: {}", c.name, c.why)).collect();
+    let mut notes = layout.notes.clone();
+    if layout.time.units.trim().is_empty() && layout.metric != Metric::Index {
+        notes.push(format!("`{}` has no unit: taken as seconds", layout.time.variable));
+    }
+    for gap in time_gaps(seconds) {
+        let show = |s: f64| layout.time.calendar.and_then(|c| c.iso(s)).unwrap_or_else(|| s.to_string());
+        let (after, before) = (show(gap.after), show(gap.before));
+        notes.push(format!("gap in time between {after} and {before}: about {} snapshot(s) are missing", gap.missing));
+    }
+    SourceDescription {
+        kind: format!("{}, {files} file(s)", format.name()),
+        variables,
+        metric: layout.metric,
+        time_unit: if layout.metric == Metric::Index { "snapshots".into() } else { "s".into() },
+        time_variable: Some(layout.time.variable.clone()),
+        time_units_in_file: Some(layout.time.units.clone()),
+        calendar: layout.time.calendar.map(|c| c.name().to_owned()),
+        synthetic: None,
+        notes,
+    }
+}

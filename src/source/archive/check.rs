@@ -1,0 +1,77 @@
+//! Checks of the archive settings: by themselves, and against the files.
+
+use crate::source::archive_settings::{ArchiveSettings, Metric, Staggering};
+use crate::source::error::SourceError;
+use crate::source::formats::Format;
+use crate::source::grids::{Layout, Resampling};
+
+/// Refuses settings that are wrong for all files.
+///
+/// # Errors
+/// The setting at fault.
+pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
+    let fault = |key, found: String, accepted: &str| Err(SourceError::setting(key, found, accepted));
+    if let Some(region) = settings.region
+        && !(region.iter().all(|v| v.is_finite()) && region[2] < region[3] && region[0] != region[1])
+    {
+        return fault("region", format!("{region:?}"), "[x0, x1, y0, y1] with y0 < y1 and x0 < x1 (longitudes may cross the seam)");
+    }
+    if let Some(slab) = settings.slab
+        && !(slab[0].is_finite() && slab[1].is_finite() && slab[0] < slab[1])
+    {
+        return fault("slab", format!("{slab:?}"), "[lower, upper] with lower < upper");
+    }
+    if let Some(scale) = settings.vertical_scale
+        && !(scale.is_finite() && scale > 0.0)
+    {
+        return fault("vertical_scale", scale.to_string(), "a number above 0");
+    }
+    if settings.level.is_some_and(|l| !l.is_finite()) {
+        return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
+    }
+    Ok(())
+}
+
+/// Refuses settings that have no effect on files of this kind.
+///
+/// # Errors
+/// The setting at fault.
+pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) -> Result<(), SourceError> {
+    let s = settings;
+    let hdf5 = format == Format::Hdf5;
+    let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
+    let curvilinear = matches!(layout.resampling, Some(Resampling::Curvilinear(_)));
+    let what = match () {
+        () if staggered => "WRF output",
+        () if curvilinear => "longitudes and latitudes of two dimensions",
+        () => format.name(),
+    };
+    let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
+    for (key, given, fits, accepted) in [
+        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; `u`, `v` and `w` name variables of NetCDF"),
+        ("order", s.order.is_some(), hdf5, "with HDF5 only"),
+        ("spacing", s.spacing.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
+        ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
+        ("time_step", s.time_step.is_some(), hdf5, "with HDF5 only; the times of NetCDF are in the file"),
+        ("heights", s.heights.is_some(), staggered, "with WRF output only"),
+        ("staggering", s.staggering != Staggering::default(), staggered, "with WRF output only"),
+        ("x", s.x.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("y", s.y.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
+        ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("grid_relative", s.grid_relative.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("vertical_scale", s.vertical_scale.is_some(), heights, "with levels, in the sphere and cartesian metrics"),
+    ] {
+        if given && !fits {
+            return Err(SourceError::setting(key, format!("given, but has no effect on {what}"), accepted));
+        }
+    }
+    let repeats = |text: &str| if hdf5 { !text.is_empty() && text.bytes().all(|b| b"xyzXYZ".contains(&b)) } else { text == "none" };
+    match s.periodic.as_deref().filter(|text| !repeats(text)) {
+        None => Ok(()),
+        Some(text) => {
+            let accepted = if hdf5 { "the letters of the axes that repeat, such as \"xy\"" } else { "\"none\", or left out" };
+            Err(SourceError::setting("periodic", format!("{text:?}"), accepted))
+        }
+    }
+}

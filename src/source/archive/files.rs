@@ -1,0 +1,69 @@
+//! Files, folders and patterns as a list of files.
+
+use crate::source::error::SourceError;
+use crate::source::formats::FormatFault;
+use std::path::{Path, PathBuf};
+
+/// Extensions of the files that are taken from a folder.
+const EXTENSIONS: [&str; 7] = ["nc", "nc4", "cdf", "netcdf", "h5", "hdf5", "hdf"];
+
+/// Expands folders and patterns, in name order. A file that is named twice counts once.
+///
+/// # Errors
+/// No paths; a folder or pattern without files, or that cannot be read.
+pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
+    if paths.is_empty() {
+        return Err(SourceError::NoFiles);
+    }
+    let mut files: Vec<PathBuf> = Vec::new();
+    for path in paths {
+        let text = path.to_string_lossy();
+        if path.is_dir() {
+            files.extend(folder(path)?);
+        } else if !path.exists() && text.contains(['*', '?', '[']) {
+            files.extend(pattern(&text)?);
+        } else {
+            files.push(path.clone());
+        }
+    }
+    let mut seen = std::collections::HashSet::new();
+    files.retain(|f| seen.insert(f.canonicalize().unwrap_or_else(|_| f.clone())));
+    Ok(files)
+}
+
+fn unreadable(path: &Path, cause: impl ToString) -> SourceError {
+    FormatFault::Open(cause.to_string()).of(path).into()
+}
+
+fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
+    let failed = |cause| unreadable(path, cause);
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(failed)? {
+        let file = entry.map_err(failed)?.path();
+        let extension = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
+        let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
+        if file.is_file() && (EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_")) {
+            files.push(file);
+        }
+    }
+    if files.is_empty() {
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5").display().to_string() });
+    }
+    files.sort();
+    Ok(files)
+}
+
+fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
+    let found = glob::glob(text).map_err(|e| SourceError::NoMatch { pattern: format!("{text} ({e})") })?;
+    let mut files = Vec::new();
+    for file in found {
+        let file = file.map_err(|e| unreadable(e.path(), e.error()))?;
+        if file.is_file() {
+            files.push(file);
+        }
+    }
+    if files.is_empty() {
+        return Err(SourceError::NoMatch { pattern: text.into() });
+    }
+    Ok(files)
+}

@@ -1,0 +1,197 @@
+//! `[archive]` of a scene file.
+
+use serde::{Deserialize, Deserializer, Serialize};
+use std::path::PathBuf;
+
+/// Conversion of coordinates to lengths.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Metric {
+    /// Longitude and latitude on the sphere, metres and seconds; levels become heights. Default for longitude-latitude, unless its
+    /// levels are neither pressures nor lengths.
+    Sphere,
+    /// Grid indices, and cells per snapshot interval; time counts snapshots. Default for levels without a unit, and for velocities in
+    /// cells.
+    Index,
+    /// Coordinates are lengths; pressures become heights. Default for everything else. With longitude and latitude, velocities become
+    /// degrees per second.
+    Cartesian,
+}
+
+/// Unit of the velocities.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum VelocityUnit {
+    /// The variable's `units`, converted to SI.
+    #[default]
+    Si,
+    /// Cells per snapshot interval, not converted; needs the index metric.
+    Cells,
+}
+
+/// Grid for components on the faces of cells (Arakawa C).
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Staggering {
+    /// A grid of faces and centres, twice as fine horizontally: linear interpolation on it is that of each component from its own faces.
+    #[default]
+    Faces,
+    /// Centres only, to which the components are averaged: an eighth of the memory, but smoothed over a cell.
+    Centres,
+}
+
+/// Layout of an archive of synthetic turbulence.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum SyntheticShape {
+    /// Longitude, latitude and pressure levels, packed to 16 bits, CF conventions: one NetCDF file per day. The turbulence is defined on
+    /// the grid: its cells are nodes of the archive, for the index metric.
+    Ecmwf,
+    /// Files as for `ecmwf`, with a turbulence defined on the sphere and smooth over the poles, for the sphere metric.
+    Globe,
+    /// Three components on (z, y, x) with their coordinates: one HDF5 file per snapshot, as from a direct numerical simulation of a flame.
+    Flame,
+}
+
+/// `[archive.synthetic]`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SyntheticSettings {
+    /// Layout.
+    pub shape: SyntheticShape,
+    /// Nodes along x, y and z.
+    #[serde(default = "SyntheticSettings::nodes")]
+    pub nodes: [usize; 3],
+    /// Number of snapshots.
+    #[serde(default = "SyntheticSettings::snapshots")]
+    pub snapshots: usize,
+    /// Number of modes of the turbulence.
+    #[serde(default = "SyntheticSettings::modes")]
+    pub modes: usize,
+    /// Largest wave number, cycles per short side.
+    #[serde(default = "SyntheticSettings::k_max")]
+    pub k_max: f64,
+    /// Root mean square speed, cells per snapshot at 192 cells along the short side.
+    #[serde(default = "SyntheticSettings::amplitude")]
+    pub amplitude: f64,
+    /// Seed of the turbulence.
+    #[serde(default)]
+    pub seed: u64,
+    /// Folder that holds a folder for these settings.
+    #[serde(default = "SyntheticSettings::folder")]
+    pub folder: PathBuf,
+}
+
+impl SyntheticSettings {
+    fn nodes() -> [usize; 3] {
+        [96, 48, 24]
+    }
+    fn snapshots() -> usize {
+        12
+    }
+    fn modes() -> usize {
+        48
+    }
+    fn k_max() -> f64 {
+        14.0
+    }
+    fn amplitude() -> f64 {
+        3.0
+    }
+    fn folder() -> PathBuf {
+        PathBuf::from("out/synthetic")
+    }
+
+    /// Description of the velocities.
+    pub(super) fn described(&self) -> String {
+        crate::field::turbulence::Turbulence::described(self.modes, self.k_max, self.amplitude, self.seed)
+    }
+
+    /// The defaults of a shape.
+    pub fn new(shape: SyntheticShape) -> Self {
+        Self {
+            shape,
+            nodes: Self::nodes(),
+            snapshots: Self::snapshots(),
+            modes: Self::modes(),
+            k_max: Self::k_max(),
+            amplitude: Self::amplitude(),
+            seed: 0,
+            folder: Self::folder(),
+        }
+    }
+}
+
+/// Files to read and, if the conventions do not say enough, how to read them.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ArchiveSettings {
+    /// Files, folders and patterns: one or a list.
+    #[serde(deserialize_with = "one_or_many")]
+    pub files: Vec<PathBuf>,
+    /// Variable of the velocity along x (eastward).
+    pub u: Option<String>,
+    /// Variable of the velocity along y (northward).
+    pub v: Option<String>,
+    /// Variable of the velocity along the level axis; `"none"` ignores vertical motion.
+    pub w: Option<String>,
+    /// Coordinate variable (or dimension) of x.
+    pub x: Option<String>,
+    /// Coordinate variable (or dimension) of y.
+    pub y: Option<String>,
+    /// Coordinate variable (or dimension) of the levels.
+    pub z: Option<String>,
+    /// Time variable.
+    pub time: Option<String>,
+    /// Takes an archive of one time as a steady flow; needs `time.tau`.
+    pub steady: bool,
+    /// Metric; by default chosen from the axes.
+    pub metric: Option<Metric>,
+    /// Unit of the velocities.
+    pub velocity_unit: VelocityUnit,
+    /// Reads only the level at this coordinate, in the file's unit: the flow becomes two-dimensional.
+    pub level: Option<f64>,
+    /// Part to read: `[x0, x1, y0, y1]` in the file's coordinates (longitudes may differ by 360 degrees).
+    pub region: Option<[f64; 4]>,
+    /// Factor of vertical lengths, in the sphere and cartesian metrics with levels; 1 by default.
+    pub vertical_scale: Option<f64>,
+    /// HDF5: one dataset that holds all components; a `*` stands for the number of a snapshot (`Velocity_*`).
+    pub velocity: Option<String>,
+    /// HDF5: letters of the axes of the velocity datasets, slowest first: x, y, z, t (time), c (component), `-` (one entry).
+    pub order: Option<String>,
+    /// HDF5 without coordinates: distances between nodes along x, y and z.
+    pub spacing: Option<[f64; 3]>,
+    /// HDF5 without coordinates: coordinates of the first node.
+    pub origin: Option<[f64; 3]>,
+    /// `"none"`: longitudes that close the circle end at their last node. HDF5: letters of the axes that repeat one spacing behind their
+    /// last node (`"xyz"`).
+    pub periodic: Option<String>,
+    /// HDF5: time between the numbers in dataset or file names, 1 by default.
+    pub time_step: Option<f64>,
+    /// WRF: heights of the grid in metres; by default the mean heights of its levels.
+    pub heights: Option<Vec<f64>>,
+    /// WRF: grid for the components on faces.
+    pub staggering: Staggering,
+    /// Curvilinear longitudes and latitudes: spacing in degrees of the resampled grid; by default their median spacing.
+    pub resolution: Option<[f64; 2]>,
+    /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
+    /// decided by their standard names.
+    pub grid_relative: Option<bool>,
+    /// If no files are named: an archive of the standard turbulence, which is written unless it exists, and read.
+    pub synthetic: Option<SyntheticSettings>,
+    /// Lower and upper end of the slab over which a two-dimensional flow is extruded; by default 0 and a tenth of the longer edge.
+    pub slab: Option<[f64; 2]>,
+}
+
+fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D::Error> {
+    #[derive(Deserialize)]
+    #[serde(untagged, expecting = "a file name or a list of file names")]
+    enum Files {
+        One(PathBuf),
+        Many(Vec<PathBuf>),
+    }
+    Ok(match Files::deserialize(deserializer)? {
+        Files::One(path) => vec![path],
+        Files::Many(paths) => paths,
+    })
+}

@@ -1,0 +1,25 @@
+//! File formats: NetCDF classic, NetCDF-4 and HDF5, as variables, attributes and numbers.
+//!
+//! In: one of three [`messages::Request`]s (list a file, describe a variable, read a hyperslab). Out: plain data ([`Listing`],
+//! [`messages::Description`], values as `f64`, [`FormatError`]). No library handle leaves this room, so that it can move to a child
+//! process. Calls no other room, and knows no meshes.
+//!
+//! [`DataFile`] is the client side of the requests. To add a format: implement [`store::Store`] and recognise its first bytes
+//! in [`server`].
+
+mod classic;
+mod data_file;
+mod guard;
+mod hdf5;
+mod libraries;
+mod messages;
+mod netcdf4;
+mod server;
+mod store;
+mod write;
+
+pub use data_file::DataFile;
+pub use guard::report_crashes;
+pub use libraries::{hdf5_version, netcdf_version};
+pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, Variable};
+pub use write::{NewVariable, Values, write_hdf5, write_netcdf};

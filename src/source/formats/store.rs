@@ -1,0 +1,13 @@
+//! One open file of some format, inside this room.
+
+use super::messages::Variable;
+
+/// Reads values of an open file.
+pub trait Store: Send {
+    /// Appends a hyperslab to `out` as `f64`. `index` is the variable's place in the listing. The caller has checked that the
+    /// block lies inside the variable's shape and holds at least one value.
+    ///
+    /// # Errors
+    /// Error message of the library or of the operating system.
+    fn read(&self, index: usize, variable: &Variable, start: &[usize], count: &[usize], out: &mut Vec<f64>) -> Result<(), String>;
+}

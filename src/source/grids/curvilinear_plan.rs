@@ -1,0 +1,229 @@
+//! Plan of files with longitudes and latitudes of two dimensions.
+
+use super::axes::{AxisPlan, Quantity};
+use super::component::Role;
+use super::curvilinear::Curvilinear;
+use super::layout::{Layout, Resampling};
+use super::locator::{Locator, Mesh, target};
+use super::planner::Planner;
+use crate::field::Axis;
+use crate::source::archive_settings::{Metric, VelocityUnit};
+use crate::source::cf::coordinate::{Kind, classify};
+use crate::source::cf::units::Unit;
+use crate::source::cf::velocity::Velocity;
+use crate::source::error::SourceError;
+use crate::source::formats::Variable;
+use std::sync::Arc;
+
+/// Longitude and latitude variables of a component.
+type Pair = [usize; 2];
+
+impl Planner<'_> {
+    /// Coordinate arrays of each component. `None` if the horizontal dimensions have coordinates of their own.
+    pub fn curvilinear_coordinates(&self, velocity: &Velocity) -> Option<Vec<Pair>> {
+        let s = self.settings;
+        if s.metric.is_some_and(|m| m != Metric::Sphere) || s.velocity_unit != VelocityUnit::Si || s.x.is_some() || s.y.is_some() {
+            return None;
+        }
+        let u = self.coordinate_arrays(velocity.u.variable)?;
+        let own = |&dimension: &usize| {
+            self.measured(dimension).coordinate.map(|c| self.variable(c)).is_some_and(|variable| {
+                let length = Unit::parse(variable.units().unwrap_or_default()).is_some_and(|u| u.is_length());
+                length || matches!(classify(variable), Kind::Longitude | Kind::Latitude)
+            })
+        };
+        if self.plane_of(u[0]).iter().any(own) {
+            return None;
+        }
+        let others = [Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
+        [Some(u)].into_iter().chain(others.map(|other| self.coordinate_arrays(other.variable))).collect()
+    }
+
+    /// The last two dimensions of a variable: x and y.
+    fn plane_of(&self, variable: usize) -> [usize; 2] {
+        let dims = &self.variable(variable).dimensions;
+        [dims[dims.len() - 1], dims[dims.len() - 2]]
+    }
+
+    /// Longitude and latitude arrays on the dimensions of a variable. Arrays that its `coordinates` attribute names go first.
+    fn coordinate_arrays(&self, variable: usize) -> Option<Pair> {
+        let (listing, of) = (self.listing(), self.variable(variable));
+        let fits = |v: &Variable| {
+            let n = v.dimensions.len();
+            let on = |d: &usize| of.dimensions.contains(d) && listing.dimensions[*d].len > 1;
+            n >= 2 && v.number.is_number() && v.dimensions[n - 2..].iter().all(on)
+        };
+        let named: Vec<&str> = of.text("coordinates").map(|t| t.split_whitespace().collect()).unwrap_or_default();
+        let find = |kind: Kind| {
+            let mut found: Vec<usize> = listing.matching(|v| fits(v) && classify(v) == kind).collect();
+            found.sort_by_key(|&i| !named.contains(&self.variable(i).name.as_str()));
+            found
+        };
+        let latitudes = find(Kind::Latitude);
+        let partner = |lon: usize| latitudes.iter().find(|&&lat| self.plane_of(lat) == self.plane_of(lon)).map(|&lat| [lon, lat]);
+        find(Kind::Longitude).into_iter().find_map(partner)
+    }
+
+    /// Points of a pair of coordinate arrays, at the first entry along all dimensions but the last two.
+    fn mesh(&self, [longitude, latitude]: Pair) -> Result<Mesh, SourceError> {
+        let shape = self.plane_of(longitude).map(|d| self.listing().dimensions[d].len);
+        let mesh = Mesh { shape, longitude: self.degrees(longitude, None)?, latitude: self.degrees(latitude, None)? };
+        match mesh.latitude.iter().find(|l| l.abs() > 90.001) {
+            Some(odd) => Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90"))),
+            None => Ok(mesh),
+        }
+    }
+
+    /// Degrees at all points of a two-dimensional coordinate, or at those of one row.
+    fn degrees(&self, index: usize, row: Option<usize>) -> Result<Vec<f64>, SourceError> {
+        let variable = self.variable(index);
+        let mut count = self.shape(index);
+        let rank = count.len();
+        count[..rank - 2].fill(1);
+        let mut start = vec![0; rank];
+        if let Some(row) = row {
+            (start[rank - 2], count[rank - 2]) = (row, 1);
+        }
+        let packing = self.packing(index)?;
+        let radians = variable.units().is_some_and(|u| u.to_ascii_lowercase().starts_with("radian"));
+        let degrees = |v: f64| if radians { v.to_degrees() } else { v };
+        Ok(self.file.read(index, start, count)?.into_iter().map(|v| degrees(packing.unpack(v))).collect())
+    }
+
+    /// Refuses a later file whose points differ from those of the first. Compares the first and the last row, which cost little to
+    /// read.
+    fn check_points(&self, pairs: &[Pair], first: &Curvilinear) -> Result<(), SourceError> {
+        for (pair, mesh) in pairs.iter().zip(&first.meshes) {
+            for (&index, known) in pair.iter().zip([&mesh.longitude, &mesh.latitude]) {
+                for row in [0, mesh.shape[1] - 1] {
+                    let here = self.degrees(index, Some(row))?;
+                    let there = &known[row * mesh.shape[0]..][..mesh.shape[0]];
+                    if let Some((a, b)) = here.iter().zip(there).find(|(a, b)| a != b && !(a.is_nan() && b.is_nan())) {
+                        let what = format!("it is {a} where the first file has {b} (row {row}); the files of an archive lie on one grid");
+                        return Err(self.misfit(index, what));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// True if u and v run along the grid's own directions; and the reason.
+    fn runs_along_grid(&self, u: usize) -> (bool, String) {
+        let variable = self.variable(u);
+        let standard = variable.text("standard_name").unwrap_or_default();
+        let says = |text: &str| text.contains("eastward") || text.contains("zonal");
+        let long = variable.text("long_name").unwrap_or_default().to_ascii_lowercase();
+        match self.settings.grid_relative {
+            Some(along) => (along, "as set".into()),
+            None if says(standard) => (false, format!("standard_name `{standard}`")),
+            None if standard.is_empty() && says(&long) => (false, format!("long_name `{long}`")),
+            None if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
+            None => (true, "no name says eastward; `grid_relative = false` otherwise".into()),
+        }
+    }
+
+    /// Plans a file whose components have the coordinate arrays `pairs`.
+    pub fn plan_curvilinear(mut self, velocity: &Velocity, pairs: Vec<Pair>, first: Option<&Layout>) -> Result<Layout, SourceError> {
+        if self.settings.region.is_some() {
+            return Err(SourceError::setting("region", "given", "longitudes and latitudes of two dimensions are read whole"));
+        }
+        let u = velocity.u.variable;
+        let planes: Vec<[usize; 2]> = pairs.iter().map(|pair| self.plane_of(pair[0])).collect();
+        let mut extents = self.extents(u)?;
+        for extent in &mut extents {
+            if let Some(k) = planes[0].iter().position(|&d| d == extent.dimension) {
+                extent.kind = [Kind::Longitude, Kind::Latitude][k];
+            }
+        }
+        self.name_by_position(u, &mut extents)?;
+        let level = self.pick_level(&extents)?;
+        let time = self.time(&extents)?;
+        let level_extent = extents.iter().find(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
+        let three = level_extent.is_some();
+        let metric = self.metric(&extents, three)?;
+        if metric != Metric::Sphere {
+            let what = "its levels are neither pressures nor lengths, which the sphere needs: pick one with `level = ...`";
+            return Err(self.misfit(u, what));
+        }
+        let level_axis = level_extent.map(|e| self.axis(u, e, 2)).transpose()?;
+
+        let role = |d: usize, plane: &[usize; 2]| match (plane.iter().position(|&t| t == d), level) {
+            (Some(k), _) => Role::Axis(k),
+            (None, Some((dimension, index))) if dimension == d => Role::Fixed(index),
+            (None, _) => match self.measured(d).kind {
+                Kind::Time => Role::Time,
+                Kind::Level if three && self.listing().dimensions[d].len > 1 => Role::Axis(2),
+                _ => Role::Fixed(0),
+            },
+        };
+        let roles = |variable: usize, plane: &[usize; 2]| -> Vec<(usize, Role)> {
+            self.variable(variable).dimensions.iter().map(|&d| (d, role(d, plane))).collect()
+        };
+        let candidates = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
+        let roles: Vec<Vec<(usize, Role)>> = candidates.zip(&planes).map(|(c, plane)| roles(c.variable, plane)).collect();
+        let mut components = vec![self.component(&velocity.u, &roles[0], None)?, self.component(&velocity.v, &roles[1], None)?];
+        let levels = [0, 1].map(|k| components[k].along(2));
+        if levels[0] != levels[1] {
+            return Err(self.misfit(velocity.v.variable, format!("u has {} levels, v {}", levels[0], levels[1])));
+        }
+        let w = self.vertical_component(velocity.w.as_ref(), roles.get(2).map_or(&[][..], Vec::as_slice), level_axis.as_ref(), three)?;
+        match w {
+            Some(w) if w.along(2) == levels[0] => components.push(w),
+            Some(w) => self.note(format!("`{}` lies on other levels than u: vertical motion is taken as 0", w.name)),
+            None => {}
+        }
+
+        let pairs = &pairs[..components.len()];
+        let same_shapes = |l: &&Layout| l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));
+        let known = first.filter(same_shapes).and_then(|l| Some((l.resampling.clone()?, l.axes[..2].to_vec())));
+        if let Some((Resampling::Curvilinear(known), _)) = &known {
+            self.check_points(pairs, known)?;
+        }
+        let (resampling, mut axes) = match known {
+            Some(known) => known,
+            None => self.resample(pairs, u)?,
+        };
+        axes.extend(level_axis);
+        let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
+        Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: Some(resampling), notes: self.notes })
+    }
+
+    /// Makes the grid and locates its nodes among the points of each component.
+    fn resample(&mut self, pairs: &[Pair], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
+        let mut meshes: Vec<Arc<Mesh>> = Vec::new();
+        // The first component with the same coordinates.
+        let twins: Vec<usize> = (0..pairs.len()).map(|k| pairs[..k].iter().position(|p| *p == pairs[k]).unwrap_or(k)).collect();
+        for (k, &twin) in twins.iter().enumerate() {
+            meshes.push(if twin < k { meshes[twin].clone() } else { Arc::new(self.mesh(pairs[k])?) });
+        }
+        let target = target(&meshes[0], self.settings.resolution).map_err(|what| self.misfit(pairs[0][0], what))?;
+        let mut locators: Vec<Arc<Locator>> = Vec::new();
+        for (k, &twin) in twins.iter().enumerate() {
+            locators.push(if twin < k { locators[twin].clone() } else { Arc::new(Locator::new(&meshes[k], &target)) });
+        }
+        let (along, why) = self.runs_along_grid(u);
+        let directions = std::array::from_fn(|k| meshes[k].directions(along).into_iter().map(|both| both[k]).collect());
+        let names = pairs[0].map(|i| self.variable(i).name.clone());
+        let what = format!(
+            "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
+            names[0], names[1], meshes[0].shape[0], meshes[0].shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]
+        );
+        self.note(what.clone());
+        let which = if along { "the grid's own directions, and are turned to east and north" } else { "east and north" };
+        self.note(format!("velocities run along {which} ({why})"));
+        let kinds = [(Kind::Longitude, "degrees_east"), (Kind::Latitude, "degrees_north")];
+        let mut axes = Vec::new();
+        for (k, (kind, units)) in kinds.into_iter().enumerate() {
+            let last = target.first[k] + target.step[k] * (target.nodes[k] - 1) as f64;
+            let axis = Axis::uniform(names[k].as_str(), units, target.first[k], last, target.nodes[k]);
+            let mut axis = axis.map_err(|fault| self.fault(fault))?;
+            if k == 0 && target.round && self.wants_periodic() {
+                axis = axis.with_period(360.0);
+            }
+            axes.push(AxisPlan::made(kind, axis, Quantity::Angle));
+        }
+        let resampled = Curvilinear { locators, meshes, target, directions, bases: target.bases(), what };
+        Ok((Resampling::Curvilinear(Arc::new(resampled)), axes))
+    }
+}

@@ -1,0 +1,159 @@
+//! Meaning of the dimensions of the velocity: by coordinate variables, then by the settings, then by position.
+
+use super::planner::Planner;
+use crate::source::cf::coordinate::{Kind, classify, classify_name};
+use crate::source::error::SourceError;
+use crate::source::formats::NumberType;
+
+/// Longest coordinate variable that is read: a damaged header must not exhaust the memory.
+const MAX_COORDINATES: usize = 1 << 26;
+
+/// A dimension, what it measures and its coordinate variable.
+#[derive(Clone, Copy)]
+pub struct Extent {
+    pub dimension: usize,
+    pub kind: Kind,
+    pub coordinate: Option<usize>,
+}
+
+impl Planner<'_> {
+    /// Dimension (and coordinate variable) that `x`, `y` or `z` of the settings names.
+    fn named_axis(&self, key: &str, name: &Option<String>) -> Result<Option<(usize, Option<usize>)>, SourceError> {
+        let Some(name) = name else { return Ok(None) };
+        if let Some(variable) = self.listing().find(name) {
+            return match self.variable(variable).dimensions[..] {
+                [dimension] => Ok(Some((dimension, Some(variable)))),
+                // Rows of characters.
+                [dimension, _] if self.variable(variable).number == NumberType::Text => Ok(Some((dimension, Some(variable)))),
+                ref dims => {
+                    Err(self.misfit(variable, format!("`{key}` must name a coordinate of one dimension, this one has {}", dims.len())))
+                }
+            };
+        }
+        match self.listing().dimensions.iter().position(|d| d.name == *name) {
+            Some(dimension) => Ok(Some((dimension, None))),
+            None => Err(self.not_found(key, name)),
+        }
+    }
+
+    /// The dimensions of `u` with more than one entry, and horizontal and time dimensions of any length.
+    pub fn extents(&mut self, u: usize) -> Result<Vec<Extent>, SourceError> {
+        let s = self.settings;
+        let mut overrides = Vec::new();
+        for (key, name, kind) in [("x", &s.x, Kind::X), ("y", &s.y, Kind::Y), ("z", &s.z, Kind::Level), ("time", &s.time, Kind::Time)] {
+            // A scalar time variable is found later.
+            let variable = name.as_ref().and_then(|n| self.listing().find(n));
+            let scalar = key == "time" && variable.is_some_and(|v| self.variable(v).dimensions.is_empty());
+            if let Some((dimension, coordinate)) = if scalar { None } else { self.named_axis(key, name)? } {
+                // The setting says which axis it is, the file whether it is an angle.
+                let kind = match (kind, coordinate.map(|c| classify(self.variable(c)))) {
+                    (Kind::X, Some(Kind::Longitude)) => Kind::Longitude,
+                    (Kind::Y, Some(Kind::Latitude)) => Kind::Latitude,
+                    _ => kind,
+                };
+                overrides.push(Extent { dimension, kind, coordinate });
+            }
+        }
+        let mut extents = Vec::new();
+        let mut squeezed = Vec::new();
+        for &dimension in &self.variable(u).dimensions {
+            let known = overrides.iter().find(|o| o.dimension == dimension);
+            let extent = known.copied().unwrap_or_else(|| self.measured(dimension));
+            let found = &self.listing().dimensions[dimension];
+            if found.len == 1 && !extent.kind.is_horizontal() && extent.kind != Kind::Time {
+                squeezed.push(found.name.as_str());
+            } else {
+                extents.push(extent);
+            }
+        }
+        if !squeezed.is_empty() {
+            self.note(format!("dimensions of one entry left out: {}", squeezed.join(", ")));
+        }
+        Ok(extents)
+    }
+
+    /// A dimension with its coordinate variable and what it measures, regardless of the settings.
+    pub fn measured(&self, dimension: usize) -> Extent {
+        let name = &self.listing().dimensions[dimension].name;
+        let candidates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
+        let first = |fits: &dyn Fn(usize) -> bool| candidates.iter().copied().find(|&i| fits(i));
+        let coordinate = first(&|i| self.variable(i).name == *name)
+            .or_else(|| first(&|i| classify(self.variable(i)) != Kind::Unknown))
+            .or_else(|| (candidates.len() == 1).then(|| candidates[0]));
+        let kind = match coordinate.map(|c| classify(self.variable(c))) {
+            None | Some(Kind::Unknown) => classify_name(name),
+            Some(kind) => kind,
+        };
+        Extent { dimension, kind, coordinate }
+    }
+
+    /// Gives unknown dimensions the meaning that their order suggests: x last, y before it, then levels.
+    pub fn name_by_position(&mut self, u: usize, extents: &mut [Extent]) -> Result<(), SourceError> {
+        let has = |extents: &[Extent], kinds: [Kind; 2]| extents.iter().any(|e| kinds.contains(&e.kind));
+        for i in (0..extents.len()).rev().filter(|&i| extents[i].kind == Kind::Unknown).collect::<Vec<_>>() {
+            let dimension = &self.listing().dimensions[extents[i].dimension];
+            let (kind, axis) = if !has(extents, [Kind::X, Kind::Longitude]) {
+                (Kind::X, "x")
+            } else if !has(extents, [Kind::Y, Kind::Latitude]) {
+                (Kind::Y, "y")
+            } else if !has(extents, [Kind::Level; 2]) && extents[i].coordinate.is_some() {
+                (Kind::Level, "z")
+            } else {
+                let what = format!(
+                    "dimension `{}` has {} entries, but is neither time nor x, y or level; name the axes with `x`, `y`, `z`, `time`",
+                    dimension.name, dimension.len
+                );
+                return Err(self.misfit(u, what));
+            };
+            extents[i].kind = kind;
+            self.note(format!("dimension `{}` is taken as {axis} by its position", dimension.name));
+        }
+        for (kinds, what) in
+            [([Kind::X, Kind::Longitude], "x"), ([Kind::Y, Kind::Latitude], "y"), ([Kind::Level; 2], "z"), ([Kind::Time; 2], "time")]
+        {
+            let found = extents.iter().filter(|e| kinds.contains(&e.kind));
+            let found: Vec<&str> = found.map(|e| self.listing().dimensions[e.dimension].name.as_str()).collect();
+            let optional = what == "z" || what == "time";
+            if found.len() > 1 || (found.is_empty() && !optional) {
+                let dims = self.listing().dimension_names(self.variable(u));
+                let which = if found.is_empty() { "no dimension".into() } else { found.join(" and ") };
+                return Err(self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with `{what} = \"...\"`")));
+            }
+        }
+        Ok(())
+    }
+
+    /// Dimension and index of the level that the settings pick.
+    pub fn pick_level(&mut self, extents: &[Extent]) -> Result<Option<(usize, usize)>, SourceError> {
+        let Some(wanted) = self.settings.level else { return Ok(None) };
+        let file = self.path().display();
+        let fault = |found: String, accepted: String| SourceError::setting("level", format!("{wanted} ({found})"), accepted);
+        let Some(extent) = extents.iter().find(|e| e.kind == Kind::Level) else {
+            return Err(fault(format!("{file} has no level axis"), "leave `level` out".into()));
+        };
+        let Some(coordinate) = extent.coordinate else {
+            return Err(fault("the level axis has no coordinates".into(), "name them with `z`".into()));
+        };
+        let values = self.coordinate_values(coordinate)?;
+        let variable = self.variable(coordinate);
+        let scale = values.iter().fold(0.0f64, |m, v| m.max(v.abs()));
+        // A difference of four roundings of f32 is the same level.
+        let Some(index) = values.iter().position(|v| (v - wanted).abs() <= 4.0 * f64::from(f32::EPSILON) * scale) else {
+            let list = values.iter().map(f64::to_string).collect::<Vec<_>>().join(", ");
+            let units = variable.units().unwrap_or_default();
+            return Err(fault("no such level".into(), format!("levels of {file} are {list} {units}")));
+        };
+        self.note(format!("level {wanted} picked (entry {index} of `{}`)", variable.name));
+        Ok(Some((extent.dimension, index)))
+    }
+
+    /// All values of a coordinate variable, unpacked.
+    pub fn coordinate_values(&self, variable: usize) -> Result<Vec<f64>, SourceError> {
+        let count: usize = self.shape(variable).iter().product();
+        if count > MAX_COORDINATES {
+            return Err(self.misfit(variable, format!("{count} coordinates are too many; accepted are up to {MAX_COORDINATES}")));
+        }
+        let packing = self.packing(variable)?;
+        Ok(self.file.read_all(variable)?.into_iter().map(|v| packing.unpack(v)).collect())
+    }
+}

@@ -1,0 +1,461 @@
+//! Locates the nodes of an even longitude-latitude grid among the cells of a mesh of points on the sphere.
+//!
+//! Algorithm: each cell is projected onto the plane that touches the sphere at its middle (gnomonic projection); the place of a node in
+//! it is the inverse of the bilinear map, by Newton's method.
+
+/// Points on the sphere in rows, x fastest; degrees, NaN for missing points.
+#[derive(Debug)]
+pub struct Mesh {
+    pub shape: [usize; 2],
+    pub longitude: Vec<f64>,
+    pub latitude: Vec<f64>,
+}
+
+/// An even grid.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Target {
+    /// Longitude and latitude of the first node.
+    pub first: [f64; 2],
+    pub step: [f64; 2],
+    pub nodes: [usize; 2],
+    /// True if longitudes close the circle.
+    pub round: bool,
+}
+
+/// Index of no cell.
+const NOWHERE: u32 = u32::MAX;
+/// Largest number of nodes for each point of the mesh: a mesh that is dense in one place must not exhaust the memory.
+const MAX_NODES: usize = 4;
+/// Extent of a mesh in degrees (0.1 m) below which it has no cells: a grid on it would have steps of 0.
+const MIN_EXTENT: f64 = 1e-6;
+/// Largest number of columns that a mesh repeats at its seam.
+const MAX_REPEATED: usize = 4;
+/// Largest distance outside a cell, in units of the cell, at which a node still counts as inside: rounding must not open seams.
+const SLACK: f64 = 1e-7;
+
+/// Bilinear interpolation from a mesh to a grid.
+#[derive(Debug)]
+pub struct Locator {
+    shape: [usize; 2],
+    /// Lower corner of the cell of each node of the grid.
+    cell: Vec<u32>,
+    /// Place of each node in its cell.
+    place: Vec<[f32; 2]>,
+}
+
+type Vector = [f64; 3];
+
+fn dot(a: Vector, b: Vector) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+fn vector(longitude: f64, latitude: f64) -> Vector {
+    let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
+    [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+}
+
+/// East and north at a point.
+fn east_north(longitude: f64, latitude: f64) -> [Vector; 2] {
+    let ((sin_lon, cos_lon), (sin_lat, cos_lat)) = (longitude.to_radians().sin_cos(), latitude.to_radians().sin_cos());
+    [[-sin_lon, cos_lon, 0.0], [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]]
+}
+
+/// Degrees between two points (longitude, latitude).
+pub fn apart(p: [f64; 2], q: [f64; 2]) -> f64 {
+    dot(vector(p[0], p[1]), vector(q[0], q[1])).clamp(-1.0, 1.0).acos().to_degrees()
+}
+
+/// A difference of longitudes in [-180, 180).
+fn turn(degrees: f64) -> f64 {
+    (degrees + 180.0).rem_euclid(360.0) - 180.0
+}
+
+impl Mesh {
+    fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
+        let n = j * self.shape[0] + i;
+        (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])
+    }
+
+    /// Degrees between neighbouring points along x and along y.
+    fn spacings(&self, along: usize) -> Vec<f64> {
+        let [nx, ny] = self.shape;
+        let (di, dj) = if along == 0 { (1, 0) } else { (0, 1) };
+        let mut found = Vec::new();
+        for j in 0..ny - dj {
+            for i in 0..nx - di {
+                if let (Some(a), Some(b)) = (self.point(i, j), self.point(i + di, j + dj)) {
+                    let (east, north) = (turn(b[0] - a[0]) * ((a[1] + b[1]) / 2.0).to_radians().cos(), b[1] - a[1]);
+                    found.push(east.hypot(north));
+                }
+            }
+        }
+        found
+    }
+
+    /// True if the last column's neighbour is the first one.
+    fn goes_round(&self, spacing: f64) -> bool {
+        let [nx, ny] = self.shape;
+        let closes = |j: &usize| match (self.point(nx - 1, *j), self.point(0, *j), self.point(nx / 2, *j)) {
+            (Some(a), Some(b), Some(m)) => apart(a, b) < 2.0 * spacing && apart(a, m) > 4.0 * spacing,
+            _ => false,
+        };
+        nx > 8 && (0..ny).filter(closes).count() * 2 > ny
+    }
+
+    /// Unit vectors along u and v at each point: east and north or, if `along` is set, the direction of the mesh's x and the direction 90
+    /// degrees to the left of it. NaN if neighbours coincide.
+    pub fn directions(&self, along: bool) -> Vec<[[f32; 3]; 2]> {
+        let [nx, ny] = self.shape;
+        let round = along && self.goes_round(median(self.spacings(0)).unwrap_or(0.0));
+        let mut out = Vec::with_capacity(nx * ny);
+        for j in 0..ny {
+            for i in 0..nx {
+                let Some(here) = self.point(i, j) else {
+                    out.push([[f32::NAN; 3]; 2]);
+                    continue;
+                };
+                let [east, north] = east_north(here[0], here[1]);
+                let [x, y] = if along {
+                    let own = vector(here[0], here[1]);
+                    let at = |i: usize| self.point(i, j).map_or(own, |p| vector(p[0], p[1]));
+                    let way = |a: Vector, b: Vector| -> Vector { std::array::from_fn(|k| b[k] - a[k]) };
+                    let (mut before, mut after) = (way(at(i.saturating_sub(1)), own), way(own, at((i + 1).min(nx - 1))));
+                    // Beyond the seam, the mesh may repeat columns: take the first one that lies ahead.
+                    let beyond = |onward: Vector, step: &dyn Fn(usize) -> Vector| {
+                        let ahead = |s: &Vector| dot(*s, onward) > 1e-6 * dot(onward, onward);
+                        (0..=MAX_REPEATED.min(nx - 1)).map(step).find(ahead).unwrap_or([0.0; 3])
+                    };
+                    if round && i == 0 {
+                        before = beyond(after, &|k| way(at(nx - 1 - k), own));
+                    } else if round && i + 1 == nx {
+                        after = beyond(before, &|k| way(own, at(k)));
+                    }
+                    let step = std::array::from_fn(|k| before[k] + after[k]);
+                    let (x, y) = (dot(step, east), dot(step, north));
+                    let length = x.hypot(y);
+                    if length > 0.0 { [x / length, y / length] } else { [f64::NAN; 2] }
+                } else {
+                    [1.0, 0.0]
+                };
+                let of = |a: f64, b: f64| std::array::from_fn(|k| (a * east[k] + b * north[k]) as f32);
+                out.push([of(x, y), of(-y, x)]);
+            }
+        }
+        out
+    }
+}
+
+fn median(mut values: Vec<f64>) -> Option<f64> {
+    values.retain(|v| *v > 0.0);
+    values.sort_by(f64::total_cmp);
+    values.get(values.len() / 2).copied()
+}
+
+/// An even grid that covers a mesh, in steps of `resolution` degrees or of the mesh's median spacing.
+///
+/// # Errors
+/// A mesh without cells, a resolution out of range, or too many nodes.
+pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, String> {
+    if mesh.shape.iter().any(|&n| n < 2) {
+        return Err(format!("{:?} points make no cell", mesh.shape));
+    }
+    if let Some(odd) = resolution.and_then(|r| r.into_iter().find(|r| !(*r > 0.0 && *r <= 45.0))) {
+        return Err(format!("a `resolution` of {odd} degrees: accepted are numbers above 0, up to 45"));
+    }
+    let known: Vec<[f64; 2]> =
+        (0..mesh.longitude.len()).map(|n| [mesh.longitude[n], mesh.latitude[n]]).filter(|p| p.iter().all(|v| v.is_finite())).collect();
+    let spacing = median(mesh.spacings(0)).zip(median(mesh.spacings(1)));
+    let Some((along_x, along_y)) = spacing else { return Err("no two neighbouring points differ".into()) };
+    let latitudes: Vec<f64> = known.iter().map(|p| p[1]).collect();
+    let (south, north) = latitudes.iter().fold((f64::INFINITY, f64::NEG_INFINITY), |(a, b), &l| (a.min(l), b.max(l)));
+    let mut middle = latitudes;
+    middle.sort_by(f64::total_cmp);
+    if north - south <= MIN_EXTENT {
+        return Err(format!("its points lie on one parallel, at {south} degrees north: they make no cell"));
+    }
+    let cosine = middle[middle.len() / 2].to_radians().cos().max(0.1);
+    let mut step = resolution.unwrap_or([along_x / cosine, along_y]);
+
+    // The widest arc without a point lies outside the mesh, unless it is as narrow as a cell.
+    let mut circle: Vec<f64> = known.iter().map(|p| p[0].rem_euclid(360.0)).collect();
+    circle.sort_by(f64::total_cmp);
+    let (mut start, mut hole) = (circle[0], circle[0] + 360.0 - circle[circle.len() - 1]);
+    for pair in circle.windows(2) {
+        if pair[1] - pair[0] > hole {
+            (start, hole) = (pair[1], pair[1] - pair[0]);
+        }
+    }
+    let round = hole < 2.0 * step[0].max(along_x / cosine);
+    if round {
+        start = 0.0;
+    } else if start > 180.0 && start + 360.0 - hole > 360.0 {
+        start -= 360.0;
+    }
+    let width = if round { 360.0 } else { 360.0 - hole };
+    if width <= MIN_EXTENT {
+        return Err(format!("its points lie on one meridian, at {start} degrees east: they make no cell"));
+    }
+    loop {
+        let across = ((width / step[0]).round() as usize).max(1);
+        let up = (((north - south) / step[1]).round() as usize).max(1);
+        if resolution.is_none() && across.saturating_mul(up) > MAX_NODES * known.len().max(64) {
+            step = step.map(|s| s * 1.25);
+            continue;
+        }
+        if across.saturating_mul(up) > 1 << 28 {
+            return Err(format!("{across} x {up} nodes are too many; give a coarser `resolution`"));
+        }
+        let step = [width / across as f64, (north - south) / up as f64];
+        let nodes = [if round { across } else { across + 1 }, up + 1];
+        return Ok(Target { first: [start, south], step, nodes, round });
+    }
+}
+
+impl Target {
+    /// Unit vectors to the east and to the north at each node.
+    pub fn bases(&self) -> [Vec<[f32; 3]>; 2] {
+        let [nx, ny] = self.nodes;
+        let at = |k: usize| -> Vec<[f32; 3]> {
+            let base = |n: usize| {
+                let place = [0, 1].map(|a| self.first[a] + self.step[a] * [n % nx, n / nx][a] as f64);
+                east_north(place[0], place[1])[k].map(|v| v as f32)
+            };
+            (0..nx * ny).map(base).collect()
+        };
+        [at(0), at(1)]
+    }
+
+    /// Bilinear interpolation of values on the grid; NaN outside.
+    pub fn interpolate(&self, values: &[f32], longitude: f64, latitude: f64) -> f64 {
+        let mut x = (longitude - self.first[0]).rem_euclid(360.0) / self.step[0];
+        let y = (latitude - self.first[1]) / self.step[1];
+        let [nx, ny] = self.nodes;
+        let cells = if self.round { nx } else { nx - 1 };
+        if !self.round && x > cells as f64 && (360.0 / self.step[0] - x) < 1e-6 {
+            x = 0.0;
+        }
+        if !(x <= cells as f64 + 1e-9 && (-1e-9..=(ny - 1) as f64 + 1e-9).contains(&y)) {
+            return f64::NAN;
+        }
+        let (i, j) = ((x as usize).min(cells - 1), (y.max(0.0) as usize).min(ny - 2));
+        let (s, t) = (x - i as f64, y - j as f64);
+        let at = |i: usize, j: usize| f64::from(values[j * nx + i % nx]);
+        (1.0 - t) * ((1.0 - s) * at(i, j) + s * at(i + 1, j)) + t * ((1.0 - s) * at(i, j + 1) + s * at(i + 1, j + 1))
+    }
+}
+
+impl Locator {
+    pub fn new(mesh: &Mesh, target: &Target) -> Self {
+        let [nx, ny] = mesh.shape;
+        let mut this = Self {
+            shape: mesh.shape,
+            cell: vec![NOWHERE; target.nodes[0] * target.nodes[1]],
+            place: vec![[0.0; 2]; target.nodes[0] * target.nodes[1]],
+        };
+        let spacing = median(mesh.spacings(0)).unwrap_or(0.0);
+        let across = if mesh.goes_round(spacing) { nx } else { nx - 1 };
+        for j in 0..ny - 1 {
+            for i in 0..across {
+                let corners = [(i, j), ((i + 1) % nx, j), (i, j + 1), ((i + 1) % nx, j + 1)].map(|(i, j)| mesh.point(i, j));
+                if let [Some(a), Some(b), Some(c), Some(d)] = corners {
+                    this.fill((j * nx + i) as u32, [a, b, c, d], target);
+                }
+            }
+        }
+        this
+    }
+
+    /// Locates the grid's nodes in one cell.
+    fn fill(&mut self, index: u32, corners: [[f64; 2]; 4], target: &Target) {
+        let vectors = corners.map(|c| vector(c[0], c[1]));
+        let sum: Vector = std::array::from_fn(|k| vectors.iter().map(|v| v[k]).sum());
+        let length = dot(sum, sum).sqrt();
+        // Corners on all sides of the globe make no cell.
+        if length < 2.0 {
+            return;
+        }
+        let middle = sum.map(|v| v / length);
+        let (longitude, latitude) = (middle[1].atan2(middle[0]).to_degrees(), middle[2].clamp(-1.0, 1.0).asin().to_degrees());
+        let [east, north] = east_north(longitude, latitude);
+        let project = |v: Vector| {
+            let ahead = dot(v, middle);
+            (ahead > 0.1).then(|| [dot(v, east) / ahead, dot(v, north) / ahead])
+        };
+        let flat = vectors.map(project);
+        let [Some(a), Some(b), Some(c), Some(d)] = flat else { return };
+        let mut low = [f64::INFINITY; 2];
+        let mut high = [f64::NEG_INFINITY; 2];
+        for corner in corners {
+            for (k, value) in [turn(corner[0] - longitude), corner[1]].into_iter().enumerate() {
+                (low[k], high[k]) = (low[k].min(value), high[k].max(value));
+            }
+        }
+        // The sides are curved in longitude and latitude.
+        for k in 0..2 {
+            let more = 0.1 * (high[k] - low[k]);
+            (low[k], high[k]) = (low[k] - more, high[k] + more);
+        }
+        let pole_inside = high[0] - low[0] > 180.0;
+        if pole_inside {
+            if latitude > 0.0 { high[1] = 90.0 } else { low[1] = -90.0 }
+        }
+        let row = |l: f64| (l - target.first[1]) / target.step[1];
+        let rows =
+            row(low[1]).ceil().max(0.0) as usize..=(row(high[1]).floor().max(-1.0) as i64).min(target.nodes[1] as i64 - 1).max(-1) as usize;
+        if row(high[1]) < 0.0 {
+            return;
+        }
+        let column = |l: f64| (l + longitude - target.first[0]) / target.step[0];
+        let (first, last) =
+            if pole_inside { (0, target.nodes[0] as i64 - 1) } else { (column(low[0]).ceil() as i64, column(high[0]).floor() as i64) };
+        let turn_nodes = (360.0 / target.step[0]).round() as i64;
+        for y in rows {
+            for x in first..=last {
+                let column = if target.round { x.rem_euclid(target.nodes[0] as i64) } else { x.rem_euclid(turn_nodes.max(1)) };
+                if column >= target.nodes[0] as i64 {
+                    continue;
+                }
+                let node = y * target.nodes[0] + column as usize;
+                if self.cell[node] != NOWHERE {
+                    continue;
+                }
+                let p = vector(target.first[0] + target.step[0] * column as f64, target.first[1] + target.step[1] * y as f64);
+                if let Some(place) = project(p).and_then(|p| inside([a, b, c, d], p)) {
+                    self.cell[node] = index;
+                    self.place[node] = place.map(|s| s as f32);
+                }
+            }
+        }
+    }
+
+    /// Points of the mesh.
+    pub fn points(&self) -> usize {
+        self.shape[0] * self.shape[1]
+    }
+
+    /// Values at the nodes of the grid; NaN outside all cells and if a corner is missing.
+    pub fn apply(&self, values: &[f32]) -> Vec<f32> {
+        let nx = self.shape[0];
+        let one = |(&cell, &[s, t]): (&u32, &[f32; 2])| {
+            if cell == NOWHERE {
+                return f32::NAN;
+            }
+            let cell = cell as usize;
+            let next = if cell % nx + 1 == nx { cell + 1 - nx } else { cell + 1 };
+            (1.0 - t) * ((1.0 - s) * values[cell] + s * values[next]) + t * ((1.0 - s) * values[cell + nx] + s * values[next + nx])
+        };
+        self.cell.iter().zip(&self.place).map(one).collect()
+    }
+}
+
+/// Place of a point in a quadrangle of corners (0,0), (1,0), (0,1), (1,1), by Newton's method. `None` outside.
+fn inside([a, b, c, d]: [[f64; 2]; 4], p: [f64; 2]) -> Option<[f64; 2]> {
+    let (mut s, mut t) = (0.5, 0.5);
+    for _ in 0..20 {
+        let at = |k: usize| a[k] + s * (b[k] - a[k]) + t * (c[k] - a[k]) + s * t * (a[k] - b[k] - c[k] + d[k]) - p[k];
+        let along_s = |k: usize| b[k] - a[k] + t * (a[k] - b[k] - c[k] + d[k]);
+        let along_t = |k: usize| c[k] - a[k] + s * (a[k] - b[k] - c[k] + d[k]);
+        let determinant = along_s(0) * along_t(1) - along_s(1) * along_t(0);
+        if determinant == 0.0 || !determinant.is_finite() {
+            return None;
+        }
+        let step = [(at(0) * along_t(1) - at(1) * along_t(0)) / determinant, (at(1) * along_s(0) - at(0) * along_s(1)) / determinant];
+        (s, t) = (s - step[0], t - step[1]);
+        if step[0].abs() + step[1].abs() < 1e-12 {
+            break;
+        }
+        if !(s.abs() < 10.0 && t.abs() < 10.0) {
+            return None;
+        }
+    }
+    let within = |v: f64| (-SLACK..=1.0 + SLACK).contains(&v);
+    (within(s) && within(t)).then(|| [s.clamp(0.0, 1.0), t.clamp(0.0, 1.0)])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A mesh turned by an angle about its middle at 30 degrees east, 50 degrees north.
+    fn turned(degrees: f64, n: usize) -> Mesh {
+        let (sine, cosine) = degrees.to_radians().sin_cos();
+        let (mut longitude, mut latitude) = (Vec::new(), Vec::new());
+        for j in 0..n {
+            for i in 0..n {
+                let (x, y) = ((i as f64 / (n - 1) as f64 - 0.5) * 10.0, (j as f64 / (n - 1) as f64 - 0.5) * 10.0);
+                longitude.push(30.0 + (cosine * x - sine * y) / 0.7);
+                latitude.push(50.0 + sine * x + cosine * y);
+            }
+        }
+        Mesh { shape: [n, n], longitude, latitude }
+    }
+
+    #[test]
+    fn smooth_fields_survive() {
+        let mesh = turned(25.0, 41);
+        let target = target(&mesh, None).unwrap();
+        assert!(!target.round && target.nodes.iter().all(|&n| n > 20 && n < 80), "{target:?}");
+        let locator = Locator::new(&mesh, &target);
+        let field = |lon: f64, lat: f64| (lon * 0.3).sin() + 0.1 * lat;
+        let values: Vec<f32> = (0..mesh.longitude.len()).map(|n| field(mesh.longitude[n], mesh.latitude[n]) as f32).collect();
+        let on_grid = locator.apply(&values);
+        let mut found = 0;
+        for (node, &value) in on_grid.iter().enumerate().filter(|(_, v)| v.is_finite()) {
+            let (x, y) = (node % target.nodes[0], node / target.nodes[0]);
+            let exact = field(target.first[0] + target.step[0] * x as f64, target.first[1] + target.step[1] * y as f64);
+            // An eighth of the square of a cell (0.36 degrees) times the second derivative (0.09).
+            assert!((f64::from(value) - exact).abs() < 3e-3, "{value} {exact}");
+            found += 1;
+        }
+        // The turned square fills more than half of the box around it.
+        assert!(found * 2 > on_grid.len() && found < on_grid.len(), "{found} of {}", on_grid.len());
+        let middle = 20 * 41 + 20;
+        let [x, y] = mesh.directions(true)[middle].map(|d| d.map(f64::from));
+        let [east, north] = east_north(mesh.longitude[middle], mesh.latitude[middle]);
+        // East is stretched by 0.7 / cos(50 degrees) here.
+        assert!((dot(x, north).atan2(dot(x, east)).to_degrees() - 25.0).abs() < 3.0);
+        assert!(dot(x, y).abs() < 1e-6 && (dot(y, north) - dot(x, east)).abs() < 1e-6, "{x:?} {y:?}");
+        assert_eq!(mesh.directions(false)[middle], [east, north].map(|e| e.map(|v| v as f32)));
+    }
+
+    #[test]
+    fn a_mesh_without_width_is_refused() {
+        let line = |longitude: fn(f64) -> f64, latitude: fn(f64) -> f64| {
+            let at = |f: fn(f64) -> f64| (0..9).map(|n| f(f64::from(n))).collect();
+            target(&Mesh { shape: [3, 3], longitude: at(longitude), latitude: at(latitude) }, Some([0.5, 0.5]))
+        };
+        // Along a meridian, the one at 180 degrees, a parallel, and a closed parallel.
+        for (longitude, latitude, word) in [
+            ((|_| 20.0) as fn(f64) -> f64, (|n| 10.0 + n) as fn(f64) -> f64, "meridian"),
+            (|n| if n > 4.0 { 180.0 } else { -180.0 }, |n| n, "meridian"),
+            (|n| 20.0 + n, |_| 10.0, "parallel"),
+            (|n| 40.0 * n, |_| 10.0, "parallel"),
+        ] {
+            let message = line(longitude, latitude).unwrap_err();
+            assert!(message.contains(word), "{message}");
+        }
+        assert!(line(|n| 20.0 + n % 3.0, |n| 10.0 + (n / 3.0).floor()).is_ok());
+    }
+
+    #[test]
+    fn a_globe_with_the_pole_in_a_cell_has_no_hole() {
+        // A polar cap on a stereographic plane.
+        let n = 41;
+        let (mut longitude, mut latitude) = (Vec::new(), Vec::new());
+        for j in 0..n {
+            for i in 0..n {
+                let (x, y) = (i as f64 - 20.3, j as f64 - 19.6);
+                longitude.push(y.atan2(x).to_degrees());
+                latitude.push(90.0 - x.hypot(y));
+            }
+        }
+        let mesh = Mesh { shape: [n, n], longitude, latitude };
+        let target = target(&mesh, Some([5.0, 1.0])).unwrap();
+        assert!(target.round);
+        let locator = Locator::new(&mesh, &target);
+        let ones = locator.apply(&vec![1.0; n * n]);
+        // All rows north of 72 degrees lie inside the square.
+        let row = ((73.0 - target.first[1]) / target.step[1]).ceil() as usize;
+        assert!(ones[row * target.nodes[0]..].iter().all(|v| (v - 1.0).abs() < 1e-6));
+    }
+}

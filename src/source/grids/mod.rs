@@ -1,0 +1,35 @@
+//! Meaning of a mesh: axes, levels, poles and staggered points, and the velocity at the nodes of one grid.
+//!
+//! In: the listing of a file and its values (by requests to `formats`), settings. Out: a [`Layout`] (axes, components, times), and
+//! the components of one time on the grid. Calls `formats` (requests only) and `cf`. Knows no file format: it distinguishes only
+//! files that name their dimensions from files that do not.
+//!
+//! [`plan()`] chooses one of four plans: `rectilinear`, `curvilinear_plan`, `staggered_plan` (WRF) and `datasets` (no named
+//! dimensions).
+
+mod axes;
+mod component;
+mod curvilinear;
+mod curvilinear_plan;
+mod datasets;
+mod dimensions;
+mod layout;
+mod levels;
+mod locator;
+mod nest;
+mod plan;
+mod planner;
+mod poles;
+mod rectilinear;
+mod staggered;
+mod staggered_plan;
+mod times;
+mod velocity_units;
+
+pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
+pub use component::{ComponentPlan, Orders, read_component};
+pub use layout::{Layout, Resampling, difference};
+pub use levels::to_heights;
+pub use plan::{plan, readable_axes};
+pub use poles::Poles;
+pub use velocity_units::VelocityScale;

@@ -1,0 +1,45 @@
+//! Choice of the plan for a file.
+
+use super::axes::{AxisPlan, Coordinates};
+use super::layout::Layout;
+use super::planner::Planner;
+use crate::source::archive_settings::ArchiveSettings;
+use crate::source::cf::coordinate::{Kind, classify};
+use crate::source::error::SourceError;
+use crate::source::formats::DataFile;
+
+/// Plans how to read a file. Costly parts are taken from `first`, the layout of the archive's first file.
+///
+/// # Errors
+/// A file that lacks a velocity, axes or times that are understood; settings that do not fit.
+pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>) -> Result<Layout, SourceError> {
+    let mut planner = Planner::new(file, settings);
+    if !file.listing.format.names_dimensions() {
+        return planner.plan_datasets();
+    }
+    let velocity = planner.velocity()?;
+    if planner.is_staggered(&velocity) {
+        planner.plan_staggered(&velocity, first)
+    } else if let Some(coordinates) = planner.curvilinear_coordinates(&velocity) {
+        planner.plan_curvilinear(&velocity, coordinates, first)
+    } else {
+        planner.plan_rectilinear(&velocity)
+    }
+}
+
+/// Axes of a file whose velocity is not understood, with their names (`x`, `y`, `z`): for each, the first variable of one dimension
+/// that measures it and whose values make an axis.
+pub fn readable_axes(file: &DataFile, settings: &ArchiveSettings) -> Vec<(&'static str, AxisPlan)> {
+    let planner = Planner::new(file, settings);
+    let axis = |(role, kinds): (&'static str, &[Kind])| {
+        (0..file.listing.variables.len()).find_map(|i| {
+            let variable = planner.variable(i);
+            let kind = classify(variable);
+            let fits = variable.dimensions.len() == 1 && variable.number.is_number() && kinds.contains(&kind);
+            let values = fits.then(|| planner.coordinate_values(i).ok()).flatten()?;
+            Some((role, Coordinates::of(planner.path(), variable, kind, values).plan(None, true).ok()?))
+        })
+    };
+    let roles: [(&str, &[Kind]); 3] = [("x", &[Kind::Longitude, Kind::X]), ("y", &[Kind::Latitude, Kind::Y]), ("z", &[Kind::Level])];
+    roles.into_iter().filter_map(axis).collect()
+}

@@ -1,0 +1,200 @@
+//! The planner of one file, and what all plans share.
+
+use super::axes::{AxisPlan, Quantity};
+use super::component::{ComponentPlan, Role};
+use super::levels::to_heights;
+use super::poles::Poles;
+use crate::source::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
+use crate::source::cf::coordinate::Kind;
+use crate::source::cf::packing::Packing;
+use crate::source::cf::units::{Unit, VELOCITY_UNITS};
+use crate::source::cf::velocity::{Candidate, judge};
+use crate::source::error::SourceError;
+use crate::source::formats::{DataFile, Listing, Variable};
+use std::fmt::Display;
+use std::path::Path;
+
+/// Plans one file.
+pub struct Planner<'a> {
+    pub file: &'a DataFile,
+    pub settings: &'a ArchiveSettings,
+    /// See [`super::layout::Layout::notes`].
+    pub notes: Vec<String>,
+}
+
+impl<'a> Planner<'a> {
+    pub fn new(file: &'a DataFile, settings: &'a ArchiveSettings) -> Self {
+        Self { file, settings, notes: Vec::new() }
+    }
+
+    pub fn listing(&self) -> &'a Listing {
+        &self.file.listing
+    }
+
+    pub fn variable(&self, index: usize) -> &'a Variable {
+        &self.file.listing.variables[index]
+    }
+
+    pub fn shape(&self, index: usize) -> Vec<usize> {
+        self.listing().shape(self.variable(index))
+    }
+
+    pub fn path(&self) -> &'a Path {
+        &self.file.listing.path
+    }
+
+    pub fn note(&mut self, text: impl Into<String>) {
+        self.notes.push(text.into());
+    }
+
+    /// Error about the file.
+    pub fn fault(&self, what: impl ToString) -> SourceError {
+        SourceError::file(self.path(), what)
+    }
+
+    /// Error about a variable.
+    pub fn misfit(&self, variable: usize, what: impl Display) -> SourceError {
+        SourceError::variable(self.path(), &self.variable(variable).name, what)
+    }
+
+    /// Error about a setting that names a variable which the file lacks.
+    pub fn not_found(&self, key: &str, name: &str) -> SourceError {
+        let names: Vec<&str> = self.listing().variables.iter().map(|v| v.name.as_str()).collect();
+        let near = names.iter().map(|n| (strsim::jaro_winkler(n, name), n)).max_by(|a, b| a.0.total_cmp(&b.0));
+        SourceError::VariableNotFound {
+            path: self.path().into(),
+            key: key.into(),
+            variable: name.into(),
+            nearest: near.filter(|n| n.0 > 0.8).map(|n| format!(" (is `{}` meant?)", n.1)).unwrap_or_default(),
+            present: names.join(", "),
+        }
+    }
+
+    /// Error about a file without a velocity.
+    pub fn no_velocity(&self, lacking: &str) -> SourceError {
+        let listing = self.listing();
+        let line = |i: usize| {
+            let variable = self.variable(i);
+            let verdict = match judge(listing, i) {
+                Ok(candidate) => format!("may be {} ({})", candidate.component.name(), candidate.why),
+                Err(lacks) => lacks,
+            };
+            format!("  {} ({}): {verdict}", variable.name, listing.dimension_names(variable))
+        };
+        let candidates = (0..listing.variables.len()).map(line).collect::<Vec<_>>().join("\n");
+        self.fault(format!(
+            "no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
+             Variables in the file:\n{candidates}"
+        ))
+    }
+
+    /// Variable that a setting names.
+    pub fn named(&self, key: &str, name: &Option<String>) -> Result<Option<usize>, SourceError> {
+        let Some(name) = name else { return Ok(None) };
+        self.listing().find(name).map(Some).ok_or_else(|| self.not_found(key, name))
+    }
+
+    /// Packing of a variable.
+    pub fn packing(&self, variable: usize) -> Result<Packing, SourceError> {
+        Packing::of(self.variable(variable)).map_err(|what| self.misfit(variable, what))
+    }
+
+    /// True if longitudes that close the circle are periodic.
+    pub fn wants_periodic(&self) -> bool {
+        self.settings.periodic.as_deref() != Some("none")
+    }
+
+    /// Turns levels into heights and closes the poles, if the metric asks for it; collects the notes of all axes.
+    pub fn finish_axes(&mut self, axes: &mut [AxisPlan], metric: Metric) -> Result<(Vec<f64>, Poles), SourceError> {
+        let mut vertical = Vec::new();
+        if metric != Metric::Index
+            && let Some(level) = axes.get(2)
+        {
+            let lowest = level.axis.first();
+            if level.quantity == Quantity::Pressure && lowest <= 0.0 {
+                let what = format!("a pressure of {lowest} Pa has no height; use `metric = \"index\"`, or another axis with `z`");
+                return Err(SourceError::variable(self.path(), level.axis.name(), what));
+            }
+            let scale = self.settings.vertical_scale.unwrap_or(1.0);
+            (axes[2], vertical) = to_heights(level.clone(), scale).map_err(|fault| self.fault(fault))?;
+        }
+        let mut poles = Poles::default();
+        if metric == Metric::Sphere {
+            let (longitude, rest) = axes.split_at_mut(1);
+            poles = Poles::close(&longitude[0], &mut rest[0]).map_err(|fault| self.fault(fault))?;
+        }
+        self.notes.extend(axes.iter().flat_map(|axis| axis.notes.iter().cloned()));
+        let geographic = |v: &Variable| v.text("standard_name").is_some_and(|n| n == "eastward_wind" || n.starts_with("eastward_sea"));
+        if (axes[0].kind, axes[1].kind) == (Kind::X, Kind::Y) && self.listing().variables.iter().any(geographic) {
+            self.note("eastward and northward velocities are taken along x and y of the projection: its grid convergence is not applied");
+        }
+        Ok((vertical, poles))
+    }
+
+    /// A component whose dimensions have `roles` and whose velocity runs along `axis`.
+    pub fn component(
+        &mut self,
+        candidate: &Candidate,
+        roles: &[(usize, Role)],
+        axis: Option<&AxisPlan>,
+    ) -> Result<ComponentPlan, SourceError> {
+        let variable = self.variable(candidate.variable);
+        let role = |d: &usize| roles.iter().find(|r| r.0 == *d).map_or(Role::Fixed(0), |r| r.1);
+        Ok(ComponentPlan {
+            factor: self.velocity_factor(candidate, axis)?,
+            name: variable.name.clone(),
+            shape: self.shape(candidate.variable),
+            roles: variable.dimensions.iter().map(role).collect(),
+            packing: self.packing(candidate.variable)?,
+            why: candidate.why.clone(),
+        })
+    }
+
+    /// Factor from the unit of a component to SI.
+    pub fn velocity_factor(&mut self, candidate: &Candidate, axis: Option<&AxisPlan>) -> Result<f64, SourceError> {
+        if self.settings.velocity_unit == VelocityUnit::Cells {
+            return Ok(1.0);
+        }
+        let variable = self.variable(candidate.variable);
+        let component = candidate.component.name();
+        let text = variable.units().unwrap_or_default();
+        let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
+        match Unit::parse(text) {
+            Some(u) if u.is_dimensionless() => {
+                self.note(format!("{component}: `{}` has no unit: taken as SI", variable.name));
+                Ok(1.0)
+            }
+            Some(u) if u.is_velocity() && !along_pressure => Ok(u.factor),
+            Some(u) if u.is_pressure_tendency() && along_pressure => Ok(u.factor),
+            Some(u) if u.is_velocity() || u.is_pressure_tendency() => {
+                let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
+                let hint = if component == "w" { ", or ignore vertical motion with `w = \"none\"`" } else { "" };
+                let what = format!(
+                    "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with `{component} = \"...\"`{hint}"
+                );
+                Err(self.misfit(candidate.variable, what))
+            }
+            _ => Err(self.fault(format!("variable `{}` has unit `{text}`; accepted are {VELOCITY_UNITS}", variable.name))),
+        }
+    }
+
+    /// The third component, if it exists and is wanted.
+    pub fn vertical_component(
+        &mut self,
+        w: Option<&Candidate>,
+        roles: &[(usize, Role)],
+        axis: Option<&AxisPlan>,
+        three: bool,
+    ) -> Result<Option<ComponentPlan>, SourceError> {
+        match (w, three) {
+            (Some(w), true) => return self.component(w, roles, axis).map(Some),
+            (Some(w), false) => {
+                self.note(format!("`{}` is not used: the flow is read in two dimensions", self.variable(w.variable).name));
+            }
+            (None, true) if self.settings.w.as_deref() == Some("none") => self.note("vertical motion is ignored, as set"),
+            (None, true) => self.note("no vertical velocity found: it is taken as 0"),
+            (None, false) => {}
+        }
+        Ok(None)
+    }
+}

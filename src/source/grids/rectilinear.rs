@@ -1,0 +1,153 @@
+//! Files whose components share one grid of coordinates in rows.
+
+use super::axes::{AxisPlan, Coordinates, Quantity};
+use super::component::Role;
+use super::dimensions::Extent;
+use super::layout::Layout;
+use super::planner::Planner;
+use crate::field::{Axis, AxisFault};
+use crate::setting::word;
+use crate::source::archive_settings::{Metric, VelocityUnit};
+use crate::source::cf::coordinate::{Kind, classify};
+use crate::source::cf::units::Unit;
+use crate::source::cf::velocity::{self, Velocity};
+use crate::source::error::SourceError;
+use crate::source::formats::Variable;
+
+impl Planner<'_> {
+    /// Finds the components of the velocity.
+    pub fn velocity(&mut self) -> Result<Velocity, SourceError> {
+        let s = self.settings;
+        let ignore_w = s.w.as_deref() == Some("none");
+        let w = if ignore_w { None } else { self.named("w", &s.w)? };
+        let fixed = [self.named("u", &s.u)?, self.named("v", &s.v)?, w];
+        let found = velocity::choose(self.listing(), fixed, ignore_w).map_err(|lacking| self.no_velocity(&lacking))?;
+        let mut names: Vec<String> = found.others.iter().map(|o| format!("`{}`", self.variable(o.variable).name)).collect();
+        if !names.is_empty() {
+            names.dedup();
+            self.note(format!("also velocities, but passed over: {} ({})", names.join(", "), velocity::RULE));
+        }
+        Ok(found)
+    }
+
+    /// Plans a file whose components lie on the same points.
+    pub fn plan_rectilinear(mut self, velocity: &Velocity) -> Result<Layout, SourceError> {
+        self.check_same_points(velocity)?;
+        let u = velocity.u.variable;
+        let mut extents = self.extents(u)?;
+        self.name_by_position(u, &mut extents)?;
+        let level = self.pick_level(&extents)?;
+        let time = self.time(&extents)?;
+
+        let mut axes = Vec::new();
+        let mut roles: Vec<(usize, Role)> = Vec::new();
+        let place = |kind: Kind| match kind {
+            Kind::Longitude | Kind::X => Some(0),
+            Kind::Latitude | Kind::Y => Some(1),
+            Kind::Level => Some(2),
+            _ => None,
+        };
+        extents.sort_by_key(|e| place(e.kind).unwrap_or(3));
+        let three = extents.iter().any(|e| e.kind == Kind::Level && Some(e.dimension) != level.map(|l| l.0));
+        let metric = self.metric(&extents, three)?;
+        for extent in &extents {
+            let role = match (place(extent.kind), level) {
+                (_, Some((dimension, index))) if dimension == extent.dimension => Role::Fixed(index),
+                (Some(k), _) => Role::Axis(k),
+                (None, _) => Role::Time,
+            };
+            if let Role::Axis(k) = role {
+                axes.push(self.axis(u, extent, k)?);
+            }
+            roles.push((extent.dimension, role));
+        }
+        let mut components =
+            vec![self.component(&velocity.u, &roles, Some(&axes[0]))?, self.component(&velocity.v, &roles, Some(&axes[1]))?];
+        components.extend(self.vertical_component(velocity.w.as_ref(), &roles, axes.get(2), three)?);
+        let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
+        Ok(Layout { frames: vec![components], axes, vertical, poles, time, metric, resampling: None, notes: self.notes })
+    }
+
+    fn check_same_points(&self, found: &Velocity) -> Result<(), SourceError> {
+        let listing = self.listing();
+        let differs = |other: &usize| !velocity::same_dimensions(listing, found.u.variable, *other);
+        let Some(other) = [Some(&found.v), found.w.as_ref()].into_iter().flatten().map(|c| c.variable).find(differs) else {
+            return Ok(());
+        };
+        let [a, b] = [found.u.variable, other].map(|i| self.variable(i));
+        Err(self.fault(format!(
+            "`{}` lies on ({}) but `{}` on ({}): staggered components are read only if they are WRF's (dimensions `..._stag`, with PH and \
+             PHB) or have longitudes and latitudes of their own",
+            a.name,
+            listing.dimension_names(a),
+            b.name,
+            listing.dimension_names(b)
+        )))
+    }
+
+    /// The metric in force; `three` says whether the flow has three dimensions.
+    pub fn metric(&mut self, extents: &[Extent], three: bool) -> Result<Metric, SourceError> {
+        let has = |kind| extents.iter().any(|e| e.kind == kind);
+        let sphere = has(Kind::Longitude) && has(Kind::Latitude);
+        let level = extents.iter().find(|e| e.kind == Kind::Level).and_then(|e| e.coordinate);
+        let unit = level.and_then(|c| Unit::parse(self.variable(c).units().unwrap_or_default()));
+        let measured = unit.is_some_and(|u| u.is_length() || u.is_pressure());
+        let fault = |found: &str, accepted: &str| Err(SourceError::setting("metric", found, accepted));
+        match (self.settings.metric, self.settings.velocity_unit) {
+            (Some(Metric::Sphere), _) if !sphere => {
+                fault("sphere", "the axes are not longitude and latitude; accepted are index and cartesian")
+            }
+            (Some(Metric::Sphere), _) if three && !measured => {
+                fault("sphere", "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`")
+            }
+            (Some(metric), VelocityUnit::Cells) if metric != Metric::Index => {
+                fault(&word(metric), "velocities in cells need `metric = \"index\"`")
+            }
+            (Some(metric), _) => Ok(metric),
+            (None, VelocityUnit::Cells) => Ok(Metric::Index),
+            (None, VelocityUnit::Si) if sphere && three && !measured => {
+                self.note(
+                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere",
+                );
+                Ok(Metric::Index)
+            }
+            (None, VelocityUnit::Si) => Ok(if sphere { Metric::Sphere } else { Metric::Cartesian }),
+        }
+    }
+
+    /// Axis `k` of the grid, along a dimension of `u`.
+    pub fn axis(&self, u: usize, extent: &Extent, k: usize) -> Result<AxisPlan, SourceError> {
+        let dimension = &self.listing().dimensions[extent.dimension];
+        let (name, len) = (&dimension.name, dimension.len);
+        if len < 2 {
+            return Err(self.fault(AxisFault::TooShort { name: name.clone(), found: len }));
+        }
+        let range = self.settings.region.and_then(|r| [Some([r[0], r[1]]), Some([r[2], r[3]]), None][k]);
+        let Some(coordinate) = extent.coordinate else {
+            if self.settings.velocity_unit != VelocityUnit::Cells {
+                return Err(self.misfit(u, self.without_coordinates(extent.dimension)));
+            }
+            let axis = Axis::uniform(name.as_str(), "", 0.0, (len - 1) as f64, len).map_err(|fault| self.fault(fault))?;
+            let notes = vec![format!("`{name}` has no coordinates: counted from 0")];
+            return Ok(AxisPlan { notes, ..AxisPlan::made(extent.kind, axis, Quantity::None) });
+        };
+        let values = self.coordinate_values(coordinate)?;
+        Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values).plan(range, self.wants_periodic())
+    }
+
+    fn without_coordinates(&self, dimension: usize) -> String {
+        let listing = self.listing();
+        let name = &listing.dimensions[dimension].name;
+        let angle = |v: &Variable| matches!(classify(v), Kind::Longitude | Kind::Latitude);
+        let wide = listing.matching(|v| v.dimensions.len() >= 2 && v.dimensions.contains(&dimension) && angle(v));
+        let wide: Vec<&str> = wide.map(|i| self.variable(i).name.as_str()).collect();
+        let why = if wide.is_empty() {
+            "has no coordinate variable".into()
+        } else {
+            format!("has only coordinates of two dimensions ({}), of which no longitude and latitude are a pair", wide.join(", "))
+        };
+        format!(
+            "dimension `{name}` {why}. Name a coordinate variable with `x`, `y` or `z`, or set `velocity_unit = \"cells\"` if its values are cells per snapshot interval"
+        )
+    }
+}

@@ -1,0 +1,176 @@
+//! `[network]` of a scene file.
+
+use crate::surrogate::SurrogateError;
+use serde::{Deserialize, Serialize};
+
+/// Encoding of the inputs of the MLP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Encoding {
+    /// Multiresolution hash grid (Müller et al. 2022).
+    HashGrid,
+    /// sin and cos of 2^0 .. 2^(L-1) (Mildenhall et al. 2020).
+    Frequency,
+}
+
+/// An input of the network besides the position.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Input {
+    /// The seed time, so that one network answers for many windows.
+    Start,
+    /// |tau| up to the scene's.
+    Duration,
+}
+
+/// Output of the network.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Target {
+    /// The log-stretch.
+    Ftle,
+    /// The arrival position; the FTLE follows by differentiating the network.
+    FlowMap,
+}
+
+/// Loss of training.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Loss {
+    /// Mean square of the log-stretch.
+    MeanSquare,
+    /// Mean |sign(y) ln(1+|y|) - yhat|^2 with y = FTLE, plus a penalty on the difference of the batch means in linear scale (Xi, Luan and
+    /// Tao, Neural Monte Carlo rendering of finite-time Lyapunov exponent fields, Visual Intelligence 1, 2023, doi
+    /// 10.1007/s44267-023-00014-x). The sign is an addition, since ln(1+y) is undefined for FTLE below -1.
+    Published,
+}
+
+/// Choice of the surrogate's size.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Size {
+    /// The size in the scene.
+    Fixed,
+    /// A size found from the measured error, at most the size in the scene ([`crate::surrogate::Sizing`]).
+    Auto,
+}
+
+/// `[network]` of a scene file.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct NetworkSettings {
+    /// Choice of `width`, `log2_table` and the nodes of a table.
+    pub size: Size,
+    /// Inputs besides the position.
+    pub inputs: Vec<Input>,
+    /// Seed times that become 0 and 1 of the input `start`; `None`: the first and the last seed time of the run.
+    pub start_range: Option<[f64; 2]>,
+    /// Encoding of the inputs.
+    pub encoding: Encoding,
+    /// Hash-grid levels.
+    pub levels: usize,
+    /// Features of a level.
+    pub features: usize,
+    /// Entries of a level at most, as a power of two.
+    pub log2_table: u32,
+    /// Nodes along each axis of the coarsest level.
+    pub base_resolution: usize,
+    /// Resolution ratio from level to level.
+    pub growth: f32,
+    /// Octaves of the frequency encoding.
+    pub octaves: usize,
+    /// Hidden layers.
+    pub hidden_layers: usize,
+    /// Neurons of a hidden layer.
+    pub width: usize,
+    /// Output.
+    pub target: Target,
+    /// Loss.
+    pub loss: Loss,
+    /// Weight of the penalty on the difference of the batch means in [`Loss::Published`].
+    pub mean_penalty: f32,
+    /// Learning rate of Adam; `None`: 1e-2 for hash grids, 1e-3 for frequency encodings (published: 1e-4, for a day of training).
+    pub learning_rate: Option<f32>,
+    /// Samples of an optimizer step.
+    pub batch: usize,
+    /// Gives shorter axes of the domain fewer cells, so that cells are about as wide as high.
+    pub scale_levels_by_aspect: bool,
+    /// Weight of the flow map's derivatives in the loss (target `flow_map`). 0 trains on arrivals alone, which renders better after the
+    /// same time: every derivative costs a pass, and the derivatives of a hash grid jump from cell to cell.
+    pub jacobian_weight: f32,
+    /// Share of the steps so far over which the weights for prediction are averaged; 0 predicts with the latest weights.
+    pub averaging: f32,
+}
+
+impl Default for NetworkSettings {
+    fn default() -> Self {
+        Self {
+            size: Size::Fixed,
+            inputs: Vec::new(),
+            start_range: None,
+            encoding: Encoding::HashGrid,
+            levels: 6,
+            features: 4,
+            log2_table: 21,
+            base_resolution: 16,
+            growth: 1.6,
+            octaves: 10,
+            hidden_layers: 2,
+            width: 64,
+            target: Target::Ftle,
+            loss: Loss::MeanSquare,
+            mean_penalty: 1.0,
+            learning_rate: None,
+            batch: 1 << 14,
+            scale_levels_by_aspect: true,
+            jacobian_weight: 0.0,
+            averaging: 0.1,
+        }
+    }
+}
+
+impl NetworkSettings {
+    /// Checks every value that has a range.
+    ///
+    /// # Errors
+    /// [`SurrogateError::Setting`] with the first key whose value is not accepted.
+    pub fn validate(&self) -> Result<(), SurrogateError> {
+        if (1..self.inputs.len()).any(|i| self.inputs[i..].contains(&self.inputs[i - 1])) {
+            return Err(refused("inputs", crate::setting::shown(&self.inputs), "each of \"start\" and \"duration\" once at most"));
+        }
+        if let Some([first, last]) = self.start_range {
+            let range = format!("[{first}, {last}]");
+            if !(first.is_finite() && last.is_finite() && first < last) {
+                return Err(refused("start_range", range, "two finite numbers, ascending"));
+            }
+            if !self.inputs.contains(&Input::Start) {
+                return Err(refused("start_range", range, "with \"start\" among network.inputs"));
+            }
+        }
+        check("levels", self.levels, 1, 32)?;
+        if ![1, 2, 4, 8].contains(&self.features) {
+            return Err(refused("features", self.features.to_string(), "1, 2, 4 or 8"));
+        }
+        check("log2_table", self.log2_table, 4, 24)?;
+        check("base_resolution", self.base_resolution, 1, 65_536)?;
+        check("growth", self.growth, 1.0, 4.0)?;
+        check("octaves", self.octaves, 1, 16)?;
+        check("hidden_layers", self.hidden_layers, 1, 64)?;
+        check("width", self.width, 1, 2048)?;
+        check("mean_penalty", self.mean_penalty, 0.0, 1e6)?;
+        check("jacobian_weight", self.jacobian_weight, 0.0, 1e6)?;
+        check("averaging", self.averaging, 0.0, 1.0)?;
+        check("batch", self.batch, 64, 1 << 22)?;
+        self.learning_rate.map_or(Ok(()), |rate| check("learning_rate", rate, 1e-9, 1.0))
+    }
+}
+
+fn check<T: PartialOrd + std::fmt::Display>(key: &str, value: T, low: T, high: T) -> Result<(), SurrogateError> {
+    let is_accepted = value >= low && value <= high;
+    is_accepted.then_some(()).ok_or_else(|| refused(key, value.to_string(), &format!("{low} to {high}")))
+}
+
+/// The error of a value of `[network]`.
+pub(super) fn refused(key: &str, found: String, accepted: &str) -> SurrogateError {
+    SurrogateError::Setting { key: format!("network.{key}"), found, accepted: accepted.into() }
+}

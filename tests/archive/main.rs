@@ -1,0 +1,62 @@
+//! Archives of every format and grid: the snapshots that they give, the reasons for which they are refused, and fields traced in them.
+#![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
+
+mod curvilinear;
+mod hdf5;
+mod hemispheres;
+#[path = "../kit/mod.rs"]
+mod kit;
+mod netcdf;
+mod real;
+mod refused;
+mod resampled;
+mod round_trip;
+
+use ridgewatch::source::{Archive, ArchiveSettings, Inspection, SnapshotSource, SourceError, inspect};
+use std::path::{Path, PathBuf};
+
+const DAYS: &str = "days since 2000-01-01";
+const HOURS: &str = "hours since 2000-01-01";
+
+fn settings(toml: &str) -> ArchiveSettings {
+    toml::from_str(toml).unwrap()
+}
+
+fn try_open(files: &[impl AsRef<Path>], toml: &str) -> Result<Archive, SourceError> {
+    let files: Vec<PathBuf> = files.iter().map(|file| file.as_ref().to_owned()).collect();
+    Archive::open(&files, &settings(toml))
+}
+
+/// Opens files as one archive with these settings.
+fn open_with(files: &[impl AsRef<Path>], toml: &str) -> Archive {
+    try_open(files, toml).unwrap()
+}
+
+/// Opens files as one archive with the default settings.
+fn open(files: &[impl AsRef<Path>]) -> Archive {
+    open_with(files, "")
+}
+
+/// Asserts that files are refused, with a message that holds each piece.
+#[track_caller]
+fn refused(files: &[impl AsRef<Path>], toml: &str, pieces: &[&str]) -> SourceError {
+    let error = match try_open(files, toml) {
+        Ok(archive) => panic!("accepted with {toml:?}: {:?}", archive.describe()),
+        Err(error) => error,
+    };
+    let message = error.to_string();
+    for piece in pieces {
+        assert!(message.contains(piece), "{toml:?}: `{piece}` is missing in: {message}");
+    }
+    error
+}
+
+/// Inspects files with the default settings.
+fn inspected(files: &[impl AsRef<Path>]) -> Inspection {
+    let files: Vec<PathBuf> = files.iter().map(|file| file.as_ref().to_owned()).collect();
+    inspect(&files, &ArchiveSettings::default(), None).unwrap()
+}
+
+fn notes(archive: &Archive) -> String {
+    archive.describe().notes.join("\n")
+}

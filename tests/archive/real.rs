@@ -1,0 +1,235 @@
+//! Real archives (`RIDGEWATCH_DATA`, by default `../shared/data`) through the whole loop, or to the right error, and against an integration
+//! by other tools: `make test-data`.
+
+use crate::kit::flow::{quasi_random, trace, window};
+use crate::kit::program::{self, project, records, set, text};
+use crate::{inspected, open, refused};
+use ridgewatch::field::Geometry;
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, VelocitySource, cpu_tracer};
+use ridgewatch::publish::read_exr;
+use ridgewatch::render::Film;
+use ridgewatch::source::{Metric, SnapshotSource};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// A file of the collection, which must exist: without it, `make test` leaves these tests out and says so.
+fn data(name: &str) -> PathBuf {
+    let root = std::env::var_os("RIDGEWATCH_DATA").map_or_else(|| project("../shared/data"), PathBuf::from);
+    let path = root.join(name);
+    assert!(path.exists(), "{} is not there; set RIDGEWATCH_DATA to the folder of the collection", path.display());
+    path
+}
+
+/// The last of eight frames of a replay by the program. The first ones exceed the tolerance, and say so: trust begins with few points.
+fn replay(files: &Path, tau: f64) -> Film {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("run");
+    let tau = format!("time.tau={tau:?}");
+    let picture = set(&["render.width=128", "render.height=64", "render.samples=4"]);
+    let length = set(&["training.steps_per_frame=100", "time.slides=1", "time.frames_per_slide=8", &tau]);
+    let mut command = program::ridgewatch(["replay", "--json", "--out", text(&out), text(files)]);
+    program::run(command.args(picture).args(length)).success();
+    let records = records(&out);
+    let last = &records[7];
+    assert!(last.tolerance_excess.is_none() && last.traced_share < 1.0 && last.trusted_error.is_some(), "{last:?}");
+    let frame = out.join("frames/frame_000007");
+    assert_eq!(image::image_dimensions(frame.with_extension("png")).unwrap(), (128, 64));
+    read_exr(&frame.with_extension("exr")).unwrap()
+}
+
+/// Compares a picture with the FTLE (1/s) of another integration: visible values vary, and lie above the low end of the transfer function,
+/// the median. `land` is the accepted range of its share of pixels.
+fn looks_right(name: &str, film: &Film, ftle: &[f64], land: std::ops::RangeInclusive<f64>) {
+    assert!(film.rgba.iter().flatten().all(|c| c.is_finite()), "{name}: every pixel has a colour");
+    let seen: Vec<f64> = film.ftle_mean.iter().filter(|f| f.is_finite()).map(|&f| f64::from(f)).collect();
+    let mean = seen.iter().sum::<f64>() / seen.len() as f64;
+    let spread = (seen.iter().map(|f| (f - mean).powi(2)).sum::<f64>() / seen.len() as f64).sqrt();
+    let share = film.missing.iter().map(|&m| f64::from(m)).sum::<f64>() / film.missing.len() as f64;
+    let mut ftle = ftle.to_vec();
+    ftle.sort_by(f64::total_cmp);
+    let (median, largest) = (ftle[ftle.len() / 2], ftle[ftle.len() - 1]);
+    println!(
+        "{name}: {} of {} pixels show FTLE {mean:.2e} +- {spread:.1e} (independent median {median:.2e}, largest {largest:.2e}); land {share:.3}",
+        seen.len(),
+        film.ftle_mean.len()
+    );
+    assert!(seen.len() * 20 > film.ftle_mean.len(), "{name}: something is seen");
+    assert!(mean > median && mean < largest, "{name}: {mean:e}");
+    assert!(spread > 0.1 * (largest - median) && spread < largest - median, "{name}: {spread:e}");
+    assert!(land.contains(&share), "{name}: {share}");
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn globcurrent() {
+    let folder = data("globcurrent");
+    let mut archive = open(&[folder.join("*.nc")]);
+    let grid = archive.grid().clone();
+    assert_eq!((grid.shape(), archive.times().len()), ([81, 41, 1], 60));
+    assert!(matches!(grid.geometry, Geometry::Sphere { .. }));
+    assert_eq!((grid.axes[0].first(), grid.axes[1].first(), grid.axes[0].period()), (14.875, -40.125, None));
+    assert_eq!(archive.date(archive.times()[0]).as_deref(), Some("2002-01-01T00:00:00Z"));
+    assert_eq!(archive.date(archive.times()[59]).as_deref(), Some("2002-03-01T00:00:00Z"));
+    assert_eq!((archive.default_tau().unwrap(), archive.gaps().len()), (29.5 * 86_400.0, 0));
+    let snapshot = archive.read(0).unwrap();
+    // Counted with another tool: 769 of 3321 values are NaN.
+    assert_eq!(snapshot.missing_nodes(), 769);
+    let fastest = snapshot.nodes.iter().map(|n| n[..3].iter().map(|v| v * v).sum::<f32>().sqrt()).fold(0.0, f32::max);
+    assert!(fastest > 1.0 && fastest < 3.0, "the Agulhas current runs at {fastest} m/s");
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn era5_on_a_projected_grid() {
+    let first = data("era5_utm32_2025_05_01_00.nc");
+    let pattern = first.with_file_name("era5_utm32_*.nc");
+    let mut archive = open(&[&pattern]);
+    assert_eq!((archive.grid().shape(), archive.times().len()), ([17, 30, 37], 3));
+    // Pressures of 1000 to 1 hPa become heights.
+    assert_eq!((archive.metric(), archive.grid().axes[2].first()), (Metric::Cartesian, 0.0));
+    assert!((archive.grid().axes[2].last() - 7000.0 * 1000f64.ln()).abs() < 1e-6);
+    let share = archive.read(1).unwrap().missing_nodes() as f64 / archive.grid().nodes() as f64;
+    // Counted with another tool: 14.1 %.
+    assert!((share - 0.141).abs() < 1e-3, "{share}");
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn wrf_hurricane() {
+    let file = data("wrf_katrina_uvw_4t.nc");
+    let mut archive = open(&[&file]);
+    assert_eq!((archive.grid().shape(), archive.times().len()), ([125, 119, 28], 4));
+    // 48 x 48 cells that follow the storm by 15 cells west and 12 north in nine hours.
+    assert_eq!(archive.date(archive.times()[3]).as_deref(), Some("2005-08-28T21:00:00Z"));
+    let snapshot = archive.read(0).unwrap();
+    let known = snapshot.nodes.len() - snapshot.missing_nodes();
+    // Some nodes at the ground are missing.
+    assert!((0.99..=1.0).contains(&(known as f64 / (95.0 * 95.0 * 28.0))), "{known}");
+    let inspection = inspected(&[&file]);
+    let resampling = inspection.resampling.unwrap();
+    println!("WRF resampling: {resampling:?}");
+    assert!(resampling.error < 0.003 * resampling.velocity, "{resampling:?}");
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn what_cannot_be_traced_says_why() {
+    for (name, pieces) in [
+        ("jhtdb_iso1024coarse_pressure_64.h5", &["Pressure_0001", "one component per point: it is a scalar"][..]),
+        ("jhtdb_legacy_cutout_10x10.h5", &["`u01000`", "1 node(s) thick along z", "2 nodes or more"]),
+    ] {
+        refused(&[data(name)], "", &[pieces, &[name]].concat());
+    }
+}
+
+/// Pairs of log-stretches that are compared.
+const PAIRS: usize = 50;
+
+/// Log-stretches at 50 seeds that live the whole tau, neighbours included: from this program and from tests/independent/ftle.py.
+fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) {
+    let python = std::env::var_os("RIDGEWATCH_PYTHON").map_or_else(|| project(".venv/bin/python"), PathBuf::from);
+    assert!(python.exists(), "{} is not there: make test-data installs it", python.display());
+    let mut archive = open(files);
+    let begin = archive.times()[archive.times().len() - 1];
+    let source = VelocitySource::Window(window(&mut archive));
+    let map = FlowMap {
+        direction: Direction::Backward,
+        integrator: Integrator::DormandPrince,
+        precision: Precision::F64,
+        boundary: Boundary::Stop,
+        ..FlowMap::tangent(tau, 1)
+    };
+    let tracer = cpu_tracer(source.clone(), &map, begin).unwrap();
+    // Seeds that stop are left out. More remain than are needed, since a neighbour of some stops.
+    let seeds: Vec<[f32; 3]> = (0..2000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
+    let out = trace(&source, &map, begin, &seeds, Extras::default());
+    let chosen: Vec<usize> = (0..seeds.len()).filter(|&i| out.lived[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
+    assert_eq!(chosen.len(), 2 * PAIRS);
+    let task = serde_json::json!({
+        "kind": kind,
+        "files": archive.files().map(|f| f.display().to_string()).collect::<Vec<_>>(),
+        "count": PAIRS,
+        "points": chosen.iter().map(|&i| seeds[i].map(f64::from)).collect::<Vec<_>>(),
+        "from": begin,
+        "tau": -tau,
+    });
+    let output = program::run_with_input(Command::new(python).arg(project("tests/independent/ftle.py")), &task.to_string()).success();
+    let theirs: Vec<serde_json::Value> = serde_json::from_str(&output.stdout).unwrap();
+    let pairs: (Vec<f64>, Vec<f64>) =
+        chosen.iter().zip(&theirs).filter_map(|(&i, theirs)| theirs.as_f64().map(|t| (out.log_stretch_f64[i], t))).unzip();
+    println!("{kind}: {} of {} points are left out, since a neighbour stops", theirs.len() - PAIRS, theirs.len());
+    for (&i, theirs) in chosen.iter().zip(&theirs) {
+        assert_ne!(theirs, "seed", "{kind}: {:?} lives here and not there", seeds[i]);
+    }
+    assert_eq!(pairs.0.len(), PAIRS);
+    pairs
+}
+
+/// Root mean square and median difference of the FTLE, per second, root mean square FTLE, correlation.
+fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, f64) {
+    let n = ours.len() as f64;
+    let mean = |f: &dyn Fn(usize) -> f64| (0..ours.len()).map(f).sum::<f64>() / n;
+    let rms = mean(&|i| (ours[i] - theirs[i]).powi(2)).sqrt();
+    let size = mean(&|i| theirs[i].powi(2)).sqrt();
+    let mut apart: Vec<f64> = ours.iter().zip(theirs).map(|(a, b)| (a - b).abs()).collect();
+    apart.sort_by(f64::total_cmp);
+    let (a, b) = (mean(&|i| ours[i]), mean(&|i| theirs[i]));
+    let correlation =
+        mean(&|i| (ours[i] - a) * (theirs[i] - b)) / (mean(&|i| (ours[i] - a).powi(2)) * mean(&|i| (theirs[i] - b).powi(2))).sqrt();
+    println!(
+        "{name}: {n} points, tau {tau} s: FTLE differs by {:.2e} 1/s root mean square, {:.2e} median, {:.2e} at most, of {:.2e}; correlation {correlation:.6}",
+        rms / tau,
+        apart[apart.len() / 2] / tau,
+        apart[apart.len() - 1] / tau,
+        size / tau
+    );
+    (rms / size, correlation)
+}
+
+/// FTLE, per second, of log-stretches.
+fn per_second(log_stretch: &[f64], tau: f64) -> Vec<f64> {
+    log_stretch.iter().map(|s| s / tau).collect()
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn globcurrent_agrees_with_an_independent_integration() {
+    let (files, tau) = (data("globcurrent").join("*.nc"), 5.0 * 86_400.0);
+    let pairs = independent("globcurrent", std::slice::from_ref(&files), tau);
+    let (relative, correlation) = report("GlobCurrent", tau, &pairs);
+    // This program interpolates vectors in space, the other one east and north: they differ by the square of a cell.
+    assert!(relative < 0.011 && correlation > 0.9999, "{relative} {correlation}");
+    // A point is on land if one of the 4 x 4 nodes of cubic interpolation, the default in two dimensions, is missing.
+    let mut archive = open(&[&files]);
+    let snapshot = archive.read(59).unwrap();
+    let [nx, ny, _] = snapshot.grid.shape();
+    let read = |cell: usize, n: usize| cell.saturating_sub(1)..=(cell + 2).min(n - 1);
+    let is_land = |i: usize, j: usize| read(j, ny).any(|y| read(i, nx).any(|x| snapshot.nodes[y * nx + x][3].is_nan()));
+    let cells = ((nx - 1) * (ny - 1)) as f64;
+    let land = (0..ny - 1).map(|j| (0..nx - 1).filter(|&i| is_land(i, j)).count()).sum::<usize>() as f64 / cells;
+    looks_right("GlobCurrent", &replay(&files, tau), &per_second(&pairs.1, tau), land - 0.005..=land + 0.005);
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn era5_agrees_with_an_independent_integration() {
+    let (files, tau) = (data("era5_utm32_2025_05_01_00.nc").with_file_name("era5_utm32_*.nc"), 7200.0);
+    let pairs = independent("era5", std::slice::from_ref(&files), tau);
+    let (relative, correlation) = report("ERA5", tau, &pairs);
+    // The same interpolant; neighbours a metre apart that straddle a face of a cell see the mean of two gradients.
+    assert!(relative < 2e-5 && correlation > 0.999_999, "{relative} {correlation}");
+    // The rim is visible behind transparent parts; 0.040 was measured.
+    looks_right("ERA5", &replay(&files, tau), &per_second(&pairs.1, tau), 0.03..=0.05);
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn wrf_agrees_with_an_independent_integration() {
+    let (file, tau) = (data("wrf_katrina_uvw_4t.nc"), 3600.0);
+    let pairs = independent("wrf", std::slice::from_ref(&file), tau);
+    let (relative, correlation) = report("WRF", tau, &pairs);
+    // Horizontally the same interpolant; vertically fixed heights here, the levels of each column there.
+    assert!(relative < 0.024 && correlation > 0.9992, "{relative} {correlation}");
+    // Outside of the nest; 0.128 was measured.
+    looks_right("WRF", &replay(&file, tau), &per_second(&pairs.1, tau), 0.1..=0.16);
+}

@@ -1,0 +1,12 @@
+//! Pages of the documentation, compared with the program that they describe.
+#![allow(clippy::unwrap_used)] // Tests: a panic is the report.
+
+#[path = "../network_support/mod.rs"]
+mod network_support;
+mod protocol;
+mod scene;
+
+/// Text of a page in `docs`.
+fn page(name: &str) -> String {
+    std::fs::read_to_string(std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("docs").join(name)).unwrap()
+}

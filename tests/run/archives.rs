@@ -1,0 +1,202 @@
+//! Archives and checkpoints in runs of the program.
+
+use crate::kit::netcdf::{Fixture, NETCDF4, f32s, fill};
+use crate::kit::program::{self, config, records, run, set, summary, text};
+use crate::kit::scene;
+use crate::{picture, ridgewatch};
+use ridgewatch::run::FrameRecord;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Replays with small pictures into the folder `out`; the result must be exit status 0.
+fn replay(scene: &str, out: &Path, options: &[&str]) -> program::Outcome {
+    let mut command = program::ridgewatch(["replay", scene, "--out", text(out)]);
+    run(command.args(picture([48, 32, 2])).args(options)).success()
+}
+
+/// Ten days of an eddy of about 1 m/s over 10 x 8 degrees, with a square of land (NaN) in the south-west.
+fn eddy(folder: &Path) -> PathBuf {
+    let (nt, ny, nx) = (10, 17, 21);
+    let land = |y: usize, x: usize| x < 5 && y < 5;
+    let component = |sign: f64, along: fn(f64, f64) -> f64| {
+        f32s(fill(nt, ny, nx, move |t, y, x| {
+            let (east, north) = (x as f64 / 20.0 - 0.5 - 0.01 * t as f64, y as f64 / 16.0 - 0.5);
+            if land(y, x) { f64::NAN } else { sign * along(east, north) * 4.0 * (-6.0 * (east * east + north * north)).exp() }
+        }))
+    };
+    let degrees = |first: f64, n: usize| (0..n).map(|i| first + 0.5 * i as f64).collect::<Vec<_>>();
+    let days: Vec<f64> = (0..nt).map(|t| t as f64).collect();
+    let (lon, lat) = (degrees(10.0, nx), degrees(-40.0, ny));
+    let axes: [(&str, &str, &[f64]); 3] =
+        [("time", "days since 2000-01-01", &days), ("lat", "degrees_north", &lat), ("lon", "degrees_east", &lon)];
+    Fixture::on(NETCDF4, &axes)
+        .fields("m/s", [("u", component(-1.0, |_, north| north))])
+        .with("standard_name", "eastward_sea_water_velocity")
+        .fields("m/s", [("v", component(1.0, |east, _| east))])
+        .with("standard_name", "northward_sea_water_velocity")
+        .write(&folder.join("eddy.nc"))
+}
+
+#[test]
+fn an_archive_with_land_goes_through_the_whole_loop() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let keys = set(&["time.tau=6 days", "training.steps_per_frame=20", "trust.cells=[8, 8, 1]"]);
+    replay(text(&eddy(folder.path())), &run, &keys);
+    let records = records(&run);
+    // Ten days, a window of six: the newest time is day 6, 7, 8, 9.
+    let dates: Vec<&str> = records.iter().map(|r| r.date.as_deref().unwrap()).collect();
+    assert_eq!(dates, ["2000-01-07T00:00:00Z", "2000-01-08T00:00:00Z", "2000-01-09T00:00:00Z", "2000-01-10T00:00:00Z"]);
+    for record in &records {
+        assert_eq!((record.direction.as_str(), record.tau), ("backward", 6.0 * 86_400.0));
+        let missing = record.missing as f64 / record.queries as f64;
+        assert!(missing > 0.0 && missing < 0.5, "land is a part of the domain: {missing}");
+        assert!(record.mean_lifetime_share < 1.0, "some particles met land");
+        assert!(record.integration_steps.is_some() && record.traced <= record.queries - record.missing);
+    }
+    let summary = summary(&run);
+    // 21 x 17 nodes of 4 f32, seven snapshots.
+    assert!(summary["run"]["window_bytes_peak"].as_u64().unwrap() < 2 * 7 * 21 * 17 * 16);
+    // Without table nodes in the scene, the table below the network has those of the data: 21 x 17 f32.
+    assert!(summary["run"]["surrogate_bytes"].as_u64().unwrap() > 21 * 17 * 4);
+}
+
+#[test]
+fn the_shipped_archive_scenes_run_over_what_they_promise() {
+    for (name, nodes, tau) in [("ecmwf", "[24, 12, 6]", 11.0), ("flame", "[24, 12, 12]", 6.0), ("globe", "[24, 13, 5]", 11.0 * 86_400.0)] {
+        let folder = tempfile::tempdir().unwrap();
+        let (run, files) = (folder.path().join("run"), folder.path().join("archive"));
+        let (nodes, files) = (format!("archive.synthetic.nodes={nodes}"), format!("archive.synthetic.folder={files:?}"));
+        let said = replay(&config(&format!("{name}.toml")), &run, &set(&[&nodes, &files])).stderr;
+        let records = records(&run);
+        assert_eq!(records.len(), 3, "{name}: of 14 or 9 snapshots, windows of 12 or 7");
+        for record in &records {
+            assert_eq!((record.direction.as_str(), record.tau, record.missing), ("backward", tau, 0), "{name}");
+            // At least two steps an interval: a path within one interval has two in all.
+            assert!(record.integration_steps.unwrap() >= if name == "flame" { 12 } else { 22 }, "{name}: {:?}", record.integration_steps);
+        }
+        assert_eq!(said.contains("goes round: periodic with 360"), name == "globe", "{name}: {said}");
+    }
+}
+
+#[test]
+fn a_variable_that_the_file_lacks_points_at_its_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = eddy(folder.path());
+    let scene = format!("[source]\nkind = \"archive\"\n[archive]\nfiles = {:?}\nu = \"uo\"\n", text(&file));
+    let scene = scene::write(folder.path(), &scene);
+    let parts = ["scene.toml:5: `archive.u` is \"uo\"", "eddy.nc", "| u = \"uo\""];
+    ridgewatch(["replay", &scene, "--out", text(&folder.path().join("run"))]).refused(2, &parts);
+    ridgewatch(["ftle", text(&file), "--set", "archive.v=vo"]).refused(2, &["--set archive.v=vo: `archive.v`"]);
+}
+
+#[test]
+fn a_default_that_an_archive_makes_unacceptable_names_the_archive() {
+    // A strip of 4 m by 400,000 km: the default extinction follows the shortest edge, and is too large along the strip.
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("strip.nc");
+    let constant = || f32s(vec![1.0; 2 * 5 * 5]);
+    let (short, long) = ([0.0, 1.0, 2.0, 3.0, 4.0], [0.0, 1e8, 2e8, 3e8, 4e8]);
+    let axes: [(&str, &str, &[f64]); 3] = [("time", "days since 2000-01-01", &[0.0, 1.0]), ("y", "m", &short), ("x", "m", &long)];
+    Fixture::on(NETCDF4, &axes).winds(constant(), constant()).write(&file);
+    ridgewatch(["ftle", text(&file), "--set", "time.tau=3600"]).refused(2, &["`transfer.extinction`", "strip.nc"]);
+}
+
+#[test]
+fn one_snapshot_is_a_steady_flow_where_that_is_set() {
+    // Half a rotation a day about (0, 0), on a plane in metres.
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("one.nc");
+    let axis: Vec<f64> = (0..21).map(|i| f64::from(i) * 1000.0 - 10_000.0).collect();
+    let rate = std::f64::consts::PI / 86_400.0;
+    let axes: [(&str, &str, &[f64]); 3] = [("time", "days since 2000-01-01", &[3.0]), ("y", "m", &axis), ("x", "m", &axis)];
+    let [u, v] = [fill(1, 21, 21, |_, y, _| -rate * axis[y]), fill(1, 21, 21, |_, _, x| rate * axis[x])];
+    Fixture::on(NETCDF4, &axes).winds(f32s(u), f32s(v)).write(&file);
+    let ftle = |keys: &[&str]| ridgewatch([&["ftle", text(&file), "--grid", "5x5", "--json"][..], &set(keys)].concat());
+    let output = ftle(&["time.tau=1 day"]);
+    assert!(output.status != Some(0) && output.stderr.contains("one.nc holds one time (2000-01-04T00:00:00Z)"), "{output:?}");
+    ftle(&["archive.steady=true"]).refused(2, &["`time.tau` is missing"]);
+    for direction in ["time.direction=backward", "time.direction=forward"] {
+        let found = ftle(&[direction, "archive.steady=true", "time.tau=1 day", "flow.boundary=clamp"]).success().json().to_string();
+        assert!(found.contains("2000-01-04T00:00:00Z"), "{found}");
+    }
+}
+
+/// A scene of so many frames, written into a folder.
+fn gyre(folder: &Path, frames: usize) -> String {
+    let keys = "
+        time.tau = 10
+        time.slides = 1
+        flow.steps = 40
+        transfer.low = 0.05
+        transfer.high = 0.45
+        surrogate.kind = \"network\"
+        network.log2_table = 14
+        network.batch = 2048
+        training.steps_per_frame = 150
+    ";
+    scene::write(folder, &scene::double_gyre([32, 16, 1], &format!("{keys}time.frames_per_slide = {frames}")))
+}
+
+#[test]
+fn a_run_goes_on_from_a_checkpoint() {
+    let folder = tempfile::tempdir().unwrap();
+    let weights = folder.path().join("weights.safetensors").display().to_string();
+    let at = |name: &str| folder.path().join(name);
+    ridgewatch(["replay", &gyre(folder.path(), 4), "--out", text(&at("first")), "--checkpoint", &weights]).success();
+    let scene = gyre(folder.path(), 1);
+    ridgewatch(["replay", &scene, "--out", text(&at("second")), "--resume", &weights]).success();
+    let (first, second) = (records(&at("first")), records(&at("second")));
+    let loss = |record: &FrameRecord| record.training.as_ref().unwrap().loss.unwrap();
+    // It begins with the loss at the end of the first run, which is far below half of the loss at its beginning.
+    assert!(loss(&second[0]) < 0.5 * loss(&first[0]), "{} against {}", loss(&second[0]), loss(&first[0]));
+    assert!(loss(&second[0]) < 1.5 * loss(&first[3]), "{} against {}", loss(&second[0]), loss(&first[3]));
+    // A checkpoint of another shape is refused, with the reason.
+    ridgewatch(["replay", &scene, "--out", text(&at("third")), "--resume", &weights, "--set", "network.width=32"])
+        .refused(1, &["weights.safetensors", "does not fit"]);
+}
+
+#[test]
+#[cfg(unix)]
+fn what_is_written_may_be_read_by_those_whom_the_umask_lets() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let weights = folder.path().join("weights.safetensors");
+    let field = folder.path().join("field.nc");
+    let scene = gyre(folder.path(), 1);
+    let shell = |command: String| run(Command::new("sh").args(["-c", &command])).success();
+    let program = env!("CARGO_BIN_EXE_ridgewatch");
+    let out = folder.path().join("run");
+    shell(format!("umask 027; '{program}' replay '{scene}' --out '{}' --checkpoint '{}'", out.display(), weights.display()));
+    shell(format!("umask 022; '{program}' ftle '{scene}' --grid 9x5 --out '{}'", field.display()));
+    let mode = |path: &Path| std::fs::metadata(path).unwrap().permissions().mode() & 0o777;
+    assert_eq!((mode(&weights), mode(&field)), (0o640, 0o644));
+}
+
+#[test]
+fn adaptive_paths_have_no_number_of_steps() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let keys = set(&["time.tau=6 days", "time.slides=2", "flow.integrator=dormandprince", "flow.precision=f64"]);
+    replay(text(&eddy(folder.path())), &run, &[&["--method", "reference"][..], &keys].concat());
+    let records = records(&run);
+    assert!(records.len() == 2 && records.iter().all(|record| record.integration_steps.is_none() && record.traced > 0));
+}
+
+#[test]
+fn a_size_left_to_the_measured_error_grows_and_says_why() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = folder.path().join("run");
+    let keys = set(&["network.size=auto", "surrogate.kind=table", "surrogate.table_nodes=[16, 8, 2]"]);
+    let scene = gyre(folder.path(), 24);
+    ridgewatch([&["replay", &scene, "--out", text(&run)][..], &keys].concat()).success();
+    let summary = summary(&run);
+    let sizes = summary["run"]["sizes"].as_array().unwrap();
+    // A quarter of 16 x 8 nodes cannot hold the double gyre's ridges within 0.03.
+    assert!(sizes.len() >= 2 && sizes.iter().all(|s| s.as_str().unwrap().contains("grow to size")), "{sizes:?}");
+    let records = records(&run);
+    let psnr = |record: &FrameRecord| record.surrogate_psnr.unwrap();
+    // Every doubling of the nodes lowers the error of linear interpolation; 3 dB are less than one of them.
+    assert!(psnr(&records[23]) > psnr(&records[0]) + 3.0, "{} against {} dB", psnr(&records[23]), psnr(&records[0]));
+    ridgewatch(["replay", &scene, "--resume", "w", "--set", "network.size=auto"]).refused(2, &["network.size"]);
+}

@@ -1,0 +1,147 @@
+//! Checkpoints that are written during a run: their content, runs that resume from them, and the file that a kill in the middle leaves.
+
+use crate::kit::program::until;
+use crate::kit::scene::{self, SMALL_NETWORK, double_gyre};
+use crate::network_support::{DoubleGyre, traced, uniform_points};
+use ridgewatch::flow::Tracer;
+use ridgewatch::run::{FrameRecord, RunOptions, RunReport};
+use ridgewatch::surrogate::network::NetworkSettings;
+use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, SurrogateSettings, build};
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::process::{Command, Stdio};
+use std::time::Duration;
+
+fn frames(count: usize, keys: &[&str], options: &RunOptions, mut seen: impl FnMut(&FrameRecord) + Send) -> RunReport {
+    let common = "
+        time.tau = 5
+        flow.steps = 10
+        surrogate.kind = \"residual\"
+        surrogate.table_nodes = [33, 17, 2]
+        training.steps_per_frame = 5
+    ";
+    let scene = double_gyre([16, 8, 2], &format!("{common}{SMALL_NETWORK}time.frames_per_slide = {count}"));
+    scene::run_frames(scene::setup(&scene, keys), options, |frame| seen(&frame.record))
+}
+
+fn ending_in(checkpoint: &Path) -> RunOptions {
+    RunOptions { checkpoint: Some(checkpoint.to_owned()), threads: 2, ..RunOptions::default() }
+}
+
+/// A checkpoint that was copied after a frame equals the last checkpoint of a run that ends with that frame, byte for byte, although training
+/// went on while it was written. A run that resumes from it continues like the first run.
+#[test]
+fn a_checkpoint_holds_the_weights_after_its_frame() {
+    const FRAMES: usize = 10;
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    let options = RunOptions { checkpoint_seconds: Some(0.0), ..ending_in(&file("weights")) };
+    let mut written = Vec::new();
+    let mut steps = Vec::new();
+    // Inode under the name of the checkpoint.
+    let mut shown = None;
+    let report = frames(FRAMES, &[], &options, |record| {
+        steps.push(record.training.as_ref().map_or(0, |learned| learned.steps));
+        let Some(checkpoint) = record.checkpoint.clone() else { return };
+        if checkpoint.bytes.is_none() {
+            let before = shown;
+            until("the write of the checkpoint", || {
+                shown = std::fs::metadata(file("weights")).ok().map(|metadata| metadata.ino());
+                shown != before
+            });
+        }
+        assert_eq!((&checkpoint.failed, checkpoint.asynchronous), (&None, true));
+        if let Some(bytes) = checkpoint.bytes {
+            let frame = checkpoint.frame.unwrap();
+            // The next checkpoint begins after this frame.
+            std::fs::copy(file("weights"), file(&frame.to_string())).unwrap();
+            assert_eq!(bytes, std::fs::metadata(file("weights")).unwrap().len());
+            assert!(
+                record.frame > frame && checkpoint.seconds >= checkpoint.copy_seconds && record.seconds.total >= record.seconds.checkpoint
+            );
+            written.push(frame);
+        }
+    });
+    assert_eq!(steps.iter().sum::<u64>(), report.train_steps);
+    assert!(steps[1..].iter().all(|steps| *steps == 5), "training went on: {steps:?}");
+    let totals = report.checkpoints.unwrap();
+    let last = totals.last.unwrap();
+    assert!(totals.failed == 0 && totals.written > written.len() as u64 && last.frame == Some(FRAMES as u64 - 1) && last.bytes.is_some());
+    assert!(written.len() >= 2, "{written:?}");
+
+    for frame in [written[0], written[written.len() - 1]] {
+        let alone = file(&format!("ends with {frame}"));
+        frames(frame as usize + 1, &[], &ending_in(&alone), |_| ());
+        assert!(std::fs::read(alone).unwrap() == std::fs::read(file(&frame.to_string())).unwrap(), "after frame {frame}");
+    }
+    // The resumed network knows as much as the copied one: the first frame shows it, which the network answers before it learns.
+    let (first, known) = (written[0], file(&written[0].to_string()));
+    let mut psnr = Vec::new();
+    let resume = format!("training.resume={known:?}");
+    frames(1, &[&resume], &RunOptions { threads: 2, ..RunOptions::default() }, |record| psnr.push(record.surrogate_psnr.unwrap()));
+    let mut fresh = Vec::new();
+    frames(first as usize + 2, &[], &RunOptions { threads: 2, ..RunOptions::default() }, |record| {
+        fresh.push(record.surrogate_psnr.unwrap());
+    });
+    let (gone_on, expected) = (psnr[0], fresh[first as usize + 1]);
+    // Audit points differ.
+    assert!((gone_on - expected).abs() < 1.5, "{gone_on} dB, where the run had {expected} dB");
+}
+
+/// Environment variable that names the checkpoint of the process that is killed.
+const TARGET: &str = "RIDGEWATCH_TEST_CHECKPOINT";
+
+fn network() -> HostSurrogate {
+    let tracer = DoubleGyre::new(0.0, 5.0, 10);
+    // 24 MB a checkpoint, so that it takes a while.
+    let network = NetworkSettings { levels: 6, log2_table: 17, ..NetworkSettings::default() };
+    let settings = SurrogateSettings { kind: Kind::Network, table_nodes: None };
+    let mut surrogate = build(&settings, &network, tracer.domain(), 5, &tracer).unwrap();
+    surrogate.learn(&ReplayBuffer::holding(&traced(&tracer, uniform_points(1, 500), false)), f64::INFINITY, 2).unwrap();
+    surrogate
+}
+
+#[test]
+fn a_kill_in_the_middle_leaves_the_old_file_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let target = folder.path().join("weights");
+    let mut known = network();
+    let mut half_written = 0;
+    for turn in 0..6 {
+        let mut writer = Command::new(std::env::current_exe().unwrap())
+            .args(["--ignored", "--exact", "checkpoints::in_a_process_of_its_own"])
+            .env(TARGET, &target)
+            .stdout(Stdio::null())
+            .spawn()
+            .unwrap();
+        let files = || std::fs::read_dir(folder.path()).unwrap().map(|entry| entry.unwrap().path());
+        let before = files().count();
+        // In the middle of a write, after a whole file exists.
+        for _ in 0..300_000 {
+            if target.exists() && files().count() > before.max(1) {
+                break;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        std::thread::sleep(Duration::from_millis(turn));
+        writer.kill().unwrap();
+        writer.wait().unwrap();
+        known.load(&target).unwrap();
+        for rest in files().filter(|path| *path != target).collect::<Vec<_>>() {
+            half_written += 1;
+            std::fs::remove_file(rest).unwrap();
+        }
+    }
+    assert!(half_written > 0, "no kill fell into a write");
+}
+
+#[test]
+#[ignore = "started, and killed, by the test above"]
+fn in_a_process_of_its_own() {
+    let Ok(target) = std::env::var(TARGET) else { return };
+    let surrogate = network();
+    // Until it is killed; the count is a bound for the case that it is not.
+    for _ in 0..2000 {
+        surrogate.save(Path::new(&target)).unwrap();
+    }
+}
