@@ -74,7 +74,7 @@ fn from_ordered_bits(image: u32) -> f32 {
 pub struct CellObservations {
     /// Number of values observed, including missing ones.
     pub count: Vec<u32>,
-    /// Order-preserving bits of the highest FTLE (see `ordered` in `kernels/majorant.cuh`); 0 if there is none.
+    /// Order-preserving bits of the highest FTLE (see `ordered` in `kernels/rendering/majorant.cuh`); 0 if there is none.
     pub highest: Vec<u32>,
     /// 1 if a missing value was observed, otherwise 0.
     pub missing: Vec<u32>,

@@ -1,4 +1,4 @@
-//! The parameters of a frame as kernels read them: the structs of `kernels/tracking.cuh`, field by field.
+//! The parameters of a frame as kernels read them: the structs of `kernels/rendering/tracking.cuh`, field by field.
 
 use super::Camera;
 use super::space::SceneBox;
@@ -43,7 +43,7 @@ pub struct FrameParameters {
     pub(super) pad_end: f32,
 }
 
-// The size that `kernels/tracking.cuh` asserts.
+// The size that `kernels/rendering/tracking.cuh` asserts.
 const _: () = assert!(size_of::<FrameParameters>() == 576);
 
 impl FrameParameters {

@@ -6,8 +6,7 @@
 
 use super::stop::RunEnd;
 use super::{RunError, Slide};
-use crate::backend::{Backend, Cpu, Surrogate, WhenLost};
-use crate::backend::{DeviceError, Interruptible};
+use crate::backend::{Backend, Cpu, DeviceError, Interruptible, Surrogate, WhenLost};
 use crate::flow::FlowMap;
 use crate::surrogate::NetworkFrom;
 use std::sync::atomic::AtomicBool;

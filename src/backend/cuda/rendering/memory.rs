@@ -122,7 +122,7 @@ impl Layout {
     }
 }
 
-/// Counters of the kernels (`Control` of `kernels/render.cu`).
+/// Counters of the kernels (`Control` of `kernels/rendering/render.cu`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(in crate::backend::cuda) struct Control {
@@ -132,7 +132,7 @@ pub(in crate::backend::cuda) struct Control {
     pub(in crate::backend::cuda) totals: [u64; 6],
 }
 
-// SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/render.cu`.
+// SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/rendering/render.cu`.
 unsafe impl DeviceRepr for Control {}
 
 /// Device memory of a plan, and pinned memory for its readback.

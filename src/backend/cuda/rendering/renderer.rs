@@ -97,7 +97,7 @@ struct QueueArgument {
     by: u64,
 }
 
-// SAFETY: `repr(C)`, plain numbers and device addresses, laid out as the structs of `kernels/wavefront.cuh` and `kernels/majorant.cuh`.
+// SAFETY: `repr(C)`, plain numbers and device addresses, laid out as the structs of `kernels/rendering/wavefront.cuh` and `kernels/rendering/majorant.cuh`.
 unsafe impl DeviceRepr for GridArgument {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for WatchArgument {}
@@ -107,7 +107,7 @@ unsafe impl DeviceRepr for BandArgument {}
 unsafe impl DeviceRepr for SlotsArgument {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for QueueArgument {}
-// SAFETY: `repr(C)`, plain numbers, laid out as `FrameScene` of `kernels/tracking.cuh`, whose size both sides assert.
+// SAFETY: `repr(C)`, plain numbers, laid out as `FrameScene` of `kernels/rendering/tracking.cuh`, whose size both sides assert.
 unsafe impl DeviceRepr for FrameParameters {}
 
 /// Renders frames on a GPU. It reuses its memory between frames.
