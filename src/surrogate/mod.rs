@@ -22,9 +22,11 @@ mod trace;
 mod trainer;
 
 pub use checkpoint_state::CheckpointState;
-pub use device::{DeviceTable, Download, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training};
+pub use device::{
+    DeviceTable, Download, FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training,
+};
 pub use host::{FrozenNetwork, Host, HostSurrogate, HostTraining, build};
-pub use hybrid::{FrozenHybrid, Hybrid};
+pub use hybrid::Hybrid;
 pub use replay_buffer::{BufferMark, KEEP_STALE, ReplayBuffer};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;

@@ -5,7 +5,6 @@
 //! step. The rate is lowered only when the loss has stopped falling.
 
 use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SyncedSamples, Training};
-use super::host::HostTraining;
 use super::network::{Architecture, Encoding, Field, Model, NetworkSettings, Objective, PlannedStep, Times};
 use super::{Learned, NetworkFrom, ReplayBuffer, SurrogateError};
 use crate::backend::DeviceError;
@@ -324,11 +323,15 @@ impl<T: Training> Trainer<T> {
         }
     }
 
-    /// Returns a trainer on the CPU that continues with the network from `from`.
+    /// Returns a trainer that continues with the network from `from`, which `training` moves to another device.
     ///
     /// # Errors
     /// The network is downloaded from the device, and the device fails.
-    pub(super) fn on_host(&mut self, from: NetworkFrom) -> Result<Trainer<HostTraining>, DeviceError> {
+    pub(super) fn moved<E: Training>(
+        &mut self,
+        from: NetworkFrom,
+        training: impl FnOnce(HostNetwork) -> E,
+    ) -> Result<Trainer<E>, DeviceError> {
         let reached = self.training.steps_taken();
         let mut progress = self.progress;
         let network = match from {
@@ -344,7 +347,7 @@ impl<T: Training> Trainer<T> {
         unreported.steps = unreported.steps.saturating_sub(lost);
         unreported.lost_steps += lost;
         Ok(Trainer {
-            training: HostTraining::new(network),
+            training: training(network),
             objective: self.objective.clone(),
             progress,
             settings: self.settings.clone(),

@@ -110,7 +110,7 @@ pub(super) struct NetworkCopy {
 impl NetworkCopy {
     /// Downloads the copy, asynchronously to the work stream, into a model of its shape and the running mean.
     pub(super) fn read_behind(&self, gpu: &Gpu, model: &mut Model, average: &mut Average) -> Result<(), DeviceError> {
-        let read = |part: usize, of: usize| gpu.read_behind(&self.parts[part][of], self.lens[part]);
+        let read = |part: usize, of: usize| gpu.readback().read(&self.parts[part][of], self.lens[part]);
         let moments = |part: usize| Ok([read(part, 0)?, read(part, 1)?, read(part, 2)?]);
         model.set_state([moments(0)?, moments(1)?], self.steps);
         *average = Average { tables: read(0, 3)?, layers: read(1, 3)? };

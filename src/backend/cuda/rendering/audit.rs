@@ -59,8 +59,8 @@ impl Memory {
             optical: gpu.alloc(what, points)?,
             begins: gpu.alloc(what, cells + 1)?,
             findings: gpu.alloc(what, cells)?,
-            optical_back: Pinned::new(gpu, points)?,
-            findings_back: Pinned::new(gpu, cells)?,
+            optical_back: Pinned::new(gpu.context(), points)?,
+            findings_back: Pinned::new(gpu.context(), cells)?,
         })
     }
 
@@ -166,7 +166,7 @@ impl Audits {
                 predictor.predict(points.unit, count, points.predicted)?;
                 let mut call = stream.launch_builder(&self.measure);
                 launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
-                memory.optical_back.copy_from(gpu, points.optical, count)?;
+                memory.optical_back.copy_from(gpu.work(), points.optical, count)?;
             }
             if request.samples.is_some() {
                 keep(memory, count, arrivals.then_some(domain), &mut samples)?;
@@ -176,7 +176,7 @@ impl Audits {
         }
         let from = memory.findings.address();
         // SAFETY: `findings` holds one entry for every cell.
-        unsafe { memory.findings_back.copy_from(gpu, from, cells) }?;
+        unsafe { memory.findings_back.copy_from(gpu.work(), from, cells) }?;
         gpu.synchronize()?;
         let findings = &memory.findings_back.values()[..cells];
         let points: f64 = findings.iter().map(|cell| cell.points).sum();

@@ -156,9 +156,9 @@ impl Memory {
             plan,
             layout,
             block: gpu.alloc("rendering", layout.end as usize)?,
-            control: Pinned::new(gpu, 1)?,
-            watch: Pinned::new(gpu, 3 * plan.cells as usize)?,
-            film: Pinned::new(gpu, plan.band as usize)?,
+            control: Pinned::new(gpu.context(), 1)?,
+            watch: Pinned::new(gpu.context(), 3 * plan.cells as usize)?,
+            film: Pinned::new(gpu.context(), plan.band as usize)?,
         })
     }
 

@@ -343,7 +343,7 @@ impl GpuRenderer {
         // SAFETY: the arguments of `render_film`; every slot of the band has written its sums.
         unsafe { launch(&mut call, threads(band.pixels as usize, 256)) }?;
         // SAFETY: the kernel writes `band.pixels` pixels, and `film` holds a band.
-        unsafe { memory.film.copy_from(&gpu, out, band.pixels as usize) }?;
+        unsafe { memory.film.copy_from(gpu.work(), out, band.pixels as usize) }?;
         let ended = gpu.mark()?;
         gpu.synchronize()?;
         film.write_pixels(band.first_pixel as usize, &memory.film.values()[..band.pixels as usize]);
@@ -387,7 +387,7 @@ impl Memory {
     fn end_wave(&mut self, gpu: &Gpu) -> Result<Control, DeviceError> {
         let from = self.at(self.layout.control);
         // SAFETY: the block holds a `Control` at this offset.
-        unsafe { self.control.copy_from(gpu, from, 1) }?;
+        unsafe { self.control.copy_from(gpu.work(), from, 1) }?;
         gpu.synchronize()?;
         Ok(self.control.values()[0])
     }
@@ -395,7 +395,7 @@ impl Memory {
     fn end_frame(&mut self, gpu: &Gpu) -> Result<(CellObservations, Control), DeviceError> {
         let (from, count) = (self.at(self.layout.watch), self.watch.len());
         // SAFETY: the block holds three values per cell at this offset.
-        unsafe { self.watch.copy_from(gpu, from, count) }?;
+        unsafe { self.watch.copy_from(gpu.work(), from, count) }?;
         let control = self.end_wave(gpu)?;
         let (count, rest) = self.watch.values().split_at(count / 3);
         let (highest, missing) = rest.split_at(count.len());

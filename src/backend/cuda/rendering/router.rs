@@ -135,7 +135,7 @@ impl Memory {
             values: gpu.alloc(what, capacity)?,
             arrivals: None,
             lengths: gpu.alloc(what, 3)?,
-            pinned: Pinned::new(gpu, 3)?,
+            pinned: Pinned::new(gpu.context(), 3)?,
         })
     }
 
@@ -143,7 +143,7 @@ impl Memory {
     fn lengths(&mut self, gpu: &Gpu) -> Result<[usize; 3], DeviceError> {
         let from = self.lengths.address();
         // SAFETY: `lengths` holds three values.
-        unsafe { self.pinned.copy_from(gpu, from, 3) }?;
+        unsafe { self.pinned.copy_from(gpu.work(), from, 3) }?;
         gpu.synchronize()?;
         let lengths = self.pinned.values();
         Ok([lengths[0] as usize, lengths[1] as usize, lengths[2] as usize])
