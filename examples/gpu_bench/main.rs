@@ -94,7 +94,7 @@ mod bench {
     struct Batch {
         seeds: Buffer<[f32; 3]>,
         stretch: Buffer<f32>,
-        lived: Buffer<f32>,
+        lifetime_share: Buffer<f32>,
         count: usize,
     }
 
@@ -107,14 +107,14 @@ mod bench {
             let count = seeds.len();
             let mut stretch = gpu.alloc("results", count)?;
             stretch.fill_bytes(0xff)?;
-            let mut lived = gpu.alloc("results", count)?;
-            lived.fill_bytes(0xff)?;
-            Ok(Self { seeds, stretch, lived, count })
+            let mut lifetime_share = gpu.alloc("results", count)?;
+            lifetime_share.fill_bytes(0xff)?;
+            Ok(Self { seeds, stretch, lifetime_share, count })
         }
 
         /// Queues a trace of the first `count` seeds.
         fn trace(&self, tracer: &DeviceTracer, count: usize) -> Outcome<()> {
-            let out = Outputs { log_stretch: self.stretch.address(), lived: self.lived.address(), ..Outputs::default() };
+            let out = Outputs { log_stretch: self.stretch.address(), lifetime_share: self.lifetime_share.address(), ..Outputs::default() };
             // SAFETY: all buffers hold `self.count` entries, at least `count`.
             unsafe { tracer.trace(self.seeds.address(), count.min(self.count), &out)? };
             Ok(())
@@ -148,9 +148,9 @@ mod bench {
             Ok(out)
         }
 
-        fn mean_lived(&self, count: usize) -> Outcome<f64> {
+        fn mean_lifetime_share(&self, count: usize) -> Outcome<f64> {
             let mut out = vec![0.0; count];
-            self.lived.read(&mut out)?;
+            self.lifetime_share.read(&mut out)?;
             Ok(out.iter().map(|&l| f64::from(l)).sum::<f64>() / count as f64)
         }
     }
@@ -348,7 +348,7 @@ mod bench {
             println!(
                 "\nShare of steps completed, mean: {:.3}. Made on the CPU in {made:.1} s; on the device, kernels ready, after {ready:.2} s; \
                  {registers} registers and {local} bytes of local memory a thread (cell kept).",
-                batch.mean_lived(1 << 20)?
+                batch.mean_lifetime_share(1 << 20)?
             );
 
             let truth = self.truth(&source, &domain)?;

@@ -198,7 +198,7 @@ RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flo
 struct Outputs {
     float* log_stretch;
     double* log_stretch_f64;
-    float* lived;
+    float* lifetime_share;
     // 3 and 9 floats per seed.
     float* arrival;
     float* jacobian;
@@ -216,12 +216,12 @@ template <class Flow> RW_FN void write_results(const Flow& flow, const Path<type
     using R = typename Flow::R;
     constexpr int C = Flow::C;
     // A quotient, as on the CPU: exactly 1 if all steps were taken.
-    double lived = double(R(path.steps) / R(policy.steps)), s = double(path.log_stretch);
+    double lifetime_share = double(R(path.steps) / R(policy.steps)), s = double(path.log_stretch);
     if (policy.zero_if_left && path.left) s = 0;
-    else if (policy.by_lifetime) s = lived > 0 ? s / lived : 0;
+    else if (policy.by_lifetime) s = lifetime_share > 0 ? s / lifetime_share : 0;
     out.log_stretch[at] = float(s);
     if (out.log_stretch_f64) out.log_stretch_f64[at] = s;
-    if (out.lived) out.lived[at] = float(lived);
+    if (out.lifetime_share) out.lifetime_share[at] = float(lifetime_share);
     if (out.arrival) {
         float there[3];
         flow.arrival(path.state, seed, there);

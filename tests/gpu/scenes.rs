@@ -101,7 +101,7 @@ pub fn on_gpu(source: &VelocitySource, map: &FlowMap, t0: f64, tuning: Tuning, s
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
-        lived: vec![f32::NAN; n],
+        lifetime_share: vec![f32::NAN; n],
         arrival: vec![[f32::NAN; 3]; n],
         jacobian: vec![[f32::NAN; 9]; n],
     };

@@ -32,8 +32,8 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let seeds = fresh(&domain(source), SEEDS);
     let exact = on_cpu(source, map, t0, &seeds);
     let double = on_gpu(source, map, t0, Tuning::default(), &seeds);
-    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
-    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - double.lifetime_share[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} of equal lifetime", same.len(), seeds.len());
     // Rounding of 1e-16 a step, amplified along the path; where a path runs along a cell face, rounding decides which of two gradients
     // counts: a few such paths are let go. Central differences divide rounding by the gap.
     let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
@@ -47,7 +47,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     });
     let odd = odd.count();
     assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{name}: {odd} of {} differ from the CPU", seeds.len());
-    let died = exact.lived.iter().filter(|l| **l < 1.0).count();
+    let died = exact.lifetime_share.iter().filter(|l| **l < 1.0).count();
     if matches!(map.boundary, Boundary::Stop | Boundary::Zero) {
         assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
     }
@@ -63,9 +63,9 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     for (sorted, keep, spread) in [(true, true, true), (true, false, true), (true, true, false), (false, true, true), (false, false, false)]
     {
         let found = on_gpu(source, &single, t0, Tuning { storage: Storage::F32, sorted, keep, spread }, &seeds);
-        let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - found.lived[i]).abs() < 1e-6).collect();
+        let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - found.lifetime_share[i]).abs() < 1e-6).collect();
         // Single precision decides more paths the other way: a step's rounding is 1e-7 of the domain.
-        assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} lived alike", alike.len(), seeds.len());
+        assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} of equal lifetime", alike.len(), seeds.len());
         assert!(found.log_stretch.iter().all(|s| !s.is_nan()), "{name}: something was not written");
         let (ours, theirs) = (most(&exact, &found, &alike), most(&exact, &theirs, &alike));
         println!(

@@ -87,14 +87,14 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
-        lived: vec![f32::NAN; n],
+        lifetime_share: vec![f32::NAN; n],
         arrival: vec![[f32::NAN; 3]; n],
         jacobian: vec![[f32::NAN; 9]; n],
     };
     let outputs = Outputs {
         log_stretch: out.log_stretch.as_mut_ptr() as u64,
         log_stretch_f64: out.log_stretch_f64.as_mut_ptr() as u64,
-        lived: out.lived.as_mut_ptr() as u64,
+        lifetime_share: out.lifetime_share.as_mut_ptr() as u64,
         arrival: out.arrival.as_mut_ptr() as u64,
         jacobian: out.jacobian.as_mut_ptr() as u64,
     };
@@ -185,8 +185,8 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let seeds = fresh(&domain, 600);
     let exact = cpu(source, map, t0, &seeds);
     let double = host(source, map, t0, Storage::F32, &seeds);
-    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
-    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - double.lifetime_share[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} of equal lifetime", same.len(), seeds.len());
     let mut died = 0;
     for &i in &same {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
@@ -194,7 +194,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
         // gradient across them. Central differences divide it by the gap.
         let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
         assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{name}: seed {:?}: {a} {b}", seeds[i]);
-        died += usize::from(exact.lived[i] < 1.0);
+        died += usize::from(exact.lifetime_share[i] < 1.0);
         for k in 0..3 {
             let (a, b) = (exact.arrival[i][k], double.arrival[i][k]);
             // Both are rounded to single precision.

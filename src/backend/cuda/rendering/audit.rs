@@ -34,7 +34,7 @@ struct Memory {
     points: Buffer<[f32; 3]>,
     land: Buffer<u8>,
     traced: Buffer<f32>,
-    lived: Buffer<f32>,
+    lifetime_share: Buffer<f32>,
     /// `None` until arrival points are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
     predicted: Buffer<f32>,
@@ -53,7 +53,7 @@ impl Memory {
             points: gpu.alloc(what, points)?,
             land: gpu.alloc(what, points)?,
             traced: gpu.alloc(what, points)?,
-            lived: gpu.alloc(what, points)?,
+            lifetime_share: gpu.alloc(what, points)?,
             arrivals: None,
             predicted: gpu.alloc(what, points)?,
             optical: gpu.alloc(what, points)?,
@@ -144,7 +144,7 @@ impl Audits {
             points: memory.points.address(),
             is_missing: memory.land.address(),
             traced: memory.traced.address(),
-            lived: memory.lived.address(),
+            lifetime_share: memory.lifetime_share.address(),
             predicted: memory.predicted.address(),
             optical: memory.optical.address(),
         };
@@ -161,7 +161,7 @@ impl Audits {
                 tracer.device().trace(
                     points.points,
                     count,
-                    &Outputs { log_stretch: points.traced, lived: points.lived, arrival, ..Outputs::default() },
+                    &Outputs { log_stretch: points.traced, lifetime_share: points.lifetime_share, arrival, ..Outputs::default() },
                 )?;
                 predictor.predict(points.unit, count, points.predicted)?;
                 let mut call = stream.launch_builder(&self.measure);
@@ -183,7 +183,7 @@ impl Audits {
         Ok(AuditFindings {
             drawn: optical.len(),
             points: points as usize,
-            mean_lifetime_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
+            mean_lifetime_share: findings.iter().map(|cell| cell.lifetimes).sum::<f64>() / points.max(1.0),
             peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
             samples,
             errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),

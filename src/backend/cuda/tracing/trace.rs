@@ -268,7 +268,7 @@ fn shifted(out: &Outputs, first: usize) -> Outputs {
     Outputs {
         log_stretch: by(out.log_stretch, 4),
         log_stretch_f64: by(out.log_stretch_f64, 8),
-        lived: by(out.lived, 4),
+        lifetime_share: by(out.lifetime_share, 4),
         arrival: by(out.arrival, 12),
         jacobian: by(out.jacobian, 36),
     }
