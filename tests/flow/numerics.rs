@@ -225,8 +225,8 @@ fn gridded_tangent_is_the_derivative_of_the_gridded_flow() {
                 let errors = sorted_errors(&exact, &stretches(&run(&source, &differences, t0, &seeds)));
                 let high = errors[errors.len() * 95 / 100];
                 println!("{name}, {interpolation:?}, {direction:?}: median {:.1e}, 95 % {high:.1e}", errors[errors.len() / 2]);
-                // The error of differences is rounding over the gap, 1e-8 times the stretch. Pairs on both sides of a cell face (linear) or of
-                // an edge at some stage see two derivatives; with a gap of 1e-7 they are rare.
+                // The error of differences is rounding over the difference step, 1e-8 times the stretch. Pairs on both sides of a cell face
+                // (linear) or of an edge at some stage see two derivatives; with a difference step of 1e-7 they are rare.
                 assert!(high < 3e-6, "{name} {interpolation:?} {direction:?}: {high:e}");
             }
         }

@@ -35,7 +35,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - double.lifetime_share[i]).abs() < 1e-6).collect();
     assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} of equal lifetime", same.len(), seeds.len());
     // Rounding of 1e-16 a step, amplified along the path; where a path runs along a cell face, rounding decides which of two gradients
-    // counts: a few such paths are let go. Central differences divide rounding by the gap.
+    // counts: a few such paths are let go. Central differences divide rounding by the difference step.
     let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
     let odd = same.iter().filter(|&&i| {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);

@@ -191,7 +191,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     for &i in &same {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
         // Rounding of 1e-16 a step, amplified by the stretch along the path (e^s below 1e4 here) and, near cell faces, by a jump of the
-        // gradient across them. Central differences divide it by the gap.
+        // gradient across them. Central differences divide it by the difference step.
         let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
         assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{name}: seed {:?}: {a} {b}", seeds[i]);
         died += usize::from(exact.lifetime_share[i] < 1.0);
@@ -263,7 +263,7 @@ fn closed_forms_with_starts() {
     for (direction, integrator, tolerance) in [
         (Direction::Forward, Integrator::Tangent, 2e-9),
         (Direction::Backward, Integrator::Tangent, 2e-9),
-        // Rounding divided by the gap.
+        // Rounding divided by the difference step.
         (Direction::Forward, Integrator::Differences, 1e-6),
     ] {
         let map = FlowMap { direction, integrator, ..map(10.0, 40) };
@@ -273,7 +273,7 @@ fn closed_forms_with_starts() {
             let exact = cpu(&gyre, &map, f64::from(seed[2]), &[seed]);
             let (a, b) = (exact.log_stretch_f64[0], found.log_stretch_f64[i]);
             assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{direction:?} {integrator:?} {seed:?}: {a} {b}");
-            // In single precision, differences over a gap of 1e-4 keep about three of seven digits.
+            // In single precision, differences over a step of 1e-4 keep about three of seven digits.
             let tolerance = if integrator == Integrator::Tangent { 2e-3 } else { 0.1 };
             assert!(
                 (f64::from(single.log_stretch[i]) - a).abs() < tolerance,
