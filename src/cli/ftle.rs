@@ -330,9 +330,9 @@ fn write(
             variable.put_attribute("long_name", "finite-time Lyapunov exponent")?;
             variable.put_attribute("units", if unit == "1" { unit.to_owned() } else { format!("{unit}-1") })?;
         }
-        let mut variable = file.add_variable::<f32>("lived", &dimensions)?;
+        let mut variable = file.add_variable::<f32>("lifetime_share", &dimensions)?;
         variable.put_values(lifetime_share, ..)?;
-        variable.put_attribute("long_name", "share of tau that the particle lived")?;
+        variable.put_attribute("long_name", "share of tau until the particle stopped")?;
         variable.put_attribute("units", "1")?;
         file.add_attribute("title", plan.scene.title.as_str())?;
         file.add_attribute("source", format!("ridgewatch {} from {}", env!("CARGO_PKG_VERSION"), plan.source))?;

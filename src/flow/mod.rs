@@ -118,7 +118,7 @@ pub enum Normalisation {
     /// |tau|: a particle stopped at a coast shows no ridge there.
     Tau,
     /// The time until it stopped; the quotient tends to the local strain rate.
-    Lived,
+    Lifetime,
 }
 
 /// Spatial interpolation of gridded velocity.

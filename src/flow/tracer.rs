@@ -172,7 +172,7 @@ where
         }
         match self.normalisation {
             Normalisation::Tau => (stretch, lifetime_share),
-            Normalisation::Lived => (if lifetime_share > 0.0 { stretch / lifetime_share } else { 0.0 }, lifetime_share),
+            Normalisation::Lifetime => (if lifetime_share > 0.0 { stretch / lifetime_share } else { 0.0 }, lifetime_share),
         }
     }
 

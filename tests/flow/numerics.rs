@@ -317,7 +317,7 @@ fn particles_that_stop_keep_their_stretch_or_not() {
     assert!((f64::from(stop.lifetime_share[0]) - lifetime_share).abs() < 6e-4);
     assert!((stop.log_stretch_f64[0] - 2.0 * lifetime_share).abs() < 1.2e-3);
     assert!((stop.log_stretch_f64[1] - 2.0).abs() < 1e-10 && stop.lifetime_share[1] == 1.0);
-    let by_life = with(Boundary::Stop, Normalisation::Lived);
+    let by_life = with(Boundary::Stop, Normalisation::Lifetime);
     assert!((by_life.log_stretch_f64[0] - 2.0).abs() < 1e-9, "stretch over life is the rate: {}", by_life.log_stretch_f64[0]);
     let zero = with(Boundary::Zero, Normalisation::Tau);
     assert_eq!(zero.log_stretch[0], 0.0);

@@ -116,7 +116,7 @@ fn closed_forms() {
     let plane = || gyre([0.0, 0.0], [2.0, 1.0]);
     let inner = || gyre([0.4, 0.2], [1.7, 0.9]);
     check("double gyre", &plane(), &map(10.0, 40), 0.3);
-    let stop = FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) };
+    let stop = FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lifetime, ..map(5.0, 40) };
     check("double gyre that stops", &inner(), &stop, 0.3);
     let zero = FlowMap { boundary: Boundary::Zero, direction: Direction::Backward, ..map(5.0, 40) };
     check("double gyre with zeros", &inner(), &zero, 0.3);
@@ -143,7 +143,7 @@ fn windows_in_the_plane() {
         &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
         0.1,
     );
-    check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lifetime, ..cubic.clone() }, 0.1);
     let mut around = even(&[19, 13]);
     around[0] = around[0].clone().with_period(11.0);
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);

@@ -237,7 +237,7 @@ fn closed_forms() {
     check(
         "double gyre that stops",
         &gyre(&inner),
-        &FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) },
+        &FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lifetime, ..map(5.0, 40) },
         0.3,
     );
     check(
@@ -350,7 +350,12 @@ fn windows_in_the_plane() {
         &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
         0.1,
     );
-    check("cubic, holes", &smooth(&cartesian(even()), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    check(
+        "cubic, holes",
+        &smooth(&cartesian(even()), 0.6, true),
+        &FlowMap { normalisation: Normalisation::Lifetime, ..cubic.clone() },
+        0.1,
+    );
     let mut around = even();
     around[0] = around[0].clone().with_period(9.5);
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);

@@ -331,7 +331,7 @@ fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<S
 pub(in crate::backend::cuda) fn result_policy(map: &FlowMap, steps: usize) -> ResultPolicy {
     ResultPolicy {
         zero_if_left: i32::from(map.boundary == Boundary::Zero),
-        by_lifetime: i32::from(map.normalisation == Normalisation::Lived),
+        by_lifetime: i32::from(map.normalisation == Normalisation::Lifetime),
         steps: steps as i32,
     }
 }
