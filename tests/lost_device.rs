@@ -14,8 +14,8 @@ use ridgewatch::run::{Event, FrameRecord, RunError, RunOptions, Setup, StageSeco
 use ridgewatch::source::Listener;
 use ridgewatch::surrogate::network::{Architecture, Objective, PlannedStep};
 use ridgewatch::surrogate::{
-    CheckpointError, CheckpointState, DeviceTable, FrozenHybrid, FrozenNetwork, HostNetwork, HostSurrogate, HostTraining, Hybrid, Kind,
-    Labels, Learned, NetworkCopy, NetworkFrom, Predict, ReplayBuffer, Samples, SurrogateDevice, SyncedSamples, Table, Trace, Training,
+    CheckpointError, CheckpointState, FrozenHybrid, FrozenNetwork, HostNetwork, HostSurrogate, HostTraining, Hybrid, Kind, Labels, Learned,
+    NetworkCopy, NetworkFrom, Predict, ReplayBuffer, Samples, SurrogateDevice, SurrogateTable, SyncedSamples, Table, Trace, Training,
 };
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
@@ -178,7 +178,7 @@ impl BreakingTable {
     }
 }
 
-impl DeviceTable for BreakingTable {
+impl SurrogateTable for BreakingTable {
     fn to_host(&self) -> Result<Table, DeviceError> {
         self.0.line.call("downloading a table")?;
         Ok(self.0.values.clone())

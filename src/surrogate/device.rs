@@ -14,7 +14,7 @@ pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     /// Traces the nodes of tables.
     type Tracer<'t>: Trace + ?Sized;
     /// Log-stretch at the nodes of a grid.
-    type Table: DeviceTable;
+    type Table: SurrogateTable;
     /// A network in training.
     type Training: Training<Table = Self::Table>;
 
@@ -70,7 +70,7 @@ impl<D: SurrogateDevice> FrozenHybrid<D> {
 }
 
 /// A table on a device. Clones share the values.
-pub trait DeviceTable: Clone + Send + Sync + 'static {
+pub trait SurrogateTable: Clone + Send + Sync + 'static {
     /// The table on the host. The values are downloaded at most once.
     ///
     /// # Errors
@@ -134,7 +134,7 @@ pub enum NetworkCopy {
 #[allow(clippy::missing_errors_doc)] // said above
 pub trait Training: Send + Sync + Sized {
     /// The table below the network.
-    type Table: DeviceTable;
+    type Table: SurrogateTable;
     /// An immutable network, for prediction.
     type Network: Send + Sync;
 

@@ -1,6 +1,8 @@
 //! Surrogates on the CPU.
 
-use super::device::{DeviceTable, FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training};
+use super::device::{
+    FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SurrogateTable, SyncedSamples, Training,
+};
 use super::hybrid::Hybrid;
 use super::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Predictor, Step};
 use super::trace::Trace;
@@ -45,7 +47,7 @@ impl SurrogateDevice for Host {
     }
 }
 
-impl DeviceTable for Table {
+impl SurrogateTable for Table {
     fn to_host(&self) -> Result<Table, DeviceError> {
         Ok(self.clone())
     }

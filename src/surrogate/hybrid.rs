@@ -6,7 +6,7 @@
 
 use super::checkpoint::Checkpoint;
 use super::checkpoint_state::CheckpointState;
-use super::device::{DeviceTable, FrozenHybrid, HostNetwork, NetworkFrom, SurrogateDevice, Training};
+use super::device::{FrozenHybrid, HostNetwork, NetworkFrom, SurrogateDevice, SurrogateTable, Training};
 use super::network::{HELD_OUT, Loss, Model, NetworkSettings, Target};
 use super::trace::Trace;
 use super::trainer::Trainer;

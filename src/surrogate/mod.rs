@@ -23,7 +23,7 @@ mod trainer;
 
 pub use checkpoint_state::CheckpointState;
 pub use device::{
-    DeviceTable, Download, FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training,
+    Download, FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SurrogateTable, SyncedSamples, Training,
 };
 pub use host::{FrozenNetwork, Host, HostSurrogate, HostTraining, build};
 pub use hybrid::Hybrid;

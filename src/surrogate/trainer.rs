@@ -4,7 +4,7 @@
 //! for prediction are a running mean over the last share of the steps (Polyak and Juditsky 1992), which has the effect of a decaying rate at every
 //! step. The rate is lowered only when the loss has stopped falling.
 
-use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SyncedSamples, Training};
+use super::device::{HostNetwork, Labels, NetworkCopy, SurrogateTable, SyncedSamples, Training};
 use super::network::{Architecture, Encoding, Field, Model, NetworkSettings, Objective, PlannedStep, Times};
 use super::{Learned, NetworkFrom, ReplayBuffer, SurrogateError};
 use crate::backend::DeviceError;
@@ -169,7 +169,7 @@ impl<T: Training> Trainer<T> {
     ) -> Result<(), DeviceError> {
         let samples = labels.buffer.samples();
         if !self.standardised && (0..samples.len()).any(|index| self.objective.is_usable(samples, index)) {
-            let base = labels.base.map(DeviceTable::to_host).transpose()?;
+            let base = labels.base.map(SurrogateTable::to_host).transpose()?;
             self.objective.standardise(self.training.shape(), samples, base.as_ref().map(|base| base as &dyn Field));
             self.standardised = true;
         }
