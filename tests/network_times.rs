@@ -25,12 +25,12 @@ fn one_network_knows_two_windows() {
     let held_out = windows.each_ref().map(|window| traced(window, uniform_points(2, 2_000), false));
     let errors = |network: &NetworkSettings| {
         let mut surrogate = build(&SETTINGS, network, windows[0].domain(), 5, &windows[0]).unwrap();
-        let mut ring = ReplayBuffer::new(1 << 16);
+        let mut buffer = ReplayBuffer::new(1 << 16);
         for (seed, window) in (7..).zip(&windows) {
-            ring.set_now(Times::new(network, 10.0).unit(window.start, 10.0));
-            ring.push(&traced(window, uniform_points(seed, 20_000), false));
+            buffer.set_now(Times::new(network, 10.0).unit(window.start, 10.0));
+            buffer.push(&traced(window, uniform_points(seed, 20_000), false));
         }
-        let learned = surrogate.learn(&ring, f64::INFINITY, 300).unwrap();
+        let learned = surrogate.learn(&buffer, f64::INFINITY, 300).unwrap();
         assert_eq!((learned.steps, learned.dropped), (300, 0));
         let frozen = surrogate.freeze().unwrap();
         let errors: Vec<f64> = windows

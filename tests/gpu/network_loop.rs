@@ -273,13 +273,13 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
     (sum / count as f64, count)
 }
 
-/// A cap that frames keep to and training does not, for its ring, for the network itself, or for what its steps need beside both: the network is
-/// trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it. The plan of the slide foresees the first
-/// two; the third shows as a shortage in the first frame, which is made again.
+/// A cap that frames keep to and training does not, for its replay buffer, for the network itself, or for what its steps need beside both: the
+/// network is trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it. The plan of the slide
+/// foresees the first two; the third shows as a shortage in the first frame, which is made again.
 #[test]
 #[ignore = "needs a GPU"]
 fn without_memory_for_training_frames_stay_on_the_device() {
-    // A ring of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
+    // A replay buffer of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
     // And the published 16x512, whose layers' values and their gradients for 65,536 samples are 1 GiB each.
     // A rate that so many layers bear: what is told is of memory alone.
     let published = [
@@ -324,7 +324,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     let (log2_table, batch) = if small() { (12, 1 << 10) } else { (18, 1 << 16) };
     let network = NetworkSettings { levels: 8, log2_table, batch, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: batch / 4, ..NetworkSettings::default() };
-    let ring = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
+    let buffer = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
     let (rounds, steps) = if small() { (1, 10) } else { (3, 1000) };
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);
@@ -332,7 +332,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     for (kind, network) in [(Kind::Network, &network), (Kind::Residual, &network), (Kind::Network, &frequency)] {
         let built = || resident(&gpu, kind, [257, 129, 2], network, &tracer);
         let mut surrogate = built();
-        surrogate.learn(&ring, f64::INFINITY, steps / 5).unwrap();
+        surrogate.learn(&buffer, f64::INFINITY, steps / 5).unwrap();
         let before = gpu.memory().0;
         let mut room = None;
         for round in 0..rounds {
@@ -341,7 +341,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
             assert_eq!(state.wait_reason(), None);
             assert!(surrogate.checkpoint_async().unwrap().is_none(), "one at a time");
             std::thread::scope(|scope| {
-                let learning = scope.spawn(|| surrogate.learn(&ring, f64::INFINITY, steps).unwrap());
+                let learning = scope.spawn(|| surrogate.learn(&buffer, f64::INFINITY, steps).unwrap());
                 state.write(&file("behind")).unwrap();
                 assert_eq!(learning.join().unwrap().steps, steps);
             });
@@ -355,7 +355,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
         drop(surrogate);
         // What others have leaves no room.
         let mut surrogate = built();
-        surrogate.learn(&ring, f64::INFINITY, steps / 50 + 1).unwrap();
+        surrogate.learn(&buffer, f64::INFINITY, steps / 50 + 1).unwrap();
         let others = gpu.alloc::<u8>("what others have", (gpu.memory_left() - (1 << 16)) as usize).unwrap();
         surrogate.save(&file("waited for")).unwrap();
         let state = surrogate.checkpoint_async().unwrap().unwrap();

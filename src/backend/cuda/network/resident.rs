@@ -296,7 +296,7 @@ impl CudaTraining {
         let most = gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
         // The kernels index the samples of pool and replay buffer together with 32 bits.
         let capacity = POOL_PER_BUFFER.saturating_mul(capacity).min(most as usize).clamp(1, 1 << 31);
-        Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.ring(capacity)?) }))
+        Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.replay_buffer(capacity)?) }))
     }
 }
 
@@ -307,7 +307,7 @@ impl Resident {
         training.reserve(batch)?;
         // The first call allocates the memory of the state for a rollback.
         training.keep()?;
-        let samples = training.ring(capacity)?;
+        let samples = training.replay_buffer(capacity)?;
         let pool = CudaTraining::pool(gpu, &training, capacity)?;
         Ok(Self {
             training,

@@ -32,7 +32,7 @@ pub struct Audits {
 struct Memory {
     unit: Buffer<[f32; 3]>,
     points: Buffer<[f32; 3]>,
-    land: Buffer<u8>,
+    missing: Buffer<u8>,
     traced: Buffer<f32>,
     lifetime_share: Buffer<f32>,
     /// `None` until arrival points are requested.
@@ -51,7 +51,7 @@ impl Memory {
         Ok(Self {
             unit: gpu.alloc(what, points)?,
             points: gpu.alloc(what, points)?,
-            land: gpu.alloc(what, points)?,
+            missing: gpu.alloc(what, points)?,
             traced: gpu.alloc(what, points)?,
             lifetime_share: gpu.alloc(what, points)?,
             arrivals: None,
@@ -142,7 +142,7 @@ impl Audits {
         let points = AuditPointsArgument {
             unit: memory.unit.address(),
             points: memory.points.address(),
-            is_missing: memory.land.address(),
+            is_missing: memory.missing.address(),
             traced: memory.traced.address(),
             lifetime_share: memory.lifetime_share.address(),
             predicted: memory.predicted.address(),
@@ -200,13 +200,13 @@ fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &m
         Ok(values)
     }
     let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
-    let land = back(&memory.land, 0, count)?;
-    let at_sea = || (0..count).filter(|&i| land[i] == 0);
-    samples.points.extend(at_sea().map(|i| unit[i]));
-    samples.log_stretch.extend(at_sea().map(|i| traced[i]));
+    let missing = back(&memory.missing, 0, count)?;
+    let present = || (0..count).filter(|&i| missing[i] == 0);
+    samples.points.extend(present().map(|i| unit[i]));
+    samples.log_stretch.extend(present().map(|i| traced[i]));
     if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
         let arrivals = back(buffer, [0.0; 3], count)?;
-        samples.arrival.extend(at_sea().map(|i| unit_arrival(domain, arrivals[i])));
+        samples.arrival.extend(present().map(|i| unit_arrival(domain, arrivals[i])));
     }
     Ok(())
 }
