@@ -224,8 +224,8 @@ impl Gpu {
     /// `most`, if that is smaller).
     pub(in crate::backend::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
         const SHARE: u64 = 4;
-        const LEAST: usize = 1 << 12;
-        usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(LEAST).min(most)
+        const MIN: usize = 1 << 12;
+        usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(MIN).min(most)
     }
 
     /// Allocates uninitialised memory for `len` values, within the cap. It is freed in the order of the work stream.

@@ -16,7 +16,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 /// Limit on the points of a batch, to bound the memory. A batch of a single cell may have more.
-const MOST: usize = 1 << 22;
+const MAX_POINTS: usize = 1 << 22;
 /// Threads of a warp. Each warp processes one cell.
 const WARP: usize = 32;
 
@@ -69,13 +69,14 @@ impl Memory {
     }
 }
 
-/// Groups consecutive cells into batches of at most [`MOST`] points. `begins` holds the first point of each cell, followed by the number of points.
+/// Groups consecutive cells into batches of at most [`MAX_POINTS`] points. `begins` holds the first point of each cell, followed by the number of
+/// points.
 fn batches(begins: &[u32]) -> Vec<Range<usize>> {
     let cells = begins.len() - 1;
     let mut batches = Vec::new();
     let mut first = 0;
     while first < cells {
-        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MOST;
+        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MAX_POINTS;
         let end = (first + 2..=cells).take_while(fits).last().unwrap_or(first + 1);
         batches.push(first..end);
         first = end;
@@ -116,7 +117,7 @@ impl Audits {
         if !self.memory.as_ref().is_some_and(|memory| memory.holds(most, cells)) {
             // Freed first, so that old and new memory are never allocated together.
             self.memory = None;
-            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MOST.max(most)), cells)?);
+            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MAX_POINTS.max(most)), cells)?);
         }
         let Some(memory) = &mut self.memory else {
             return Err(DeviceError::Unsupported { what: "an audit without memory".into() });

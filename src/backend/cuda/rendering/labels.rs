@@ -13,7 +13,7 @@ use crate::surrogate::Samples;
 use rayon::prelude::*;
 
 /// Limit on the labels of one frame (64 MiB).
-const MOST: usize = 1 << 22;
+const MAX_LABELS: usize = 1 << 22;
 
 /// With training on the device, one label in 2^3 may go to the host instead of the label pool of the device. The host holds out some of its labels
 /// for validation, so the pool must not contain them.
@@ -68,7 +68,7 @@ impl Labels {
     /// # Errors
     /// The device fails or lacks memory.
     pub fn new(gpu: &Gpu, keep: usize, shift: u32, arrivals: bool) -> Result<Self, DeviceError> {
-        let keep = if keep > 1 { keep.min(MOST) } else { 0 };
+        let keep = if keep > 1 { keep.min(MAX_LABELS) } else { 0 };
         let room = Self::with_luck(keep);
         let memory = || -> Result<Memory, DeviceError> {
             let arrivals = arrivals.then(|| gpu.alloc("labels", room)).transpose()?;
