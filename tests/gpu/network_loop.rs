@@ -3,6 +3,7 @@
 use super::network_support::{traced, uniform_points};
 use super::scenes::*;
 use super::small;
+use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, GpuSettings, SnapshotStore, Tuning};
 use ridgewatch::backend::{Device, WhenLost};
 use ridgewatch::run::{Frame, RunOptions};
@@ -10,36 +11,18 @@ use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, ReplayBuffer};
 
 /// A small run that trains a fixed number of steps a frame.
-const SCENE: &str = "
-[source]
-kind = \"turbulence\"
-nodes = [48, 24, 24]
-[time]
-tau = 8
-slides = 1
-frames_per_slide = 3
-[flow]
-steps = 16
-[surrogate]
-kind = \"residual\"
-[network]
-levels = 4
-features = 2
-log2_table = 14
-base_resolution = 8
-width = 16
-batch = 4096
-[training]
-steps_per_frame = 60
-[render]
-method = \"gated\"
-width = 48
-height = 24
-samples = 8
-[transfer]
-low = 0.1
-high = 0.3
-";
+fn turbulence() -> String {
+    scene::gated_turbulence(
+        "
+        time.tau = 8
+        time.frames_per_slide = 3
+        flow.steps = 16
+        surrogate.kind = \"residual\"
+        network.width = 16
+        training.steps_per_frame = 60
+        ",
+    )
+}
 
 /// What the device learned is worth as much as what the CPU learned, goes into a checkpoint, and either goes on from the other's.
 #[test]
@@ -57,7 +40,7 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
             format!("training.steps_per_frame={steps}"),
         ];
         keys.extend(from.map(|from| format!("training.resume=\"{}\"", file(from).display())));
-        let frames = frames(SCENE, &keys, &options);
+        let frames = frames(&turbulence(), &keys, &options);
         for frame in &frames {
             let learned = frame.record.training.clone().unwrap();
             assert_eq!((learned.steps, learned.rollbacks), (steps, 0));
@@ -90,35 +73,24 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_network_with_the_start_time_slides_on_the_device() {
-    const GYRE: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.2]
-[time]
-tau = 5
-seed_step = 0.5
-slides = 4
-frames_per_slide = 4
-[flow]
-steps = 25
-[surrogate]
-kind = \"network\"
-[network]
-inputs = [\"start\"]
-log2_table = 16
-width = 32
-batch = 4096
-[training]
-steps_per_frame = 200
-[render]
-width = 48
-height = 24
-samples = 4
-";
+    let gyre = scene::double_gyre(
+        [48, 24, 4],
+        "
+            time.tau = 5
+            time.seed_step = 0.5
+            time.slides = 4
+            time.frames_per_slide = 4
+            flow.steps = 25
+            surrogate.kind = \"network\"
+            network.inputs = [\"start\"]
+            network.log2_table = 16
+            network.width = 32
+            network.batch = 4096
+            training.steps_per_frame = 200
+        ",
+    );
     let keys = if small() { vec!["training.steps_per_frame=20".to_owned(), "time.slides=2".to_owned()] } else { Vec::new() };
-    let made = |device: &Device| frames(GYRE, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
+    let made = |device: &Device| frames(&gyre, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
     let (found, expected) = (made(&device(GpuSettings::default())), made(&Device::CPU));
     let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
     println!("dB: GPU {:.1?}, CPU {:.1?}", psnr(&found), psnr(&expected));
@@ -148,7 +120,7 @@ fn a_run_whose_network_diverges_goes_on() {
     let options = RunOptions { device: device(GpuSettings::default()), ..RunOptions::default() };
     let mut keys = vec!["network.learning_rate=1", "surrogate.kind=\"network\""];
     keys.extend(if small() { &["training.steps_per_frame=20", "time.frames_per_slide=2"][..] } else { &[] });
-    let frames = frames(ANSWERED, &keys.into_iter().map(str::to_owned).collect::<Vec<_>>(), &options);
+    let frames = frames(&answered(), &keys.into_iter().map(str::to_owned).collect::<Vec<_>>(), &options);
     let learned: Vec<_> = frames.iter().map(|frame| frame.record.training.clone().unwrap()).collect();
     let [rollbacks, lost] = [learned.iter().map(|l| l.rollbacks).sum::<u64>(), learned.iter().map(|l| l.lost_steps).sum()];
     measured!("a rate of 1: {rollbacks} rollbacks, {lost} steps lost");
@@ -165,34 +137,28 @@ fn a_run_whose_network_diverges_goes_on() {
 }
 
 /// A double gyre of which about half is traced after some frames, the rest answered by a network above a coarse table.
-const ANSWERED: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.5]
-[time]
-tau = 5
-slides = 1
-frames_per_slide = 6
-[flow]
-steps = 25
-[surrogate]
-kind = \"residual\"
-table_nodes = [17, 9, 2]
-[network]
-levels = 6
-features = 2
-log2_table = 14
-width = 16
-batch = 4096
-[training]
-steps_per_frame = 100
-[render]
-width = 48
-height = 24
-samples = 8
-";
+fn answered() -> String {
+    scene::scene(
+        "double_gyre",
+        [48, 24, 8],
+        "
+        domain.min = [0, 0, 0]
+        domain.max = [2, 1, 0.5]
+        time.tau = 5
+        time.slides = 1
+        time.frames_per_slide = 6
+        flow.steps = 25
+        surrogate.kind = \"residual\"
+        surrogate.table_nodes = [17, 9, 2]
+        network.levels = 6
+        network.features = 2
+        network.log2_table = 14
+        network.width = 16
+        network.batch = 4096
+        training.steps_per_frame = 100
+        ",
+    )
+}
 
 /// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
 /// networks, which are trained on other samples. A network that has learned a tenth as long shows.
@@ -203,7 +169,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
     let pictures = |device: &Device, first: u64, keys: &[&str]| -> Vec<Frame> {
         let options = RunOptions { device: device.clone(), ..RunOptions::default() };
         let keys = |seed: u64| keys.iter().map(|key| (*key).to_owned()).chain([format!("seed={seed}")]).collect::<Vec<String>>();
-        (first..first + seeds).map(|seed| frames(ANSWERED, &keys(seed), &options).pop().unwrap()).collect()
+        (first..first + seeds).map(|seed| frames(&answered(), &keys(seed), &options).pop().unwrap()).collect()
     };
     let few: &[&str] = if small() { &["training.steps_per_frame=20", "time.frames_per_slide=3"] } else { &[] };
     let found = pictures(&device(GpuSettings::default()), 0, few);
@@ -298,7 +264,7 @@ fn without_memory_for_training_frames_stay_on_the_device() {
         let settings = GpuSettings { memory_cap: Some(mib << 20), ..GpuSettings::default() };
         let keys = ["surrogate.kind=\"network\"", "training.steps_per_frame=5"].iter().chain(more).map(ToString::to_string);
         let options = RunOptions { device: device_when_lost(settings, WhenLost::Stop), ..RunOptions::default() };
-        let frames = frames(SCENE, &keys.collect::<Vec<_>>(), &options);
+        let frames = frames(&turbulence(), &keys.collect::<Vec<_>>(), &options);
         assert_eq!(frames.len(), 3);
         for (i, Frame { record, .. }) in frames.iter().enumerate() {
             let learned = record.training.as_ref().unwrap();
