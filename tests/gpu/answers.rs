@@ -3,9 +3,9 @@
 use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
 use ridgewatch::backend::cuda::{
     CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceQueryRouter, DeviceTable, FrameQueries, Gpu, GpuRenderer, GpuSettings,
-    LookAhead, Outputs, SnapshotStore, Tuning, keeps_label,
+    LookAhead, Outputs, SnapshotStore, Tuning,
 };
-use ridgewatch::backend::{Device, QueryRouter, Routing, Tally, audit, residuals, stratified_points};
+use ridgewatch::backend::{Device, QueryRouter, Routing, Tally, audit, keeps_label, residuals, stratified_points};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,

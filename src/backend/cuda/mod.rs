@@ -23,7 +23,7 @@ pub use network::{
 };
 pub use rendering::{
     Audits, CudaSamples, DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries, GpuFrames, GpuRenderer, LookAhead,
-    RoutedQueries, Timeline, TraceAll, keeps_label,
+    RoutedQueries, Timeline, TraceAll,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};
