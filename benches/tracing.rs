@@ -163,12 +163,12 @@ fn main() -> Result<(), Box<dyn Error>> {
     let rate = rates(&[&*reference], &[&seeds])[0];
     let mut out = Traced::default();
     reference.trace(&seeds, Extras::default(), &mut out);
-    let lived = out.lived.iter().map(|&l| f64::from(l)).sum::<f64>() / seeds.len() as f64;
+    let lifetime_share = out.lifetime_share.iter().map(|&l| f64::from(l)).sum::<f64>() / seeds.len() as f64;
     println!(
         "\nreference scene (double gyre, tau 40, 400 steps, box [0,2]x[0,1]): {:.0} thousand FTLE samples/s on {} threads, mean steps completed {:.1}",
         rate / 1e3,
         rayon::current_num_threads(),
-        400.0 * lived
+        400.0 * lifetime_share
     );
     Ok(())
 }

@@ -119,7 +119,7 @@ mod bench {
             let mut points = gpu.alloc("points", 1 << 24)?;
             // Room for arrivals, which are three numbers each.
             let values = gpu.upload("values", &vec![0.5f32; 3 << 24])?;
-            let mut pool = training.ring(1 << 26)?;
+            let mut pool = training.replay_buffer(1 << 26)?;
             for part in 0..4 {
                 training.draw_points(&cube, 3, part << 24, &mut points)?;
                 // SAFETY: both buffers hold 2^24 entries or more and outlive the work below.
@@ -312,7 +312,7 @@ mod bench {
         // SAFETY: both buffers hold `MANY` entries.
         let predicted = |count| time(gpu, || unsafe { network.predict(points.address(), count, values.address()) });
         let (few, many) = (predicted(FEW)?, predicted(MANY)?);
-        let mut pool = training.ring(MANY)?;
+        let mut pool = training.replay_buffer(MANY)?;
         // SAFETY: as above.
         unsafe { training.append(&mut pool, &cube, points.address(), values.address(), MANY, None)? };
         let mut drawn = 0;
@@ -583,7 +583,7 @@ mod bench {
         let least = NetworkSettings { log2_table: 4, ..settings.clone() };
         let least = Model::new(Architecture::new(&least, axes, domain.lengths())?, 1, base.is_some());
         let scout = DeviceTraining::new(gpu, &least, &objective)?;
-        let mut pool = scout.ring(SCOUTS)?;
+        let mut pool = scout.replay_buffer(SCOUTS)?;
         gpu.synchronize()?;
         let start = Instant::now();
         scout.draw_points(domain, 5, 0, &mut scouts.points)?;
@@ -592,7 +592,7 @@ mod bench {
         unsafe { scout.append(&mut pool, domain, scouts.points.address(), scouts.values.address(), SCOUTS, base)? };
         objective.scale = scale(&pool, base.is_some())?;
         let mut training = DeviceTraining::new(gpu, &Model::new(shape, 1, base.is_some()), &objective)?;
-        let mut ring = training.ring(KEPT)?;
+        let mut buffer = training.replay_buffer(KEPT)?;
         gpu.synchronize()?;
         let mut clock = start.elapsed().as_secs_f64() + if base.is_some() { before } else { 0.0 };
         drop((scout, pool, scouts));
@@ -604,7 +604,7 @@ mod bench {
             training.draw_points(domain, 7, *labels, &mut chunk.points)?;
             chunk.trace(tracer)?;
             // SAFETY: both buffers hold `CHUNK` entries.
-            unsafe { training.append(&mut ring, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
+            unsafe { training.append(&mut buffer, domain, chunk.points.address(), chunk.values.address(), CHUNK, base)? };
             *labels += CHUNK as u64;
             let done = training.steps();
             let steps: Vec<PlannedStep> = (0..STEPS)
@@ -615,7 +615,7 @@ mod bench {
                     PlannedStep { average_share, ..step(pace.batch, *trained + (i * pace.batch) as u64, pace.rate) }
                 })
                 .collect();
-            training.train_steps(&ring, None, &steps)?;
+            training.train_steps(&buffer, None, &steps)?;
             *trained += (STEPS * pace.batch) as u64;
             clock += start.elapsed().as_secs_f64();
             if clock >= MARKS[psnr.len()] {

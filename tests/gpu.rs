@@ -21,6 +21,7 @@ mod answers;
 mod audit;
 #[path = "gpu/device.rs"]
 mod device;
+mod kit;
 #[path = "gpu/live.rs"]
 mod live;
 #[path = "gpu/lost.rs"]

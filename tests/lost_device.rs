@@ -3,9 +3,12 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch::backend::{HostPicture, 
-    AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, Rendered, Surrogate, SurrogateRequest,
-    WhenLost, audit, render_on_cpu,
+mod kit;
+
+use kit::scene;
+use ridgewatch::backend::{
+    AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, HostPicture, Rendered, Surrogate,
+    SurrogateRequest, WhenLost, audit, render_on_cpu,
 };
 use ridgewatch::config::SceneFile;
 use ridgewatch::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
@@ -14,8 +17,8 @@ use ridgewatch::run::{Event, FrameRecord, RunError, RunOptions, Setup, StageSeco
 use ridgewatch::source::Listener;
 use ridgewatch::surrogate::network::{Architecture, Objective, PlannedStep};
 use ridgewatch::surrogate::{
-    CheckpointError, CheckpointState, DeviceTable, FrozenHybrid, FrozenNetwork, HostNetwork, HostSurrogate, HostTraining, Hybrid, Kind,
-    Labels, Learned, NetworkCopy, NetworkFrom, Predict, ReplayBuffer, Samples, SurrogateDevice, SyncedSamples, Table, Trace, Training,
+    CheckpointError, CheckpointState, FrozenHybrid, FrozenNetwork, HostNetwork, HostSurrogate, HostTraining, Hybrid, Kind, Labels, Learned,
+    NetworkCopy, NetworkFrom, Predict, ReplayBuffer, Samples, SurrogateDevice, SurrogateTable, SyncedSamples, Table, Trace, Training,
 };
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
@@ -178,7 +181,7 @@ impl BreakingTable {
     }
 }
 
-impl DeviceTable for BreakingTable {
+impl SurrogateTable for BreakingTable {
     fn to_host(&self) -> Result<Table, DeviceError> {
         self.0.line.call("downloading a table")?;
         Ok(self.0.values.clone())
@@ -450,42 +453,45 @@ fn points(count: usize, below: usize) -> Vec<usize> {
     points
 }
 
-fn scene(text: &str) -> SceneFile {
-    SceneFile::parse(Path::new("scene.toml"), text, &[]).unwrap()
+fn reference() -> SceneFile {
+    let keys = "
+        time.tau = 5
+        time.seed_step = 0.1
+        time.slides = 2
+        time.frames_per_slide = 2
+        flow.steps = 10
+        trust.cells = [4, 2, 1]
+        render.method = \"reference\"
+    ";
+    scene::parse(&scene::double_gyre([16, 8, 2], keys), &[]).unwrap()
 }
 
-const REFERENCE: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.2]
-[time]
-tau = 5
-seed_step = 0.1
-slides = 2
-frames_per_slide = 2
-[flow]
-steps = 10
-[trust]
-cells = [4, 2, 1]
-[render]
-method = \"reference\"
-width = 16
-height = 8
-samples = 2
+/// A network whose steps take little of the many runs.
+const TINY_NETWORK: &str = "
+    network.levels = 4
+    network.log2_table = 8
+    network.width = 16
+    network.batch = 256
 ";
 
 fn sliding(kind: Kind, frames_per_slide: usize) -> SceneFile {
-    let table = if kind == Kind::Network { "" } else { "table_nodes = [16, 8, 8]\n" };
-    let network = format!("[network]\nlevels = 4\nlog2_table = 8\nwidth = 16\nbatch = 256\n[training]\nsteps_per_frame = {STEPS}\n");
-    scene(&format!(
-        "[source]\nkind = \"turbulence\"\nnodes = [16, 8, 8]\nsnapshots = 8\n[time]\ntau = 4\nframes_per_slide = {frames_per_slide}\n\
-         [flow]\nsteps = 8\n[surrogate]\nkind = \"{}\"\n{table}{}[trust]\ncells = [2, 2, 2]\n\
-         [render]\nwidth = 16\nheight = 8\nsamples = 2\n",
-        kind.name(),
-        if kind == Kind::Table { "" } else { &network }
-    ))
+    let surrogate = format!("surrogate.kind = \"{}\"", kind.name());
+    let table = if kind == Kind::Network { "" } else { "surrogate.table_nodes = [16, 8, 8]" };
+    let network = if kind == Kind::Table { "" } else { TINY_NETWORK };
+    let keys = format!(
+        "
+        source.nodes = [16, 8, 8]
+        source.snapshots = 8
+        time.tau = 4
+        time.frames_per_slide = {frames_per_slide}
+        flow.steps = 8
+        trust.cells = [2, 2, 2]
+        training.steps_per_frame = {STEPS}
+        {surrogate}
+        {table}
+        {network}"
+    );
+    scene::parse(&scene::scene("turbulence", [16, 8, 2], &keys), &[]).unwrap()
 }
 
 /// Breaks the device at random points of the run. The frame in progress is discarded and made again by the CPU, so that every film and every figure is
@@ -544,8 +550,8 @@ fn lack_memory_at_random(scene: &SceneFile) {
 
 #[test]
 fn reference_frames_of_a_closed_form() {
-    break_at_random(&scene(REFERENCE));
-    lack_memory_at_random(&scene(REFERENCE));
+    break_at_random(&reference());
+    lack_memory_at_random(&reference());
 }
 
 #[test]
@@ -557,7 +563,7 @@ fn gated_frames_with_a_table_over_a_sliding_window() {
 /// A device chosen automatically may refuse its first window, and the CPU computes; one that was asked for by name may not.
 #[test]
 fn a_device_chosen_automatically_may_refuse_the_first_window() {
-    let scene = scene(REFERENCE);
+    let scene = reference();
     let expected = made(ridgewatch::backend::Cpu, &scene);
     let by_name = made(Breaking::on(&Line::new(0, How::Shortage(usize::MAX))), &scene);
     assert!(matches!(by_name.error, Some(RunError::Device(_))) && by_name.films.is_empty(), "{:?}", by_name.error);

@@ -60,12 +60,12 @@ fn numpy_reproduces_predictions_from_a_checkpoint() {
     ] {
         let settings = SurrogateSettings { kind, table_nodes: Some([21, 11, 2]) };
         let mut surrogate = build(&settings, network, tracer.domain(), 5, &tracer).unwrap();
-        let mut ring = ReplayBuffer::new(2 * samples.len());
+        let mut buffer = ReplayBuffer::new(2 * samples.len());
         for (window, samples) in [(&tracer, &samples), (&later, &other)] {
-            ring.set_now(Times::new(network, tracer.tau).unit(window.start, window.tau));
-            ring.push(samples);
+            buffer.set_now(Times::new(network, tracer.tau).unit(window.start, window.tau));
+            buffer.push(samples);
         }
-        surrogate.learn(&ring, f64::INFINITY, 200).unwrap();
+        surrogate.learn(&buffer, f64::INFINITY, 200).unwrap();
         let path = folder.path().join(name);
         surrogate.save(&path).unwrap();
         let mut points = uniform_points(8, 500);

@@ -2,18 +2,17 @@
 
 #![allow(clippy::unwrap_used)]
 
+mod kit;
 mod network_support;
 
+use kit::scene;
 use network_support::{DoubleGyre, rms, traced, uniform_points};
-use ridgewatch::config::SceneFile;
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-use ridgewatch::run::{Event, FrameRecord, RunOptions, Setup, run};
+use ridgewatch::run::{FrameRecord, RunOptions, Setup};
 use ridgewatch::surrogate::network::{Input, NetworkSettings, Times};
 use ridgewatch::surrogate::{Kind, Predict, ReplayBuffer, SurrogateSettings, build};
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
 
 const SETTINGS: SurrogateSettings = SurrogateSettings { kind: Kind::Network, table_nodes: None };
 
@@ -25,12 +24,12 @@ fn one_network_knows_two_windows() {
     let held_out = windows.each_ref().map(|window| traced(window, uniform_points(2, 2_000), false));
     let errors = |network: &NetworkSettings| {
         let mut surrogate = build(&SETTINGS, network, windows[0].domain(), 5, &windows[0]).unwrap();
-        let mut ring = ReplayBuffer::new(1 << 16);
+        let mut buffer = ReplayBuffer::new(1 << 16);
         for (seed, window) in (7..).zip(&windows) {
-            ring.set_now(Times::new(network, 10.0).unit(window.start, 10.0));
-            ring.push(&traced(window, uniform_points(seed, 20_000), false));
+            buffer.set_now(Times::new(network, 10.0).unit(window.start, 10.0));
+            buffer.push(&traced(window, uniform_points(seed, 20_000), false));
         }
-        let learned = surrogate.learn(&ring, f64::INFINITY, 300).unwrap();
+        let learned = surrogate.learn(&buffer, f64::INFINITY, 300).unwrap();
         assert_eq!((learned.steps, learned.dropped), (300, 0));
         let frozen = surrogate.freeze().unwrap();
         let errors: Vec<f64> = windows
@@ -54,40 +53,34 @@ fn one_network_knows_two_windows() {
 
 /// Runs a scene and returns its records.
 fn records(text: &str, keys: &[&str], options: &RunOptions) -> Vec<FrameRecord> {
-    let keys: Vec<String> = keys.iter().map(|&key| key.to_owned()).collect();
-    let scene = SceneFile::parse(Path::new("a test"), text, &keys).unwrap();
     let mut records = Vec::new();
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            records.push(FrameRecord::clone(&frame.record));
-        }
-    };
-    run(Setup::new(scene.settings()).unwrap(), options, &mut sink, &AtomicBool::new(false)).unwrap();
+    scene::run_frames(scene::setup(text, keys), options, |frame| records.push(FrameRecord::clone(&frame.record)));
     records
 }
 
-const COMMON: &str = "
-[render]
-width = 24
-height = 12
-samples = 2
-[training]
-steps_per_frame = 60
-[network]
-levels = 4
-log2_table = 12
-width = 16
-batch = 1024
-[surrogate]
-kind = \"network\"
+const NETWORK: &str = "
+    surrogate.kind = \"network\"
+    network.levels = 4
+    network.log2_table = 12
+    network.width = 16
+    network.batch = 1024
+    training.steps_per_frame = 60
 ";
 
 /// In the flow of a saddle, the log-stretch is rate * duration for every duration; frames use tau alone.
 #[test]
 fn durations_below_tau_are_learned() {
-    let scene = format!(
-        "[source]\nkind = \"saddle\"\nrate = 0.7\n[domain]\nmin = [-1, -1, 0]\nmax = [1, 1, 0.2]\n[time]\ntau = 4\nframes_per_slide = 4\n[flow]\nsteps = 40\n[transfer]\nlow = 0\nhigh = 1\n{COMMON}"
-    );
+    let keys = "
+        source.rate = 0.7
+        domain.min = [-1, -1, 0]
+        domain.max = [1, 1, 0.2]
+        time.tau = 4
+        time.frames_per_slide = 4
+        flow.steps = 40
+        transfer.low = 0
+        transfer.high = 1
+    ";
+    let scene = scene::scene("saddle", [24, 12, 2], &format!("{keys}{NETWORK}"));
     let folder = tempfile::tempdir().unwrap();
     let error = |inputs: &str, network: &NetworkSettings| {
         let checkpoint = folder.path().join(inputs.len().to_string());
@@ -117,25 +110,22 @@ fn durations_below_tau_are_learned() {
     assert!(with < 0.2 && without > 2.0, "{with} and {without}");
 }
 
-const GYRE: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.2]
-[time]
-tau = 5
-seed_step = 1
-slides = 4
-frames_per_slide = 3
-[flow]
-steps = 25
-";
+/// Four windows of the double gyre.
+fn four_windows() -> String {
+    let keys = "
+        time.tau = 5
+        time.seed_step = 1
+        time.slides = 4
+        time.frames_per_slide = 3
+        flow.steps = 25
+    ";
+    scene::double_gyre([24, 12, 2], &format!("{keys}{NETWORK}"))
+}
 
 /// With the start as an input, labels stay valid after a slide and are kept. The trusted error is inflated nevertheless.
 #[test]
 fn labels_outlive_a_slide_where_the_start_is_an_input() {
-    let scene = format!("{GYRE}{COMMON}");
+    let scene = four_windows();
     let run = |keys: &[&str]| records(&scene, keys, &RunOptions::default());
     let (with, without) = (run(&["network.inputs=[\"start\"]", "trust.tolerance=0.15"]), run(&["trust.tolerance=0.15"]));
     assert_eq!((with.len(), without.len()), (12, 12));
@@ -170,8 +160,7 @@ fn labels_outlive_a_slide_where_the_start_is_an_input() {
 #[test]
 fn wrong_inputs_are_refused_with_the_reason() {
     let refused = |keys: &[&str]| {
-        let keys: Vec<String> = keys.iter().map(|&key| key.to_owned()).collect();
-        let scene = SceneFile::parse(Path::new("a test"), &format!("{GYRE}{COMMON}"), &keys);
+        let scene = scene::parse(&four_windows(), keys);
         scene.map(|scene| Setup::new(scene.settings()).err().map(|e| e.to_string())).map_err(|e| e.to_string())
     };
     let (start, both) = ("network.inputs=[\"start\"]", "network.inputs=[\"start\", \"duration\"]");
@@ -193,7 +182,6 @@ fn wrong_inputs_are_refused_with_the_reason() {
     let fault = build(&SETTINGS, &cube, tracer.domain(), 0, &tracer).err().unwrap().to_string();
     assert!(fault.contains("network.inputs") && fault.contains("4 inputs in all"), "{fault}");
     // A single start time needs no input.
-    let scene = SceneFile::parse(Path::new("a test"), &format!("{GYRE}{COMMON}"), &[start.to_owned(), "time.slides=1".to_owned()]).unwrap();
-    let setup = Setup::new(scene.settings()).unwrap();
+    let setup = scene::setup(&four_windows(), &[start, "time.slides=1"]);
     assert!(setup.plan.scene.network.inputs.is_empty() && setup.notes.iter().any(|note| note.contains("\"start\" is left out")));
 }

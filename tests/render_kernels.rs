@@ -476,10 +476,10 @@ fn audits_draw_the_same_points_and_add_up_to_the_same_bits() {
         input.extend(bytes(&[drawn]));
         for _ in 0..drawn {
             // Some points are missing, some traces are NaN, some predictions are not finite.
-            let (missing, lived) = (random() < 0.1, random());
+            let (missing, lifetime_share) = (random() < 0.1, random());
             let traced = if random() < 0.05 { f32::NAN } else { 2.0 * random() - 0.2 };
             let said = if random() < 0.05 { f32::INFINITY } else { traced + 0.2 * random() * random() };
-            input.extend(bytes(&[f32::from(u8::from(missing)), lived, said, traced]));
+            input.extend(bytes(&[f32::from(u8::from(missing)), lifetime_share, said, traced]));
             if !missing {
                 samples.points.push(unit[number]);
                 samples.log_stretch.push(traced);
@@ -518,7 +518,7 @@ fn the_same_labels_are_kept() {
     for shift in [0_u32, 1, 5, 32] {
         let mut input = bytes(&[shift, points.len() as u32]);
         input.extend(bytes(&points));
-        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::backend::cuda::keeps_label(p, shift))).collect();
+        let expected: Vec<u8> = points.iter().map(|&p| u8::from(ridgewatch::backend::keeps_label(p, shift))).collect();
         assert!(ask("labels", &input) == expected, "1 in 2^{shift}");
     }
 }

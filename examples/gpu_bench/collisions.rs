@@ -1,7 +1,7 @@
 //! Collision points that a frame's waves query.
 
 use cudarc::driver::result;
-use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, TraceAll};
+use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, TraceAll};
 use ridgewatch::flow::Extras;
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
 use ridgewatch::surrogate::Trace;
@@ -63,8 +63,8 @@ struct Listening<'a> {
     waves: Vec<usize>,
 }
 
-impl DeviceAnswers for Listening<'_> {
-    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
+impl DeviceLogStretch for Listening<'_> {
+    fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         let filled: usize = self.waves.iter().sum();
         let part = count.min(self.points.len() - filled);
         if part > 0 {
@@ -75,6 +75,6 @@ impl DeviceAnswers for Listening<'_> {
                 .map_err(DeviceError::driver("copying points"))?;
             self.waves.push(part);
         }
-        self.inner.answer(points, count, log_stretch, by)
+        self.inner.evaluate(points, count, log_stretch, by)
     }
 }

@@ -60,14 +60,14 @@ mod bench {
 
     type Outcome<T> = Result<T, Box<dyn Error>>;
 
-    fn map(tau: f64, steps: usize, integrator: Integrator, precision: Precision, gap: f64, boundary: Boundary) -> FlowMap {
+    fn map(tau: f64, steps: usize, integrator: Integrator, precision: Precision, difference_step: f64, boundary: Boundary) -> FlowMap {
         FlowMap {
             tau,
             direction: Direction::Forward,
             integrator,
             precision,
             steps: Steps::Fixed(steps),
-            difference_step: gap,
+            difference_step,
             boundary,
             normalisation: Normalisation::Tau,
             interpolation: Interpolation::Linear,
@@ -94,7 +94,7 @@ mod bench {
     struct Batch {
         seeds: Buffer<[f32; 3]>,
         stretch: Buffer<f32>,
-        lived: Buffer<f32>,
+        lifetime_share: Buffer<f32>,
         count: usize,
     }
 
@@ -107,14 +107,14 @@ mod bench {
             let count = seeds.len();
             let mut stretch = gpu.alloc("results", count)?;
             stretch.fill_bytes(0xff)?;
-            let mut lived = gpu.alloc("results", count)?;
-            lived.fill_bytes(0xff)?;
-            Ok(Self { seeds, stretch, lived, count })
+            let mut lifetime_share = gpu.alloc("results", count)?;
+            lifetime_share.fill_bytes(0xff)?;
+            Ok(Self { seeds, stretch, lifetime_share, count })
         }
 
         /// Queues a trace of the first `count` seeds.
         fn trace(&self, tracer: &DeviceTracer, count: usize) -> Outcome<()> {
-            let out = Outputs { log_stretch: self.stretch.address(), lived: self.lived.address(), ..Outputs::default() };
+            let out = Outputs { log_stretch: self.stretch.address(), lifetime_share: self.lifetime_share.address(), ..Outputs::default() };
             // SAFETY: all buffers hold `self.count` entries, at least `count`.
             unsafe { tracer.trace(self.seeds.address(), count.min(self.count), &out)? };
             Ok(())
@@ -148,9 +148,9 @@ mod bench {
             Ok(out)
         }
 
-        fn mean_lived(&self, count: usize) -> Outcome<f64> {
+        fn mean_lifetime_share(&self, count: usize) -> Outcome<f64> {
             let mut out = vec![0.0; count];
-            self.lived.read(&mut out)?;
+            self.lifetime_share.read(&mut out)?;
             Ok(out.iter().map(|&l| f64::from(l)).sum::<f64>() / count as f64)
         }
     }
@@ -348,24 +348,24 @@ mod bench {
             println!(
                 "\nShare of steps completed, mean: {:.3}. Made on the CPU in {made:.1} s; on the device, kernels ready, after {ready:.2} s; \
                  {registers} registers and {local} bytes of local memory a thread (cell kept).",
-                batch.mean_lived(1 << 20)?
+                batch.mean_lifetime_share(1 << 20)?
             );
 
             let truth = self.truth(&source, &domain)?;
             block(&format!("{name}-differences"));
             println!(
-                "| integrator | precision | gap, cells | window | M samples/s | tangent in f32 is faster by | PSNR, dB |\n|---|---|---|---|---|---|---|"
+                "| integrator | precision | difference step, cells | window | M samples/s | tangent in f32 is faster by | PSNR, dB |\n|---|---|---|---|---|---|---|"
             );
-            let (count, gap) = (1 << 23, 1e-4);
-            // Integrator, precision, gap, cell kept, a lane each.
+            let (count, difference_step) = (1 << 23, 1e-4);
+            // Integrator, precision, difference step, cell kept, a lane each.
             let rivals = [
                 (Integrator::Tangent, Precision::F64, 0.0, false, false),
                 (Integrator::Differences, Precision::F32, 0.05, true, true),
                 (Integrator::Differences, Precision::F32, 0.05, false, true),
-                (Integrator::Differences, Precision::F64, gap, false, true),
+                (Integrator::Differences, Precision::F64, difference_step, false, true),
                 (Integrator::Differences, Precision::F32, 0.05, true, false),
                 (Integrator::Differences, Precision::F32, 0.05, false, false),
-                (Integrator::Differences, Precision::F64, gap, false, false),
+                (Integrator::Differences, Precision::F64, difference_step, false, false),
             ];
             for storage in [Storage::F32, Storage::F16Pairs] {
                 let held = Tuning { storage, ..Tuning::default() };
@@ -374,8 +374,10 @@ mod bench {
                 let (rate, psnr) = (count as f64 / tangent / 1e3, truth.psnr_of(&tracer)?);
                 println!("| tangent | f32 | - | {} | {rate:.0} | 1 | {psnr:.1} |", storage.name());
                 // For storage in pairs only the best rivals.
-                for &(integrator, precision, gap, keep, spread) in &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }] {
-                    let changed = FlowMap { integrator, precision, difference_step: gap, ..turbulent(22) };
+                for &(integrator, precision, difference_step, keep, spread) in
+                    &rivals[..if storage == Storage::F32 { rivals.len() } else { 4 }]
+                {
+                    let changed = FlowMap { integrator, precision, difference_step, ..turbulent(22) };
                     let tracer = self.tracer(&source, &changed, Tuning { keep, spread, ..held })?;
                     let ms = batch.time(&tracer, count)?;
                     let what = if integrator == Integrator::Tangent { "tangent" } else { "six particles" };
@@ -386,9 +388,9 @@ mod bench {
                     };
                     let kept = if keep { ", cell kept" } else { "" };
                     let precision = if precision == Precision::F32 { "f32" } else { "f64" };
-                    let gap = if gap > 0.0 { gap.to_string() } else { "-".into() };
+                    let difference_step = if difference_step > 0.0 { difference_step.to_string() } else { "-".into() };
                     println!(
-                        "| {what}{how}{kept} | {precision} | {gap} | {} | {:.0} | {:.2} | {:.1} |",
+                        "| {what}{how}{kept} | {precision} | {difference_step} | {} | {:.0} | {:.2} | {:.1} |",
                         storage.name(),
                         count as f64 / ms / 1e3,
                         ms / tangent,
@@ -403,7 +405,7 @@ mod bench {
             let published = self.tracer(&source, &published, random)?;
             let slow = batch.time(&published, count)? / count as f64;
             println!(
-                "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, gap of 1e-6 cells) traces {:.2} M/s at {:.1} dB.",
+                "\nThe published way as it was (six particles in one thread, order as they come, 110 steps, f64, difference step of 1e-6 cells) traces {:.2} M/s at {:.1} dB.",
                 1e-3 / slow,
                 truth.psnr_of(&published)?
             );
@@ -453,13 +455,14 @@ mod bench {
             let batch = Batch::new(&self.gpu, &scattered(&plane, 1 << 24, 3))?;
             block("gyre");
             println!("| integrator | precision | M samples/s | registers |\n|---|---|---|---|");
-            for (integrator, precision, gap) in [
+            for (integrator, precision, difference_step) in [
                 (Integrator::Tangent, Precision::F32, 1e-4),
                 (Integrator::Tangent, Precision::F64, 1e-4),
                 (Integrator::Differences, Precision::F32, 1e-3),
                 (Integrator::Differences, Precision::F64, 1e-5),
             ] {
-                let tracer = self.tracer(&source, &map(10.0, 100, integrator, precision, gap, Boundary::Unbounded), Tuning::default())?;
+                let tracer =
+                    self.tracer(&source, &map(10.0, 100, integrator, precision, difference_step, Boundary::Unbounded), Tuning::default())?;
                 let ms = batch.time(&tracer, batch.count)?;
                 println!("| {integrator:?} | {precision:?} | {:.0} | {} |", batch.count as f64 / ms / 1e3, tracer.resources()?.0);
             }

@@ -13,7 +13,7 @@ RW_FN void to_unit(const UnitBox& box, const float point[3], float (&unit)[3]) {
     for (int k = 0; k < 3; ++k) unit[k] = min_(max_((float)(((double)point[k] - box.min[k]) / box.extent[k]), 0.0f), 1.0f);
 }
 
-// Returns true for 1 point in 2^shift. A function of the point alone, so that the kept labels do not depend on the order of threads.
+// Returns true for 1 point in 2^shift: the label rule, stated in src/backend/router.rs.
 RW_FN bool keeps_label(const float point[3], uint32_t shift) {
     if (shift == 0) return true;
     const Words random = philox(float_bits(point[0]), float_bits(point[1]), float_bits(point[2]), 0u, 0u, 0u);

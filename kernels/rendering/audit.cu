@@ -30,7 +30,7 @@ struct AuditPoints {
     float* points;              // three per point, domain coordinates
     unsigned char* is_missing;  // 1: the point is in a missing cell
     const float* traced;
-    const float* lived;
+    const float* lifetime_share;
     const float* predicted;
     float* optical;
 };
@@ -66,11 +66,11 @@ audit_measure(float low, float per_range, float tau, AuditBatch batch, AuditPoin
     for (uint32_t base = begin; base < end; base += 32u) {
         const uint32_t i = base + lane, here = end - base < 32u ? end - base : 32u;
         Residual mine = {not_a_number(), not_a_number()};
-        float traced = 0.0f, lived = 0.0f;
+        float traced = 0.0f, lifetime_share = 0.0f;
         uint32_t missing = 1u;
         if (i < end) {
             traced = at.traced[i];
-            lived = at.lived[i];
+            lifetime_share = at.lifetime_share[i];
             missing = at.is_missing[i];
             if (!missing) mine = residual(low, per_range, tau, at.predicted[i], traced);
             at.optical[i] = mine.optical;
@@ -78,7 +78,7 @@ audit_measure(float low, float per_range, float tau, AuditBatch batch, AuditPoin
         for (uint32_t from = 0; from < here; ++from) {
             const Residual next = {__shfl_sync(0xffffffffu, mine.optical, int(from)), __shfl_sync(0xffffffffu, mine.log_stretch, int(from))};
             add_residual(sums, next);
-            add_point(sums, __shfl_sync(0xffffffffu, missing, int(from)) != 0u, __shfl_sync(0xffffffffu, lived, int(from)),
+            add_point(sums, __shfl_sync(0xffffffffu, missing, int(from)) != 0u, __shfl_sync(0xffffffffu, lifetime_share, int(from)),
                       __shfl_sync(0xffffffffu, traced, int(from)));
         }
     }

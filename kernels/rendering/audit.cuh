@@ -60,18 +60,18 @@ RW_FN Residual residual(float low, float per_range, float tau, float predicted, 
 // Sums over a cell's points: those of `trust::CellErrors`, then those of the points themselves.
 struct CellFindings {
     double count, optical, square, fourth, second, third, log_square;
-    double points;  // outside missing cells
-    double lived;   // sum of their lifetime shares
-    double peak;    // largest finite log-stretch; minus infinity if there is none
+    double points;     // outside missing cells
+    double lifetimes;  // sum of their lifetime shares
+    double peak;       // largest finite log-stretch; minus infinity if there is none
 };
 static_assert(sizeof(CellFindings) == 80, "layout");
 
 RW_FN CellFindings no_findings() { return {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -double(infinity())}; }
 
-RW_FN void add_point(CellFindings& sums, bool missing, float lived, float traced) {
+RW_FN void add_point(CellFindings& sums, bool missing, float lifetime_share, float traced) {
     if (missing) return;
     sums.points = plus(sums.points, 1.0);
-    sums.lived = plus(sums.lived, double(lived));
+    sums.lifetimes = plus(sums.lifetimes, double(lifetime_share));
     if (is_finite(traced)) sums.peak = max_(sums.peak, double(traced));
 }
 

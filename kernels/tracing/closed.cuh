@@ -185,7 +185,7 @@ template <class Config, class Real> struct ClosedFlow {
     RW_FN void first_tangent(const double (&)[3], R (&m)[D][C]) const {
         RW_UNROLL for (int i = 0; i < D; i++) RW_UNROLL for (int c = 0; c < C; c++) m[i][c] = R(i == c);
     }
-    RW_FN R separation(const double (&)[3], int, double gap) const { return R(2.0 * gap); }
+    RW_FN R separation(const double (&)[3], int, double difference_step) const { return R(2.0 * difference_step); }
 
     RW_FN R confine(int k, R x) const {
         R low = data.box_low[k], high = data.box_high[k];

@@ -440,7 +440,7 @@ template <class Config, class Real> struct GridFlow {
     RW_FN void first_tangent(const double (&)[3], R (&m)[D][C]) const {
         RW_UNROLL for (int i = 0; i < D; i++) RW_UNROLL for (int c = 0; c < C; c++) m[i][c] = R(i == c);
     }
-    RW_FN R separation(const double (&)[3], int axis, double gap) const { return R(2.0 * gap / data.axes[axis].spacing); }
+    RW_FN R separation(const double (&)[3], int axis, double difference_step) const { return R(2.0 * difference_step / data.axes[axis].spacing); }
     RW_FN bool velocity(const Step& step, int stage, const R (&x)[D], R (&v)[D], Memory& memory) const {
         Sample<R, D> sample;
         const bool known = Field{data}.template interpolate<false>(step, stage, x, sample, memory);

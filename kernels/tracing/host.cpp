@@ -12,11 +12,11 @@ static_assert(sizeof(GridStep<float>) == 64 && sizeof(GridStep<double>) == 72, "
 // layout.rs asserts the same sizes.
 static_assert(sizeof(Outputs) == 40 && sizeof(ResultPolicy) == 12, "layout");
 
-extern "C" void host_trace(const FlowData* data, const FlowTimes* times, const RW_REAL* h, double gap, const ResultPolicy* policy,
+extern "C" void host_trace(const FlowData* data, const FlowTimes* times, const RW_REAL* h, double difference_step, const ResultPolicy* policy,
                            const float* seeds, uint32_t n, const Outputs* out) {
     for (uint32_t i = 0; i < n; i++) {
         const float seed[3] = {seeds[3 * size_t(i)], seeds[3 * size_t(i) + 1], seeds[3 * size_t(i) + 2]};
-        trace_seed(Flow(*data, times, seed), *h, gap, *policy, seed, i, *out);
+        trace_seed(Flow(*data, times, seed), *h, difference_step, *policy, seed, i, *out);
     }
 }
 

@@ -98,13 +98,14 @@ template <class Flow, int D> RW_FN bool runge_kutta(const Flow& flow, const type
 }
 
 // Gradient from the end points of a seed's particles, and the log-stretch.
-template <class Flow> RW_FN void gradient_by_differences(const Flow& flow, const typename Flow::R (&x)[2 * Flow::C][Flow::D], double gap, const double (&seed)[3],
-                                         Path<typename Flow::R, Flow::D, Flow::C>& path) {
+template <class Flow>
+RW_FN void gradient_by_differences(const Flow& flow, const typename Flow::R (&x)[2 * Flow::C][Flow::D], double difference_step,
+                                     const double (&seed)[3], Path<typename Flow::R, Flow::D, Flow::C>& path) {
     using R = typename Flow::R;
     constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
     R m[D][C];
     RW_UNROLL for (int c = 0; c < C; c++) {
-        R inverse = R(1) / flow.separation(seed, c, gap);
+        R inverse = R(1) / flow.separation(seed, c, difference_step);
         RW_UNROLL for (int i = 0; i < D; i++) m[i][c] = (x[2 * c][i] - x[2 * c + 1][i]) * inverse;
     }
     RW_UNROLL for (int i = 0; i < D; i++) {
@@ -118,8 +119,10 @@ template <class Flow> RW_FN void gradient_by_differences(const Flow& flow, const
     path.log_stretch = log_stretch<C, R>(path.metric);
 }
 
-// Two particles per axis, `gap` coordinate units before and behind the seed. All stop as soon as one of them does.
-template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences(const Flow& flow, int steps, typename Flow::R h, double gap, const double (&seed)[3]) {
+// Two particles per axis, `difference_step` coordinate units before and behind the seed. All stop as soon as one of them does.
+template <class Flow>
+RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences(const Flow& flow, int steps, typename Flow::R h, double difference_step,
+                                                                              const double (&seed)[3]) {
     using R = typename Flow::R;
     constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
     Path<R, D, C> path;
@@ -128,7 +131,7 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
     path.left = false;
     RW_UNROLL for (int p = 0; p < P; p++) {
         double there[3] = {seed[0], seed[1], seed[2]};
-        RW_UNROLL for (int k = 0; k < C; k++) if (k == p / 2) there[k] += p % 2 == 0 ? gap : -gap;
+        RW_UNROLL for (int k = 0; k < C; k++) if (k == p / 2) there[k] += p % 2 == 0 ? difference_step : -difference_step;
         flow.start(there, x[p]);
         path.left = path.left || !flow.inside(x[p]);
     }
@@ -148,7 +151,7 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
         }
         RW_UNROLL for (int p = 0; p < P; p++) RW_UNROLL for (int i = 0; i < D; i++) x[p][i] = end[p][i];
     }
-    gradient_by_differences(flow, x, gap, seed, path);
+    gradient_by_differences(flow, x, difference_step, seed, path);
     return path;
 }
 
@@ -157,7 +160,7 @@ template <class Flow> RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_diffe
 // `group`, from lane `first` on. All lanes of the warp must call it; a lane without a seed has an empty `group`. The result is valid in lane
 // `first`.
 template <class Flow>
-RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flow& flow, int steps, typename Flow::R h, double gap,
+RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flow& flow, int steps, typename Flow::R h, double difference_step,
                                                                       const double (&seed)[3], int particle, int first, uint32_t group) {
     using R = typename Flow::R;
     constexpr int D = Flow::D, C = Flow::C, P = 2 * C;
@@ -166,7 +169,7 @@ RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flo
     R x[D], end[D];
     typename Flow::Memory memory{};
     double there[3] = {seed[0], seed[1], seed[2]};
-    RW_UNROLL for (int k = 0; k < C; k++) if (k == particle / 2) there[k] += particle % 2 == 0 ? gap : -gap;
+    RW_UNROLL for (int k = 0; k < C; k++) if (k == particle / 2) there[k] += particle % 2 == 0 ? difference_step : -difference_step;
     flow.start(there, x);
     path.left = (__ballot_sync(ALL, flow.inside(x)) & group) != group;
     bool going = group != 0 && !path.left;
@@ -189,7 +192,7 @@ RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flo
     }
     R all[P][D];
     RW_UNROLL for (int p = 0; p < P; p++) RW_UNROLL for (int i = 0; i < D; i++) all[p][i] = __shfl_sync(ALL, x[i], first + p);
-    gradient_by_differences(flow, all, gap, seed, path);
+    gradient_by_differences(flow, all, difference_step, seed, path);
     return path;
 }
 #endif
@@ -198,7 +201,7 @@ RW_FN Path<typename Flow::R, Flow::D, Flow::C> trace_differences_lanes(const Flo
 struct Outputs {
     float* log_stretch;
     double* log_stretch_f64;
-    float* lived;
+    float* lifetime_share;
     // 3 and 9 floats per seed.
     float* arrival;
     float* jacobian;
@@ -216,12 +219,12 @@ template <class Flow> RW_FN void write_results(const Flow& flow, const Path<type
     using R = typename Flow::R;
     constexpr int C = Flow::C;
     // A quotient, as on the CPU: exactly 1 if all steps were taken.
-    double lived = double(R(path.steps) / R(policy.steps)), s = double(path.log_stretch);
+    double lifetime_share = double(R(path.steps) / R(policy.steps)), s = double(path.log_stretch);
     if (policy.zero_if_left && path.left) s = 0;
-    else if (policy.by_lifetime) s = lived > 0 ? s / lived : 0;
+    else if (policy.by_lifetime) s = lifetime_share > 0 ? s / lifetime_share : 0;
     out.log_stretch[at] = float(s);
     if (out.log_stretch_f64) out.log_stretch_f64[at] = s;
-    if (out.lived) out.lived[at] = float(lived);
+    if (out.lifetime_share) out.lifetime_share[at] = float(lifetime_share);
     if (out.arrival) {
         float there[3];
         flow.arrival(path.state, seed, there);

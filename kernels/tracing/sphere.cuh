@@ -111,13 +111,13 @@ template <class Config, class Real> struct SphereFlow {
         const double start[4][3] = {{-a.sin_lon, -a.sin_lat * a.cos_lon, 0}, {a.cos_lon, -a.sin_lat * a.sin_lon, 0}, {0, a.cos_lat, 0}, {0, 0, 1.0 / data.level}};
         RW_UNROLL for (int i = 0; i < D; i++) RW_UNROLL for (int c = 0; c < C; c++) m[i][c] = R(start[i][c]);
     }
-    RW_FN R separation(const double (&seed)[3], int axis, double gap) const {
+    RW_FN R separation(const double (&seed)[3], int axis, double difference_step) const {
         if constexpr (LEVELS) {
             double scale[3];
             scales(cos(seed[1] * RADIAN), scale);
-            return R(2.0 * gap * scale[axis]);
+            return R(2.0 * difference_step * scale[axis]);
         } else {
-            const double arc = 2.0 * gap * RADIAN;
+            const double arc = 2.0 * difference_step * RADIAN;
             return R(axis == 0 ? arc * cos(seed[1] * RADIAN) : arc);
         }
     }

@@ -4,7 +4,7 @@
 #if RW_DIFFERENCES
 // As `trace_sorted`, with one particle per lane. A warp traces as many seeds as it has room for all their particles.
 extern "C" __global__ void __launch_bounds__(BLOCK)
-trace_particles(const __grid_constant__ FlowData data, const FlowTimes* __restrict__ times, RW_REAL h, double gap, ResultPolicy policy,
+trace_particles(const __grid_constant__ FlowData data, const FlowTimes* __restrict__ times, RW_REAL h, double difference_step, ResultPolicy policy,
                 const float4* __restrict__ sorted, uint32_t n, Outputs out) {
     constexpr uint32_t PARTICLES = 2 * Flow::C, SEEDS = 32 / PARTICLES;
     const uint32_t lane = threadIdx.x % 32, mine = lane / PARTICLES, first = mine < SEEDS ? mine * PARTICLES : 0;
@@ -14,7 +14,7 @@ trace_particles(const __grid_constant__ FlowData data, const FlowTimes* __restri
     const double from[3] = {s.x, s.y, s.z};
     const float seed[3] = {s.x, s.y, s.z};
     const Flow flow(data, times, seed);
-    const auto path = trace_differences_lanes(flow, policy.steps, h, gap, from, int(lane - first) % int(PARTICLES), int(first), group);
+    const auto path = trace_differences_lanes(flow, policy.steps, h, difference_step, from, int(lane - first) % int(PARTICLES), int(first), group);
     if (group != 0 && lane == first) write_results(flow, path, policy, seed, at, out);
 }
 #endif

@@ -73,28 +73,28 @@ pub fn trace(tracer: &dyn Trace, unit: &[[f32; 3]], extras: Extras) -> Result<Au
     // Chunks are summed in order, so that the result does not depend on the number of threads.
     let parts: Vec<(Samples, Vec<usize>, f64)> = (points.par_chunks(CHUNK).enumerate())
         .map(|(chunk, points)| {
-            let (mut samples, mut numbers, mut lived) = (Samples::default(), Vec::new(), 0.0);
+            let (mut samples, mut numbers, mut lifetimes) = (Samples::default(), Vec::new(), 0.0);
             for (i, &point) in (chunk * CHUNK..).zip(points) {
                 if !tracer.flow().is_missing(point) {
                     push_sample(&mut samples, domain, point, &traced, i, extras);
                     numbers.push(i);
-                    lived += f64::from(traced.lived[i]);
+                    lifetimes += f64::from(traced.lifetime_share[i]);
                 }
             }
-            (samples, numbers, lived)
+            (samples, numbers, lifetimes)
         })
         .collect();
     let (mut samples, mut numbers) = (Samples::default(), Vec::new());
-    let mut lived = 0.0;
-    for (mut part, mut part_numbers, part_lived) in parts {
+    let mut lifetimes = 0.0;
+    for (mut part, mut part_numbers, part_lifetimes) in parts {
         numbers.append(&mut part_numbers);
         samples.points.append(&mut part.points);
         samples.log_stretch.append(&mut part.log_stretch);
         samples.arrival.append(&mut part.arrival);
         samples.jacobian.append(&mut part.jacobian);
-        lived += part_lived;
+        lifetimes += part_lifetimes;
     }
-    let mean_lifetime_share = lived / samples.len().max(1) as f64;
+    let mean_lifetime_share = lifetimes / samples.len().max(1) as f64;
     Ok(Audit { samples, numbers, drawn: points.len(), mean_lifetime_share })
 }
 

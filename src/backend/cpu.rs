@@ -160,11 +160,7 @@ fn refine_on_cpu(
 ///
 /// # Errors
 /// The device of the tracer or of the surrogate fails, or the renderer rejects the number of samples. The state of `renderer` is then unspecified.
-pub fn render_on_cpu(
-    frame: &HostFrame<'_>,
-    renderer: &mut Renderer,
-    picture: &mut HostPicture,
-) -> Result<Rendered<Samples>, DeviceError> {
+pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer, picture: &mut HostPicture) -> Result<Rendered<Samples>, DeviceError> {
     if let Some(smooth) = frame.smooth {
         return refine_on_cpu(frame, smooth, renderer, picture);
     }

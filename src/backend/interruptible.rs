@@ -59,7 +59,7 @@ impl Trace for Interruptible<'_> {
                 self.tracer.trace(part, extras, &mut piece)?;
                 out.log_stretch.append(&mut piece.log_stretch);
                 out.log_stretch_f64.append(&mut piece.log_stretch_f64);
-                out.lived.append(&mut piece.lived);
+                out.lifetime_share.append(&mut piece.lifetime_share);
                 out.arrival.append(&mut piece.arrival);
                 out.jacobian.append(&mut piece.jacobian);
             }
@@ -106,7 +106,7 @@ mod tests {
             *traced += seeds.len();
             self.stop.fetch_or(*traced >= self.limit, Ordering::Relaxed);
             out.log_stretch = seeds.iter().map(|s| s[0]).collect();
-            out.lived = vec![1.0; seeds.len()];
+            out.lifetime_share = vec![1.0; seeds.len()];
             out.arrival = if extras.arrival { seeds.to_vec() } else { Vec::new() };
         }
     }
@@ -125,7 +125,7 @@ mod tests {
         let (seeds, out) = traced(usize::MAX);
         assert_eq!(out.arrival, seeds);
         assert!(out.log_stretch.iter().zip(&seeds).all(|(s, seed)| *s == seed[0]));
-        assert_eq!((out.lived.len(), out.log_stretch_f64.len(), out.jacobian.len()), (seeds.len(), 0, 0));
+        assert_eq!((out.lifetime_share.len(), out.log_stretch_f64.len(), out.jacobian.len()), (seeds.len(), 0, 0));
     }
 
     #[test]
@@ -133,7 +133,7 @@ mod tests {
         let (seeds, out) = traced(5000);
         let known = out.log_stretch.iter().filter(|s| !s.is_nan()).count();
         assert!((5000..seeds.len()).contains(&known), "{known}");
-        assert_eq!((out.log_stretch.len(), out.lived.len(), out.arrival.len()), (seeds.len(), seeds.len(), seeds.len()));
+        assert_eq!((out.log_stretch.len(), out.lifetime_share.len(), out.arrival.len()), (seeds.len(), seeds.len(), seeds.len()));
         assert!(out.log_stretch[known..].iter().all(|s| s.is_nan()));
     }
 }

@@ -22,7 +22,7 @@ pub use device::{Device, TracedOnce};
 pub use error::DeviceError;
 pub use interruptible::Interruptible;
 pub use placement::{Needs, Place, Placement};
-pub use router::{QueryRouter, Routing, Tally};
+pub use router::{QueryRouter, Routing, Tally, keeps_label};
 pub use settings::{DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 
 use crate::field::Domain;

@@ -1,15 +1,21 @@
 //! Routes the log-stretch queries of a frame on the CPU, and keeps a sample of the traced ones as training labels.
 //!
-//! The rule is the same on every backend; `kernels/rendering/answer.cu` applies it on a GPU:
+//! The routing rule is the same on every backend; `kernels/rendering/answer.cu` applies it on a GPU:
 //! 1. A query in a missing cell has the value NaN.
 //! 2. The surrogate predicts in cells that the gate trusts.
 //! 3. RK4 traces all other queries. After the tracing budget of the frame is spent, the surrogate predicts them instead, and they are counted.
 //! 4. Without a surrogate, every query outside missing cells is traced.
+//!
+//! So is the label rule ([`keeps_label`], `keeps_label` of `kernels/common/domain.cuh`): a traced query is a label if the hash of its point is among
+//! the lowest 2^-shift of all hashes (adaptive sampling by hash value as in Wegman; Flajolet 1990). The shift grows until three quarters of the
+//! bound hold the expected number of labels and the bound holds the labels themselves. So the set of the labels is a function of the set of traced
+//! queries, whatever their order, and a uniform sample of it.
 
 use super::DeviceError;
 use crate::field::Domain;
 use crate::flow::{Extras, Traced};
 use crate::render::LogStretch;
+use crate::render::rng::philox;
 use crate::surrogate::{Predict, Samples, Trace};
 use crate::trust::Gate;
 use std::time::Instant;
@@ -32,16 +38,62 @@ pub struct QueryRouter<'a> {
     tracer: &'a dyn Trace,
     surrogate: Option<&'a dyn Predict>,
     routing: Routing<'a>,
-    stride: usize,
-    since_kept: usize,
-    /// Labels: traced queries, spread evenly over the frame (fewer than `keep`).
+    share: LabelShare,
+    /// Labels, in the order of the queries (fewer than `keep`).
     pub samples: Samples,
+    /// Domain coordinates of the labels, whose hash the label rule takes.
+    label_points: Vec<[f32; 3]>,
     /// Counts and times of the frame so far.
     pub tally: Tally,
     /// First device error. All later queries are NaN.
     failure: Option<DeviceError>,
     traced: Traced,
     scratch: Scratch,
+}
+
+/// Returns true if the label at a point is in the sample of 1 in 2^shift.
+pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
+    let [x, y, z] = point.map(f32::to_bits);
+    shift == 0 || (shift < 32 && philox([x, y, z, 0], [0, 0])[0] >> (32 - shift) == 0)
+}
+
+/// Share of the traced queries of a frame that are kept as labels, one in 2^shift.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LabelShare {
+    /// Upper bound (exclusive) on the labels, at least 2.
+    bound: usize,
+    pub(super) shift: u32,
+    /// Queries traced so far.
+    traced: u64,
+}
+
+impl LabelShare {
+    /// A share of at most one in 2^shift for fewer than `bound` labels.
+    pub(super) fn new(bound: usize, shift: u32) -> Self {
+        Self { bound: bound.max(2), shift, traced: 0 }
+    }
+
+    pub(super) fn keeps(&self, point: [f32; 3]) -> bool {
+        keeps_label(point, self.shift)
+    }
+
+    /// Takes in the number of further traced queries. Returns true if the share shrinks; the caller then drops the labels outside it.
+    pub(super) fn expect(&mut self, traced: usize) -> bool {
+        self.traced += traced as u64;
+        let before = self.shift;
+        // Three quarters of the bound: a random excess over the bound would halve the labels.
+        while self.traced >> self.shift > (self.bound - self.bound / 4) as u64 {
+            self.shift += 1;
+        }
+        self.shift > before
+    }
+
+    /// Halves the share if so many labels reach the bound. If true, the caller drops the labels outside the share and asks again.
+    pub(super) fn halve_if_full(&mut self, labels: usize) -> bool {
+        let full = labels >= self.bound;
+        self.shift += u32::from(full);
+        full
+    }
 }
 
 /// Query counts and times of one frame.
@@ -77,9 +129,9 @@ impl<'a> QueryRouter<'a> {
             tracer,
             surrogate,
             routing,
-            stride: 1,
-            since_kept: 0,
+            share: LabelShare::new(routing.keep, 0),
             samples: Samples::default(),
+            label_points: Vec::new(),
             tally: Tally::default(),
             failure: None,
             traced: Traced::default(),
@@ -103,39 +155,38 @@ impl<'a> QueryRouter<'a> {
         self.routing.trace_budget.is_some_and(|budget| self.tally.trace_seconds >= budget)
     }
 
-    /// Keeps every stride-th traced query. At the limit, every other label is dropped and the stride doubles, so that the labels stay spread
-    /// evenly over the frame.
+    /// Keeps the labels among the `count` queries traced last.
     fn keep_samples(&mut self, count: usize) {
         let domain = self.domain();
         let extras = self.routing.extras;
+        if self.share.expect(count) {
+            self.thin();
+        }
         for i in 0..count {
-            self.since_kept += 1;
-            if self.since_kept < self.stride {
-                continue;
-            }
-            self.since_kept = 0;
-            push_sample(&mut self.samples, domain, self.scratch.points[i], &self.traced, i, extras);
-            if self.samples.len() >= self.routing.keep {
-                halve(&mut self.samples);
-                self.stride *= 2;
+            let point = self.scratch.points[i];
+            if self.share.keeps(point) {
+                push_sample(&mut self.samples, domain, point, &self.traced, i, extras);
+                self.label_points.push(point);
+                while self.share.halve_if_full(self.samples.len()) {
+                    self.thin();
+                }
             }
         }
     }
-}
 
-/// Drops every other sample.
-fn halve(samples: &mut Samples) {
-    fn every_other<T>(values: &mut Vec<T>) {
-        let mut keep = false;
-        values.retain(|_| {
-            keep = !keep;
-            keep
-        });
+    /// Drops the labels outside the share.
+    fn thin(&mut self) {
+        fn retain<T>(values: &mut Vec<T>, kept: &[bool]) {
+            let mut kept = kept.iter();
+            values.retain(|_| kept.next() == Some(&true));
+        }
+        let kept: Vec<bool> = self.label_points.iter().map(|&point| self.share.keeps(point)).collect();
+        retain(&mut self.label_points, &kept);
+        retain(&mut self.samples.points, &kept);
+        retain(&mut self.samples.log_stretch, &kept);
+        retain(&mut self.samples.arrival, &kept);
+        retain(&mut self.samples.jacobian, &kept);
     }
-    every_other(&mut samples.points);
-    every_other(&mut samples.log_stretch);
-    every_other(&mut samples.arrival);
-    every_other(&mut samples.jacobian);
 }
 
 /// Converts an arrival point to unit coordinates, which may lie outside [0, 1].
@@ -221,5 +272,106 @@ impl LogStretch for QueryRouter<'_> {
             log_stretch.fill(f32::NAN);
             traced.fill(false);
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::field::analytic::Analytic;
+    use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+    use crate::render::{RenderSettings, Renderer, Scene, TransferSettings};
+    use std::sync::atomic::AtomicBool;
+
+    fn saddle() -> Box<dyn Tracer> {
+        let domain = Domain::slab([-1.0; 2], [1.0; 2], (-1.0, 1.0));
+        cpu_tracer(VelocitySource::Analytic(Analytic::Saddle { rate: 0.7 }, domain), &FlowMap::tangent(1.0, 4), 0.0).unwrap()
+    }
+
+    fn routing(gate: &Gate, keep: usize) -> Routing<'_> {
+        Routing { gate, trace_budget: None, keep, extras: Extras { arrival: true, jacobian: true } }
+    }
+
+    fn bits(samples: &Samples) -> Vec<[u32; 3]> {
+        samples.points.iter().map(|point| point.map(f32::to_bits)).collect()
+    }
+
+    fn sorted<T: Ord>(mut values: Vec<T>) -> Vec<T> {
+        values.sort_unstable();
+        values
+    }
+
+    #[test]
+    fn each_shift_halves_what_is_kept() {
+        let point = |i: u32| [i as f32 * 0.001, (i % 97) as f32, 0.5];
+        let kept = |shift| (0..1 << 16).filter(|&i| keeps_label(point(i), shift)).count() as f64;
+        for shift in 0..6 {
+            let expected = f64::from(1 << 16) / f64::from(1 << shift);
+            // Four standard deviations of a binomial count.
+            assert!((kept(shift) - expected).abs() <= 4.0 * expected.sqrt(), "{} of {expected} at {shift}", kept(shift));
+        }
+        assert!((0..1000).all(|i| !keeps_label(point(i), 4) || keeps_label(point(i), 3)), "a larger share holds the smaller");
+        assert_eq!(kept(32), 0.0);
+    }
+
+    #[test]
+    fn labels_are_an_even_share_below_the_bound_in_any_order() {
+        const TRACED: usize = 20_000;
+        let (tracer, gate) = (saddle(), Gate::uniform(false));
+        let mut points: Vec<[f32; 3]> = (0..TRACED as u32)
+            .map(|i| philox([i, 0, 0, 0], [7, 0]))
+            .map(|w| [0, 1, 2].map(|k| 2.0 * crate::render::rng::unit(w[k]) - 1.0))
+            .collect();
+        for keep in [0, 1, 2, 10, 1000, 4096, TRACED, 2 * TRACED] {
+            let mut labels = |batch: usize| {
+                points.reverse();
+                let mut router = QueryRouter::new(&tracer, None, routing(&gate, keep));
+                for points in points.chunks(batch) {
+                    router.evaluate(points, &mut vec![0.0; points.len()], &mut vec![false; points.len()]);
+                    assert!(router.samples.len() < keep.max(1), "{} for {keep}", router.samples.len());
+                }
+                let (tally, samples) = router.finish().unwrap();
+                assert_eq!(tally.traced, TRACED as u64);
+                let lengths = [samples.log_stretch.len(), samples.arrival.len(), samples.jacobian.len()];
+                assert_eq!(lengths, [samples.len(); 3]);
+                samples
+            };
+            let first = labels(TRACED);
+            assert_eq!(sorted(bits(&first)), sorted(bits(&labels(777))), "{keep}");
+            // Each arrival belongs to its point: x grows by e^0.7 about the middle, while the path is in the domain.
+            for (point, arrival) in first.points.iter().zip(&first.arrival).filter(|(point, _)| (point[0] - 0.5).abs() < 0.2) {
+                assert!((arrival[0] - 0.5 - 0.7_f32.exp() * (point[0] - 0.5)).abs() < 1e-3, "{point:?} arrives at {arrival:?}");
+            }
+            let share = (0..32).map(|shift| TRACED >> shift).find(|&share| share <= keep - keep / 4);
+            if let Some(share) = share.filter(|_| keep >= 1000) {
+                let most = if share == TRACED { 0.0 } else { 4.0 * (share as f64).sqrt() };
+                assert!((first.len() as f64 - share as f64).abs() <= most, "{} of {share} for {keep}", first.len());
+                let left = first.points.iter().filter(|point| point[0] < 0.5).count() as f64;
+                assert!((left - first.len() as f64 / 2.0).abs() <= 2.0 * (first.len() as f64).sqrt() + most, "{left} lie left");
+            }
+        }
+        // Copies of a point have one hash: no share keeps some of them.
+        let mut router = QueryRouter::new(&tracer, None, routing(&gate, 100));
+        router.evaluate(&[[0.25; 3]; 1000], &mut [0.0; 1000], &mut [false; 1000]);
+        assert_eq!(router.samples.len(), 0);
+    }
+
+    #[test]
+    fn labels_of_a_frame_do_not_depend_on_threads_and_waves() {
+        let (tracer, gate) = (saddle(), Gate::uniform(false));
+        let labels = |threads: usize, flights: usize| {
+            let settings = RenderSettings { width: 40, height: 30, ..RenderSettings::default() };
+            let transfer = TransferSettings { low: Some(0.2), high: Some(0.9), extinction: Some(20.0), ..TransferSettings::default() };
+            let scene = Scene::assemble(tracer.domain(), None, None, Some(transfer), settings, 1);
+            let mut renderer = Renderer::new(scene, tracer.domain(), tracer.tau()).unwrap().with_wave_flights(flights);
+            let mut router = QueryRouter::new(&tracer, None, routing(&gate, 1000));
+            let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+            pool.install(|| renderer.render(0, &mut router, 4, None, &AtomicBool::new(false))).unwrap();
+            bits(&router.finish().unwrap().1)
+        };
+        let one = labels(1, 1 << 17);
+        assert!(one.len() > 300 && one.len() < 1000, "{}", one.len());
+        assert_eq!(one, labels(4, 1 << 17));
+        assert_eq!(sorted(one), sorted(labels(2, 700)));
     }
 }

@@ -54,10 +54,10 @@ pub fn exit_status(error: &anyhow::Error) -> u8 {
         return interrupted.status;
     }
     let configuration = error.chain().any(|cause| {
-        let engine = cause.downcast_ref().is_some_and(|error: &RunError| error.refused().is_some());
+        let run = cause.downcast_ref().is_some_and(|error: &RunError| error.refused().is_some());
         let publish = cause.downcast_ref().is_some_and(|error: &PublishError| error.refused().is_some());
         let source = cause.downcast_ref().is_some_and(|error: &SourceError| error.refused().is_some());
-        engine || publish || source || cause.is::<ConfigError>() || cause.is::<Usage>()
+        run || publish || source || cause.is::<ConfigError>() || cause.is::<Usage>()
     });
     if configuration { 2 } else { 1 }
 }

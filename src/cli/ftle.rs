@@ -165,7 +165,8 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
     let convergence = if options.convergence { Some(convergence(plan, slide, &*tracer, &seeds)?) } else { None };
     spinner.finish_and_clear();
     if let Some(out) = &options.out {
-        write(out, plan, slide, &*tracer, grid, &ftle, &traced.lived).with_context(|| format!("cannot write {}", out.display()))?;
+        write(out, plan, slide, &*tracer, grid, &ftle, &traced.lifetime_share)
+            .with_context(|| format!("cannot write {}", out.display()))?;
     }
     Ok(Report {
         time: slide.time,
@@ -183,7 +184,7 @@ fn compute(plan: &Plan, slide: &Slide, options: &Options, device: &Device) -> Re
         maximum: known.iter().copied().fold(f64::NEG_INFINITY, f64::max),
         missing_seeds: missing,
         failed_seeds: seeds.len() - missing - known.len(),
-        stopped_early_share: traced.lived.iter().zip(&ftle).filter(|(lived, ftle)| **lived < 1.0 && !ftle.is_nan()).count() as f64
+        stopped_early_share: traced.lifetime_share.iter().zip(&ftle).filter(|(share, ftle)| **share < 1.0 && !ftle.is_nan()).count() as f64
             / seeds.len() as f64,
         seconds,
         samples_per_second: seeds.len() as f64 / seconds,
@@ -292,7 +293,15 @@ fn convergence(plan: &Plan, slide: &Slide, tracer: &dyn Tracer, seeds: &[[f32; 3
 }
 
 /// Writes the field under a temporary name and renames it, so that an unfinished file never has the final name.
-fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usize; 3], ftle: &[f64], lived: &[f32]) -> Result<()> {
+fn write(
+    out: &Path,
+    plan: &Plan,
+    slide: &Slide,
+    tracer: &dyn Tracer,
+    grid: [usize; 3],
+    ftle: &[f64],
+    lifetime_share: &[f32],
+) -> Result<()> {
     let folder = out.parent().filter(|p| !p.as_os_str().is_empty()).unwrap_or(Path::new("."));
     // Mode by the umask; by default temporary files are private.
     let mode = std::os::unix::fs::PermissionsExt::from_mode(0o666);
@@ -321,9 +330,9 @@ fn write(out: &Path, plan: &Plan, slide: &Slide, tracer: &dyn Tracer, grid: [usi
             variable.put_attribute("long_name", "finite-time Lyapunov exponent")?;
             variable.put_attribute("units", if unit == "1" { unit.to_owned() } else { format!("{unit}-1") })?;
         }
-        let mut variable = file.add_variable::<f32>("lived", &dimensions)?;
-        variable.put_values(lived, ..)?;
-        variable.put_attribute("long_name", "share of tau that the particle lived")?;
+        let mut variable = file.add_variable::<f32>("lifetime_share", &dimensions)?;
+        variable.put_values(lifetime_share, ..)?;
+        variable.put_attribute("long_name", "share of tau until the particle stopped")?;
         variable.put_attribute("units", "1")?;
         file.add_attribute("title", plan.scene.title.as_str())?;
         file.add_attribute("source", format!("ridgewatch {} from {}", env!("CARGO_PKG_VERSION"), plan.source))?;

@@ -134,8 +134,8 @@ pub fn trace<V: Velocity<f64, D, N>, const D: usize, const N: usize>(
     }
     let gradient = field.gradient(&state.0, &state.1);
     let stretch = if gave_up { f64::NAN } else { exponent.mul_add(std::f64::consts::LN_2, log_stretch(&gradient)) };
-    let lived = if alive { 1.0 } else { (time - from) / span };
-    TracedBatch { log_stretch: stretch, lived, left_domain, state: state.0, gradient, exponent }
+    let lifetime_share = if alive { 1.0 } else { (time - from) / span };
+    TracedBatch { log_stretch: stretch, lifetime_share, left_domain, state: state.0, gradient, exponent }
 }
 
 fn derivative<V: Velocity<f64, D, N>, const D: usize, const N: usize>(field: &V, time: f64, at: &State<D, N>, k: &mut State<D, N>) -> f64 {

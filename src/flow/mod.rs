@@ -118,7 +118,7 @@ pub enum Normalisation {
     /// |tau|: a particle stopped at a coast shows no ridge there.
     Tau,
     /// The time until it stopped; the quotient tends to the local strain rate.
-    Lived,
+    Lifetime,
 }
 
 /// Spatial interpolation of gridded velocity.
@@ -210,7 +210,7 @@ pub struct Traced {
     /// The log-stretch in double precision; empty unless the integration is in double precision.
     pub log_stretch_f64: Vec<f64>,
     /// Share of |tau| until the particle stopped, in [0, 1]; 1 if it never stopped.
-    pub lived: Vec<f32>,
+    pub lifetime_share: Vec<f32>,
     /// Arrival positions; empty unless requested.
     pub arrival: Vec<[f32; 3]>,
     /// Jacobians; empty unless requested.
@@ -223,7 +223,7 @@ impl Traced {
         let wanted = |yes: bool| if yes { count } else { 0 };
         self.log_stretch.resize(count, f32::NAN);
         self.log_stretch_f64.resize(wanted(double), f64::NAN);
-        self.lived.resize(count, 0.0);
+        self.lifetime_share.resize(count, 0.0);
         self.arrival.resize(wanted(extras.arrival), [f32::NAN; 3]);
         self.jacobian.resize(wanted(extras.jacobian), [f32::NAN; 9]);
     }

@@ -13,7 +13,7 @@ pub struct TracedBatch<L: Lanes, const D: usize, const C: usize> {
     /// ln of the largest singular value.
     pub log_stretch: L,
     /// Share of |tau| until the particle stopped.
-    pub lived: L,
+    pub lifetime_share: L,
     /// True for particles that left the domain.
     pub left_domain: L::Mask,
     /// Final state.
@@ -132,7 +132,7 @@ pub fn tangent<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usize>(
     }
     let gradient = field.gradient(&x, &m);
     let log_stretch = exponent.mul_add(L::splat_f64(std::f64::consts::LN_2), log_stretch(&gradient));
-    TracedBatch { log_stretch, lived: status.lifetime_share(steps), left_domain: status.left_domain, state: x, gradient, exponent }
+    TracedBatch { log_stretch, lifetime_share: status.lifetime_share(steps), left_domain: status.left_domain, state: x, gradient, exponent }
 }
 
 /// One step of one particle: returns its new state and its mark.
@@ -207,7 +207,7 @@ pub fn differences<L: Lanes, V: Velocity<L, D, C>, const D: usize, const C: usiz
     let gradient = field.gradient(&state, &m);
     TracedBatch {
         log_stretch: log_stretch(&gradient),
-        lived: status.lifetime_share(steps),
+        lifetime_share: status.lifetime_share(steps),
         left_domain: status.left_domain,
         state,
         gradient,

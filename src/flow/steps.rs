@@ -37,10 +37,10 @@ pub fn rms_difference(a: &Traced, b: &Traced) -> f64 {
 /// [`rms_difference`] without the share `trimmed` of the points that differ most, and the number of points without a finite difference. The
 /// difference is infinite if the latter are more than [`TRIMMED_SHARE`] of all.
 fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> (f64, usize) {
-    let whole = |i: &usize| a.lived[*i] >= 1.0 && b.lived[*i] >= 1.0;
-    let all = 0..a.lived.len();
-    let lived = all.clone().filter(whole).count();
-    let chosen: Vec<usize> = if lived >= MIN_COMPLETE_PATHS { all.filter(whole).collect() } else { all.collect() };
+    let whole = |i: &usize| a.lifetime_share[*i] >= 1.0 && b.lifetime_share[*i] >= 1.0;
+    let all = 0..a.lifetime_share.len();
+    let complete = all.clone().filter(whole).count();
+    let chosen: Vec<usize> = if complete >= MIN_COMPLETE_PATHS { all.filter(whole).collect() } else { all.collect() };
     let value = |t: &Traced, i: usize| t.log_stretch_f64.get(i).copied().unwrap_or(f64::from(t.log_stretch[i]));
     let compared = chosen.len();
     let mut squares: Vec<f64> =
@@ -129,7 +129,7 @@ mod tests {
     fn paths_without_a_number_are_counted() {
         let traced = |failed: usize| Traced {
             log_stretch: (0..1000).map(|i| if i < failed { f32::NAN } else { 1.0 }).collect(),
-            lived: vec![1.0; 1000],
+            lifetime_share: vec![1.0; 1000],
             ..Traced::default()
         };
         for trimmed in [0.0, TRIMMED_SHARE] {

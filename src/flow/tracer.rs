@@ -166,13 +166,13 @@ where
 
     /// Log-stretch and lifetime share of a lane, with boundary policy and normalisation applied.
     fn normalised_stretch(&self, batch: &TracedBatch<L, D, C>, lane: usize) -> (f64, f64) {
-        let (stretch, lived) = (batch.log_stretch.lane(lane).to_f64(), batch.lived.lane(lane).to_f64());
+        let (stretch, lifetime_share) = (batch.log_stretch.lane(lane).to_f64(), batch.lifetime_share.lane(lane).to_f64());
         if self.boundary == Boundary::Zero && batch.left_domain.lane(lane) {
-            return (0.0, lived);
+            return (0.0, lifetime_share);
         }
         match self.normalisation {
-            Normalisation::Tau => (stretch, lived),
-            Normalisation::Lived => (if lived > 0.0 { stretch / lived } else { 0.0 }, lived),
+            Normalisation::Tau => (stretch, lifetime_share),
+            Normalisation::Lifetime => (if lifetime_share > 0.0 { stretch / lifetime_share } else { 0.0 }, lifetime_share),
         }
     }
 
@@ -230,7 +230,7 @@ where
             let seeds = &seeds[block.clone()];
             let order = self.sorted(seeds);
             let stretch = Scatter::new(&mut out.log_stretch[block.clone()]);
-            let lived = Scatter::new(&mut out.lived[block.clone()]);
+            let lifetime_share = Scatter::new(&mut out.lifetime_share[block.clone()]);
             let arrival = Scatter::new(if extras.arrival { &mut out.arrival[block.clone()] } else { &mut [] });
             let jacobian = Scatter::new(if extras.jacobian { &mut out.jacobian[block.clone()] } else { &mut [] });
             let precise = Scatter::new(if double { &mut out.log_stretch_f64[block.clone()] } else { &mut [] });
@@ -255,7 +255,7 @@ where
                             if let Some(array) = &stretch {
                                 array.write(index, s as f32);
                             }
-                            if let Some(array) = &lived {
+                            if let Some(array) = &lifetime_share {
                                 array.write(index, share as f32);
                             }
                             if let Some(array) = &precise {

@@ -178,7 +178,10 @@ mod tests {
         let meta = MetaData::read_from_buffered(Cursor::new(&bytes), true).unwrap();
         assert_eq!(meta.headers.len(), 1);
         let names: Vec<String> = meta.headers[0].channels.list.iter().map(|c| c.name.to_string()).collect();
-        assert_eq!(names, ["A", "B", "G", "R", "error", "ftle.mean", "missing.share", "queries.count", "samples.count", "trust.traced", "variance"]);
+        assert_eq!(
+            names,
+            ["A", "B", "G", "R", "error", "ftle.mean", "missing.share", "queries.count", "samples.count", "trust.traced", "variance"]
+        );
         let other = &meta.headers[0].own_attributes.other;
         assert_eq!(other.get(&Text::from("ridgewatch.time")), Some(&AttributeValue::F64(1.5)));
         let AttributeValue::Text(json) = &other[&Text::from("ridgewatch.record")] else { panic!("text") };

@@ -1,7 +1,7 @@
 //! Output of frames (ZeroMQ, EXR, PNG, records) and comparison of pictures.
 //!
 //! In: finished frames. Out: files and messages, described in docs/protocol.md. A slow subscriber or a full disk never stops the cycle, which
-//! calls [`Output`] alone. This room uses `engine` and `render` for their types only.
+//! calls [`Output`] alone. This room uses `run` and `render` for their types only.
 
 mod compare;
 mod error;

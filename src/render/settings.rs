@@ -94,8 +94,11 @@ impl std::str::FromStr for Target {
     type Err = String;
 
     fn from_str(text: &str) -> Result<Self, String> {
-        let accepted = || format!("{text:?} is not accepted; accepted: decibels such as \"40dB\" (1 to 80), or \"relmse=1e-3\" (1e-9 to 1)");
-        let number = |digits: &str, range: std::ops::RangeInclusive<f64>| digits.trim().parse().ok().filter(|v| range.contains(v)).ok_or_else(accepted);
+        let accepted =
+            || format!("{text:?} is not accepted; accepted: decibels such as \"40dB\" (1 to 80), or \"relmse=1e-3\" (1e-9 to 1)");
+        let number = |digits: &str, range: std::ops::RangeInclusive<f64>| {
+            digits.trim().parse().ok().filter(|v| range.contains(v)).ok_or_else(accepted)
+        };
         let lower = text.trim().to_ascii_lowercase();
         match (lower.strip_suffix("db"), lower.strip_prefix("relmse=")) {
             (Some(decibels), _) => Ok(Self::Psnr(number(decibels, 1.0..=80.0)?)),

@@ -160,7 +160,11 @@ impl Run<'_> {
         };
         let smooth = match scene.render.method {
             method if method.is_smooth() => {
-                let nodes = self.learning.settings.nodes(&self.plan.domain).map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
+                let nodes = self
+                    .learning
+                    .settings
+                    .nodes(&self.plan.domain)
+                    .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
                 Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes })
             }
             _ => None,

@@ -3,10 +3,9 @@
 //! [`Host`](super::Host) implements them on the CPU, the CUDA backend on a GPU. The schedule of training, the shrinkage and the checkpoints are
 //! written once, over these traits.
 
-use super::hybrid::FrozenHybrid;
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::trace::Trace;
-use super::{ReplayBuffer, Table};
+use super::{Kind, Predict, ReplayBuffer, Table};
 use crate::backend::DeviceError;
 use std::sync::Arc;
 
@@ -15,7 +14,7 @@ pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     /// Traces the nodes of tables.
     type Tracer<'t>: Trace + ?Sized;
     /// Log-stretch at the nodes of a grid.
-    type Table: DeviceTable;
+    type Table: SurrogateTable;
     /// A network in training.
     type Training: Training<Table = Self::Table>;
 
@@ -32,8 +31,46 @@ pub trait SurrogateDevice: Sized + Send + Sync + 'static {
     fn predict(frozen: &FrozenHybrid<Self>, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
 }
 
+/// An immutable copy of a surrogate. Frames are rendered with it while training continues.
+pub struct FrozenHybrid<D: SurrogateDevice> {
+    /// The table, if there is one.
+    pub table: Option<D::Table>,
+    /// The network, if there is one.
+    pub network: Option<Arc<<D::Training as Training>::Network>>,
+    /// Factor on the network above a table; 1 without a table.
+    pub shrinkage: f32,
+    /// Start time and duration of predictions, in unit intervals.
+    pub times: [f32; 2],
+    /// Unique number of this frozen surrogate in this process.
+    pub stamp: u64,
+    pub(super) kind: Kind,
+    pub(super) bytes: usize,
+}
+
+impl<D: SurrogateDevice> Predict for FrozenHybrid<D> {
+    fn name(&self) -> &'static str {
+        self.kind.name()
+    }
+
+    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
+        D::predict(self, points, out)
+    }
+
+    fn bytes(&self) -> usize {
+        self.bytes
+    }
+}
+
+impl<D: SurrogateDevice> FrozenHybrid<D> {
+    /// Returns the surrogate with shrinkage 1, to evaluate its parts.
+    pub(super) fn parts(&self) -> Self {
+        let Self { table, network, times, stamp, kind, bytes, .. } = self;
+        Self { table: table.clone(), network: network.clone(), shrinkage: 1.0, times: *times, stamp: *stamp, kind: *kind, bytes: *bytes }
+    }
+}
+
 /// A table on a device. Clones share the values.
-pub trait DeviceTable: Clone + Send + Sync + 'static {
+pub trait SurrogateTable: Clone + Send + Sync + 'static {
     /// The table on the host. The values are downloaded at most once.
     ///
     /// # Errors
@@ -97,7 +134,7 @@ pub enum NetworkCopy {
 #[allow(clippy::missing_errors_doc)] // said above
 pub trait Training: Send + Sync + Sized {
     /// The table below the network.
-    type Table: DeviceTable;
+    type Table: SurrogateTable;
     /// An immutable network, for prediction.
     type Network: Send + Sync;
 

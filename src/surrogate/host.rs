@@ -1,7 +1,9 @@
 //! Surrogates on the CPU.
 
-use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SurrogateDevice, SyncedSamples, Training};
-use super::hybrid::{FrozenHybrid, Hybrid};
+use super::device::{
+    FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SurrogateTable, SyncedSamples, Training,
+};
+use super::hybrid::Hybrid;
 use super::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Predictor, Step};
 use super::trace::Trace;
 use super::{Kind, NetworkSettings, SurrogateError, SurrogateSettings, Table};
@@ -45,7 +47,7 @@ impl SurrogateDevice for Host {
     }
 }
 
-impl DeviceTable for Table {
+impl SurrogateTable for Table {
     fn to_host(&self) -> Result<Table, DeviceError> {
         Ok(self.clone())
     }
@@ -72,6 +74,16 @@ pub fn build(
     let nodes = if settings.kind == Kind::Network { [2; 3] } else { settings.nodes(domain)? };
     let training = |model: Model| HostTraining::new(HostNetwork::fresh(model));
     Ok(Hybrid::new(settings.kind, nodes, network, seed, tracer, training)?.unwrap_or_else(|error| panic!("a tracer of the CPU: {error}")))
+}
+
+impl<D: SurrogateDevice> Hybrid<D> {
+    /// Returns the surrogate on the CPU, with its network and without its table, which is traced later.
+    ///
+    /// # Errors
+    /// The network is downloaded from the device, and the device fails.
+    pub fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
+        self.moved(from, HostTraining::new)
+    }
 }
 
 impl HostNetwork {

@@ -6,14 +6,13 @@
 
 use super::checkpoint::Checkpoint;
 use super::checkpoint_state::CheckpointState;
-use super::device::{DeviceTable, NetworkFrom, SurrogateDevice, Training};
+use super::device::{FrozenHybrid, HostNetwork, NetworkFrom, SurrogateDevice, SurrogateTable, Training};
 use super::network::{HELD_OUT, Loss, Model, NetworkSettings, Target};
 use super::trace::Trace;
 use super::trainer::Trainer;
-use super::{CheckpointError, HostSurrogate, Kind, Learned, Predict, ReplayBuffer, Samples, SurrogateError, fresh_stamp};
+use super::{CheckpointError, Kind, Learned, Predict, ReplayBuffer, Samples, SurrogateError, fresh_stamp};
 use crate::backend::DeviceError;
 use std::path::Path;
-use std::sync::Arc;
 use std::time::Instant;
 
 /// Largest number of held-out samples that decide the shrinkage.
@@ -30,36 +29,6 @@ pub struct Hybrid<D: SurrogateDevice> {
     shrinkage: f32,
     /// True if the table has changed since the last training.
     slid: bool,
-}
-
-/// An immutable copy of a surrogate. Frames are rendered with it while training continues.
-pub struct FrozenHybrid<D: SurrogateDevice> {
-    /// The table, if there is one.
-    pub table: Option<D::Table>,
-    /// The network, if there is one.
-    pub network: Option<Arc<<D::Training as Training>::Network>>,
-    /// Factor on the network above a table; 1 without a table.
-    pub shrinkage: f32,
-    /// Start time and duration of predictions, in unit intervals.
-    pub times: [f32; 2],
-    /// Unique number of this frozen surrogate in this process.
-    pub stamp: u64,
-    kind: Kind,
-    bytes: usize,
-}
-
-impl<D: SurrogateDevice> Predict for FrozenHybrid<D> {
-    fn name(&self) -> &'static str {
-        self.kind.name()
-    }
-
-    fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
-        D::predict(self, points, out)
-    }
-
-    fn bytes(&self) -> usize {
-        self.bytes
-    }
 }
 
 impl<D: SurrogateDevice> Predict for Hybrid<D> {
@@ -308,20 +277,16 @@ impl<D: SurrogateDevice> Hybrid<D> {
         Ok(())
     }
 
-    /// Returns the surrogate on the CPU, with its network and without its table, which is traced later.
+    /// Returns the surrogate on another device, without its table, which is traced later. `training` moves the network there.
     ///
     /// # Errors
     /// The network is downloaded from the device, and the device fails.
-    pub fn to_host(&mut self, from: NetworkFrom) -> Result<HostSurrogate, DeviceError> {
-        let trainer = self.trainer.as_mut().map(|trainer| trainer.on_host(from)).transpose()?;
+    pub(super) fn moved<E: SurrogateDevice>(
+        &mut self,
+        from: NetworkFrom,
+        training: impl FnOnce(HostNetwork) -> E::Training,
+    ) -> Result<Hybrid<E>, DeviceError> {
+        let trainer = self.trainer.as_mut().map(|trainer| trainer.moved(from, training)).transpose()?;
         Ok(Hybrid { kind: self.kind, nodes: self.nodes, table: None, trainer, shrinkage: self.shrinkage, slid: self.slid })
-    }
-}
-
-impl<D: SurrogateDevice> FrozenHybrid<D> {
-    /// Returns the surrogate with shrinkage 1, to evaluate its parts.
-    fn parts(&self) -> Self {
-        let Self { table, network, times, stamp, kind, bytes, .. } = self;
-        Self { table: table.clone(), network: network.clone(), shrinkage: 1.0, times: *times, stamp: *stamp, kind: *kind, bytes: *bytes }
     }
 }

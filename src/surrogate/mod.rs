@@ -22,9 +22,11 @@ mod trace;
 mod trainer;
 
 pub use checkpoint_state::CheckpointState;
-pub use device::{DeviceTable, Download, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SyncedSamples, Training};
+pub use device::{
+    Download, FrozenHybrid, HostNetwork, Labels, NetworkCopy, NetworkFrom, SurrogateDevice, SurrogateTable, SyncedSamples, Training,
+};
 pub use host::{FrozenNetwork, Host, HostSurrogate, HostTraining, build};
-pub use hybrid::{FrozenHybrid, Hybrid};
+pub use hybrid::Hybrid;
 pub use replay_buffer::{BufferMark, KEEP_STALE, ReplayBuffer};
 pub use sizing::{Resize, Sizing};
 pub use table::Table;
@@ -251,9 +253,9 @@ impl Default for SurrogateSettings {
 /// Default nodes along the longest edge of a table for closed forms: of a table alone, and of a table below a network.
 const DEFAULT_NODES: [usize; 2] = [256, 128];
 /// Maximum nodes of a table with the nodes of the data. Every slide traces them again, which takes two cores about ten seconds.
-const MOST_OWN_NODES: usize = 1 << 21;
+const MAX_OWN_NODES: usize = 1 << 21;
 /// Maximum nodes of a table: 4 GiB of f32.
-const MOST_NODES: usize = 1 << 30;
+const MAX_NODES: usize = 1 << 30;
 
 impl SurrogateSettings {
     /// Checks the settings that do not depend on the domain.
@@ -288,7 +290,7 @@ impl SurrogateSettings {
         if active.iter().any(|&n| n < 2) {
             return refuse("at least 2 along every axis that the flow varies along");
         }
-        if active.iter().try_fold(1_usize, |product, &n| product.checked_mul(n)).is_none_or(|n| n > MOST_NODES) {
+        if active.iter().try_fold(1_usize, |product, &n| product.checked_mul(n)).is_none_or(|n| n > MAX_NODES) {
             return refuse("at most 2^30 in all");
         }
         Ok(())
@@ -299,7 +301,7 @@ impl SurrogateSettings {
     pub fn at_resolution_of(&self, shape: [usize; 3], most: usize) -> Self {
         let all: f64 = shape.iter().map(|&n| n as f64).product();
         let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
-        let share = (most.min(MOST_OWN_NODES) as f64 / all).min(1.0).powf(1.0 / axes as f64);
+        let share = (most.min(MAX_OWN_NODES) as f64 / all).min(1.0).powf(1.0 / axes as f64);
         let own = shape.map(|n| ((n as f64 * share) as usize).max(2));
         Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
     }
@@ -329,7 +331,7 @@ mod tests {
         let set = SurrogateSettings { table_nodes: Some([5, 6, 7]), ..open.clone() };
         assert_eq!(set.at_resolution_of([81, 41, 1], usize::MAX), set);
         let [x, y, z] = open.at_resolution_of([3000, 1500, 100], usize::MAX).table_nodes.unwrap();
-        assert!(x * y * z <= MOST_OWN_NODES && x * y * z > MOST_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
+        assert!(x * y * z <= MAX_OWN_NODES && x * y * z > MAX_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
         assert!(x.abs_diff(2 * y) <= 2, "{x} x {y}: all axes are divided alike");
         assert_eq!(open.at_resolution_of([128, 128, 128], 64 * 64 * 64).table_nodes, Some([64, 64, 64]));
     }

@@ -42,9 +42,9 @@ impl ReplayBuffer {
 
     /// Creates a full buffer of these samples.
     pub fn holding(samples: &Samples) -> Self {
-        let mut ring = Self::new(samples.len());
-        ring.push(samples);
-        ring
+        let mut buffer = Self::new(samples.len());
+        buffer.push(samples);
+        buffer
     }
 
     /// Sets the unit times of samples that are pushed without times. From now on every sample is stored with its times.
@@ -210,71 +210,71 @@ mod tests {
 
     #[test]
     fn the_newest_stay() {
-        let mut ring = ReplayBuffer::new(10);
-        ring.push(&numbered(0..7));
-        ring.push(&numbered(7..13));
-        assert_eq!(labels(ring.samples()), (3..13).collect::<Vec<_>>());
-        ring.push(&numbered(100..125));
-        assert_eq!(labels(ring.samples()), (115..125).collect::<Vec<_>>());
-        assert_eq!((ring.len(), ring.pushed()), (10, 38));
-        assert!(ring.samples().points.iter().zip(&ring.samples().log_stretch).all(|(p, s)| p[0] == *s));
+        let mut buffer = ReplayBuffer::new(10);
+        buffer.push(&numbered(0..7));
+        buffer.push(&numbered(7..13));
+        assert_eq!(labels(buffer.samples()), (3..13).collect::<Vec<_>>());
+        buffer.push(&numbered(100..125));
+        assert_eq!(labels(buffer.samples()), (115..125).collect::<Vec<_>>());
+        assert_eq!((buffer.len(), buffer.pushed()), (10, 38));
+        assert!(buffer.samples().points.iter().zip(&buffer.samples().log_stretch).all(|(p, s)| p[0] == *s));
     }
 
     #[test]
     fn stale_labels_are_not_drawn_until_they_are_shown_to_hold() {
         let half_stale = || {
-            let mut ring = ReplayBuffer::new(10);
-            ring.push(&numbered(0..8));
-            ring.mark_stale();
-            assert!(ring.is_empty() && ring.stale().len() == 8);
-            ring.push(&numbered(50..55));
-            ring
+            let mut buffer = ReplayBuffer::new(10);
+            buffer.push(&numbered(0..8));
+            buffer.mark_stale();
+            assert!(buffer.is_empty() && buffer.stale().len() == 8);
+            buffer.push(&numbered(50..55));
+            buffer
         };
         // Capacity ten: five fresh samples replace three of the eight stale ones.
-        let (mut ring, mut dropped) = (half_stale(), half_stale());
-        assert_eq!((ring.len(), ring.stale().len()), (5, 5));
-        assert_eq!(labels(ring.samples()), (50..55).collect::<Vec<_>>());
-        assert_eq!(ring.probe(100, 1, 0).len(), 5);
+        let (mut buffer, mut dropped) = (half_stale(), half_stale());
+        assert_eq!((buffer.len(), buffer.stale().len()), (5, 5));
+        assert_eq!(labels(buffer.samples()), (50..55).collect::<Vec<_>>());
+        assert_eq!(buffer.probe(100, 1, 0).len(), 5);
         assert!(!dropped.revalidate(0.94));
         assert_eq!((dropped.len(), dropped.stale().len()), (5, 0));
-        assert!(ring.revalidate(0.96));
-        assert_eq!(ring.len(), 10);
+        assert!(buffer.revalidate(0.96));
+        assert_eq!(buffer.len(), 10);
     }
 
     #[test]
     fn a_copy_that_takes_what_was_written_stays_a_copy() {
-        let mut ring = ReplayBuffer::new(10);
+        let mut buffer = ReplayBuffer::new(10);
         let (mut copy, mut mark, mut next) = (Vec::new(), None, 0);
         for count in [0, 3, 4, 5, 10, 1, 9, 25, 7] {
-            ring.push(&numbered(next..next + count));
+            buffer.push(&numbered(next..next + count));
             next += count;
-            copy.resize(ring.len(), f32::NAN);
-            let ranges = ring.written_since(mark);
+            copy.resize(buffer.len(), f32::NAN);
+            let ranges = buffer.written_since(mark);
             assert!(ranges.iter().map(ExactSizeIterator::len).sum::<usize>() <= count as usize, "nothing is taken twice");
             for range in ranges {
-                copy[range.clone()].copy_from_slice(&ring.samples().log_stretch[range]);
+                copy[range.clone()].copy_from_slice(&buffer.samples().log_stretch[range]);
             }
-            assert_eq!(copy, ring.samples().log_stretch, "after {next}");
-            mark = Some(ring.mark());
+            assert_eq!(copy, buffer.samples().log_stretch, "after {next}");
+            mark = Some(buffer.mark());
         }
-        ring.mark_stale();
-        ring.push(&numbered(90..92));
-        ring.revalidate(1.0);
-        assert_eq!((ring.len(), ring.written_since(mark)), (10, [0..10, 0..0]), "all were moved");
+        buffer.mark_stale();
+        buffer.push(&numbered(90..92));
+        buffer.revalidate(1.0);
+        assert_eq!((buffer.len(), buffer.written_since(mark)), (10, [0..10, 0..0]), "all were moved");
         assert_ne!(ReplayBuffer::new(10).mark(), ReplayBuffer::new(10).mark(), "two rings are never the same");
     }
 
     #[test]
     fn flow_map_labels_travel_along() {
-        let mut ring = ReplayBuffer::new(4);
+        let mut buffer = ReplayBuffer::new(4);
         let mut samples = numbered(0..6);
         samples.arrival = (0..6).map(|i| [i as f32; 3]).collect();
         samples.jacobian = (0..6).map(|i| [i as f32; 9]).collect();
-        ring.push(&samples);
-        ring.push(&samples);
-        let held = ring.samples();
+        buffer.push(&samples);
+        buffer.push(&samples);
+        let held = buffer.samples();
         assert!((0..4).all(|i| held.arrival[i][1] == held.log_stretch[i] && held.jacobian[i][8] == held.log_stretch[i]));
-        ring.push(&numbered(6..8));
-        assert_eq!((ring.len(), ring.samples().arrival.len()), (2, 0));
+        buffer.push(&numbered(6..8));
+        assert_eq!((buffer.len(), buffer.samples().arrival.len()), (2, 0));
     }
 }

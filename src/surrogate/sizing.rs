@@ -5,7 +5,7 @@
 //! tolerance. Rejected sizes are remembered, so that the search ends.
 
 use super::network::{Encoding, NetworkSettings};
-use super::{Kind, MOST_OWN_NODES, SurrogateError, SurrogateSettings};
+use super::{Kind, MAX_OWN_NODES, SurrogateError, SurrogateSettings};
 use crate::field::Domain;
 
 /// Frames before a size is judged, since new weights need some training first.
@@ -127,7 +127,7 @@ fn at_size(
 ) -> (SurrogateSettings, NetworkSettings) {
     let axes = dimensions.clamp(1, 3);
     let all: f64 = nodes[..axes].iter().map(|&n| n as f64).product();
-    let bound = (MOST_OWN_NODES as f64 / all).max(1.0).powf(1.0 / axes as f64);
+    let bound = (MAX_OWN_NODES as f64 / all).max(1.0).powf(1.0 / axes as f64);
     let growth = 2f64.powf((f64::from(size) - f64::from(PLAIN)) / axes as f64).min(bound);
     let mut sized = network.clone();
     sized.width = network.width.min(SMALLEST_WIDTH << size.div_ceil(2));
@@ -192,6 +192,6 @@ mod tests {
             Sizing::new(&SurrogateSettings { kind, table_nodes: None }, &network, &domain).unwrap().most
         };
         // 2^12 entries are doubled twice; width 64 is reached at size 3; the plain table has 2^15 nodes. Nothing is tried that changes nothing.
-        assert_eq!((most(Kind::Network, 16), most(Kind::Network, 64), most(Kind::Table, 64)), (2, 3, PLAIN + MOST_OWN_NODES.ilog2() - 15));
+        assert_eq!((most(Kind::Network, 16), most(Kind::Network, 64), most(Kind::Table, 64)), (2, 3, PLAIN + MAX_OWN_NODES.ilog2() - 15));
     }
 }

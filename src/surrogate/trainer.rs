@@ -4,8 +4,7 @@
 //! for prediction are a running mean over the last share of the steps (Polyak and Juditsky 1992), which has the effect of a decaying rate at every
 //! step. The rate is lowered only when the loss has stopped falling.
 
-use super::device::{DeviceTable, HostNetwork, Labels, NetworkCopy, SyncedSamples, Training};
-use super::host::HostTraining;
+use super::device::{HostNetwork, Labels, NetworkCopy, SurrogateTable, SyncedSamples, Training};
 use super::network::{Architecture, Encoding, Field, Model, NetworkSettings, Objective, PlannedStep, Times};
 use super::{Learned, NetworkFrom, ReplayBuffer, SurrogateError};
 use crate::backend::DeviceError;
@@ -170,7 +169,7 @@ impl<T: Training> Trainer<T> {
     ) -> Result<(), DeviceError> {
         let samples = labels.buffer.samples();
         if !self.standardised && (0..samples.len()).any(|index| self.objective.is_usable(samples, index)) {
-            let base = labels.base.map(DeviceTable::to_host).transpose()?;
+            let base = labels.base.map(SurrogateTable::to_host).transpose()?;
             self.objective.standardise(self.training.shape(), samples, base.as_ref().map(|base| base as &dyn Field));
             self.standardised = true;
         }
@@ -324,11 +323,15 @@ impl<T: Training> Trainer<T> {
         }
     }
 
-    /// Returns a trainer on the CPU that continues with the network from `from`.
+    /// Returns a trainer that continues with the network from `from`, which `training` moves to another device.
     ///
     /// # Errors
     /// The network is downloaded from the device, and the device fails.
-    pub(super) fn on_host(&mut self, from: NetworkFrom) -> Result<Trainer<HostTraining>, DeviceError> {
+    pub(super) fn moved<E: Training>(
+        &mut self,
+        from: NetworkFrom,
+        training: impl FnOnce(HostNetwork) -> E,
+    ) -> Result<Trainer<E>, DeviceError> {
         let reached = self.training.steps_taken();
         let mut progress = self.progress;
         let network = match from {
@@ -344,7 +347,7 @@ impl<T: Training> Trainer<T> {
         unreported.steps = unreported.steps.saturating_sub(lost);
         unreported.lost_steps += lost;
         Ok(Trainer {
-            training: HostTraining::new(network),
+            training: training(network),
             objective: self.objective.clone(),
             progress,
             settings: self.settings.clone(),

@@ -53,7 +53,7 @@ fn around(pole: f64, latitudes: &[f64]) {
     let seeds: Vec<[f32; 3]> =
         (0..200).map(|i| [(i as f32 * 137.507_76) % 360.0, (pole - pole.signum() * f64::from(i) / 5.0) as f32, 3000.0]).collect();
     let out = traced(&mut archive, &seeds);
-    assert!(out.lived.iter().all(|&l| l == 1.0), "no particle stops at the pole");
+    assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "no particle stops at the pole");
     let worst = out.log_stretch_f64.iter().fold(0.0f64, |m, s| m.max(s.abs()));
     println!(
         "{} latitudes from {} to {}: |FTLE| at most {worst:.1e} / |tau|",
@@ -66,7 +66,7 @@ fn around(pole: f64, latitudes: &[f64]) {
     // The equator is an edge of a hemisphere only.
     let out = traced(&mut archive, &[[90.0, 0.5 * pole.signum() as f32, 3000.0], [270.0, 0.5 * pole.signum() as f32, 3000.0]]);
     let whole = grid.axes[1].last() - grid.axes[1].first() > 170.0;
-    assert_eq!(out.lived.iter().all(|&l| l == 1.0), whole, "{:?}", out.lived);
+    assert_eq!(out.lifetime_share.iter().all(|&l| l == 1.0), whole, "{:?}", out.lifetime_share);
 }
 
 #[test]

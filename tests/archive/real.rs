@@ -143,7 +143,8 @@ fn independent(kind: &str, files: &[PathBuf], tau: f64) -> (Vec<f64>, Vec<f64>) 
     // Seeds that stop are left out. More remain than are needed, since a neighbour of some stops.
     let seeds: Vec<[f32; 3]> = (0..2000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
     let out = trace(&source, &map, begin, &seeds, Extras::default());
-    let chosen: Vec<usize> = (0..seeds.len()).filter(|&i| out.lived[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
+    let chosen: Vec<usize> =
+        (0..seeds.len()).filter(|&i| out.lifetime_share[i] == 1.0 && !tracer.is_missing(seeds[i])).take(2 * PAIRS).collect();
     assert_eq!(chosen.len(), 2 * PAIRS);
     let task = serde_json::json!({
         "kind": kind,

@@ -165,7 +165,7 @@ fn metres_over_a_globe_give_the_analytic_ftle() {
     seeds.extend([[12.0, 89.8, 8000.0], [230.0, -89.5, 8000.0]]);
     let exact: Vec<f64> = seeds.iter().map(|&s| globe_stretch(&globe, s, 4.0)).collect();
     let out = traced(&window(&mut archive), &seeds);
-    assert!(out.lived.iter().all(|&l| l == 1.0));
+    assert!(out.lifetime_share.iter().all(|&l| l == 1.0));
     let (difference, size) = compare(&out.log_stretch_f64, &exact);
     println!("globe, sphere: log-stretch off by {difference:.1e} of {size:.2}, root mean square");
     // Uneven levels up to 5 km apart in a field whose vertical shear counts most: 0.5 %; and packing.

@@ -79,7 +79,7 @@ fn a_particle_that_lives_all_steps_lives_the_whole_of_tau() {
     for steps in [11, 41, 47, 55, 194] {
         for precision in [Precision::F32, Precision::F64] {
             let out = run(&source, &map(1.0, steps, precision), 0.0, &seeds);
-            assert!(out.lived.iter().all(|&lived| lived == 1.0), "{steps} steps, {precision:?}: {:?}", out.lived);
+            assert!(out.lifetime_share.iter().all(|&share| share == 1.0), "{steps} steps, {precision:?}: {:?}", out.lifetime_share);
         }
     }
 }
@@ -225,8 +225,8 @@ fn gridded_tangent_is_the_derivative_of_the_gridded_flow() {
                 let errors = sorted_errors(&exact, &stretches(&run(&source, &differences, t0, &seeds)));
                 let high = errors[errors.len() * 95 / 100];
                 println!("{name}, {interpolation:?}, {direction:?}: median {:.1e}, 95 % {high:.1e}", errors[errors.len() / 2]);
-                // The error of differences is rounding over the gap, 1e-8 times the stretch. Pairs on both sides of a cell face (linear) or of
-                // an edge at some stage see two derivatives; with a gap of 1e-7 they are rare.
+                // The error of differences is rounding over the difference step, 1e-8 times the stretch. Pairs on both sides of a cell face
+                // (linear) or of an edge at some stage see two derivatives; with a difference step of 1e-7 they are rare.
                 assert!(high < 3e-6, "{name} {interpolation:?} {direction:?}: {high:e}");
             }
         }
@@ -290,17 +290,17 @@ fn missing_cells_and_edges_stop_particles() {
         let map = FlowMap { boundary: Boundary::Stop, interpolation, ..map(8.0, 80, Precision::F32) };
         let out = trace(&source, &map, 0.0, &seeds, EVERYTHING);
         // A path stops within the step of 0.1 that would cross.
-        assert!((out.lived[0] - (coast - 1.5) / 8.0).abs() < 0.02, "stops before the missing corner: {:?}", out.lived);
+        assert!((out.lifetime_share[0] - (coast - 1.5) / 8.0).abs() < 0.02, "stops before the missing corner: {:?}", out.lifetime_share);
         assert!((out.arrival[0][0] - coast).abs() < 0.11, "{:?}", out.arrival);
         assert!((out.arrival[1][0] - free).abs() < 0.11, "{:?}", out.arrival);
-        assert_eq!(out.lived[3], 0.0, "starts in a cell with a missing corner");
+        assert_eq!(out.lifetime_share[3], 0.0, "starts in a cell with a missing corner");
         assert!(out.log_stretch.iter().all(|s| s.abs() < 1e-6), "uniform flow does not stretch: {:?}", out.log_stretch);
         assert!((out.jacobian[1][0] - 1.0).abs() < 1e-6 && out.jacobian[1][8] == 1.0);
         if interpolation == Interpolation::Linear {
-            assert!((out.lived[2] - 5.5 / 8.0).abs() < 0.02, "stops at the edge of the domain");
+            assert!((out.lifetime_share[2] - 5.5 / 8.0).abs() < 0.02, "stops at the edge of the domain");
             // The adaptive reference comes nearer to the edge.
             let exact = run(&source, &FlowMap { integrator: Integrator::DormandPrince, ..map }, 0.0, &seeds);
-            assert!((f64::from(exact.lived[2]) - 5.5 / 8.0).abs() < 1e-6, "{:?}", exact.lived);
+            assert!((f64::from(exact.lifetime_share[2]) - 5.5 / 8.0).abs() < 1e-6, "{:?}", exact.lifetime_share);
         }
     }
 }
@@ -312,20 +312,20 @@ fn particles_that_stop_keep_their_stretch_or_not() {
     let seeds = [[0.5, 0.5, 0.5], [0.01, 0.5, 0.5]];
     let with = |boundary, normalisation| run(&source, &FlowMap { boundary, normalisation, ..map(2.0, 2000, Precision::F64) }, 0.0, &seeds);
     let stop = with(Boundary::Stop, Normalisation::Tau);
-    let lived = 2f64.ln() / 2.0;
+    let lifetime_share = 2f64.ln() / 2.0;
     // A path stops within a step, which is 1/2000 of the span.
-    assert!((f64::from(stop.lived[0]) - lived).abs() < 6e-4);
-    assert!((stop.log_stretch_f64[0] - 2.0 * lived).abs() < 1.2e-3);
-    assert!((stop.log_stretch_f64[1] - 2.0).abs() < 1e-10 && stop.lived[1] == 1.0);
-    let by_life = with(Boundary::Stop, Normalisation::Lived);
+    assert!((f64::from(stop.lifetime_share[0]) - lifetime_share).abs() < 6e-4);
+    assert!((stop.log_stretch_f64[0] - 2.0 * lifetime_share).abs() < 1.2e-3);
+    assert!((stop.log_stretch_f64[1] - 2.0).abs() < 1e-10 && stop.lifetime_share[1] == 1.0);
+    let by_life = with(Boundary::Stop, Normalisation::Lifetime);
     assert!((by_life.log_stretch_f64[0] - 2.0).abs() < 1e-9, "stretch over life is the rate: {}", by_life.log_stretch_f64[0]);
     let zero = with(Boundary::Zero, Normalisation::Tau);
     assert_eq!(zero.log_stretch[0], 0.0);
     assert!((zero.log_stretch_f64[1] - 2.0).abs() < 1e-10);
     // Beyond the edge the clamped velocity is constant along x, so that the stretch ends.
     let clamp = with(Boundary::Clamp, Normalisation::Tau);
-    assert_eq!(clamp.lived, [1.0, 1.0]);
-    assert!((clamp.log_stretch_f64[0] - 2.0 * lived).abs() < 1.2e-3, "{}", clamp.log_stretch_f64[0]);
+    assert_eq!(clamp.lifetime_share, [1.0, 1.0]);
+    assert!((clamp.log_stretch_f64[0] - 2.0 * lifetime_share).abs() < 1.2e-3, "{}", clamp.log_stretch_f64[0]);
 }
 
 #[test]
@@ -345,7 +345,7 @@ fn a_periodic_seam_is_a_cell_like_others() {
         let map = FlowMap { boundary: Boundary::Stop, interpolation, ..map(6.0, 60, Precision::F64) };
         let across = run(&make(0), &map, 0.0, &at(30.0));
         let beside = run(&make(18), &map, 0.0, &at(12.0));
-        assert!(across.lived.iter().all(|&l| l == 1.0), "no edge there");
+        assert!(across.lifetime_share.iter().all(|&l| l == 1.0), "no edge there");
         let (_, max) = rms_and_max(&stretches(&across), &stretches(&beside));
         assert!(max < 1e-12, "{interpolation:?} {max:e}: the same numbers at other places, except for rounding");
         assert!(stretches(&across)[4] > 0.05, "and there is stretch");

@@ -92,7 +92,7 @@ fn solid_rotation_about_a_tilted_axis_has_ftle_0() {
             [u, v, 0.0]
         });
         let out = traced(&source, &map(tau, 100, precision, interpolation), &seeds);
-        assert!(out.lived.iter().all(|&l| l == 1.0), "a globe has no edge");
+        assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "a globe has no edge");
         let worst = greatest(&stretches(&out), &vec![0.0; seeds.len()]);
         println!("solid rotation, {cell} degrees, {levels} level(s), {precision:?}, {interpolation:?}: |FTLE| at most {worst:.1e} / |tau|");
         assert!(worst < tolerance, "{worst:e}");
@@ -218,7 +218,7 @@ fn missing_levels_stop_particles() {
     let source = globe(5.0, 5, tau, |_, _, z| [0.0, 0.0, if z < 1.0 { f64::NAN } else { -0.01 }]);
     let out = traced(&source, &map(tau, 100, Precision::F32, Interpolation::Linear), &[[0.0, 0.0, 6000.0], [0.0, 0.0, 19_000.0]]);
     // The lowest cell ends at 2500 m.
-    assert!(out.lived[0] > 0.3 && out.lived[0] < 0.5 && out.lived[1] == 1.0, "{:?}", out.lived);
+    assert!(out.lifetime_share[0] > 0.3 && out.lifetime_share[0] < 0.5 && out.lifetime_share[1] == 1.0, "{:?}", out.lifetime_share);
 }
 
 #[test]
@@ -239,7 +239,7 @@ fn solid_rotation_of_the_sphere_does_not_stretch() {
         (Precision::F32, Interpolation::Cubic, 4e-4),
     ] {
         let out = traced(&source, &map(tau, 200, precision, interpolation), &seeds);
-        assert!(out.lived.iter().all(|&l| l == 1.0), "a globe has no edge");
+        assert!(out.lifetime_share.iter().all(|&l| l == 1.0), "a globe has no edge");
         let stretch = stretches(&out);
         let rms = (stretch.iter().map(|s| s * s).sum::<f64>() / stretch.len() as f64).sqrt();
         println!(

@@ -2,10 +2,10 @@
 
 use crate::scenes::{cartesian, device, even, frames, gpu, opened, smooth, store, turbulence};
 use ridgewatch::backend::cuda::{
-    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceTable, FrameQueries, Gpu, GpuRenderer, GpuSettings, LookAhead, Outputs,
-    QueryRouter, SnapshotStore, Tuning, keeps_label,
+    CudaTracer, DeviceError, DeviceLearns, DevicePredict, DeviceQueryRouter, DeviceTable, FrameQueries, Gpu, GpuRenderer, GpuSettings,
+    LookAhead, Outputs, SnapshotStore, Tuning,
 };
-use ridgewatch::backend::{Device, QueryRouter as HostRouter, Routing, Tally, audit, residuals, stratified_points};
+use ridgewatch::backend::{Device, QueryRouter, Routing, Tally, audit, keeps_label, residuals, stratified_points};
 use ridgewatch::field::Domain;
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Tracer, VelocitySource, cpu_tracer,
@@ -94,7 +94,7 @@ impl Stage {
         let frozen = self.table.freeze().unwrap();
         let surrogate = how.surrogate.then_some(&frozen as &dyn Predict);
         let routing = Routing { gate: &self.gate, trace_budget: how.budget, keep: 0, extras: Extras::default() };
-        let mut router = HostRouter::new(&self.host, surrogate, routing);
+        let mut router = QueryRouter::new(&self.host, surrogate, routing);
         let (film, stats) = renderer.render_samples(frame, 0..samples, &mut router, None, &NEVER).unwrap();
         let (tally, _) = router.finish().unwrap();
         (film, stats, tally)
@@ -143,12 +143,12 @@ impl Stage {
 /// What the GPU keeps from frame to frame.
 struct Side {
     renderer: GpuRenderer,
-    router: QueryRouter,
+    router: DeviceQueryRouter,
 }
 
 impl Side {
     fn new(gpu: &Arc<Gpu>) -> Self {
-        Self { renderer: GpuRenderer::new(gpu).unwrap(), router: QueryRouter::new(gpu).unwrap() }
+        Self { renderer: GpuRenderer::new(gpu).unwrap(), router: DeviceQueryRouter::new(gpu).unwrap() }
     }
 }
 

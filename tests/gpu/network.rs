@@ -415,20 +415,20 @@ fn a_ring_keeps_the_newest() {
     let (model, objective, _) = prepare(&cases()[0]);
     let device = training(&model, &objective);
     let unit = Domain::cuboid([0.0; 3], [1.0; 3]);
-    let mut ring = device.ring(1000).unwrap();
+    let mut buffer = device.replay_buffer(1000).unwrap();
     let mut expected = vec![[f32::NAN; 4]; 1000];
     let mut written = 0;
     for (seed, count) in [(1, 300), (2, 500), (3, 300), (4, 1000), (5, 1)] {
         let samples = labels(count, seed);
         let (points, values) = (gpu().upload("points", &samples.points).unwrap(), gpu().upload("values", &samples.log_stretch).unwrap());
         // SAFETY: both buffers hold `count` entries and are freed in the order of the work stream.
-        unsafe { device.append(&mut ring, &unit, points.address(), values.address(), count, None) }.unwrap();
+        unsafe { device.append(&mut buffer, &unit, points.address(), values.address(), count, None) }.unwrap();
         for (p, s) in samples.points.iter().zip(&samples.log_stretch) {
             expected[written % 1000] = [p[0], p[1], p[2], (s - objective.scale.mean[0]) / objective.scale.deviation[0]];
             written += 1;
         }
-        assert_eq!(ring.len(), written.min(1000));
-        for (found, expected) in ring.values().unwrap().iter().zip(&expected) {
+        assert_eq!(buffer.len(), written.min(1000));
+        for (found, expected) in buffer.values().unwrap().iter().zip(&expected) {
             assert!(found.iter().zip(expected).all(|(a, b)| (a - b).abs() < 1e-6), "{found:?} {expected:?}");
         }
     }
@@ -469,7 +469,7 @@ fn what_is_kept_comes_back() {
     assert!(values[..layers - 65] == now[..layers - 65] && mean.layers[..layers - 65] == kept.2.layers[..layers - 65]);
 }
 
-/// Samples come over from a ring that fills up, goes round, and is moved: a step on all of them has the loss that the CPU has on the ring's.
+/// Samples come over from a replay buffer that fills up, goes round, and is moved: a step on all of them has the CPU's loss on the buffer.
 #[test]
 #[ignore = "needs a GPU"]
 fn a_ring_is_followed_wherever_it_writes() {
@@ -477,35 +477,35 @@ fn a_ring_is_followed_wherever_it_writes() {
     assert!(DeviceTraining::takes(&gpu(), &model.shape, &objective));
     let mut device = CudaTraining::new(&gpu(), HostNetwork::fresh(model.clone()), true);
     device.begin(&objective, 1 << 16, 1 << 10).unwrap();
-    let mut ring = ReplayBuffer::new(1000);
-    let mut follow = |ring: &ReplayBuffer, broken: usize| {
-        let labels = Labels { buffer: ring, base: None };
-        assert_eq!(device.sync(&objective, labels).unwrap(), SyncedSamples { usable: ring.len() - broken, dropped: broken });
-        let found = device.train(&objective, labels, &[step(ring.len(), 1e-12)]).unwrap()[0];
-        let finite: Vec<usize> = (0..ring.len()).filter(|&i| ring.samples().log_stretch[i].is_finite()).collect();
+    let mut buffer = ReplayBuffer::new(1000);
+    let mut follow = |buffer: &ReplayBuffer, broken: usize| {
+        let labels = Labels { buffer, base: None };
+        assert_eq!(device.sync(&objective, labels).unwrap(), SyncedSamples { usable: buffer.len() - broken, dropped: broken });
+        let found = device.train(&objective, labels, &[step(buffer.len(), 1e-12)]).unwrap()[0];
+        let finite: Vec<usize> = (0..buffer.len()).filter(|&i| buffer.samples().log_stretch[i].is_finite()).collect();
         let samples = Samples {
-            points: finite.iter().map(|&i| ring.samples().points[i]).collect(),
-            log_stretch: finite.iter().map(|&i| ring.samples().log_stretch[i]).collect(),
+            points: finite.iter().map(|&i| buffer.samples().points[i]).collect(),
+            log_stretch: finite.iter().map(|&i| buffer.samples().log_stretch[i]).collect(),
             ..Samples::default()
         };
         let expected = stock_step(&mut model.clone(), &objective, &samples, samples.len(), 1e-12);
-        assert!((found / expected - 1.0).abs() < 2e-3, "{} samples: {found} and {expected}", ring.len());
+        assert!((found / expected - 1.0).abs() < 2e-3, "{} samples: {found} and {expected}", buffer.len());
     };
     for (seed, count) in [(1, 300), (2, 500), (3, 300), (4, 1), (5, 1000), (6, 999), (7, 2500)] {
         let mut samples = labels(count, seed);
         // What is left of other pushes shows in the loss.
         samples.log_stretch.iter_mut().for_each(|s| *s += seed as f32);
-        ring.push(&samples);
-        follow(&ring, 0);
+        buffer.push(&samples);
+        follow(&buffer, 0);
     }
-    ring.mark_stale();
+    buffer.mark_stale();
     let mut samples = labels(10, 9);
     samples.log_stretch[4] = f32::NAN;
-    ring.push(&samples);
+    buffer.push(&samples);
     // Those set aside are not there, though the device has them.
-    follow(&ring, 1);
-    ring.revalidate(1.0);
-    follow(&ring, 1);
+    follow(&buffer, 1);
+    buffer.revalidate(1.0);
+    follow(&buffer, 1);
     follow(&ReplayBuffer::holding(&labels(700, 10)), 0);
     assert!(device.device_seconds().unwrap() > 0.0 && device.device_seconds() == Some(0.0), "asked for once");
 }

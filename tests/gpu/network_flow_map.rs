@@ -6,6 +6,7 @@ use super::network_support::reference::{Reference, norm};
 use super::network_support::{self, Case};
 use super::scenes::*;
 use super::small;
+use crate::kit::scene;
 use nalgebra::DMatrix;
 use ridgewatch::backend::Device;
 use ridgewatch::backend::cuda::{DeviceNetwork, GpuSettings};
@@ -92,66 +93,39 @@ fn gradients_of_flow_maps_and_further_inputs() {
 }
 
 /// A small run whose frames are answered by a network that learns, in space.
-const TURBULENCE: &str = "
-[source]
-kind = \"turbulence\"
-nodes = [48, 24, 24]
-[time]
-tau = 6
-slides = 1
-frames_per_slide = 5
-[flow]
-steps = 12
-[surrogate]
-kind = \"network\"
-[network]
-levels = 4
-features = 2
-log2_table = 14
-base_resolution = 8
-width = 32
-batch = 4096
-[training]
-steps_per_frame = 150
-[render]
-method = \"gated\"
-width = 48
-height = 24
-samples = 8
-[transfer]
-low = 0.1
-high = 0.3
-";
+fn turbulence() -> String {
+    scene::gated_turbulence(
+        "
+        time.tau = 6
+        time.frames_per_slide = 5
+        flow.steps = 12
+        surrogate.kind = \"network\"
+        network.width = 32
+        training.steps_per_frame = 150
+        ",
+    )
+}
 
 /// The same in the plane.
-const GYRE: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.2]
-[time]
-tau = 5
-seed_step = 0.5
-slides = 2
-frames_per_slide = 3
-[flow]
-steps = 25
-[surrogate]
-kind = \"network\"
-[network]
-log2_table = 14
-levels = 4
-width = 32
-batch = 4096
-[training]
-steps_per_frame = 150
-[render]
-method = \"gated\"
-width = 48
-height = 24
-samples = 8
-";
+fn gyre() -> String {
+    scene::double_gyre(
+        [48, 24, 8],
+        "
+        time.tau = 5
+        time.seed_step = 0.5
+        time.slides = 2
+        time.frames_per_slide = 3
+        flow.steps = 25
+        surrogate.kind = \"network\"
+        network.log2_table = 14
+        network.levels = 4
+        network.width = 32
+        network.batch = 4096
+        training.steps_per_frame = 150
+        render.method = \"gated\"
+        ",
+    )
+}
 
 /// Of the first slide.
 fn frames_of_a_slide(frames: &[Frame]) -> usize {
@@ -163,13 +137,14 @@ fn frames_of_a_slide(frames: &[Frame]) -> usize {
 #[ignore = "needs a GPU"]
 fn runs_learn_on_the_device_what_the_cpu_learns() {
     let gpu = device(GpuSettings::default());
+    let (turbulence, gyre) = (turbulence(), gyre());
     let runs: [(&str, &str, &[&str]); 6] = [
-        ("flow map in space", TURBULENCE, &["network.target=\"flow_map\""]),
-        ("flow map in the plane", GYRE, &["network.target=\"flow_map\""]),
-        ("flow map in the plane and start", GYRE, &["network.target=\"flow_map\"", "network.inputs=[\"start\"]"]),
-        ("space and start", TURBULENCE, &["network.inputs=[\"start\"]", "time.slides=2"]),
-        ("plane and both times", GYRE, &["network.inputs=[\"start\", \"duration\"]"]),
-        ("published loss", GYRE, &["network.loss=\"published\"", "network.mean_penalty=1.0"]),
+        ("flow map in space", &turbulence, &["network.target=\"flow_map\""]),
+        ("flow map in the plane", &gyre, &["network.target=\"flow_map\""]),
+        ("flow map in the plane and start", &gyre, &["network.target=\"flow_map\"", "network.inputs=[\"start\"]"]),
+        ("space and start", &turbulence, &["network.inputs=[\"start\"]", "time.slides=2"]),
+        ("plane and both times", &gyre, &["network.inputs=[\"start\", \"duration\"]"]),
+        ("published loss", &gyre, &["network.loss=\"published\"", "network.mean_penalty=1.0"]),
     ];
     let few: &[&str] = if small() { &["training.steps_per_frame=10", "time.frames_per_slide=2", "network.batch=512"] } else { &[] };
     for (name, scene, keys) in runs {

@@ -3,6 +3,7 @@
 use super::network_support::{traced, uniform_points};
 use super::scenes::*;
 use super::small;
+use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, GpuSettings, SnapshotStore, Tuning};
 use ridgewatch::backend::{Device, WhenLost};
 use ridgewatch::run::{Frame, RunOptions};
@@ -10,36 +11,18 @@ use ridgewatch::surrogate::network::{Encoding, NetworkSettings};
 use ridgewatch::surrogate::{Kind, ReplayBuffer};
 
 /// A small run that trains a fixed number of steps a frame.
-const SCENE: &str = "
-[source]
-kind = \"turbulence\"
-nodes = [48, 24, 24]
-[time]
-tau = 8
-slides = 1
-frames_per_slide = 3
-[flow]
-steps = 16
-[surrogate]
-kind = \"residual\"
-[network]
-levels = 4
-features = 2
-log2_table = 14
-base_resolution = 8
-width = 16
-batch = 4096
-[training]
-steps_per_frame = 60
-[render]
-method = \"gated\"
-width = 48
-height = 24
-samples = 8
-[transfer]
-low = 0.1
-high = 0.3
-";
+fn turbulence() -> String {
+    scene::gated_turbulence(
+        "
+        time.tau = 8
+        time.frames_per_slide = 3
+        flow.steps = 16
+        surrogate.kind = \"residual\"
+        network.width = 16
+        training.steps_per_frame = 60
+        ",
+    )
+}
 
 /// What the device learned is worth as much as what the CPU learned, goes into a checkpoint, and either goes on from the other's.
 #[test]
@@ -57,7 +40,7 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
             format!("training.steps_per_frame={steps}"),
         ];
         keys.extend(from.map(|from| format!("training.resume=\"{}\"", file(from).display())));
-        let frames = frames(SCENE, &keys, &options);
+        let frames = frames(&turbulence(), &keys, &options);
         for frame in &frames {
             let learned = frame.record.training.clone().unwrap();
             assert_eq!((learned.steps, learned.rollbacks), (steps, 0));
@@ -90,35 +73,24 @@ fn a_run_trains_on_the_device_and_goes_on_on_either() {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_network_with_the_start_time_slides_on_the_device() {
-    const GYRE: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.2]
-[time]
-tau = 5
-seed_step = 0.5
-slides = 4
-frames_per_slide = 4
-[flow]
-steps = 25
-[surrogate]
-kind = \"network\"
-[network]
-inputs = [\"start\"]
-log2_table = 16
-width = 32
-batch = 4096
-[training]
-steps_per_frame = 200
-[render]
-width = 48
-height = 24
-samples = 4
-";
+    let gyre = scene::double_gyre(
+        [48, 24, 4],
+        "
+            time.tau = 5
+            time.seed_step = 0.5
+            time.slides = 4
+            time.frames_per_slide = 4
+            flow.steps = 25
+            surrogate.kind = \"network\"
+            network.inputs = [\"start\"]
+            network.log2_table = 16
+            network.width = 32
+            network.batch = 4096
+            training.steps_per_frame = 200
+        ",
+    );
     let keys = if small() { vec!["training.steps_per_frame=20".to_owned(), "time.slides=2".to_owned()] } else { Vec::new() };
-    let made = |device: &Device| frames(GYRE, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
+    let made = |device: &Device| frames(&gyre, &keys, &RunOptions { device: device.clone(), ..RunOptions::default() });
     let (found, expected) = (made(&device(GpuSettings::default())), made(&Device::CPU));
     let psnr = |frames: &[Frame]| -> Vec<f64> { frames.iter().map(|frame| frame.record.surrogate_psnr.unwrap()).collect() };
     println!("dB: GPU {:.1?}, CPU {:.1?}", psnr(&found), psnr(&expected));
@@ -148,7 +120,7 @@ fn a_run_whose_network_diverges_goes_on() {
     let options = RunOptions { device: device(GpuSettings::default()), ..RunOptions::default() };
     let mut keys = vec!["network.learning_rate=1", "surrogate.kind=\"network\""];
     keys.extend(if small() { &["training.steps_per_frame=20", "time.frames_per_slide=2"][..] } else { &[] });
-    let frames = frames(ANSWERED, &keys.into_iter().map(str::to_owned).collect::<Vec<_>>(), &options);
+    let frames = frames(&answered(), &keys.into_iter().map(str::to_owned).collect::<Vec<_>>(), &options);
     let learned: Vec<_> = frames.iter().map(|frame| frame.record.training.clone().unwrap()).collect();
     let [rollbacks, lost] = [learned.iter().map(|l| l.rollbacks).sum::<u64>(), learned.iter().map(|l| l.lost_steps).sum()];
     measured!("a rate of 1: {rollbacks} rollbacks, {lost} steps lost");
@@ -165,34 +137,28 @@ fn a_run_whose_network_diverges_goes_on() {
 }
 
 /// A double gyre of which about half is traced after some frames, the rest answered by a network above a coarse table.
-const ANSWERED: &str = "
-[source]
-kind = \"double_gyre\"
-[domain]
-min = [0, 0, 0]
-max = [2, 1, 0.5]
-[time]
-tau = 5
-slides = 1
-frames_per_slide = 6
-[flow]
-steps = 25
-[surrogate]
-kind = \"residual\"
-table_nodes = [17, 9, 2]
-[network]
-levels = 6
-features = 2
-log2_table = 14
-width = 16
-batch = 4096
-[training]
-steps_per_frame = 100
-[render]
-width = 48
-height = 24
-samples = 8
-";
+fn answered() -> String {
+    scene::scene(
+        "double_gyre",
+        [48, 24, 8],
+        "
+        domain.min = [0, 0, 0]
+        domain.max = [2, 1, 0.5]
+        time.tau = 5
+        time.slides = 1
+        time.frames_per_slide = 6
+        flow.steps = 25
+        surrogate.kind = \"residual\"
+        surrogate.table_nodes = [17, 9, 2]
+        network.levels = 6
+        network.features = 2
+        network.log2_table = 14
+        network.width = 16
+        network.batch = 4096
+        training.steps_per_frame = 100
+        ",
+    )
+}
 
 /// A network above a table answers on the device, and the mean picture is the CPU's within its noise: seeds of the noise differ, as do the
 /// networks, which are trained on other samples. A network that has learned a tenth as long shows.
@@ -203,7 +169,7 @@ fn frames_with_a_network_are_the_cpu_s_over_many_seeds() {
     let pictures = |device: &Device, first: u64, keys: &[&str]| -> Vec<Frame> {
         let options = RunOptions { device: device.clone(), ..RunOptions::default() };
         let keys = |seed: u64| keys.iter().map(|key| (*key).to_owned()).chain([format!("seed={seed}")]).collect::<Vec<String>>();
-        (first..first + seeds).map(|seed| frames(ANSWERED, &keys(seed), &options).pop().unwrap()).collect()
+        (first..first + seeds).map(|seed| frames(&answered(), &keys(seed), &options).pop().unwrap()).collect()
     };
     let few: &[&str] = if small() { &["training.steps_per_frame=20", "time.frames_per_slide=3"] } else { &[] };
     let found = pictures(&device(GpuSettings::default()), 0, few);
@@ -273,13 +239,13 @@ fn difference_over_noise(frames: &[Vec<f64>], dealt: &[usize]) -> (f64, usize) {
     (sum / count as f64, count)
 }
 
-/// A cap that frames keep to and training does not, for its ring, for the network itself, or for what its steps need beside both: the network is
-/// trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it. The plan of the slide foresees the first
-/// two; the third shows as a shortage in the first frame, which is made again.
+/// A cap that frames keep to and training does not, for its replay buffer, for the network itself, or for what its steps need beside both: the
+/// network is trained on the CPU, which is told once, and frames stay on the device, even where a run is to end with it. The plan of the slide
+/// foresees the first two; the third shows as a shortage in the first frame, which is made again.
 #[test]
 #[ignore = "needs a GPU"]
 fn without_memory_for_training_frames_stay_on_the_device() {
-    // A ring of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
+    // A replay buffer of 1 GiB; and a network of 17 million parameters, of which training holds nine times as many and prediction halves.
     // And the published 16x512, whose layers' values and their gradients for 65,536 samples are 1 GiB each.
     // A rate that so many layers bear: what is told is of memory alone.
     let published = [
@@ -298,7 +264,7 @@ fn without_memory_for_training_frames_stay_on_the_device() {
         let settings = GpuSettings { memory_cap: Some(mib << 20), ..GpuSettings::default() };
         let keys = ["surrogate.kind=\"network\"", "training.steps_per_frame=5"].iter().chain(more).map(ToString::to_string);
         let options = RunOptions { device: device_when_lost(settings, WhenLost::Stop), ..RunOptions::default() };
-        let frames = frames(SCENE, &keys.collect::<Vec<_>>(), &options);
+        let frames = frames(&turbulence(), &keys.collect::<Vec<_>>(), &options);
         assert_eq!(frames.len(), 3);
         for (i, Frame { record, .. }) in frames.iter().enumerate() {
             let learned = record.training.as_ref().unwrap();
@@ -324,7 +290,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     let (log2_table, batch) = if small() { (12, 1 << 10) } else { (18, 1 << 16) };
     let network = NetworkSettings { levels: 8, log2_table, batch, ..NetworkSettings::default() };
     let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 4, batch: batch / 4, ..NetworkSettings::default() };
-    let ring = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
+    let buffer = ReplayBuffer::holding(&traced(tracer.host(), uniform_points(1, 20_000), false));
     let (rounds, steps) = if small() { (1, 10) } else { (3, 1000) };
     let folder = tempfile::tempdir().unwrap();
     let file = |name: &str| folder.path().join(name);
@@ -332,7 +298,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
     for (kind, network) in [(Kind::Network, &network), (Kind::Residual, &network), (Kind::Network, &frequency)] {
         let built = || resident(&gpu, kind, [257, 129, 2], network, &tracer);
         let mut surrogate = built();
-        surrogate.learn(&ring, f64::INFINITY, steps / 5).unwrap();
+        surrogate.learn(&buffer, f64::INFINITY, steps / 5).unwrap();
         let before = gpu.memory().0;
         let mut room = None;
         for round in 0..rounds {
@@ -341,7 +307,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
             assert_eq!(state.wait_reason(), None);
             assert!(surrogate.checkpoint_async().unwrap().is_none(), "one at a time");
             std::thread::scope(|scope| {
-                let learning = scope.spawn(|| surrogate.learn(&ring, f64::INFINITY, steps).unwrap());
+                let learning = scope.spawn(|| surrogate.learn(&buffer, f64::INFINITY, steps).unwrap());
                 state.write(&file("behind")).unwrap();
                 assert_eq!(learning.join().unwrap().steps, steps);
             });
@@ -355,7 +321,7 @@ fn a_checkpoint_is_of_its_moment_though_training_went_on() {
         drop(surrogate);
         // What others have leaves no room.
         let mut surrogate = built();
-        surrogate.learn(&ring, f64::INFINITY, steps / 50 + 1).unwrap();
+        surrogate.learn(&buffer, f64::INFINITY, steps / 50 + 1).unwrap();
         let others = gpu.alloc::<u8>("what others have", (gpu.memory_left() - (1 << 16)) as usize).unwrap();
         surrogate.save(&file("waited for")).unwrap();
         let state = surrogate.checkpoint_async().unwrap().unwrap();

@@ -1,7 +1,7 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
 use crate::scenes::{gpu, opened, store, turbulence};
-use ridgewatch::backend::cuda::{CudaTracer, DeviceAnswers, DeviceError, Gpu, GpuRenderer, GpuSettings, LookAhead, TraceAll, Tuning};
+use ridgewatch::backend::cuda::{CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, GpuSettings, LookAhead, TraceAll, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::flow::{
@@ -33,8 +33,8 @@ impl LogStretch for OnHost {
 /// Answers device points on the host: the very same answers, so that what differs is tracking.
 struct ThroughHost<'a>(&'a Gpu);
 
-impl DeviceAnswers for ThroughHost<'_> {
-    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
+impl DeviceLogStretch for ThroughHost<'_> {
+    fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         use cudarc::driver::result;
         let doing = DeviceError::driver("answering on the host");
         let stream = self.0.work().cu_stream();

@@ -1,21 +1,19 @@
 //! Flows that the tests trace, and the two ways to trace them.
 
+use crate::kit::scene;
 use ridgewatch::backend::cuda::{CudaTracer, CudaTraining, Gpu, GpuSettings, OnGpu, SnapshotStore, Storage, Tuning};
 use ridgewatch::backend::{CudaDevice, Device, WhenLost};
-use ridgewatch::config::SceneFile;
 use ridgewatch::field::analytic::Analytic;
 use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
 use ridgewatch::flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
-use ridgewatch::run::{Event, Frame, RunOptions, Setup, run};
+use ridgewatch::run::{Frame, RunOptions, Setup};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostNetwork, Hybrid, Kind, Trace};
 use std::collections::hash_map::RandomState;
 use std::hash::{BuildHasher, Hasher};
-use std::path::Path;
-use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
 /// The device that tests share.
@@ -47,19 +45,14 @@ pub fn resident(gpu: &Arc<Gpu>, kind: Kind, nodes: [usize; 3], network: &Network
 
 /// All frames of a scene with further `keys`.
 pub fn frames(scene: &str, keys: &[String], options: &RunOptions) -> Vec<Frame> {
-    let scene = SceneFile::parse(Path::new("a test"), scene, keys).unwrap();
-    frames_of(Setup::new(scene.settings()).unwrap(), options)
+    let keys: Vec<&str> = keys.iter().map(String::as_str).collect();
+    frames_of(scene::setup(scene, &keys), options)
 }
 
 /// All frames of a run.
 pub fn frames_of(setup: Setup, options: &RunOptions) -> Vec<Frame> {
     let mut frames = Vec::new();
-    let mut sink = |event: Event| {
-        if let Event::Frame(frame) = event {
-            frames.push(frame);
-        }
-    };
-    run(setup, options, &mut sink, &AtomicBool::new(false)).unwrap();
+    scene::run_frames(setup, options, |frame| frames.push(frame));
     frames
 }
 
@@ -101,7 +94,7 @@ pub fn on_gpu(source: &VelocitySource, map: &FlowMap, t0: f64, tuning: Tuning, s
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
-        lived: vec![f32::NAN; n],
+        lifetime_share: vec![f32::NAN; n],
         arrival: vec![[f32::NAN; 3]; n],
         jacobian: vec![[f32::NAN; 9]; n],
     };

@@ -4,7 +4,7 @@ use super::scenes::*;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceTable, OnGpu, Tuning};
 use ridgewatch::flow::{Boundary, FlowMap, Precision, VelocitySource, cpu_tracer};
 use ridgewatch::surrogate::network::NetworkSettings;
-use ridgewatch::surrogate::{DeviceTable as _, HostSurrogate, Hybrid, Kind, Predict, SurrogateSettings, Table, build};
+use ridgewatch::surrogate::{HostSurrogate, Hybrid, Kind, Predict, SurrogateSettings, SurrogateTable as _, Table, build};
 
 fn on_device(tracer: &CudaTracer, nodes: [usize; 3]) -> Hybrid<OnGpu> {
     resident(&gpu(), Kind::Table, nodes, &NetworkSettings::default(), tracer)

@@ -32,10 +32,10 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let seeds = fresh(&domain(source), SEEDS);
     let exact = on_cpu(source, map, t0, &seeds);
     let double = on_gpu(source, map, t0, Tuning::default(), &seeds);
-    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
-    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - double.lifetime_share[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} of equal lifetime", same.len(), seeds.len());
     // Rounding of 1e-16 a step, amplified along the path; where a path runs along a cell face, rounding decides which of two gradients
-    // counts: a few such paths are let go. Central differences divide rounding by the gap.
+    // counts: a few such paths are let go. Central differences divide rounding by the difference step.
     let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
     let odd = same.iter().filter(|&&i| {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
@@ -47,7 +47,7 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     });
     let odd = odd.count();
     assert!(odd as f64 <= UNDECIDED * seeds.len() as f64, "{name}: {odd} of {} differ from the CPU", seeds.len());
-    let died = exact.lived.iter().filter(|l| **l < 1.0).count();
+    let died = exact.lifetime_share.iter().filter(|l| **l < 1.0).count();
     if matches!(map.boundary, Boundary::Stop | Boundary::Zero) {
         assert!(died > 0, "{name}: some particle should leave, or the edge is not tested");
     }
@@ -63,9 +63,9 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     for (sorted, keep, spread) in [(true, true, true), (true, false, true), (true, true, false), (false, true, true), (false, false, false)]
     {
         let found = on_gpu(source, &single, t0, Tuning { storage: Storage::F32, sorted, keep, spread }, &seeds);
-        let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - found.lived[i]).abs() < 1e-6).collect();
+        let alike: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - found.lifetime_share[i]).abs() < 1e-6).collect();
         // Single precision decides more paths the other way: a step's rounding is 1e-7 of the domain.
-        assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} lived alike", alike.len(), seeds.len());
+        assert!(alike.len() as f64 >= 0.99 * seeds.len() as f64, "{name}: {} of {} of equal lifetime", alike.len(), seeds.len());
         assert!(found.log_stretch.iter().all(|s| !s.is_nan()), "{name}: something was not written");
         let (ours, theirs) = (most(&exact, &found, &alike), most(&exact, &theirs, &alike));
         println!(
@@ -116,7 +116,7 @@ fn closed_forms() {
     let plane = || gyre([0.0, 0.0], [2.0, 1.0]);
     let inner = || gyre([0.4, 0.2], [1.7, 0.9]);
     check("double gyre", &plane(), &map(10.0, 40), 0.3);
-    let stop = FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) };
+    let stop = FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lifetime, ..map(5.0, 40) };
     check("double gyre that stops", &inner(), &stop, 0.3);
     let zero = FlowMap { boundary: Boundary::Zero, direction: Direction::Backward, ..map(5.0, 40) };
     check("double gyre with zeros", &inner(), &zero, 0.3);
@@ -143,7 +143,7 @@ fn windows_in_the_plane() {
         &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
         0.1,
     );
-    check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    check("cubic, holes", &smooth(&grid(), 0.6, true), &FlowMap { normalisation: Normalisation::Lifetime, ..cubic.clone() }, 0.1);
     let mut around = even(&[19, 13]);
     around[0] = around[0].clone().with_period(11.0);
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);

@@ -198,8 +198,8 @@ def main():
         if np.isfinite(jacobian).all():
             out.append(float(np.log(np.linalg.svd(jacobian, compute_uv=False)[0])))
         else:
-            lived = np.isfinite(arrive(flow, point, task["from"], task["tau"])).all()
-            out.append("neighbour" if lived else "seed")
+            complete = np.isfinite(arrive(flow, point, task["from"], task["tau"])).all()
+            out.append("neighbour" if complete else "seed")
     json.dump(out, sys.stdout)
 
 

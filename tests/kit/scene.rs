@@ -29,6 +29,23 @@ pub fn double_gyre(picture: [usize; 3], keys: &str) -> String {
     scene("double_gyre", picture, &format!("{GYRE_BOX}{keys}"))
 }
 
+/// A turbulence whose frames a surrogate answers where it is trusted. `keys` choose the surrogate and how long it is trained.
+pub fn gated_turbulence(keys: &str) -> String {
+    let common = "
+        source.nodes = [48, 24, 24]
+        time.slides = 1
+        network.levels = 4
+        network.features = 2
+        network.log2_table = 14
+        network.base_resolution = 8
+        network.batch = 4096
+        render.method = \"gated\"
+        transfer.low = 0.1
+        transfer.high = 0.3
+    ";
+    scene("turbulence", [48, 24, 8], &(common.to_owned() + keys))
+}
+
 /// Writes `scene.toml` into a folder; returns its path.
 pub fn write(folder: &Path, text: &str) -> String {
     let path = folder.join("scene.toml");

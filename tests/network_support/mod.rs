@@ -78,7 +78,7 @@ impl Tracer for DoubleGyre {
                 (0.5 * largest.ln()) as f32
             })
             .collect();
-        out.lived = vec![1.0; seeds.len()];
+        out.lifetime_share = vec![1.0; seeds.len()];
         out.arrival =
             if extras.arrival { states.iter().zip(seeds).map(|(s, p)| [s[0] as f32, s[1] as f32, p[2]]).collect() } else { Vec::new() };
         let matrix = |s: &[f64; 6]| [s[2] as f32, s[3] as f32, 0.0, s[4] as f32, s[5] as f32, 0.0, 0.0, 0.0, 1.0];

@@ -5,7 +5,7 @@ use serde_json::Value;
 use std::collections::{BTreeMap, BTreeSet};
 
 /// Every table, with only those keys that have no default.
-const LEAST: &str = "
+const MINIMAL: &str = "
     [source]
     kind = \"archive\"
     [domain]
@@ -73,22 +73,22 @@ fn the_page_names_every_renamed_key() {
 
 #[test]
 fn the_page_names_every_key_with_its_default_and_no_other() {
-    let scene: SceneFile = toml::from_str(LEAST).unwrap();
+    let scene: SceneFile = toml::from_str(MINIMAL).unwrap();
     let mut read = BTreeMap::new();
     leaves(&serde_json::to_value(&scene).unwrap(), "", &mut read);
     let page = documented();
     assert_eq!(page.keys().collect::<BTreeSet<_>>(), read.keys().collect::<BTreeSet<_>>());
-    let least: toml::Table = LEAST.parse().unwrap();
+    let minimal: toml::Table = MINIMAL.parse().unwrap();
     for (key, cell) in &page {
         let parts: Vec<&str> = key.split('.').collect();
-        let required = parts.iter().try_fold(&toml::Value::Table(least.clone()), |value, part| value.get(part)).is_some();
+        let required = parts.iter().try_fold(&toml::Value::Table(minimal.clone()), |value, part| value.get(part)).is_some();
         let Some(default) = back_quoted(cell) else {
             assert_eq!(cell == "required", required, "{key}: {cell}");
             assert!(required || (cell == "none" && read[key].is_null()), "{key}: the page says {cell}, it is {}", read[key]);
             continue;
         };
         // Setting a key to its default changes nothing.
-        let mut set = least.clone();
+        let mut set = minimal.clone();
         let mut table = &mut set;
         for part in &parts[..parts.len() - 1] {
             table = table.entry(*part).or_insert_with(|| toml::Value::Table(toml::Table::new())).as_table_mut().unwrap();

@@ -189,7 +189,7 @@ int main(int, char** arguments) {
                 float point[3];
                 audit_point(cells, cell, number++, point);
                 for (float u : point) give_one(u);
-                const auto x = take<float>(4);  // missing, lived, predicted, traced
+                const auto x = take<float>(4);  // missing, lifetime_share, predicted, traced
                 const bool missing = x[0] != 0.0f;
                 const Residual found = missing ? Residual{not_a_number(), not_a_number()} : residual(ramp[0], ramp[1], ramp[2], x[2], x[3]);
                 add_residual(sums, found);

@@ -87,14 +87,14 @@ fn host_in<R: DeviceReal>(source: &VelocitySource, map: &FlowMap, start: Option<
     let mut out = Traced {
         log_stretch: vec![f32::NAN; n],
         log_stretch_f64: vec![f64::NAN; n],
-        lived: vec![f32::NAN; n],
+        lifetime_share: vec![f32::NAN; n],
         arrival: vec![[f32::NAN; 3]; n],
         jacobian: vec![[f32::NAN; 9]; n],
     };
     let outputs = Outputs {
         log_stretch: out.log_stretch.as_mut_ptr() as u64,
         log_stretch_f64: out.log_stretch_f64.as_mut_ptr() as u64,
-        lived: out.lived.as_mut_ptr() as u64,
+        lifetime_share: out.lifetime_share.as_mut_ptr() as u64,
         arrival: out.arrival.as_mut_ptr() as u64,
         jacobian: out.jacobian.as_mut_ptr() as u64,
     };
@@ -185,16 +185,16 @@ fn check(name: &str, source: &VelocitySource, map: &FlowMap, t0: f64) {
     let seeds = fresh(&domain, 600);
     let exact = cpu(source, map, t0, &seeds);
     let double = host(source, map, t0, Storage::F32, &seeds);
-    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lived[i] - double.lived[i]).abs() < 1e-6).collect();
-    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} lived alike", same.len(), seeds.len());
+    let same: Vec<usize> = (0..seeds.len()).filter(|&i| (exact.lifetime_share[i] - double.lifetime_share[i]).abs() < 1e-6).collect();
+    assert!(same.len() as f64 >= (1.0 - UNDECIDED) * seeds.len() as f64, "{name}: {} of {} of equal lifetime", same.len(), seeds.len());
     let mut died = 0;
     for &i in &same {
         let (a, b) = (exact.log_stretch_f64[i], double.log_stretch_f64[i]);
         // Rounding of 1e-16 a step, amplified by the stretch along the path (e^s below 1e4 here) and, near cell faces, by a jump of the
-        // gradient across them. Central differences divide it by the gap.
+        // gradient across them. Central differences divide it by the difference step.
         let tolerance = if map.integrator == Integrator::Differences { 1e-6 } else { 2e-9 };
         assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{name}: seed {:?}: {a} {b}", seeds[i]);
-        died += usize::from(exact.lived[i] < 1.0);
+        died += usize::from(exact.lifetime_share[i] < 1.0);
         for k in 0..3 {
             let (a, b) = (exact.arrival[i][k], double.arrival[i][k]);
             // Both are rounded to single precision.
@@ -237,7 +237,7 @@ fn closed_forms() {
     check(
         "double gyre that stops",
         &gyre(&inner),
-        &FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lived, ..map(5.0, 40) },
+        &FlowMap { boundary: Boundary::Stop, normalisation: Normalisation::Lifetime, ..map(5.0, 40) },
         0.3,
     );
     check(
@@ -263,7 +263,7 @@ fn closed_forms_with_starts() {
     for (direction, integrator, tolerance) in [
         (Direction::Forward, Integrator::Tangent, 2e-9),
         (Direction::Backward, Integrator::Tangent, 2e-9),
-        // Rounding divided by the gap.
+        // Rounding divided by the difference step.
         (Direction::Forward, Integrator::Differences, 1e-6),
     ] {
         let map = FlowMap { direction, integrator, ..map(10.0, 40) };
@@ -273,7 +273,7 @@ fn closed_forms_with_starts() {
             let exact = cpu(&gyre, &map, f64::from(seed[2]), &[seed]);
             let (a, b) = (exact.log_stretch_f64[0], found.log_stretch_f64[i]);
             assert!((a - b).abs() < tolerance * a.abs().max(1.0), "{direction:?} {integrator:?} {seed:?}: {a} {b}");
-            // In single precision, differences over a gap of 1e-4 keep about three of seven digits.
+            // In single precision, differences over a step of 1e-4 keep about three of seven digits.
             let tolerance = if integrator == Integrator::Tangent { 2e-3 } else { 0.1 };
             assert!(
                 (f64::from(single.log_stretch[i]) - a).abs() < tolerance,
@@ -350,7 +350,12 @@ fn windows_in_the_plane() {
         &FlowMap { boundary: Boundary::Clamp, ..cubic.clone() },
         0.1,
     );
-    check("cubic, holes", &smooth(&cartesian(even()), 0.6, true), &FlowMap { normalisation: Normalisation::Lived, ..cubic.clone() }, 0.1);
+    check(
+        "cubic, holes",
+        &smooth(&cartesian(even()), 0.6, true),
+        &FlowMap { normalisation: Normalisation::Lifetime, ..cubic.clone() },
+        0.1,
+    );
     let mut around = even();
     around[0] = around[0].clone().with_period(9.5);
     check("cubic, around", &smooth(&cartesian(around), 0.6, false), &cubic, 0.1);

@@ -113,7 +113,7 @@ pub struct Outputs {
     /// Log-stretch in double precision.
     pub log_stretch_f64: u64,
     /// Lifetime as a share of |tau|.
-    pub lived: u64,
+    pub lifetime_share: u64,
     /// Arrival positions.
     pub arrival: u64,
     /// Jacobians, row-major.
@@ -237,7 +237,7 @@ pub struct AuditPointsArgument {
     pub points: u64,
     pub is_missing: u64,
     pub traced: u64,
-    pub lived: u64,
+    pub lifetime_share: u64,
     pub predicted: u64,
     pub optical: u64,
 }
@@ -248,7 +248,7 @@ pub struct AuditPointsArgument {
 pub struct CellFindings {
     pub errors: CellErrors,
     pub points: f64,
-    pub lived: f64,
+    pub lifetimes: f64,
     pub peak: f64,
 }
 

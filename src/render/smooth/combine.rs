@@ -75,7 +75,8 @@ fn b3(from: &[Weighted], width: usize, spacing: usize, along_rows: bool) -> Vec<
         for (x, value) in row.iter_mut().enumerate() {
             let mut sum = [0.0; 4];
             for (i, weight) in KERNEL.iter().enumerate() {
-                let at = if along_rows { y * width + reflected(x as isize + (i as isize - 2) * spacing as isize, width) } else { rows[i] + x };
+                let at =
+                    if along_rows { y * width + reflected(x as isize + (i as isize - 2) * spacing as isize, width) } else { rows[i] + x };
                 (0..4).for_each(|k| sum[k] += weight * from[at][k]);
             }
             *value = sum;

@@ -159,7 +159,8 @@ impl LightVolume {
         let Some(shear) = &self.shear else {
             let cell: [usize; 3] = std::array::from_fn(|k| lower(place[k], self.size[k]));
             let f: [f32; 3] = std::array::from_fn(|k| place[k] - cell[k] as f32);
-            let value = |x: usize, y: usize, z: usize| self.depth[((cell[2] + z) * self.size[1] + cell[1] + y) * self.size[0] + cell[0] + x];
+            let value =
+                |x: usize, y: usize, z: usize| self.depth[((cell[2] + z) * self.size[1] + cell[1] + y) * self.size[0] + cell[0] + x];
             let plane = |z| between(between(value(0, 0, z), value(1, 0, z), f[0]), between(value(0, 1, z), value(1, 1, z), f[0]), f[1]);
             return between(plane(0), plane(1), f[2]);
         };
@@ -170,9 +171,8 @@ impl LightVolume {
         let f: [f32; 2] = std::array::from_fn(|side| column[side] - first[side]);
         let at = |plane: usize| {
             // The clamp guards against rounding at the outermost columns.
-            let index = |side: usize| {
-                (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, self.size[side] as i32 - 2) as usize
-            };
+            let index =
+                |side: usize| (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, self.size[side] as i32 - 2) as usize;
             let start = (plane * self.size[1] + index(1)) * self.size[0] + index(0);
             let near = &self.depth[start..start + self.size[0] + 2];
             let row = self.size[0];

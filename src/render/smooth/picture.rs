@@ -155,9 +155,8 @@ impl Picture {
 
     /// Starts anew if the picture shows anything else. Returns true if it did.
     fn settle(&mut self, scene: &Scene, inverse_tau: f32, nodes: &Nodes, number: u64) -> bool {
-        let same = |(shown, tau, old): &(Scene, f32, Nodes)| {
-            shown == scene && *tau == inverse_tau && std::ptr::eq(old.values(), nodes.values())
-        };
+        let same =
+            |(shown, tau, old): &(Scene, f32, Nodes)| shown == scene && *tau == inverse_tau && std::ptr::eq(old.values(), nodes.values());
         if self.shows.as_ref().is_some_and(same) {
             return false;
         }
@@ -352,8 +351,9 @@ impl Picture {
                 for pixel in &sums[y * width + left..y * width + (left + TILE).min(width)] {
                     let pairs = f64::from(pixel.pairs());
                     if pairs > 0.0 {
-                        let difference: f64 =
-                            (0..3).map(|k| (0..2).map(|q| f64::from(pixel.radiance[0][q][k] - pixel.radiance[1][q][k])).sum::<f64>().powi(2)).sum();
+                        let difference: f64 = (0..3)
+                            .map(|k| (0..2).map(|q| f64::from(pixel.radiance[0][q][k] - pixel.radiance[1][q][k])).sum::<f64>().powi(2))
+                            .sum();
                         // The sums of the halves differ by twice the pairs times the variance of one sample.
                         sum += difference / (6.0 * pairs);
                         pixels += 1.0;

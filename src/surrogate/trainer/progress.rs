@@ -13,7 +13,7 @@ const STALLED: f64 = 0.02;
 /// Factor on the rate at each stall, and the lower bound of their product.
 const STALL_FACTOR: f64 = 0.7;
 /// See [`STALL_FACTOR`].
-const LEAST_FACTOR: f64 = 0.1;
+const MIN_FACTOR: f64 = 0.1;
 
 /// State of training besides weights and moments.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -56,7 +56,7 @@ impl Progress {
         self.smooth = if self.smooth == 0.0 { loss } else { 0.99 * self.smooth + 0.01 * loss };
         if averaged.is_multiple_of(LOOK_EVERY) {
             if self.looked > 0.0 && self.smooth > (1.0 - STALLED) * self.looked {
-                self.stall = (self.stall * STALL_FACTOR).max(LEAST_FACTOR);
+                self.stall = (self.stall * STALL_FACTOR).max(MIN_FACTOR);
             }
             self.looked = self.smooth;
         }

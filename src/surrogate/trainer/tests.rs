@@ -4,7 +4,7 @@ use super::*;
 use crate::field::Domain;
 use crate::field::analytic::Analytic;
 use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
-use crate::surrogate::{Samples, Table};
+use crate::surrogate::{HostTraining, Samples, Table};
 use std::sync::Mutex;
 use std::time::Duration;
 

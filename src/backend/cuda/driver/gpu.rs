@@ -50,7 +50,7 @@ pub struct Gpu {
     context: Arc<CudaContext>,
     work: Arc<CudaStream>,
     transfer: Arc<CudaStream>,
-    behind: AsyncReadback,
+    readback: AsyncReadback,
     budget: Arc<Budget>,
     cache: KernelCache,
     /// Loaded modules by source and macros. A compile error is stored too, so that no later frame tries again.
@@ -130,7 +130,7 @@ impl Gpu {
             }
         };
         let (work, transfer) = (stream().map_err(&opening)?, stream().map_err(&opening)?);
-        let behind = AsyncReadback::new(stream().map_err(&opening)?);
+        let readback = AsyncReadback::new(stream().map_err(&opening)?, work.clone());
         let (free, total) = context.mem_get_info().map_err(&opening)?;
         let attribute = |which| context.attribute(which).map_err(&opening);
         let multiprocessors = attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_MULTIPROCESSOR_COUNT)? as u32;
@@ -144,7 +144,7 @@ impl Gpu {
             driver_version: driver_version()?,
             work,
             transfer,
-            behind,
+            readback,
             budget: Arc::new(Budget::new(settings.memory_cap, free as u64, total as u64).filling(settings.poison.then_some(0xFF))),
             cache: KernelCache::new(settings.cache.clone()),
             modules: Mutex::new(HashMap::new()),
@@ -205,8 +205,8 @@ impl Gpu {
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
     }
-    pub(in crate::backend::cuda) fn behind(&self) -> &AsyncReadback {
-        &self.behind
+    pub(in crate::backend::cuda) fn readback(&self) -> &AsyncReadback {
+        &self.readback
     }
     pub(in crate::backend::cuda) fn budget(&self) -> &Arc<Budget> {
         &self.budget
@@ -224,8 +224,8 @@ impl Gpu {
     /// `most`, if that is smaller).
     pub(in crate::backend::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
         const SHARE: u64 = 4;
-        const LEAST: usize = 1 << 12;
-        usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(LEAST).min(most)
+        const MIN: usize = 1 << 12;
+        usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(MIN).min(most)
     }
 
     /// Allocates uninitialised memory for `len` values, within the cap. It is freed in the order of the work stream.

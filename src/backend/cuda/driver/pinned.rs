@@ -1,10 +1,10 @@
 //! Pinned (page-locked) host memory, the target of asynchronous copies from the device.
 
-use crate::backend::cuda::{DeviceError, Gpu};
+use crate::backend::cuda::DeviceError;
 use cudarc::driver::{CudaContext, CudaStream, result};
 use std::sync::Arc;
 
-/// Pinned values. The device may write them at any time between [`Self::copy_on`] and the next synchronisation of its stream, so a caller
+/// Pinned values. The device may write them at any time between [`Self::copy_from`] and the next synchronisation of its stream, so a caller
 /// synchronises before it reads them.
 pub(in crate::backend::cuda) struct Pinned<T: Copy> {
     values: *mut T,
@@ -22,9 +22,8 @@ impl<T: Copy + Default> Pinned<T> {
     ///
     /// # Errors
     /// The driver cannot allocate pinned memory.
-    pub(in crate::backend::cuda) fn new(gpu: &Gpu, len: usize) -> Result<Self, DeviceError> {
+    pub(in crate::backend::cuda) fn new(context: &Arc<CudaContext>, len: usize) -> Result<Self, DeviceError> {
         let doing = DeviceError::driver("allocating pinned host memory");
-        let context = gpu.context().clone();
         context.bind_to_thread().map_err(&doing)?;
         // SAFETY: the context is current. Flags 0 select memory that the CPU caches, since the CPU reads it.
         let values = unsafe { result::malloc_host(len.max(1) * size_of::<T>(), 0) }.map_err(&doing)?.cast::<T>();
@@ -32,7 +31,7 @@ impl<T: Copy + Default> Pinned<T> {
             // SAFETY: within the allocation, which the driver aligns to a page.
             unsafe { values.add(i).write(T::default()) };
         }
-        Ok(Self { values, len, context })
+        Ok(Self { values, len, context: context.clone() })
     }
 
     /// Number of values.
@@ -40,26 +39,14 @@ impl<T: Copy + Default> Pinned<T> {
         self.len
     }
 
-    /// Enqueues on the work stream a copy of `count` values at the device address `from` to the front of this memory.
-    ///
-    /// # Errors
-    /// A driver call fails.
-    ///
-    /// # Safety
-    /// As for [`Self::copy_on`], with the work stream.
-    pub(in crate::backend::cuda) unsafe fn copy_from(&mut self, gpu: &Gpu, from: u64, count: usize) -> Result<(), DeviceError> {
-        // SAFETY: guaranteed by the caller.
-        unsafe { self.copy_on(gpu.work(), from, count) }
-    }
-
-    /// Enqueues the copy of [`Self::copy_from`] on any stream.
+    /// Enqueues on `stream` a copy of `count` values at the device address `from` to the front of this memory.
     ///
     /// # Errors
     /// A driver call fails.
     ///
     /// # Safety
     /// The address `from` holds `count` values when the stream executes the copy, and `count` is at most `len`.
-    pub(in crate::backend::cuda) unsafe fn copy_on(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
+    pub(in crate::backend::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
         debug_assert!(count <= self.len);
         // SAFETY: `count` values of `T` lie within the allocation.
         let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };

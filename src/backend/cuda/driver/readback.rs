@@ -2,8 +2,9 @@
 //!
 //! Two pinned buffers alternate (double buffering): one receives a piece from the device while the CPU copies the other to its destination.
 
+use crate::backend::cuda::DeviceError;
+use crate::backend::cuda::driver::memory::Buffer;
 use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu};
 use cudarc::driver::CudaStream;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -13,17 +14,17 @@ const PIECE: usize = 1 << 20;
 /// Stream and pinned buffers of the readback. The lock admits one reader at a time.
 pub(in crate::backend::cuda) struct AsyncReadback {
     stream: Arc<CudaStream>,
+    /// The stream whose results are read.
+    work: Arc<CudaStream>,
     /// The two alternating buffers, allocated at the first readback.
     pieces: Mutex<Option<[Pinned<f32>; 2]>>,
 }
 
 impl AsyncReadback {
-    pub(in crate::backend::cuda) fn new(stream: Arc<CudaStream>) -> Self {
-        Self { stream, pieces: Mutex::new(None) }
+    pub(in crate::backend::cuda) fn new(stream: Arc<CudaStream>, work: Arc<CudaStream>) -> Self {
+        Self { stream, work, pieces: Mutex::new(None) }
     }
-}
 
-impl Gpu {
     /// Returns the first `len` values of a buffer, after the work that is already enqueued. Later work runs concurrently and must not change them
     /// before this returns.
     ///
@@ -32,25 +33,28 @@ impl Gpu {
     ///
     /// # Panics
     /// If `len` exceeds the length of the buffer.
-    pub(in crate::backend::cuda) fn read_behind(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
+    pub(in crate::backend::cuda) fn read(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
         assert!(len <= from.len(), "the buffer holds as many");
-        let mut pieces = self.behind().pieces.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut pieces = self.pieces.lock().unwrap_or_else(PoisonError::into_inner);
         let pieces = match &mut *pieces {
             Some(pieces) => pieces,
-            none => none.insert([Pinned::new(self, PIECE)?, Pinned::new(self, PIECE)?]),
+            none => {
+                let context = self.work.context();
+                none.insert([Pinned::new(context, PIECE)?, Pinned::new(context, PIECE)?])
+            }
         };
         let read = self.read_in(pieces, from, len);
         if read.is_err() {
             // Neither the buffer nor the pinned memory may be freed during a copy in progress. A second error adds no information.
-            let _ = self.behind().stream.synchronize();
+            let _ = self.stream.synchronize();
         }
         read
     }
 
     fn read_in(&self, pieces: &mut [Pinned<f32>; 2], from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
         let doing = DeviceError::driver("reading values back");
-        let stream = &self.behind().stream;
-        stream.wait(&self.mark()?).map_err(&doing)?;
+        let stream = &self.stream;
+        stream.join(&self.work).map_err(&doing)?;
         let mut values = vec![0.0; len];
         let mut coming = None;
         // While the CPU copies one piece to its destination, the device sends the next one.
@@ -59,7 +63,7 @@ impl Gpu {
             let sent = if at < len {
                 let count = PIECE.min(len - at);
                 // SAFETY: the buffer holds `count` values from `at` on, and the previous copy to this piece was waited for in the previous turn.
-                unsafe { pieces[turn % 2].copy_on(stream, from.address_of(at), count) }?;
+                unsafe { pieces[turn % 2].copy_from(stream, from.address_of(at), count) }?;
                 Some((at, count, stream.record_event(None).map_err(&doing)?))
             } else {
                 None

@@ -13,8 +13,8 @@ use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::field::Domain;
 use crate::surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
 use crate::surrogate::{
-    BufferMark, DeviceTable as TableOnDevice, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice,
-    SyncedSamples, Table, Training, fresh_stamp,
+    BufferMark, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice, SurrogateTable, SyncedSamples,
+    Table, Training, fresh_stamp,
 };
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::Instant;
@@ -126,7 +126,7 @@ impl CudaTable {
     }
 }
 
-impl TableOnDevice for CudaTable {
+impl SurrogateTable for CudaTable {
     fn to_host(&self) -> Result<Table, DeviceError> {
         if let Some(table) = self.host.get() {
             return Ok(table.clone());
@@ -296,7 +296,7 @@ impl CudaTraining {
         let most = gpu.memory_left() / MEMORY_SHARE / writer.sample_bytes() as u64;
         // The kernels index the samples of pool and replay buffer together with 32 bits.
         let capacity = POOL_PER_BUFFER.saturating_mul(capacity).min(most as usize).clamp(1, 1 << 31);
-        Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.ring(capacity)?) }))
+        Ok(Arc::new(LabelPool { writer, samples: Mutex::new(training.replay_buffer(capacity)?) }))
     }
 }
 
@@ -307,7 +307,7 @@ impl Resident {
         training.reserve(batch)?;
         // The first call allocates the memory of the state for a rollback.
         training.keep()?;
-        let samples = training.ring(capacity)?;
+        let samples = training.replay_buffer(capacity)?;
         let pool = CudaTraining::pool(gpu, &training, capacity)?;
         Ok(Self {
             training,
@@ -384,7 +384,7 @@ impl Training for CudaTraining {
 
     fn train(&mut self, objective: &Objective, labels: Labels<'_, CudaTable>, steps: &[PlannedStep]) -> Result<Vec<f64>, DeviceError> {
         let Some(resident) = &mut self.resident else {
-            let base = labels.base.map(TableOnDevice::to_host).transpose()?;
+            let base = labels.base.map(SurrogateTable::to_host).transpose()?;
             return self.host.train(objective, Labels { buffer: labels.buffer, base: base.as_ref() }, steps);
         };
         let begin = Instant::now();

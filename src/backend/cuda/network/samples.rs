@@ -33,7 +33,7 @@ pub(super) struct TracedBatch<'a> {
     pub(super) base: Option<&'a DeviceTable>,
     /// Unit times of all points; `None` if points carry theirs.
     pub(super) times: Option<[f32; 2]>,
-    /// One point in 2^held_back gets no target ([`super::keeps_label`]), since the host may keep it for validation; with 0 all get one.
+    /// One point in 2^held_back gets no target ([`crate::backend::keeps_label`]), since the host may keep it for validation; with 0 all get one.
     pub(super) held_back: u32,
 }
 

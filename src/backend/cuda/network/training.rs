@@ -110,7 +110,7 @@ pub(super) struct NetworkCopy {
 impl NetworkCopy {
     /// Downloads the copy, asynchronously to the work stream, into a model of its shape and the running mean.
     pub(super) fn read_behind(&self, gpu: &Gpu, model: &mut Model, average: &mut Average) -> Result<(), DeviceError> {
-        let read = |part: usize, of: usize| gpu.read_behind(&self.parts[part][of], self.lens[part]);
+        let read = |part: usize, of: usize| gpu.readback().read(&self.parts[part][of], self.lens[part]);
         let moments = |part: usize| Ok([read(part, 0)?, read(part, 1)?, read(part, 2)?]);
         model.set_state([moments(0)?, moments(1)?], self.steps);
         *average = Average { tables: read(0, 3)?, layers: read(1, 3)? };
@@ -324,7 +324,7 @@ impl DeviceTraining {
     ///
     /// # Errors
     /// Out of memory.
-    pub fn ring(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
+    pub fn replay_buffer(&self, capacity: usize) -> Result<DeviceSamples, DeviceError> {
         let float4s = sample_float4s(self.shape());
         Ok(DeviceSamples { samples: self.gpu.alloc("samples", float4s * capacity)?, float4s, filled: Filled::default() })
     }
@@ -334,9 +334,9 @@ impl DeviceTraining {
     /// # Errors
     /// Out of memory.
     pub fn upload(&self, samples: &Samples, base: Option<&DeviceTable>) -> Result<DeviceSamples, DeviceError> {
-        let mut ring = self.ring(samples.len())?;
-        self.write(&mut ring, 0..samples.len(), samples, base)?;
-        Ok(ring)
+        let mut buffer = self.replay_buffer(samples.len())?;
+        self.write(&mut buffer, 0..samples.len(), samples, base)?;
+        Ok(buffer)
     }
 
     /// Uploads a range of samples, each to its index in `samples`. Samples before the range must be present already.
@@ -348,7 +348,7 @@ impl DeviceTraining {
     /// If the range exceeds the buffer or the samples.
     pub fn write(
         &self,
-        ring: &mut DeviceSamples,
+        buffer: &mut DeviceSamples,
         range: Range<usize>,
         samples: &Samples,
         base: Option<&DeviceTable>,
@@ -362,9 +362,9 @@ impl DeviceTraining {
             let (points, labels, count) = (points.address(), labels.address(), part.len());
             let batch = TracedBatch { domain: &unit, points, labels, count, base, times: None, held_back: 0 };
             // SAFETY: these buffers hold `count` entries and are freed in the order of the work stream.
-            unsafe { self.writer.write(ring, part.start, batch, further.address()) }?;
+            unsafe { self.writer.write(buffer, part.start, batch, further.address()) }?;
         }
-        ring.filled.len = ring.filled.len.max(range.end);
+        buffer.filled.len = buffer.filled.len.max(range.end);
         Ok(())
     }
 
@@ -372,16 +372,16 @@ impl DeviceTraining {
     ///
     /// # Errors
     /// Error of the driver.
-    pub fn usable(&self, ring: &DeviceSamples) -> Result<usize, DeviceError> {
-        if ring.is_empty() {
+    pub fn usable(&self, buffer: &DeviceSamples) -> Result<usize, DeviceError> {
+        if buffer.is_empty() {
             return Ok(0);
         }
         let count = self.gpu.upload("a counter", &[0_u32])?;
-        let (samples, n, to) = (ring.samples.address(), ring.len() as u32, count.address());
+        let (samples, n, to) = (buffer.samples.address(), buffer.len() as u32, count.address());
         let mut call = self.gpu.work().launch_builder(&self.writer.kernels.usable);
         call.arg(&samples).arg(&n).arg(&to);
         // SAFETY: the arguments of `network_usable`; the buffer holds `n` samples.
-        unsafe { launch(&mut call, threads(ring.len(), 256)) }?;
+        unsafe { launch(&mut call, threads(buffer.len(), 256)) }?;
         let mut found = [0];
         count.read(&mut found)?;
         Ok(found[0] as usize)
@@ -401,17 +401,17 @@ impl DeviceTraining {
     /// The memory at both addresses is on this device, holds `count` entries, and lives until the work stream has passed this call.
     pub unsafe fn append(
         &self,
-        ring: &mut DeviceSamples,
+        buffer: &mut DeviceSamples,
         domain: &Domain,
         points: u64,
         labels: u64,
         count: usize,
         base: Option<&DeviceTable>,
     ) -> Result<(), DeviceError> {
-        let capacity = ring.capacity();
+        let capacity = buffer.capacity();
         assert!(count <= capacity, "a buffer of {capacity} for {count} samples");
         // SAFETY: as required of the caller.
-        unsafe { self.writer.append(ring, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
+        unsafe { self.writer.append(buffer, TracedBatch { domain, points, labels, count, base, times: None, held_back: 0 }) }
     }
 
     /// Fills `points` with uniform points of the domain, a function of `seed` and of their numbers from `first` on.

@@ -16,7 +16,7 @@ use std::ops::Range;
 use std::sync::Arc;
 
 /// Limit on the points of a batch, to bound the memory. A batch of a single cell may have more.
-const MOST: usize = 1 << 22;
+const MAX_POINTS: usize = 1 << 22;
 /// Threads of a warp. Each warp processes one cell.
 const WARP: usize = 32;
 
@@ -32,9 +32,9 @@ pub struct Audits {
 struct Memory {
     unit: Buffer<[f32; 3]>,
     points: Buffer<[f32; 3]>,
-    land: Buffer<u8>,
+    missing: Buffer<u8>,
     traced: Buffer<f32>,
-    lived: Buffer<f32>,
+    lifetime_share: Buffer<f32>,
     /// `None` until arrival points are requested.
     arrivals: Option<Buffer<[f32; 3]>>,
     predicted: Buffer<f32>,
@@ -51,16 +51,16 @@ impl Memory {
         Ok(Self {
             unit: gpu.alloc(what, points)?,
             points: gpu.alloc(what, points)?,
-            land: gpu.alloc(what, points)?,
+            missing: gpu.alloc(what, points)?,
             traced: gpu.alloc(what, points)?,
-            lived: gpu.alloc(what, points)?,
+            lifetime_share: gpu.alloc(what, points)?,
             arrivals: None,
             predicted: gpu.alloc(what, points)?,
             optical: gpu.alloc(what, points)?,
             begins: gpu.alloc(what, cells + 1)?,
             findings: gpu.alloc(what, cells)?,
-            optical_back: Pinned::new(gpu, points)?,
-            findings_back: Pinned::new(gpu, cells)?,
+            optical_back: Pinned::new(gpu.context(), points)?,
+            findings_back: Pinned::new(gpu.context(), cells)?,
         })
     }
 
@@ -69,13 +69,14 @@ impl Memory {
     }
 }
 
-/// Groups consecutive cells into batches of at most [`MOST`] points. `begins` holds the first point of each cell, followed by the number of points.
+/// Groups consecutive cells into batches of at most [`MAX_POINTS`] points. `begins` holds the first point of each cell, followed by the number of
+/// points.
 fn batches(begins: &[u32]) -> Vec<Range<usize>> {
     let cells = begins.len() - 1;
     let mut batches = Vec::new();
     let mut first = 0;
     while first < cells {
-        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MOST;
+        let fits = |end: &usize| (begins[*end] - begins[first]) as usize <= MAX_POINTS;
         let end = (first + 2..=cells).take_while(fits).last().unwrap_or(first + 1);
         batches.push(first..end);
         first = end;
@@ -116,7 +117,7 @@ impl Audits {
         if !self.memory.as_ref().is_some_and(|memory| memory.holds(most, cells)) {
             // Freed first, so that old and new memory are never allocated together.
             self.memory = None;
-            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MOST.max(most)), cells)?);
+            self.memory = Some(Memory::new(&self.gpu, most.next_power_of_two().min(MAX_POINTS.max(most)), cells)?);
         }
         let Some(memory) = &mut self.memory else {
             return Err(DeviceError::Unsupported { what: "an audit without memory".into() });
@@ -142,9 +143,9 @@ impl Audits {
         let points = AuditPointsArgument {
             unit: memory.unit.address(),
             points: memory.points.address(),
-            is_missing: memory.land.address(),
+            is_missing: memory.missing.address(),
             traced: memory.traced.address(),
-            lived: memory.lived.address(),
+            lifetime_share: memory.lifetime_share.address(),
             predicted: memory.predicted.address(),
             optical: memory.optical.address(),
         };
@@ -161,12 +162,12 @@ impl Audits {
                 tracer.device().trace(
                     points.points,
                     count,
-                    &Outputs { log_stretch: points.traced, lived: points.lived, arrival, ..Outputs::default() },
+                    &Outputs { log_stretch: points.traced, lifetime_share: points.lifetime_share, arrival, ..Outputs::default() },
                 )?;
                 predictor.predict(points.unit, count, points.predicted)?;
                 let mut call = stream.launch_builder(&self.measure);
                 launch(call.arg(&low).arg(&per_range).arg(&tau).arg(&argument).arg(&points).arg(&findings), warps)?;
-                memory.optical_back.copy_from(gpu, points.optical, count)?;
+                memory.optical_back.copy_from(gpu.work(), points.optical, count)?;
             }
             if request.samples.is_some() {
                 keep(memory, count, arrivals.then_some(domain), &mut samples)?;
@@ -176,14 +177,14 @@ impl Audits {
         }
         let from = memory.findings.address();
         // SAFETY: `findings` holds one entry for every cell.
-        unsafe { memory.findings_back.copy_from(gpu, from, cells) }?;
+        unsafe { memory.findings_back.copy_from(gpu.work(), from, cells) }?;
         gpu.synchronize()?;
         let findings = &memory.findings_back.values()[..cells];
         let points: f64 = findings.iter().map(|cell| cell.points).sum();
         Ok(AuditFindings {
             drawn: optical.len(),
             points: points as usize,
-            mean_lifetime_share: findings.iter().map(|cell| cell.lived).sum::<f64>() / points.max(1.0),
+            mean_lifetime_share: findings.iter().map(|cell| cell.lifetimes).sum::<f64>() / points.max(1.0),
             peak: findings.iter().map(|cell| cell.peak as f32).fold(f32::NEG_INFINITY, f32::max),
             samples,
             errors: Some(Audited::new(strata.clone(), findings.iter().map(|cell| cell.errors).collect(), optical)),
@@ -200,13 +201,13 @@ fn keep(memory: &Memory, count: usize, arrivals_in: Option<&Domain>, samples: &m
         Ok(values)
     }
     let (unit, traced) = (back(&memory.unit, [0.0; 3], count)?, back(&memory.traced, 0.0, count)?);
-    let land = back(&memory.land, 0, count)?;
-    let at_sea = || (0..count).filter(|&i| land[i] == 0);
-    samples.points.extend(at_sea().map(|i| unit[i]));
-    samples.log_stretch.extend(at_sea().map(|i| traced[i]));
+    let missing = back(&memory.missing, 0, count)?;
+    let present = || (0..count).filter(|&i| missing[i] == 0);
+    samples.points.extend(present().map(|i| unit[i]));
+    samples.log_stretch.extend(present().map(|i| traced[i]));
     if let (Some(domain), Some(buffer)) = (arrivals_in, &memory.arrivals) {
         let arrivals = back(buffer, [0.0; 3], count)?;
-        samples.arrival.extend(at_sea().map(|i| unit_arrival(domain, arrivals[i])));
+        samples.arrival.extend(present().map(|i| unit_arrival(domain, arrivals[i])));
     }
     Ok(())
 }

@@ -2,7 +2,7 @@
 
 use super::audit::Audits;
 use super::renderer::GpuRenderer;
-use super::router::{DeviceLearns, DevicePredict, FrameQueries, QueryRouter, TraceAll};
+use super::router::{DeviceLearns, DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
 use crate::backend::cuda::driver::Gpu;
 use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
 use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
@@ -14,7 +14,7 @@ use std::sync::Arc;
 /// Renders and audits frames. It reuses kernels and memory between frames.
 pub struct GpuFrames {
     renderer: GpuRenderer,
-    router: QueryRouter,
+    router: DeviceQueryRouter,
     audits: Audits,
 }
 
@@ -95,7 +95,7 @@ impl GpuFrames {
     /// # Errors
     /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
-        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: QueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
+        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: DeviceQueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
     }
 
     /// Renders a frame. Every query is traced if `surrogate` is `None`.

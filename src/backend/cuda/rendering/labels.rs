@@ -1,19 +1,16 @@
-//! Training labels of a frame on the host: a bounded, uniform sample of all traced queries.
+//! Training labels of a frame on the host, by the label rule of [`crate::backend::QueryRouter`].
 //!
-//! The sample is selected by a hash of each point (`keeps_label` of `answer.cuh`, adaptive sampling by hash value as in Wegman; Flajolet 1990): one
-//! point in 2^shift is kept, and the shift grows as the frame traces more. So the set does not depend on the order in which GPU threads run. The
-//! host sorts it, so its order does not either.
+//! The set of the labels does not depend on the order in which GPU threads run. The host sorts it, so its order does not either.
 
 use crate::backend::cuda::layout::LabelsArgument;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu};
-use crate::backend::router::unit_arrival;
+use crate::backend::router::{LabelShare, unit_arrival};
 use crate::field::Domain;
-use crate::render::rng::philox;
 use crate::surrogate::Samples;
 use rayon::prelude::*;
 
 /// Limit on the labels of one frame (64 MiB).
-const MOST: usize = 1 << 22;
+const MAX_LABELS: usize = 1 << 22;
 
 /// With training on the device, one label in 2^3 may go to the host instead of the label pool of the device. The host holds out some of its labels
 /// for validation, so the pool must not contain them.
@@ -42,19 +39,9 @@ struct Memory {
     arrivals: Option<Buffer<[f32; 3]>>,
 }
 
-/// Returns true if the label at a point is in the sample of 1 in 2^shift.
-pub fn keeps_label(point: [f32; 3], shift: u32) -> bool {
-    let [x, y, z] = point.map(f32::to_bits);
-    shift == 0 || (shift < 32 && philox([x, y, z, 0], [0, 0])[0] >> (32 - shift) == 0)
-}
-
 /// The labels of one frame.
 pub struct Labels {
-    /// Upper bound (exclusive) on the labels; 0 keeps none.
-    keep: usize,
-    shift: u32,
-    /// Points traced so far.
-    offered: u64,
+    share: LabelShare,
     /// Labels on the host, read back whenever the device's memory was full.
     back: Vec<Label>,
     memory: Option<Memory>,
@@ -68,13 +55,13 @@ impl Labels {
     /// # Errors
     /// The device fails or lacks memory.
     pub fn new(gpu: &Gpu, keep: usize, shift: u32, arrivals: bool) -> Result<Self, DeviceError> {
-        let keep = if keep > 1 { keep.min(MOST) } else { 0 };
+        let keep = if keep > 1 { keep.min(MAX_LABELS) } else { 0 };
         let room = Self::with_luck(keep);
         let memory = || -> Result<Memory, DeviceError> {
             let arrivals = arrivals.then(|| gpu.alloc("labels", room)).transpose()?;
             Ok(Memory { at: gpu.alloc("labels", room)?, arrivals })
         };
-        Ok(Self { keep, shift, offered: 0, back: Vec::new(), memory: (keep > 0).then(memory).transpose()?, arrivals })
+        Ok(Self { share: LabelShare::new(keep, shift), back: Vec::new(), memory: (keep > 0).then(memory).transpose()?, arrivals })
     }
 
     /// Returns the capacity for an expected number of labels: a margin of six standard deviations of the binomial count, and 64.
@@ -91,18 +78,15 @@ impl Labels {
         let Some(memory) = &self.memory else {
             return Ok((LabelsArgument { at: 0, arrivals: 0, length, capacity: 0, shift: 0 }, false));
         };
-        self.offered += traced as u64;
-        // Three quarters of the limit: a random excess over the limit would halve the sample in `finish`.
-        while self.offered >> self.shift > (self.keep - self.keep / 4) as u64 {
-            self.shift += 1;
-        }
+        self.share.expect(traced);
+        let shift = self.share.shift;
         let (at, capacity) = (memory.at.address(), memory.at.len());
         let arrivals = memory.arrivals.as_ref().map_or(0, Buffer::address);
-        let full = stored + Self::with_luck(traced >> self.shift) > capacity;
+        let full = stored + Self::with_luck(traced >> shift) > capacity;
         if full {
             self.take(stored)?;
         }
-        Ok((LabelsArgument { at, arrivals, length, capacity: capacity as u32, shift: self.shift }, full))
+        Ok((LabelsArgument { at, arrivals, length, capacity: capacity as u32, shift }, full))
     }
 
     /// Reads back the `stored` labels that are on the device.
@@ -123,14 +107,13 @@ impl Labels {
     }
 
     fn thin(&mut self) {
-        let shift = self.shift;
-        self.back.retain(|label| keeps_label(label.point(), shift));
+        let share = self.share;
+        self.back.retain(|label| share.keeps(label.point()));
     }
 
     /// Returns the labels on the host, sorted, in unit coordinates of `domain`.
     pub fn finish(&mut self, domain: &Domain) -> Samples {
-        while self.back.len() >= self.keep.max(1) && self.shift < 32 {
-            self.shift += 1;
+        while self.share.halve_if_full(self.back.len()) {
             self.thin();
         }
         self.back.par_sort_unstable_by_key(|label| label.at.map(f32::to_bits));
@@ -141,23 +124,5 @@ impl Labels {
             arrival: arrivals.par_iter().map(|label| unit_arrival(domain, label.arrival)).collect(),
             ..Samples::default()
         }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_shift_halves_what_is_kept() {
-        let point = |i: u32| [i as f32 * 0.001, (i % 97) as f32, 0.5];
-        let kept = |shift| (0..1 << 16).filter(|&i| keeps_label(point(i), shift)).count() as f64;
-        for shift in 0..6 {
-            let expected = f64::from(1 << 16) / f64::from(1 << shift);
-            // Four standard deviations of a binomial count.
-            assert!((kept(shift) - expected).abs() <= 4.0 * expected.sqrt(), "{} of {expected} at {shift}", kept(shift));
-        }
-        assert!((0..1000).all(|i| !keeps_label(point(i), 4) || keeps_label(point(i), 3)), "a larger share holds the smaller");
-        assert_eq!(kept(32), 0.0);
     }
 }

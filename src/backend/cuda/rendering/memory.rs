@@ -10,9 +10,9 @@ use cudarc::driver::DeviceRepr;
 /// Target number of slots: enough to fill the device and to make sorting worthwhile.
 const WANTED_SLOTS: u64 = 1 << 21;
 /// Limit on the slots; larger pictures are rendered band by band.
-const MOST_SLOTS: u64 = 1 << 22;
+const MAX_SLOTS: u64 = 1 << 22;
 /// Minimum length of the collision queue if memory allows: room for speculative queries beyond one collision per slot.
-const LEAST_QUEUE: u64 = 1 << 23;
+const MIN_QUEUE: u64 = 1 << 23;
 /// Number of sums per pixel (`PIXEL_SUM_FIELDS` of the kernels).
 const SUM_FIELDS: u64 = 11;
 
@@ -36,8 +36,8 @@ impl Plan {
     pub(in crate::backend::cuda) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
         let pixels = pixels.max(1) as u64;
         let parts = (WANTED_SLOTS / pixels).clamp(1, u64::from(samples));
-        let mut band = pixels.min(MOST_SLOTS / parts).max(1);
-        let mut queue = LEAST_QUEUE.max(band * parts);
+        let mut band = pixels.min(MAX_SLOTS / parts).max(1);
+        let mut queue = MIN_QUEUE.max(band * parts);
         let plan = |band: u64, queue: u64| Self { band: band as u32, parts: parts as u32, queue: queue as u32, cells: cells as u32 };
         while plan(band, queue).bytes() > memory && band > 1 {
             if queue > band * parts {
@@ -156,9 +156,9 @@ impl Memory {
             plan,
             layout,
             block: gpu.alloc("rendering", layout.end as usize)?,
-            control: Pinned::new(gpu, 1)?,
-            watch: Pinned::new(gpu, 3 * plan.cells as usize)?,
-            film: Pinned::new(gpu, plan.band as usize)?,
+            control: Pinned::new(gpu.context(), 1)?,
+            watch: Pinned::new(gpu.context(), 3 * plan.cells as usize)?,
+            film: Pinned::new(gpu.context(), plan.band as usize)?,
         })
     }
 
@@ -195,7 +195,7 @@ mod tests {
     fn parts_do_not_depend_on_memory_and_bands_fit_it() {
         for (pixels, samples) in [(1920 * 1080, 1), (320 * 160, 64), (200 * 100, 4096), (8192 * 8192, 4), (1, 1)] {
             let ample = Plan::new(pixels, samples, 4096, u64::MAX);
-            assert!(ample.slots() <= MOST_SLOTS && ample.parts <= samples && u64::from(ample.queue) >= ample.slots());
+            assert!(ample.slots() <= MAX_SLOTS && ample.parts <= samples && u64::from(ample.queue) >= ample.slots());
             for memory in [1 << 31, 1 << 28, 1 << 24] {
                 let plan = Plan::new(pixels, samples, 4096, memory);
                 assert_eq!(plan.parts, ample.parts, "{pixels} pixels, {memory} bytes");

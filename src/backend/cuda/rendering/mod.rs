@@ -10,6 +10,5 @@ mod router;
 pub use audit::Audits;
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
-pub use labels::keeps_label;
 pub use renderer::{GpuRenderer, LookAhead, Timeline};
-pub use router::{DeviceAnswers, DeviceLearns, DevicePredict, FrameQueries, QueryRouter, RoutedQueries, TraceAll};
+pub use router::{DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries, RoutedQueries, TraceAll};

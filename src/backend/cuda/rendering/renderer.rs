@@ -3,14 +3,14 @@
 //!
 //! All paths of a band advance together, in waves. Each wave runs two steps:
 //! 1. `render_start` or `render_advance` moves every flight to its next tentative collisions and appends their points to a queue.
-//! 2. [`DeviceAnswers`] evaluates the log-stretch at the queued points. The next wave uses the values to accept or reject the collisions.
+//! 2. [`DeviceLogStretch`] evaluates the log-stretch at the queued points. The next wave uses the values to accept or reject the collisions.
 //!
 //! Only a few counters leave the device after each wave. `render_film` then sums the samples of each pixel. The picture equals that of
 //! [`Renderer::render`] up to rounding if the evaluated values are equal: random numbers and states are the same, and the order of the sums depends
 //! only on the numbers of pixels and samples. Between frames, the host updates the majorants from the observations of the device.
 
 use crate::backend::cuda::rendering::memory::{Control, Memory, Plan};
-use crate::backend::cuda::{DeviceAnswers, DeviceError, Gpu, launch, threads};
+use crate::backend::cuda::{DeviceError, DeviceLogStretch, Gpu, launch, threads};
 use crate::render::{CellObservations, Film, FrameParameters, RenderError, RenderStats, Renderer};
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
 use std::ops::Range;
@@ -194,7 +194,7 @@ impl GpuRenderer {
         renderer: &mut Renderer,
         frame: u64,
         samples: Range<u32>,
-        answers: &mut dyn DeviceAnswers,
+        answers: &mut dyn DeviceLogStretch,
         progress: Option<&dyn Fn(f32)>,
         stop: &AtomicBool,
     ) -> Result<(Film, RenderStats), DeviceError> {
@@ -275,7 +275,7 @@ impl GpuRenderer {
         &mut self,
         parameters: &FrameParameters,
         band: BandArgument,
-        answers: &mut dyn DeviceAnswers,
+        answers: &mut dyn DeviceLogStretch,
         report: &dyn Fn(u64),
         stop: &AtomicBool,
     ) -> Result<bool, DeviceError> {
@@ -323,7 +323,7 @@ impl GpuRenderer {
                 self.timeline.add(&timeline);
                 return Ok(stopped && control.live != 0);
             }
-            answers.answer(queue.points, control.length as usize, queue.log_stretch, queue.by)?;
+            answers.evaluate(queue.points, control.length as usize, queue.log_stretch, queue.by)?;
             answered = Some([ended, gpu.mark()?]);
             timeline.waves += 1;
             timeline.points += u64::from(control.length);
@@ -343,7 +343,7 @@ impl GpuRenderer {
         // SAFETY: the arguments of `render_film`; every slot of the band has written its sums.
         unsafe { launch(&mut call, threads(band.pixels as usize, 256)) }?;
         // SAFETY: the kernel writes `band.pixels` pixels, and `film` holds a band.
-        unsafe { memory.film.copy_from(&gpu, out, band.pixels as usize) }?;
+        unsafe { memory.film.copy_from(gpu.work(), out, band.pixels as usize) }?;
         let ended = gpu.mark()?;
         gpu.synchronize()?;
         film.write_pixels(band.first_pixel as usize, &memory.film.values()[..band.pixels as usize]);
@@ -387,7 +387,7 @@ impl Memory {
     fn end_wave(&mut self, gpu: &Gpu) -> Result<Control, DeviceError> {
         let from = self.at(self.layout.control);
         // SAFETY: the block holds a `Control` at this offset.
-        unsafe { self.control.copy_from(gpu, from, 1) }?;
+        unsafe { self.control.copy_from(gpu.work(), from, 1) }?;
         gpu.synchronize()?;
         Ok(self.control.values()[0])
     }
@@ -395,7 +395,7 @@ impl Memory {
     fn end_frame(&mut self, gpu: &Gpu) -> Result<(CellObservations, Control), DeviceError> {
         let (from, count) = (self.at(self.layout.watch), self.watch.len());
         // SAFETY: the block holds three values per cell at this offset.
-        unsafe { self.watch.copy_from(gpu, from, count) }?;
+        unsafe { self.watch.copy_from(gpu.work(), from, count) }?;
         let control = self.end_wave(gpu)?;
         let (count, rest) = self.watch.values().split_at(count / 3);
         let (highest, missing) = rest.split_at(count.len());

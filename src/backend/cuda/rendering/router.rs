@@ -15,7 +15,7 @@ use cudarc::driver::{CudaEvent, CudaFunction, PushKernelArg, result};
 use std::sync::Arc;
 
 /// Evaluates log-stretch queries in device memory.
-pub trait DeviceAnswers {
+pub trait DeviceLogStretch {
     /// Enqueues on the work stream the evaluation of `count` points. All addresses are device addresses.
     ///
     /// - `points`: three f32 per point, domain coordinates.
@@ -24,7 +24,7 @@ pub trait DeviceAnswers {
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError>;
+    fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError>;
 
     /// Called after all waves of a frame, before its results are used.
     ///
@@ -64,8 +64,8 @@ pub trait DeviceLearns {
 /// Traces every query.
 pub struct TraceAll<'a>(pub &'a DeviceTracer);
 
-impl DeviceAnswers for TraceAll<'_> {
-    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
+impl DeviceLogStretch for TraceAll<'_> {
+    fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         let gpu = self.0.gpu();
         let doing = DeviceError::driver("filling device memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
@@ -105,7 +105,7 @@ const CHUNK: usize = 1 << 23;
 const POINT: u64 = 20;
 
 /// Splits the queries of each wave between surrogate and tracer. It reuses its memory between frames.
-pub struct QueryRouter {
+pub struct DeviceQueryRouter {
     gpu: Arc<Gpu>,
     split: CudaFunction,
     join: CudaFunction,
@@ -135,7 +135,7 @@ impl Memory {
             values: gpu.alloc(what, capacity)?,
             arrivals: None,
             lengths: gpu.alloc(what, 3)?,
-            pinned: Pinned::new(gpu, 3)?,
+            pinned: Pinned::new(gpu.context(), 3)?,
         })
     }
 
@@ -143,14 +143,14 @@ impl Memory {
     fn lengths(&mut self, gpu: &Gpu) -> Result<[usize; 3], DeviceError> {
         let from = self.lengths.address();
         // SAFETY: `lengths` holds three values.
-        unsafe { self.pinned.copy_from(gpu, from, 3) }?;
+        unsafe { self.pinned.copy_from(gpu.work(), from, 3) }?;
         gpu.synchronize()?;
         let lengths = self.pinned.values();
         Ok([lengths[0] as usize, lengths[1] as usize, lengths[2] as usize])
     }
 }
 
-impl QueryRouter {
+impl DeviceQueryRouter {
     /// Compiles the kernels or loads them from the cache.
     ///
     /// # Errors
@@ -313,8 +313,8 @@ impl RoutedQueries<'_> {
     }
 }
 
-impl DeviceAnswers for RoutedQueries<'_> {
-    fn answer(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
+impl DeviceLogStretch for RoutedQueries<'_> {
+    fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         for first in (0..count).step_by(self.memory.capacity) {
             let (part, at) = ((count - first).min(self.memory.capacity), first as u64);
             self.chunk(points + 12 * at, part, log_stretch + 4 * at, by + at)?;

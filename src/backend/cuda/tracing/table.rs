@@ -144,7 +144,7 @@ impl DeviceTable {
     /// # Errors
     /// The device fails or lacks pinned memory.
     pub fn values(&self) -> Result<Vec<f32>, DeviceError> {
-        self.gpu.read_behind(&self.values, self.values.len())
+        self.gpu.readback().read(&self.values, self.values.len())
     }
 }
 

@@ -48,7 +48,7 @@ pub struct DeviceTracer {
     /// Address of the steps (windows) or the stage constants (closed forms).
     times: u64,
     step: [u64; 1],
-    gap: f64,
+    difference_step: f64,
     result_policy: ResultPolicy,
     cells: Option<SortCells>,
     sorter: Mutex<Option<Sorter>>,
@@ -114,7 +114,7 @@ impl DeviceTracer {
             data,
             times: stages.address(),
             step: step_word::<R>(map, steps),
-            gap: map.difference_step,
+            difference_step: map.difference_step,
             result_policy: result_policy(map, steps),
             cells: None,
             sorter: Mutex::new(None),
@@ -164,7 +164,7 @@ impl DeviceTracer {
                     data: arguments.data,
                     times: arguments.steps,
                     step: step_word::<R>(map, steps),
-                    gap: map.difference_step,
+                    difference_step: map.difference_step,
                     result_policy: result_policy(map, steps),
                     cells: tuning.sorted.then(|| SortCells::of_grid(&grid)),
                     sorter: Mutex::new(None),
@@ -256,7 +256,14 @@ impl DeviceTracer {
         }
         let n = count as u32;
         let mut call = self.gpu.work().launch_builder(kernel);
-        call.arg(&self.data).arg(&self.times).arg(&self.step).arg(&self.gap).arg(&self.result_policy).arg(&seeds).arg(&n).arg(out);
+        call.arg(&self.data)
+            .arg(&self.times)
+            .arg(&self.step)
+            .arg(&self.difference_step)
+            .arg(&self.result_policy)
+            .arg(&seeds)
+            .arg(&n)
+            .arg(out);
         // SAFETY: as required of the caller; `self` owns all memory that the data points to.
         unsafe { launch(&mut call, threads(32 * count.div_ceil(seeds_a_warp), self.block)) }
     }
@@ -268,7 +275,7 @@ fn shifted(out: &Outputs, first: usize) -> Outputs {
     Outputs {
         log_stretch: by(out.log_stretch, 4),
         log_stretch_f64: by(out.log_stretch_f64, 8),
-        lived: by(out.lived, 4),
+        lifetime_share: by(out.lifetime_share, 4),
         arrival: by(out.arrival, 12),
         jacobian: by(out.jacobian, 36),
     }
@@ -324,7 +331,7 @@ fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<S
 pub(in crate::backend::cuda) fn result_policy(map: &FlowMap, steps: usize) -> ResultPolicy {
     ResultPolicy {
         zero_if_left: i32::from(map.boundary == Boundary::Zero),
-        by_lifetime: i32::from(map.normalisation == Normalisation::Lived),
+        by_lifetime: i32::from(map.normalisation == Normalisation::Lifetime),
         steps: steps as i32,
     }
 }

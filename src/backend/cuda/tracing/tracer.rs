@@ -30,7 +30,7 @@ struct Room {
     extras: Extras,
     seeds: Buffer<[f32; 3]>,
     log_stretch: Buffer<f32>,
-    lived: Buffer<f32>,
+    lifetime_share: Buffer<f32>,
     double: Option<Buffer<f64>>,
     arrival: Option<Buffer<[f32; 3]>>,
     jacobian: Option<Buffer<[f32; 9]>>,
@@ -101,7 +101,7 @@ impl Trace for CudaTracer {
                 extras,
                 seeds: gpu.alloc(what, capacity)?,
                 log_stretch: gpu.alloc(what, capacity)?,
-                lived: gpu.alloc(what, capacity)?,
+                lifetime_share: gpu.alloc(what, capacity)?,
                 double: self.double.then(|| gpu.alloc(what, capacity)).transpose()?,
                 arrival: extras.arrival.then(|| gpu.alloc(what, capacity)).transpose()?,
                 jacobian: extras.jacobian.then(|| gpu.alloc(what, capacity)).transpose()?,
@@ -116,14 +116,14 @@ impl Trace for CudaTracer {
             let addresses = Outputs {
                 log_stretch: room.log_stretch.address(),
                 log_stretch_f64: room.double.as_ref().map_or(0, Buffer::address),
-                lived: room.lived.address(),
+                lifetime_share: room.lifetime_share.address(),
                 arrival: arrival.map_or(0, Buffer::address),
                 jacobian: jacobian.map_or(0, Buffer::address),
             };
             // SAFETY: every buffer holds `capacity` entries, which is at least `part.len()`, and the reads below wait for the stream.
             unsafe { self.device.trace(room.seeds.address(), part.len(), &addresses)? };
             room.log_stretch.read(&mut out.log_stretch[part.clone()])?;
-            room.lived.read(&mut out.lived[part.clone()])?;
+            room.lifetime_share.read(&mut out.lifetime_share[part.clone()])?;
             if let Some(buffer) = &room.double {
                 buffer.read(&mut out.log_stretch_f64[part.clone()])?;
             }
