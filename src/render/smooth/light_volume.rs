@@ -44,35 +44,37 @@ impl Shear {
 }
 
 impl LightVolume {
-    /// Tabulates the depth with at most about `max_values` values. `refine` multiplies the quadrature points.
+    /// Tabulates the depth at distances that are those of the nodes divided by `refine`, or larger ones if there would be more than about
+    /// `max_values` values.
     pub(super) fn new(medium: &Medium<'_>, max_values: usize, refine: usize) -> Self {
         let space = medium.scene.space;
         let edges = space.edges();
         let shape = medium.nodes.shape();
         let spacing = medium.spacing();
-        let mut coarsen = 1;
-        let grid = loop {
-            let grid: [usize; 3] = std::array::from_fn(|k| {
+        // Quarters of the distance between nodes, from the finest on.
+        let quarters = (1..=256_usize).map(|i| (4 * i).div_ceil(refine.max(1)).max(1));
+        let grid_of = |quarter: usize| -> [usize; 3] {
+            std::array::from_fn(|k| {
                 if shape[k] > 1 {
-                    (shape[k] - 1).div_ceil(coarsen) + 1
+                    (4 * (shape[k] - 1)).div_ceil(quarter) + 1
                 } else {
-                    ((edges[k] / (spacing * coarsen as f64)).ceil() as usize + 1).clamp(2, 257)
+                    ((4.0 * edges[k] / (spacing * quarter as f64)).ceil() as usize + 1).clamp(2, 1025)
                 }
-            });
-            if coarsen >= 64 || grid.iter().map(|n| n + 4).product::<usize>() <= max_values {
-                break grid;
-            }
-            coarsen += 1;
+            })
         };
+        let fits = |quarter: &usize| grid_of(*quarter).iter().map(|n| n + 4).product::<usize>() <= max_values;
+        let quarter = quarters.clone().find(fits).unwrap_or(1024);
+        let grid = grid_of(quarter);
         let cells = grid.map(|n| (n - 1) as f32);
-        let samples = 2 * coarsen * refine;
+        // Two quadrature points in the distance of two nodes at least, more if `refine` asks for them.
+        let samples = (quarter * refine).div_ceil(4).max(1) * 2;
         match medium.scene.light {
             Light::Directional { toward, .. } => {
                 let delta: [f64; 3] = std::array::from_fn(|k| toward[k] / edges[k] * f64::from(cells[k]));
                 Self::sheared(medium, grid, delta, samples)
             }
             Light::Point { .. } => {
-                let step = (spacing * coarsen as f64) as f32;
+                let step = (spacing * quarter as f64 / 4.0) as f32;
                 let depth = (0..grid.iter().product::<usize>())
                     .into_par_iter()
                     .map(|i| {

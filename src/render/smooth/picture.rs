@@ -16,7 +16,7 @@ use std::time::Instant;
 /// Edge of a tile, in pixels. Samples are distributed over tiles, and errors are averaged over them.
 const TILE: usize = 16;
 /// Rays per pixel of the first round; later rounds add one each, up to `MAX_RAYS` in all.
-const FIRST_RAYS: u64 = 4;
+const FIRST_RAYS: u64 = 2;
 const MAX_RAYS: u64 = 256;
 /// First step of marching, as a share of the distance between nodes.
 const FIRST_STEP: f32 = 0.5;
@@ -281,15 +281,22 @@ impl Picture {
         };
         let combined = combine(&self.sums, width, how);
         let (mut film, mut error) = self.film(scene, width, height, how, &combined);
-        while self.march.quadrature() > MARCH_SHARE * error.rms.value.powi(2) && self.step > MIN_STEP {
-            self.step *= 0.5;
-            (self.next_rays, self.rays, self.light, self.march) = (self.rays, 0, None, MarchAudit::default());
-            self.base.fill(RaySum::default());
+        // Marching becomes finer until its error is well below that of the picture.
+        loop {
+            let allowed = MARCH_SHARE * (error.rms.value.powi(2) - self.march_error()).max(0.0);
+            if self.march.quadrature() > allowed && self.step > MIN_STEP {
+                self.step *= 0.5;
+                (self.next_rays, self.rays, self.light, self.march) = (self.rays, 0, None, MarchAudit::default());
+                self.base.fill(RaySum::default());
+            } else if self.march.filter(self.rays) > allowed && self.rays < MAX_RAYS {
+                self.next_rays = self.rays;
+            } else {
+                break;
+            }
             self.march(&medium, round.sum);
             (film, error) = self.film(scene, width, height, how, &combined);
         }
-        let enough = self.march.filter(self.rays) <= MARCH_SHARE * error.rms.value.powi(2);
-        self.next_rays = if enough { 1 } else { self.rays }.min(MAX_RAYS - self.rays.min(MAX_RAYS));
+        self.next_rays = u64::from(self.rays < MAX_RAYS);
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
     }
