@@ -22,8 +22,8 @@ pub use network::{
     CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
 };
 pub use rendering::{
-    Audits, CudaSamples, DeviceAnswers, DeviceLearns, DevicePredict, FrameQueries, GpuFrames, GpuRenderer, LookAhead, QueryRouter,
-    RoutedQueries, Timeline, TraceAll, keeps_label,
+    Audits, CoupledStats, CoupledTracker, CudaSamples, DeviceAnswers, DeviceLearns, DevicePredict, FrameQueries, GpuFrames, GpuRenderer,
+    LookAhead, PairTiles, QueryRouter, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll, bayer_rank, keeps_label,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};
