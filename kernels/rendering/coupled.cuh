@@ -341,10 +341,12 @@ struct CoupledWork {
     const float* sums;   // SUM_PLANES arrays of `pixels` values
     Float4* found;       // per path of the list: difference, alpha
     uint32_t* traced;    // per path of the list
+    uint32_t width;      // of the picture
     uint32_t pixels;
     uint32_t entries;
     uint32_t first;      // first path of the band
     uint32_t count;      // paths of the band, one a slot
+    uint32_t pad;
 };
 
 // Planes of the sums: differences by half, quarter and channel, then pairs by quarter, differences of alpha, traced queries.
@@ -433,9 +435,10 @@ RW_FN bool advance_coupled(const CoupledFrame& frame, const CoupledWork& work, c
     }
 }
 
-// Adds the two paths of an entry to the sums of its pixel.
+// Adds the two paths of an entry to the sums of its pixel. Pairs alternate between the quarters, in neighbouring pixels the other way round.
 RW_FN void add_pair(const CoupledWork& work, float* sums, uint32_t entry) {
-    const uint32_t pixel = work.list[entry], quarter = pairs_before(sums, work.pixels, pixel) & 1u;
+    const uint32_t pixel = work.list[entry];
+    const uint32_t quarter = (pairs_before(sums, work.pixels, pixel) + pixel % work.width + pixel / work.width) & 1u;
     float alpha = 0.0f, traced = 0.0f;
     for (uint32_t half = 0; half < 2; ++half) {
         const Float4 found = work.found[2 * entry + half];

@@ -27,7 +27,7 @@ template <class Answers> static void coupled(const Surrogate& surrogate, const A
     std::vector<uint32_t> traced(2 * entries);
     const CoupledSlots slots = {place.data(),  way.data(),         kept_place.data(),   kept_way.data(), factors.data(),
                                 colour.data(), colour_rest.data(), found_so_far.data(), progress.data()};
-    CoupledWork work = {list.data(), sums.data(), found.data(), traced.data(), pixels, entries, 0, 0};
+    CoupledWork work = {list.data(), sums.data(), found.data(), traced.data(), scene.width, pixels, entries, 0, 0, 0};
 
     const size_t capacity = size_t(band) + most_guesses;
     std::vector<float> points(3 * capacity), log_stretch(capacity);

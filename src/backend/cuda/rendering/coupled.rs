@@ -10,7 +10,7 @@ use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::{MissingCellsArgument, TableArgument};
 use crate::backend::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument};
 use crate::backend::cuda::{Buffer, DeviceAnswers, DeviceError, DeviceMissingCells, Gpu, launch, threads};
-use crate::render::{CellObservations, FrameParameters, RenderError, Renderer};
+use crate::render::{CellObservations, FrameParameters, Renderer};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
 use std::mem::offset_of;
@@ -106,10 +106,12 @@ struct WorkArgument {
     sums: u64,
     found: u64,
     traced: u64,
+    width: u32,
     pixels: u32,
     entries: u32,
     first: u32,
     count: u32,
+    pad: u32,
 }
 #[repr(C)]
 #[derive(Clone, Copy)]
@@ -227,8 +229,8 @@ impl CoupledTracker {
     }
 
     /// Tracks one pair of paths for each listed pixel and adds the results to `sums`, which hold [`SUM_PLANES`] planes of the picture's pixels.
-    /// The pair of a pixel that has had v pairs are its samples 2 v (half A) and 2 v + 1 (half B) of the random stream of `picture`; they go to
-    /// quarter v mod 2. If this fails or stops, the sums are unchanged.
+    /// The pair of a pixel (x, y) that has had v pairs are its samples 2 v (half A) and 2 v + 1 (half B) of the random stream `number`, which
+    /// stays the same while a picture accumulates; they go to quarter (v + x + y) mod 2. If this fails or stops, the sums are unchanged.
     ///
     /// No query lies in a missing cell, so [`super::TraceAll`] answers all of them unless traced values are wanted as labels.
     ///
@@ -241,7 +243,7 @@ impl CoupledTracker {
     pub unsafe fn track(
         &mut self,
         renderer: &mut Renderer,
-        picture: u64,
+        number: u64,
         nodes: SurrogateNodes,
         missing_cells: Option<&DeviceMissingCells>,
         tiles: PairTiles<'_>,
@@ -261,8 +263,7 @@ impl CoupledTracker {
             answers.end()?;
             return Ok(stats);
         }
-        let refused = |refused: RenderError| DeviceError::Unsupported { what: refused.to_string() };
-        let setup = renderer.frame_setup(picture, 0..1).map_err(refused)?;
+        let setup = renderer.round_setup(number);
         let own = self.memory.as_ref().map_or(0, |memory| memory.block.len() as u64);
         let allowed = self.allowed.min(own + self.gpu.memory_left() / MEMORY_SHARE);
         // Powers of two, so that lists of similar length share memory.
@@ -281,7 +282,7 @@ impl CoupledTracker {
             nodes: TableArgument { nodes: nodes.shape.map(|n| n as i32), dimensions: nodes.dimensions as i32, values: nodes.values },
             missing_cells: missing_cells.map_or_else(Zeroable::zeroed, DeviceMissingCells::argument),
         };
-        let mut frame = memory.frame(setup.parameters, surrogate, [pixels, entries], sums.address());
+        let mut frame = memory.frame(setup.parameters, surrogate, entries, sums.address());
         let (across, down, at) = (width as u32, height as u32, memory.at(memory.layout.tiles));
         let mut call = self.gpu.work().launch_builder(&self.list);
         call.arg(&across).arg(&down).arg(&at).arg(&frame.work.list);
@@ -544,7 +545,7 @@ impl Memory {
         Ok(self.control.values()[0])
     }
 
-    fn frame(&self, parameters: FrameParameters, surrogate: SurrogateArgument, [pixels, entries]: [usize; 2], sums: u64) -> Frame {
+    fn frame(&self, parameters: FrameParameters, surrogate: SurrogateArgument, entries: usize, sums: u64) -> Frame {
         let l = &self.layout;
         let [place, way, kept_place, kept_way, factors, colour, colour_rest, found, progress] = l.slots.map(|offset| self.at(offset));
         let (watch, cells) = (self.at(l.watch), 4 * self.plan.cells);
@@ -559,10 +560,12 @@ impl Memory {
                 sums,
                 found: self.at(l.found),
                 traced: self.at(l.traced),
-                pixels: pixels as u32,
+                width: parameters.width(),
+                pixels: parameters.pixels() as u32,
                 entries: entries as u32,
                 first: 0,
                 count: 0,
+                pad: 0,
             },
             control: self.at(l.control),
         }
