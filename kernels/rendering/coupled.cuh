@@ -62,8 +62,9 @@ struct Collision {
     float roulette;
 };
 
-// A queued collision as the next wave reads it. A path whose flight has the same `t` in the same cell and stage is at this point.
-struct Record {
+// A queued collision as the next wave reads it. It is that of a path if `t`, cell and stage are the same: a camera ray is always the same, and a
+// light ray of the same place in the chain begins at the same collision.
+struct alignas(16) Record {
     float t;
     float s;
     uint32_t cell;   // uppermost bit: stage SHADOW
@@ -277,6 +278,7 @@ struct CoupledSlots {
     Float4* found;         // difference, alpha
     Uint4* progress;       // dimension, sample and (in the upper five bits) flags, traced, first record
 };
+static_assert(sizeof(CoupledSlots) == 72, "layout");
 
 RW_FN void load_path(const CoupledSlots& slots, uint32_t slot, Coupled& path, uint32_t& first) {
     const Uint4 progress = slots.progress[slot];
@@ -333,6 +335,7 @@ struct CoupledQueue {
     const float* log_stretch;    // NaN: no value exists
     const unsigned char* by;     // AnsweredBy
 };
+static_assert(sizeof(CoupledQueue) == 64 && sizeof(Record) == 16, "layout");
 
 // The list of a frame: an entry is a pixel that gets one pair of paths. Path 2 i + h is sample 2 v + h of entry i, and v is the number of pairs
 // that the pixel has had.
@@ -348,6 +351,7 @@ struct CoupledWork {
     uint32_t count;      // paths of the band, one a slot
     uint32_t pad;
 };
+static_assert(sizeof(CoupledWork) == 56, "layout");
 
 // Planes of the sums: differences by half, quarter and channel, then pairs by quarter, differences of alpha, traced queries.
 constexpr uint32_t PAIR_PLANE = 12, ALPHA_PLANE = 14, TRACED_PLANE = 15, SUM_PLANES = 16;

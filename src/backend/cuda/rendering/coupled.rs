@@ -153,6 +153,7 @@ struct Control {
 
 // Sizes that the kernels assert.
 const _: () = assert!(size_of::<PairTile>() == 8 && size_of::<SurrogateArgument>() == 120 && size_of::<Control>() == 64);
+const _: () = assert!(size_of::<WorkArgument>() == 56 && size_of::<SlotsArgument>() == 72 && size_of::<QueueArgument>() == 64);
 
 // SAFETY: `repr(C)`, plain numbers and device addresses, laid out as the structs of `kernels/rendering/coupled.cuh` and `coupled.cu`.
 unsafe impl DeviceRepr for PairTile {}
