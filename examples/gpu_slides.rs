@@ -39,6 +39,7 @@ impl Backend for Timed {
     type Tracer = CudaTracer;
     type Surrogate = CudaSurrogate;
     type Samples = CudaSamples;
+    type Picture = <Cuda as Backend>::Picture;
 
     fn name(&self) -> String {
         self.inner.name()
@@ -57,9 +58,14 @@ impl Backend for Timed {
     fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &CudaTracer) -> Result<CudaSurrogate, BackendError> {
         self.inner.surrogate(request, tracer)
     }
-    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
-        let &FrameJob { tracer, surrogate, routing, picture, samples, progress, stop } = job;
-        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, progress, stop }, renderer)
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        accumulated: &mut Self::Picture,
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let &FrameJob { tracer, surrogate, routing, picture, samples, smooth, progress, stop } = job;
+        self.inner.render(&FrameJob { tracer, surrogate, routing, picture, samples, smooth, progress, stop }, renderer, accumulated)
     }
     fn audit(
         &mut self,

@@ -6,7 +6,7 @@ use super::common::{
 use super::{messages, session};
 use anyhow::{Context, Result, bail};
 use ridgewatch::publish::{refuse_foreign_scene, write_exr, write_png, write_scene};
-use ridgewatch::render::Method;
+use ridgewatch::render::{Method, Target};
 use ridgewatch::run::{self, Event, Frame, RunError, RunOptions};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -23,6 +23,12 @@ pub struct Options {
     /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
     #[arg(long, value_name = "N")]
     spp: Option<f64>,
+    /// marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3.
+    #[arg(long, value_name = "TARGET")]
+    until: Option<Target>,
+    /// marched and two_level: milliseconds of sampling per frame, instead of --spp.
+    #[arg(long, value_name = "MS")]
+    budget: Option<f64>,
     /// Number of frames rendered and discarded first, with the scene's samples; they train the surrogate and tighten the majorants.
     /// Default: the scene's time.warmup_frames.
     #[arg(long, value_name = "N")]
@@ -57,6 +63,8 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.render.samples = samples;
         scene.set_by("render.samples", format!("--spp {samples}"));
     }
+    scene.render.until = options.until.or(scene.render.until);
+    scene.render.budget = options.budget.or(scene.render.budget);
     scene.time.slides = Some(1);
     scene.time.frames_per_slide = 1;
     if let Some(frames) = options.warmup {

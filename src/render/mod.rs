@@ -34,7 +34,8 @@ pub use parameters::FrameParameters;
 pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
 pub(crate) use settings::MAX_SAMPLES;
-pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, TransferSettings};
+pub use settings::MAX_FRAMES_UNTIL;
+pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
 pub use space::overview_scale;
 pub use transfer::Transfer;
 

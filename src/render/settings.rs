@@ -2,8 +2,11 @@
 
 use super::albedo::{albedo_preset, published_albedo};
 use super::error::{RenderError, require};
+use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
+/// Largest number of frames that `until` gives a slide.
+pub const MAX_FRAMES_UNTIL: usize = 4096;
 /// Largest picture edge, in pixels.
 const MAX_EDGE: usize = 16_384;
 /// Largest number of pixels; their film takes 3 GB.
@@ -57,6 +60,58 @@ pub enum Combine {
     Shrink,
     /// As it is: noisier, and unbiased up to the error of marching.
     Sum,
+}
+
+/// Stated error at which a smooth picture is good enough: `"40dB"` (PSNR over lit pixels) or `"relmse=1e-3"`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Target {
+    /// PSNR of the tone-mapped picture over lit pixels, in decibels.
+    Psnr(f64),
+    /// Mean of squared error / (radiance^2 + 0.01) over lit pixels.
+    Relmse(f64),
+}
+
+impl Target {
+    /// True if a stated error is within the target.
+    pub fn is_met_by(self, error: &PictureError) -> bool {
+        match self {
+            Self::Psnr(decibels) => error.psnr.value >= decibels,
+            Self::Relmse(most) => error.relmse.value <= most,
+        }
+    }
+}
+
+impl TryFrom<String> for Target {
+    type Error = String;
+
+    fn try_from(text: String) -> Result<Self, String> {
+        text.parse()
+    }
+}
+
+impl std::str::FromStr for Target {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let accepted = || format!("{text:?} is not accepted; accepted: decibels such as \"40dB\" (1 to 80), or \"relmse=1e-3\" (1e-9 to 1)");
+        let number = |digits: &str, range: std::ops::RangeInclusive<f64>| digits.trim().parse().ok().filter(|v| range.contains(v)).ok_or_else(accepted);
+        let lower = text.trim().to_ascii_lowercase();
+        match (lower.strip_suffix("db"), lower.strip_prefix("relmse=")) {
+            (Some(decibels), _) => Ok(Self::Psnr(number(decibels, 1.0..=80.0)?)),
+            (_, Some(most)) => Ok(Self::Relmse(number(most, 1e-9..=1.0)?)),
+            _ => Err(accepted()),
+        }
+    }
+}
+
+impl From<Target> for String {
+    fn from(target: Target) -> Self {
+        match target {
+            Target::Psnr(decibels) => format!("{decibels}dB"),
+            Target::Relmse(most) => format!("relmse={most:e}"),
+        }
+    }
 }
 
 /// `[camera]` of a scene file. `half_width = |look_at - eye| tan(field_of_view/2)`, `half_height = |look_at - eye| tan(field_of_view/(2 aspect))`.
@@ -144,6 +199,12 @@ pub struct RenderSettings {
     pub samples: f64,
     /// How the correction of `two_level` is added.
     pub combine: Combine,
+    /// Smooth methods: stated error at which a slide needs no further frames. A slide gets frames until then, at most `MAX_FRAMES_UNTIL`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub until: Option<Target>,
+    /// Smooth methods: milliseconds of coupled samples per frame, instead of `samples`.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub budget: Option<f64>,
     /// Background colour, linear.
     pub background: [f64; 3],
     /// Colour (linear) of missing cells, seen by camera paths that leave the box through them.
@@ -162,6 +223,8 @@ impl Default for RenderSettings {
             height: 160,
             samples: 8.0,
             combine: Combine::Shrink,
+            until: None,
+            budget: None,
             background: [1.0; 3],
             missing_color: [0.3; 3],
             majorant_cells: None,
@@ -194,6 +257,12 @@ impl RenderSettings {
         } else {
             let whole = samples.fract() == 0.0 && (1.0..=MAX_SAMPLES as f64).contains(&samples);
             require(whole, "render.samples", samples, "a whole number from 1 to 16777216 with this render.method")?;
+        }
+        if let Some(budget) = settings.budget {
+            require((0.1..=600_000.0).contains(&budget), "render.budget", budget, "milliseconds, 0.1 to 600000")?;
+        }
+        for (key, given) in [("render.until", settings.until.is_some()), ("render.budget", settings.budget.is_some())] {
+            require(!given || settings.method.is_smooth(), key, "given", "with render.method = \"marched\" or \"two_level\"")?;
         }
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;

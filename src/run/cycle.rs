@@ -17,7 +17,7 @@ use super::{RunError, Settings, TransferRecord};
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
-use crate::render::{Method, Renderer, Scene};
+use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
 use crate::surrogate::{Learned, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
 use crate::trust::TrustMap;
@@ -162,8 +162,22 @@ pub(super) struct RunProgress {
     /// True once the warning about short particle lifetimes was given.
     pub(super) has_warned_of_deaths: bool,
     pub(super) warnings: Vec<String>,
+    /// Seconds of a coupled sample a pixel in the last smooth frame; `None` before it.
+    pub(super) seconds_per_sample: Option<f64>,
     /// Seconds that the loop paused since the last frame for a checkpoint.
     pub(super) checkpoint_pause: f64,
+}
+
+impl RunProgress {
+    /// Samples a pixel of the next frame: those of the settings, or as many as the budget of a smooth frame allows.
+    pub(super) fn affordable_samples(&self, settings: &RenderSettings) -> f64 {
+        /// Samples a pixel of the first frame with a budget, whose cost is not known.
+        const FIRST: f64 = 0.25;
+        let Some(milliseconds) = settings.budget else { return settings.samples };
+        let affordable = self.seconds_per_sample.map_or(FIRST, |seconds| 1e-3 * milliseconds / seconds);
+        // An even sixteenth at least, so that every tile gets samples.
+        affordable.clamp(1.0 / 16.0, 4096.0)
+    }
 }
 
 impl Recovering for Run<'_> {
@@ -444,7 +458,10 @@ impl<B: Backend> Cycle<'_, B> {
     fn frames(&mut self, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
-        for number in 0..warmups + time.frames_per_slide {
+        let target = self.run.plan.scene.render.until;
+        let planned = warmups + time.frames_per_slide;
+        let most = if target.is_some() { planned.max(warmups + MAX_FRAMES_UNTIL) } else { planned };
+        for number in 0..most {
             let place =
                 FramePlace { is_warmup: number < warmups, preparing: if number == 0 { begun.elapsed().as_secs_f64() } else { 0.0 } };
             if self.run.learning.resize.is_some() {
@@ -458,11 +475,16 @@ impl<B: Backend> Cycle<'_, B> {
             let frame = transaction!(self, slide, run, on => run.frame(on, slide, place, start, sink));
             slide.warnings.clear();
             slide.waited = 0.0;
+            let is_good = |target: Target| frame.record.picture_error.is_some_and(|error| target.is_met_by(&error));
+            let is_done = target.is_some_and(is_good) && number >= warmups;
             sink(Event::Frame(frame));
             transaction!(self, slide, run, on => run.checkpoint_if_due(on));
             check_stop(self.run.stop)?;
             if self.run.options.seconds.is_some_and(|seconds| self.run.began.elapsed().as_secs_f64() >= seconds) {
                 return Err(RunEnd::TimeIsUp);
+            }
+            if is_done {
+                break;
             }
         }
         Ok(())

@@ -85,6 +85,9 @@ impl Run<'_> {
         record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
         record.verified_error = verified;
         record.picture_error = work.rendered.error;
+        if scene.render.method.is_smooth() {
+            self.progress.seconds_per_sample = Some(work.render_seconds / work.samples_per_pixel);
+        }
         let samples = work.rendered.samples.commit();
         if let Some(assessment) = assessment {
             self.take_in(on, assessment, &work.audit, samples, &mut record);
@@ -153,7 +156,7 @@ impl Run<'_> {
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
         let samples_per_pixel = match scene.time.warmup_samples.filter(|_| picture.place.is_warmup) {
             Some(samples) => samples as f64,
-            None => scene.render.samples,
+            None => self.progress.affordable_samples(&scene.render),
         };
         let smooth = match scene.render.method {
             method if method.is_smooth() => {

@@ -3,6 +3,7 @@
 
 mod closed_forms;
 mod frames;
+mod smooth;
 
 use std::sync::atomic::AtomicBool;
 

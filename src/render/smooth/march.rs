@@ -1,8 +1,7 @@
 //! Marching: the expected picture of the surrogate, by quadrature along camera rays (emission and absorption, Max 1995).
 //!
-//! The picture is the mean over the pixel's area, as it is for tracking. Ray `j` of a pixel goes through a point of the film, and its quadrature
-//! points start at an offset, that follow an additive recurrence in three dimensions (Roberts 2018), the same for every pixel: the first ray goes
-//! through the pixel's centre, later ones fill the pixel evenly, and their mean converges to the integral over pixel and ray.
+//! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through points that follow an additive recurrence
+//! in two dimensions (Roberts 2018), the same for every pixel: the first ray goes through the pixel's centre, later ones fill the pixel evenly.
 
 use super::light_volume::LightVolume;
 use super::nodes::Nodes;
@@ -55,10 +54,12 @@ impl RaySum {
     }
 }
 
-/// Offsets of ray `j`: across the pixel, down the pixel, along the step.
+/// Offsets of ray `j`: across the pixel, down the pixel, and of the quadrature points in their steps (the midpoint rule).
 fn offsets(j: u64) -> [f32; 3] {
-    const G: f64 = 1.220_744_084_605_759_6;
-    [1.0 / G, 1.0 / (G * G), 1.0 / (G * G * G)].map(|a| (0.5 + j as f64 * a).fract() as f32)
+    /// The root of x^3 = x + 1.
+    const PLASTIC: f64 = 1.324_717_957_244_746;
+    let [x, y] = [1.0 / PLASTIC, 1.0 / (PLASTIC * PLASTIC)].map(|a| (0.5 + j as f64 * a).fract() as f32);
+    [x, y, 0.5]
 }
 
 impl Medium<'_> {

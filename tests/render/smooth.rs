@@ -1,0 +1,245 @@
+//! Smooth pictures: marching and coupled samples against tracking, and the error that they state.
+
+use crate::NEVER;
+use ridgewatch::field::Domain;
+use ridgewatch::render::smooth::{IsMissing, Nodes, Picture, PictureError, Refinement};
+use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
+use std::sync::Arc;
+
+const TAU: f64 = 2.0;
+
+/// A field of log-stretch with ridges, and a corner without values.
+fn field(p: [f32; 3]) -> f32 {
+    1.0 + (5.0 * p[0] + 2.0 * p[2]).sin() * (6.0 * p[1] - p[2]).cos()
+}
+
+/// A surrogate that differs from it by up to 0.15 and misses a thin ridge.
+fn nearby(p: [f32; 3]) -> f32 {
+    field(p) + 0.15 * (11.0 * p[0]).sin()
+}
+
+fn is_missing(p: [f32; 3]) -> bool {
+    p[0] < 0.3 && p[1] < 0.4
+}
+
+struct Traced<F>(F);
+
+impl<F: FnMut([f32; 3]) -> f32> LogStretch for Traced<F> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        points.iter().zip(log_stretch).for_each(|(p, s)| *s = (self.0)(*p));
+        traced.fill(true);
+    }
+}
+
+fn cube() -> Domain {
+    Domain::cuboid([0.0; 3], [1.0; 3])
+}
+
+fn slab() -> Domain {
+    Domain::slab([0.0; 2], [1.0; 2], (0.0, 0.5))
+}
+
+fn nodes(domain: &Domain, shape: [usize; 3], of: impl Fn([f32; 3]) -> f32) -> Nodes {
+    let count = shape.iter().product();
+    Nodes::new(shape, Arc::new((0..count).map(|i| of(domain.from_unit(Nodes::unit(shape, i)))).collect()))
+}
+
+fn scene(domain: &Domain, width: usize, orthographic: bool, light: LightSettings) -> Scene {
+    let camera = CameraSettings { eye: [0.8, -0.4, 1.9], look_at: [0.5, 0.5, 0.4], up: [0.0, 1.0, 0.2], field_of_view: 60.0, orthographic };
+    let transfer = TransferSettings { low: Some(0.3), high: Some(0.9), extinction: Some(8.0), ..TransferSettings::default() };
+    let settings = RenderSettings { width, height: width, background: [1.0, 0.7, 0.4], ..RenderSettings::default() };
+    Scene::assemble(domain, Some(camera), Some(light), Some(transfer), settings, 5)
+}
+
+fn oblique() -> LightSettings {
+    LightSettings::directional([0.6, 0.3, -1.0], 12.0)
+}
+
+fn point(position: [f64; 3]) -> LightSettings {
+    LightSettings { direction: None, position: Some(position), radiance: [4.0; 3] }
+}
+
+/// A tracked picture of `frames` frames of 256 samples.
+fn tracked(scene: &Scene, domain: &Domain, frames: u64, of: impl Fn([f32; 3]) -> f32) -> Film {
+    let mut renderer = Renderer::new(scene.clone(), domain, TAU).unwrap();
+    let mut answers = Traced(&of);
+    // The first frame tightens the majorants.
+    let mut sum = renderer.render(1000, &mut answers, 256, None, &NEVER).unwrap().0;
+    for frame in 1..frames {
+        sum.accumulate(&renderer.render(1000 + frame, &mut answers, 256, None, &NEVER).unwrap().0).unwrap();
+    }
+    sum
+}
+
+struct Smooth {
+    renderer: Renderer,
+    picture: Picture,
+    rounds: u64,
+}
+
+impl Smooth {
+    fn new(scene: &Scene, domain: &Domain) -> Self {
+        Self { renderer: Renderer::new(scene.clone(), domain, TAU).unwrap(), picture: Picture::default(), rounds: 0 }
+    }
+
+    fn round(
+        &mut self,
+        nodes: &Nodes,
+        missing: Option<IsMissing<'_>>,
+        (method, sum, samples): (Method, bool, f64),
+        of: impl Fn([f32; 3]) -> f32,
+    ) -> (Film, PictureError) {
+        let round = Refinement { nodes, missing, method, sum, samples, number: self.rounds, stop: &NEVER };
+        self.rounds += 1;
+        let (film, _, error) = self.renderer.refine(&mut self.picture, &round, &mut Traced(of)).unwrap();
+        (film, error)
+    }
+}
+
+/// Deviation of the mean of every block of 8 x 8 pixels from that of a tracked picture, in standard errors of the latter; the variances of the
+/// former are added. Returns root mean square and maximum over blocks and channels.
+fn deviations(found: &Film, truth: &Film, variance: impl Fn(usize) -> f64) -> (f64, f64) {
+    const BLOCK: usize = 8;
+    let (mut square, mut count, mut most) = (0.0, 0.0, 0.0_f64);
+    for y in (0..truth.height).step_by(BLOCK) {
+        for x in (0..truth.width).step_by(BLOCK) {
+            let block: Vec<usize> = (0..BLOCK * BLOCK).map(|i| (y + i / BLOCK) * truth.width + x + i % BLOCK).collect();
+            let luminance = |p: [f32; 4]| f64::from(0.2126 * p[0] + 0.7152 * p[1] + 0.0722 * p[2]);
+            let difference: f64 = block.iter().map(|&i| luminance(found.rgba[i]) - luminance(truth.rgba[i])).sum();
+            let spread: f64 = block.iter().map(|&i| f64::from(truth.variance[i]) + variance(i)).sum();
+            if spread > 0.0 {
+                let deviation = difference / spread.sqrt();
+                (square, count, most) = (square + deviation * deviation, count + 1.0, most.max(deviation.abs()));
+            }
+        }
+    }
+    (f64::sqrt(square / count), most)
+}
+
+#[test]
+fn a_marched_picture_is_the_mean_of_tracked_ones() {
+    for (what, domain, orthographic, light) in [
+        ("directional light, pinhole", cube(), false, oblique()),
+        ("directional light from below, parallel rays", cube(), true, LightSettings::directional([-0.2, 1.0, 0.5], 12.0)),
+        ("light along an axis", cube(), false, LightSettings::directional([0.0, 0.0, -1.0], 12.0)),
+        ("point light outside", cube(), false, point([1.5, -0.5, 1.8])),
+        ("point light inside", cube(), false, point([0.4, 0.6, 0.5])),
+        ("slab", slab(), false, oblique()),
+    ] {
+        let scene = scene(&domain, 32, orthographic, light);
+        let shape = if domain.dimensions == 2 { [65, 65, 1] } else { [65, 65, 65] };
+        let nodes = nodes(&domain, shape, field);
+        for missing in [false, true] {
+            let gone: IsMissing<'_> = &is_missing;
+            let of = |p: [f32; 3]| if missing && is_missing(p) { f32::NAN } else { nodes.at(domain.to_unit(p)) };
+            let truth = tracked(&scene, &domain, 16, of);
+            let mut smooth = Smooth::new(&scene, &domain);
+            // No difference between the fields: all that is left is the march.
+            let mut film = Film::new(32, 32);
+            for _ in 0..6 {
+                film = smooth.round(&nodes, missing.then_some(gone), (Method::Marched, false, 2.0), of).0;
+            }
+            let (rms, most) = deviations(&film, &truth, |_| 0.0);
+            assert!(rms < 1.5 && most < 5.0, "{what}, missing cells: {missing}: {rms} and {most} standard errors");
+        }
+    }
+}
+
+#[test]
+fn equal_fields_leave_no_difference() {
+    let (domain, scene) = (cube(), scene(&cube(), 32, false, oblique()));
+    let nodes = nodes(&domain, [17, 17, 17], field);
+    let of = |p: [f32; 3]| nodes.at(domain.to_unit(p));
+    let mut smooth = Smooth::new(&scene, &domain);
+    let (marched, _) = Smooth::new(&scene, &domain).round(&nodes, None, (Method::Marched, false, 2.0), of);
+    let (summed, error) = smooth.round(&nodes, None, (Method::TwoLevel, true, 4.0), of);
+    let most = marched.rgba.iter().flatten().zip(summed.rgba.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // Unit coordinates of a query are rounded to f32, which moves values by some 1e-6 and parts a path in a million.
+    assert!(most < 1e-3, "{most}");
+    assert!(error.samples_per_pixel > 3.5 && error.rms.value < 0.01, "{error:?}");
+}
+
+#[test]
+fn the_sum_of_march_and_correction_is_the_traced_picture() {
+    let domain = cube();
+    for light in [oblique(), point([0.4, 0.6, 0.5])] {
+        let scene = scene(&domain, 32, false, light);
+        let nodes = nodes(&domain, [33, 33, 33], nearby);
+        let gone: IsMissing<'_> = &is_missing;
+        let of = |p: [f32; 3]| if is_missing(p) { f32::NAN } else { field(p) };
+        let truth = tracked(&scene, &domain, 16, of);
+        let mut smooth = Smooth::new(&scene, &domain);
+        let mut last = None;
+        for _ in 0..32 {
+            last = Some(smooth.round(&nodes, Some(gone), (Method::TwoLevel, true, 32.0), of));
+        }
+        let (film, error) = last.unwrap();
+        let variance = |_: usize| error.rms.value.powi(2);
+        let (rms, most) = deviations(&film, &truth, variance);
+        assert!(rms < 1.5 && most < 5.0, "{rms} and {most} standard errors");
+        // The surrogate alone is another picture, which the test would notice.
+        let (marched, _) = Smooth::new(&scene, &domain).round(&nodes, Some(gone), (Method::Marched, false, 2.0), of);
+        assert!(deviations(&marched, &truth, variance).0 > 5.0, "the surrogate is wrong by much");
+    }
+}
+
+/// Mean square error over lit pixels and channels, with the noise of the truth removed by the product of two halves.
+fn true_error(film: &Film, [a, b]: &[Film; 2]) -> f64 {
+    let (mut sum, mut count) = (0.0, 0.0);
+    for i in 0..film.rgba.len() {
+        if film.rgba[i][3] > 0.01 {
+            let d = |other: &Film, k: usize| f64::from(film.rgba[i][k] - other.rgba[i][k]);
+            sum += (0..3).map(|k| d(a, k) * d(b, k)).sum::<f64>() / 3.0;
+            count += 1.0;
+        }
+    }
+    sum / count
+}
+
+#[test]
+fn the_stated_error_is_the_true_one() {
+    let domain = cube();
+    let scene = scene(&domain, 64, false, oblique());
+    let nodes = nodes(&domain, [33, 33, 33], nearby);
+    let truth = [tracked(&scene, &domain, 8, field), {
+        let other = Scene { seed: 6, ..scene.clone() };
+        tracked(&other, &domain, 8, field)
+    }];
+    let (mut inside, mut all, mut ratio) = (0, 0, 0.0);
+    let mut lasts = Vec::new();
+    for seed in 0..8 {
+        let mut smooth = Smooth::new(&Scene { seed: 100 + seed, ..scene.clone() }, &domain);
+        let mut errors = Vec::new();
+        for _ in 0..4 {
+            let (film, stated) = smooth.round(&nodes, None, (Method::TwoLevel, false, 4.0), field);
+            let error = true_error(&film, &truth).max(0.0).sqrt();
+            inside += u32::from((stated.rms.low..=stated.rms.high).contains(&error));
+            all += 1;
+            ratio += stated.rms.value / error;
+            errors.push(error);
+        }
+        lasts.push((errors[0], errors[3]));
+    }
+    eprintln!("inside {inside} of {all}, ratio {}, errors {lasts:?}", ratio / f64::from(all));
+    assert!((ratio / f64::from(all) - 1.0).abs() < 0.2, "{ratio} over {all}");
+    assert!(inside * 10 >= all * 8, "{inside} of {all} inside");
+    assert!(lasts.iter().all(|(first, last)| last < first), "more samples, less error: {lasts:?}");
+}
+
+#[test]
+fn a_picture_starts_anew_when_anything_else_is_shown() {
+    let (domain, scene) = (cube(), scene(&cube(), 16, false, oblique()));
+    let nodes = nodes(&domain, [17, 17, 17], nearby);
+    let mut smooth = Smooth::new(&scene, &domain);
+    let method = (Method::TwoLevel, false, 2.0);
+    let samples = |smooth: &mut Smooth, nodes: &Nodes| smooth.round(nodes, None, method, field).1.samples_per_pixel;
+    let first = samples(&mut smooth, &nodes);
+    let second = samples(&mut smooth, &nodes);
+    assert!((1.5..2.5).contains(&first) && (3.0..5.0).contains(&second), "{first} {second}");
+    let mut other = scene.clone();
+    other.camera.eye[0] += 0.1;
+    smooth.renderer.set_scene(other).unwrap();
+    assert!(samples(&mut smooth, &nodes) < 2.5, "another camera");
+    let renewed = Nodes::new(nodes.shape(), Arc::new(nodes.values().to_vec()));
+    assert!(samples(&mut smooth, &renewed) < 2.5, "another window");
+}
