@@ -19,6 +19,8 @@ fn small() -> bool {
 mod answers;
 #[path = "gpu/audit.rs"]
 mod audit;
+#[path = "gpu/coupled.rs"]
+mod coupled;
 #[path = "gpu/device.rs"]
 mod device;
 mod kit;

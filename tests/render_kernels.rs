@@ -21,6 +21,9 @@ use std::process::{Command, Stdio};
 use std::sync::atomic::AtomicBool;
 use std::sync::{Arc, OnceLock};
 
+#[path = "render_kernels/coupled.rs"]
+mod coupled;
+
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// Path of the compiled harness. Contraction to fused multiply-add is off, as in rustc.

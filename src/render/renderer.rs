@@ -5,7 +5,7 @@ use super::film::Film;
 use super::majorant::{CellObservations, MajorantGrid};
 use super::parameters::FrameParameters;
 use super::rng::FrameRandom;
-use super::smooth::{Picture, PictureError, Refinement};
+use super::smooth::{CoupledPath, IsMissing, Nodes, Picture, PictureError, Refinement, coupled_paths};
 use super::space::{SceneBox, length};
 use super::tracking::FrameScene;
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
@@ -220,6 +220,30 @@ impl Renderer {
         self.majorants.commit(&self.transfer);
         let scene = self.frame_scene(round.number);
         picture.refine(&scene, &self.scene, round, self.wave_flights, answers)
+    }
+
+    /// Begins a round of a picture whose coupled paths a device tracks itself and returns its input. `number` is that of the random stream, which
+    /// stays the same while the picture accumulates; majorants take up the observations of earlier rounds.
+    pub fn round_setup(&mut self, number: u64) -> FrameSetup<'_> {
+        self.majorants.commit(&self.transfer);
+        FrameSetup {
+            parameters: self.frame_scene(number).parameters(),
+            majorants: self.majorants.majorants(),
+            may_be_missing: self.majorants.may_be_missing_all(),
+        }
+    }
+
+    /// Coupled paths of a round, one for each pair of pixel and sample: the reference for a device that tracks them itself.
+    pub fn coupled_paths(
+        &mut self,
+        number: u64,
+        nodes: &Nodes,
+        missing: Option<IsMissing<'_>>,
+        paths: &[(u32, u32)],
+        answers: &mut dyn LogStretch,
+    ) -> Vec<CoupledPath> {
+        self.majorants.commit(&self.transfer);
+        coupled_paths(&self.frame_scene(number), nodes, missing, paths, self.wave_flights, answers)
     }
 
     /// Begins a frame whose paths a device tracks itself and returns its input. The device passes its observations to [`Self::absorb`].

@@ -15,12 +15,12 @@ use std::sync::atomic::AtomicBool;
 static NEVER: AtomicBool = AtomicBool::new(false);
 
 /// Something cheap with structure, some of it missing, some traced.
-fn waves(p: [f32; 3]) -> (f32, bool) {
+pub fn waves(p: [f32; 3]) -> (f32, bool) {
     let value = (7.0 * p[0] + 3.0 * p[2]).sin() * (9.0 * p[1]).cos();
     (if p[0] > 1.8 && p[1] < 0.3 { f32::NAN } else { value }, p[1] > 0.5)
 }
 
-struct OnHost;
+pub struct OnHost;
 
 impl LogStretch for OnHost {
     fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
@@ -31,7 +31,7 @@ impl LogStretch for OnHost {
 }
 
 /// Answers device points on the host: the very same answers, so that what differs is tracking.
-struct ThroughHost<'a>(&'a Gpu);
+pub struct ThroughHost<'a>(pub &'a Gpu);
 
 impl DeviceLogStretch for ThroughHost<'_> {
     fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
@@ -54,11 +54,11 @@ impl DeviceLogStretch for ThroughHost<'_> {
     }
 }
 
-fn domain() -> Domain {
+pub fn domain() -> Domain {
     Domain::cuboid([0.0; 3], [2.0, 1.0, 1.0])
 }
 
-fn scene(width: usize, height: usize, point_light: bool) -> Scene {
+pub fn scene(width: usize, height: usize, point_light: bool) -> Scene {
     let settings = RenderSettings { width, height, ..RenderSettings::default() };
     let camera =
         CameraSettings { eye: [1.1, 0.4, 2.3], look_at: [1.0, 0.5, 0.5], up: [0.1, 1.0, 0.0], field_of_view: 90.0, orthographic: false };

@@ -131,6 +131,8 @@ template <class Answers> static void frame(const Answers& answers) {
     give(missing);
 }
 
+#include "coupled.hpp"
+
 int main(int, char** arguments) {
     const std::string request = arguments[1];
     if (request == "words") {
@@ -216,6 +218,10 @@ int main(int, char** arguments) {
         }
     } else if (request == "frame") {
         frame(waves);
+    } else if (request == "coupled") {
+        coupled_request();
+    } else if (request == "listed") {
+        listed_request();
     } else {
         return 2;
     }

@@ -22,8 +22,8 @@ pub use network::{
     CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
 };
 pub use rendering::{
-    Audits, CudaSamples, DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries, GpuFrames, GpuRenderer, LookAhead,
-    RoutedQueries, Timeline, TraceAll,
+    Audits, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries,
+    GpuFrames, GpuRenderer, LookAhead, PairTiles, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll, bayer_rank,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};

@@ -5,10 +5,11 @@
 //! the fields agree. This is a two-level estimator (Giles 2015) with delta and ratio tracking (see [`crate::render`]) as the path sampler. Each
 //! field has weights of its own where its extinction exceeds the majorant, so that the estimate stays unbiased.
 
-use super::march::Medium;
+use super::march::{IsMissing, Medium};
+use super::nodes::Nodes;
 use crate::render::LogStretch;
 use crate::render::rng::unit;
-use crate::render::tracking::{Hit, PHASE, ROULETTE, walk};
+use crate::render::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -18,14 +19,17 @@ const SIGN: [f32; 2] = [1.0, -1.0];
 /// Flights per parallel task.
 const TASK: usize = 512;
 
-/// Result of one coupled path.
+/// Result of one coupled path: the traced field less the surrogate.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Difference {
-    pub(super) radiance: [f32; 3],
-    pub(super) alpha: f32,
+pub struct CoupledPath {
+    /// CoupledPath of the radiances.
+    pub radiance: [f32; 3],
+    /// CoupledPath of the weights of the scattering events.
+    pub alpha: f32,
     /// Queries of the traced field.
-    pub(super) queries: u32,
-    pub(super) traced: u32,
+    pub queries: u32,
+    /// Queries that were traced by RK4.
+    pub traced: u32,
 }
 
 /// One field's share of a path.
@@ -71,7 +75,7 @@ pub(super) struct CoupledFlight {
     pixel: u32,
     sample: u32,
     dimension: u32,
-    found: Difference,
+    found: CoupledPath,
 }
 
 impl CoupledFlight {
@@ -95,7 +99,7 @@ impl CoupledFlight {
             pixel,
             sample,
             dimension: 1,
-            found: Difference::default(),
+            found: CoupledPath::default(),
         };
         let Some((enter, leave)) = scene.space.intersect(origin, direction) else { return (flight, false) };
         flight.camera.origin = scene.space.grid_point(std::array::from_fn(|k| origin[k] + enter * direction[k]));
@@ -114,7 +118,7 @@ impl CoupledFlight {
     }
 
     /// The difference, once the path is over.
-    pub(super) fn found(&self) -> Difference {
+    pub(super) fn found(&self) -> CoupledPath {
         self.found
     }
 
@@ -275,7 +279,7 @@ pub(super) fn track(
     wave_flights: usize,
     answers: &mut dyn LogStretch,
     stop: &AtomicBool,
-) -> (Vec<Difference>, CoupledCounts) {
+) -> (Vec<CoupledPath>, CoupledCounts) {
     let mut found = Vec::with_capacity(paths.len());
     let mut counts = CoupledCounts::default();
     for paths in paths.chunks(wave_flights.max(TASK)) {
@@ -321,4 +325,16 @@ pub(super) fn track(
         found.extend(flights.iter().map(CoupledFlight::found));
     }
     (found, counts)
+}
+
+/// [`track`] in a medium of these parts, to the end.
+pub(in crate::render) fn coupled_paths(
+    scene: &FrameScene<'_>,
+    nodes: &Nodes,
+    missing: Option<IsMissing<'_>>,
+    paths: &[(u32, u32)],
+    wave_flights: usize,
+    answers: &mut dyn LogStretch,
+) -> Vec<CoupledPath> {
+    track(&Medium { scene, nodes, missing }, paths, wave_flights, answers, &AtomicBool::new(false)).0
 }

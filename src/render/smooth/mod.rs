@@ -10,6 +10,8 @@ mod march;
 mod nodes;
 mod picture;
 
+pub use coupled::CoupledPath;
+pub(in crate::render) use coupled::coupled_paths;
 pub use march::IsMissing;
 pub use nodes::{BRICK, Nodes};
 pub use picture::{ErrorEstimate, Picture, PictureError, Refinement};

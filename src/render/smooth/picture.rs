@@ -17,11 +17,11 @@ use std::time::Instant;
 const TILE: usize = 16;
 /// Rays per pixel of the first round; later rounds add one each, up to `MAX_RAYS` in all.
 const FIRST_RAYS: u64 = 2;
-const MAX_RAYS: u64 = 256;
+const MAX_RAYS: u64 = 64;
 /// First step of marching, as a share of the distance between nodes.
 const FIRST_STEP: f32 = 0.5;
 /// Smallest step: marching is not refined further.
-const MIN_STEP: f32 = 1.0 / 64.0;
+const MIN_STEP: f32 = 1.0 / 16.0;
 /// The error of marching stays this factor below the stated one (10 dB).
 const MARCH_SHARE: f64 = 0.1;
 /// Pixels per round whose march is compared with a finer one, while rays are added.

@@ -1,6 +1,7 @@
 //! Frames on the GPU: wavefront path tracing, query routing, labels and audits.
 
 mod audit;
+mod coupled;
 mod frames;
 mod labels;
 mod memory;
@@ -8,6 +9,7 @@ mod renderer;
 mod router;
 
 pub use audit::Audits;
+pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes, bayer_rank};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
 pub use renderer::{GpuRenderer, LookAhead, Timeline};

@@ -22,7 +22,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 const LOOK_AHEAD: LookAhead = LookAhead { camera: 4, shadow: 8 };
 /// Rendering uses at most 1 / `MEMORY_SHARE` of the device memory that is free when the renderer is created, and, for each frame, at most its own
 /// memory plus that share of the free memory.
-const MEMORY_SHARE: u64 = 2;
+pub(super) const MEMORY_SHARE: u64 = 2;
 
 /// Limit on the collisions of a flight that one wave evaluates, some of them speculatively. The picture does not depend on it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,16 +52,16 @@ pub struct Timeline {
 
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct GridArgument {
-    majorants: u64,
-    may_miss: u64,
+pub(super) struct GridArgument {
+    pub(super) majorants: u64,
+    pub(super) may_miss: u64,
 }
 #[repr(C)]
 #[derive(Clone, Copy)]
-struct WatchArgument {
-    count: u64,
-    highest: u64,
-    missing: u64,
+pub(super) struct WatchArgument {
+    pub(super) count: u64,
+    pub(super) highest: u64,
+    pub(super) missing: u64,
 }
 #[repr(C)]
 #[derive(Clone, Copy)]
