@@ -173,7 +173,7 @@ fn main() {
     keys.extend(told);
     let mut scene = SceneFile::parse(Path::new("turbulence_easy.toml"), text, &keys).unwrap().settings();
     scene.source.nodes = Some(nodes);
-    (scene.render.width, scene.render.height, scene.render.samples) = (value(0, 1920), value(1, 1080), 1);
+    (scene.render.width, scene.render.height, scene.render.samples) = (value(0, 1920), value(1, 1080), 1.0);
     scene.transfer = Some(colours(&scene, &device));
     (scene.time.warmup_frames, scene.time.frames_per_slide) = (WARM_UP, FRAMES);
     let size = format!("{}x{}", scene.render.width, scene.render.height);
@@ -187,7 +187,7 @@ fn main() {
     let mut truth = scene.clone();
     truth.seed = 77;
     truth.render.method = Method::Reference;
-    truth.render.samples = value(5, 4096);
+    truth.render.samples = value(5, 4096) as f64;
     (truth.time.warmup_frames, truth.time.frames_per_slide) = (1, 1);
     let (reference, records) = pictures(&truth, &device);
     let frame = &records[0];

@@ -3,7 +3,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
-use ridgewatch::backend::{
+use ridgewatch::backend::{HostPicture, 
     AuditFindings, AuditRequest, Backend, BackendError, DeviceError, FrameJob, FrozenOf, HostFrame, Rendered, Surrogate, SurrogateRequest,
     WhenLost, audit, render_on_cpu,
 };
@@ -324,6 +324,7 @@ impl Backend for Breaking {
     type Tracer = BreakingTracer;
     type Surrogate = BreakingSurrogate;
     type Samples = Samples;
+    type Picture = HostPicture;
 
     fn name(&self) -> String {
         NAME.into()
@@ -345,10 +346,15 @@ impl Backend for Breaking {
         };
         Ok(BreakingSurrogate(Hybrid::new(settings.kind, nodes, network, seed, tracer, training)??))
     }
-    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut HostPicture,
+    ) -> Result<Rendered<Samples>, DeviceError> {
         self.line.call("starting a frame")?;
         let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
-        let rendered = render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer)?;
+        let rendered = render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer, picture)?;
         self.line.call("downloading a film")?;
         Ok(rendered)
     }

@@ -5,14 +5,18 @@
 use super::audit::{AuditFindings, AuditRequest, audit};
 use super::interruptible::Interruptible;
 use super::router::QueryRouter;
-use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Surrogate, SurrogateRequest};
+use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-use crate::render::Renderer;
+use crate::render::smooth::{Nodes, Picture, Refinement};
+use crate::render::{Film, RenderStats, Renderer};
 use crate::source::Listener;
 use crate::surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, Trace, build,
 };
+use crate::trust::Gate;
+use rayon::prelude::*;
 use std::path::Path;
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
 /// The CPU.
@@ -23,6 +27,7 @@ impl Backend for Cpu {
     type Tracer = Box<dyn Tracer>;
     type Surrogate = HostSurrogate;
     type Samples = Samples;
+    type Picture = HostPicture;
 
     fn name(&self) -> String {
         "cpu".into()
@@ -41,9 +46,14 @@ impl Backend for Cpu {
         Ok(build(request.settings, request.network, request.domain, request.seed, &tracer)?)
     }
 
-    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut HostPicture,
+    ) -> Result<Rendered<Samples>, DeviceError> {
         let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
-        render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer)
+        render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer, picture)
     }
 
     fn audit(
@@ -66,7 +76,8 @@ pub struct HostFrame<'a> {
     surrogate: Option<&'a dyn Predict>,
     routing: Routing<'a>,
     picture: u64,
-    samples: usize,
+    samples: f64,
+    smooth: Option<Smooth>,
     progress: Option<&'a (dyn Fn(f32) + Sync)>,
     stop: &'a AtomicBool,
 }
@@ -74,22 +85,95 @@ pub struct HostFrame<'a> {
 impl<'a> HostFrame<'a> {
     /// Takes the settings of a backend's job, with `tracer` and `surrogate` as the CPU calls them.
     pub fn of<B: Backend>(job: &FrameJob<'a, B>, tracer: &'a dyn Trace, surrogate: Option<&'a dyn Predict>) -> Self {
-        let &FrameJob { routing, picture, samples, progress, stop, .. } = job;
-        Self { tracer, surrogate, routing, picture, samples, progress, stop }
+        let &FrameJob { routing, picture, samples, smooth, progress, stop, .. } = job;
+        Self { tracer, surrogate, routing, picture, samples, smooth, progress, stop }
     }
+}
+
+/// A picture that the CPU accumulates, with the nodes of the surrogate that it shows.
+#[derive(Debug, Default)]
+pub struct HostPicture {
+    nodes: Option<Nodes>,
+    picture: Picture,
+}
+
+impl HostPicture {
+    /// Lays the surrogate out on nodes, once.
+    fn nodes(&mut self, surrogate: &dyn Predict, shape: [usize; 3]) -> Result<Nodes, DeviceError> {
+        /// Nodes that are predicted at once, which bounds the memory beside the nodes.
+        const AT_ONCE: usize = 1 << 20;
+        if let Some(nodes) = &self.nodes {
+            return Ok(nodes.clone());
+        }
+        let mut values = vec![0.0; shape.iter().product()];
+        for (part, values) in values.chunks_mut(AT_ONCE).enumerate() {
+            let first = part * AT_ONCE;
+            let points: Vec<[f32; 3]> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
+            surrogate.predict(&points, values)?;
+        }
+        Ok(self.nodes.insert(Nodes::new(shape, Arc::new(values))).clone())
+    }
+}
+
+/// Renders a smooth frame on the CPU.
+fn refine_on_cpu(
+    frame: &HostFrame<'_>,
+    smooth: Smooth,
+    renderer: &mut Renderer,
+    picture: &mut HostPicture,
+) -> Result<Rendered<Samples>, DeviceError> {
+    let missing_surrogate = || DeviceError::Unsupported { what: "a smooth frame without a surrogate".into() };
+    let nodes = picture.nodes(frame.surrogate.ok_or_else(missing_surrogate)?, smooth.nodes)?;
+    let flow = frame.tracer.flow();
+    let is_missing = |point: [f32; 3]| flow.is_missing(point);
+    let nothing_trusted = Gate::uniform(false);
+    let routing = Routing { gate: &nothing_trusted, trace_budget: None, ..frame.routing };
+    let mut router = QueryRouter::new(frame.tracer, None, routing);
+    let round = Refinement {
+        nodes: &nodes,
+        missing: flow.has_missing().then_some(&is_missing),
+        method: smooth.method,
+        sum: smooth.sum,
+        samples: frame.samples,
+        number: frame.picture,
+        stop: frame.stop,
+    };
+    let refined = renderer.refine(&mut picture.picture, &round, &mut router);
+    let (tally, samples) = router.finish()?;
+    if let Some(report) = frame.progress {
+        report(1.0);
+    }
+    let stopped = || {
+        let settings = &renderer.scene().settings;
+        (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() })
+    };
+    Ok(match refined {
+        Some((film, stats, error)) => Rendered { film, stats, tally, samples, error: Some(error) },
+        None => {
+            let (film, stats) = stopped();
+            Rendered { film, stats, tally, samples, error: None }
+        }
+    })
 }
 
 /// Renders a frame on the CPU.
 ///
 /// # Errors
 /// The device of the tracer or of the surrogate fails, or the renderer rejects the number of samples. The state of `renderer` is then unspecified.
-pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer) -> Result<Rendered<Samples>, DeviceError> {
+pub fn render_on_cpu(
+    frame: &HostFrame<'_>,
+    renderer: &mut Renderer,
+    picture: &mut HostPicture,
+) -> Result<Rendered<Samples>, DeviceError> {
+    if let Some(smooth) = frame.smooth {
+        return refine_on_cpu(frame, smooth, renderer, picture);
+    }
     let mut router = QueryRouter::new(frame.tracer, frame.surrogate, frame.routing);
     let (film, stats) = renderer
-        .render(frame.picture, &mut router, frame.samples, frame.progress.map(|report| report as &dyn Fn(f32)), frame.stop)
+        .render(frame.picture, &mut router, frame.samples.ceil() as usize, frame.progress.map(|report| report as &dyn Fn(f32)), frame.stop)
         .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
     let (tally, samples) = router.finish()?;
-    Ok(Rendered { film, stats, tally, samples })
+    Ok(Rendered { film, stats, tally, samples, error: None })
 }
 
 impl Surrogate for HostSurrogate {

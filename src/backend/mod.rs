@@ -15,7 +15,7 @@ mod router;
 mod settings;
 
 pub use audit::{Audit, AuditFindings, AuditRequest, residuals, stratified_points, trusted_error};
-pub use cpu::{Cpu, HostFrame, render_on_cpu};
+pub use cpu::{Cpu, HostFrame, HostPicture, render_on_cpu};
 #[cfg(feature = "cuda")]
 pub use device::CudaDevice;
 pub use device::{Device, TracedOnce};
@@ -27,7 +27,8 @@ pub use settings::{DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLos
 
 use crate::field::Domain;
 use crate::flow::{FlowError, FlowMap, VelocitySource};
-use crate::render::{Film, RenderStats, Renderer};
+use crate::render::smooth::PictureError;
+use crate::render::{Film, Method, RenderStats, Renderer};
 use crate::source::Listener;
 use crate::surrogate::network::NetworkSettings;
 use crate::surrogate::{
@@ -46,6 +47,8 @@ pub trait Backend: Send + Sync + Sized {
     type Surrogate: Surrogate<Tracer = Self::Tracer>;
     /// Labels that a frame traced. They take effect when they are committed.
     type Samples: FrameSamples;
+    /// Picture that accumulates over frames. The default value has no samples.
+    type Picture: Default + Send;
 
     /// Device name in the records, for example `cuda:0 NVIDIA H200`.
     fn name(&self) -> String;
@@ -65,11 +68,17 @@ pub trait Backend: Send + Sync + Sized {
     /// A setting is out of range, or the device fails or lacks memory.
     fn surrogate(&mut self, request: &SurrogateRequest<'_>, tracer: &Self::Tracer) -> Result<Self::Surrogate, BackendError>;
 
-    /// Renders one frame. Until its samples are committed, the frame changes no lasting state except `renderer`.
+    /// Renders one frame. Until its samples are committed, the frame changes no lasting state except `renderer` and, for smooth frames, `picture`,
+    /// to which it adds its samples.
     ///
     /// # Errors
-    /// The device fails or lacks memory.
-    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<Self::Samples>, DeviceError>;
+    /// The device fails or lacks memory. `picture` is then unspecified if the device is lost, and otherwise as before.
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut Self::Picture,
+    ) -> Result<Rendered<Self::Samples>, DeviceError>;
 
     /// Draws and traces the audit points of a frame, and measures the surrogate on them.
     ///
@@ -177,11 +186,24 @@ pub struct FrameJob<'a, B: Backend> {
     /// Picture number; it selects the random stream.
     pub picture: u64,
     /// Samples per pixel.
-    pub samples: usize,
+    pub samples: f64,
+    /// `Some` for methods whose picture accumulates; `None`: the frame is tracked.
+    pub smooth: Option<Smooth>,
     /// Called with the share of the frame that is rendered, from 0 to 1.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
     /// Setting it ends the frame after the wave in progress.
     pub stop: &'a AtomicBool,
+}
+
+/// Settings of a frame whose picture accumulates.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Smooth {
+    /// `marched` or `two_level`.
+    pub method: Method,
+    /// Adds the correction without shrinkage.
+    pub sum: bool,
+    /// Nodes along x, y, z on which a surrogate without a table is laid out.
+    pub nodes: [usize; 3],
 }
 
 /// A rendered frame.
@@ -194,6 +216,8 @@ pub struct Rendered<S> {
     pub tally: Tally,
     /// Traced queries that are kept as labels.
     pub samples: S,
+    /// Stated error of a smooth frame.
+    pub error: Option<PictureError>,
 }
 
 /// Labels of one frame. If they are dropped without [`FrameSamples::commit`], they are removed from the device as well.

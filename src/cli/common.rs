@@ -159,7 +159,7 @@ pub fn word<T: serde::de::DeserializeOwned>(word: &str, accepted: &str) -> Resul
 
 /// Parses a method.
 pub fn method(text: &str) -> Result<Method, String> {
-    word(text, "reference, surrogate, neural, gated")
+    word(text, "reference, surrogate, neural, gated, marched, two_level")
 }
 
 /// Parses a number of threads.

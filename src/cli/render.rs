@@ -17,12 +17,12 @@ pub struct Options {
     /// A scene file (.toml), or data files and globs.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// reference, surrogate (neural) or gated; overrides the scene's.
+    /// reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
-    /// Samples a pixel; overrides the scene's `render.samples`.
+    /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
     #[arg(long, value_name = "N")]
-    spp: Option<usize>,
+    spp: Option<f64>,
     /// Number of frames rendered and discarded first, with the scene's samples; they train the surrogate and tighten the majorants.
     /// Default: the scene's time.warmup_frames.
     #[arg(long, value_name = "N")]
@@ -53,7 +53,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let scene_file = options.out.with_extension("scene.toml");
     refuse_foreign_scene(&scene_file)?;
     if let Some(samples) = options.spp {
-        scene.time.warmup_samples.get_or_insert(scene.render.samples);
+        scene.time.warmup_samples.get_or_insert(scene.render.samples.ceil() as usize);
         scene.render.samples = samples;
         scene.set_by("render.samples", format!("--spp {samples}"));
     }

@@ -30,6 +30,11 @@ impl MissingCells {
         Self { snapshots, extra_nodes: usize::from(interpolation == Interpolation::Cubic) }
     }
 
+    /// True if no cell is missing.
+    pub fn is_empty(&self) -> bool {
+        self.snapshots.is_empty()
+    }
+
     /// True if a node that the interpolation reads at the seed has no velocity.
     pub fn is_missing(&self, seed: [f32; 3]) -> bool {
         let Some(grid) = self.grid() else { return false };

@@ -261,7 +261,11 @@ pub trait Tracer: Send + Sync {
     fn step_choice(&self) -> Option<StepChoice> {
         None
     }
-    /// True if a seed lies in a missing cell at the start time: it has no FTLE. Closed forms have no missing cells.
+    /// True if there are missing cells at the start time. Closed forms have none.
+    fn has_missing(&self) -> bool {
+        false
+    }
+    /// True if a seed lies in a missing cell at the start time: it has no FTLE.
     fn is_missing(&self, _seed: [f32; 3]) -> bool {
         false
     }

@@ -214,6 +214,9 @@ where
         self.chosen
     }
 
+    fn has_missing(&self) -> bool {
+        !self.missing_cells.is_empty()
+    }
     fn is_missing(&self, seed: [f32; 3]) -> bool {
         self.missing_cells.is_missing(seed)
     }

@@ -9,7 +9,7 @@ use std::io::{Cursor, Read};
 use std::path::Path;
 
 /// Layers of a film beside its colours.
-const LAYERS: [&str; 6] = ["ftle.mean", "trust.traced", "variance", "samples.count", "missing.share", "queries.count"];
+const LAYERS: [&str; 7] = ["ftle.mean", "trust.traced", "variance", "samples.count", "missing.share", "queries.count", "error"];
 
 /// Maximum number of samples of all channels of a file that is read, so that a damaged header cannot ask for all memory.
 const MAX_SAMPLES: usize = 1 << 30;
@@ -26,7 +26,7 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     }
     let colour = |k: usize| film.rgba.iter().map(|p| p[k]).collect::<Vec<f32>>();
     let mut channels = vec![("R", colour(0)), ("G", colour(1)), ("B", colour(2)), ("A", colour(3))];
-    let layers = [&film.ftle_mean, &film.traced, &film.variance, &film.samples, &film.missing, &film.queries];
+    let layers = [&film.ftle_mean, &film.traced, &film.variance, &film.samples, &film.missing, &film.queries, &film.error];
     for (name, layer) in LAYERS.into_iter().zip(layers) {
         match layer.len() {
             0 => {}
@@ -38,7 +38,7 @@ pub fn encode_exr(film: &Film, record: Option<&FrameRecord>) -> std::result::Res
     if let Some(record) = record {
         let json = serde_json::to_string(record).map_err(|e| e.to_string())?;
         attributes.comments = Some(Text::from(
-            "linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples, share missing, queries",
+            "linear radiance; layers: mean FTLE, share traced, variance of the mean luminance, samples, share missing, queries, stated error",
         ));
         let frame = i32::try_from(record.frame).unwrap_or(i32::MAX);
         attributes.other.insert(Text::from("ridgewatch.frame"), AttributeValue::I32(frame));
@@ -112,10 +112,10 @@ pub fn decode_exr(bytes: &[u8]) -> std::result::Result<Film, String> {
         if values.len() == pixels { Ok(values) } else { Err(format!("channel {name} is subsampled; one value a pixel is accepted")) }
     };
     let (red, green, blue, alpha) = (full("R")?, full("G")?, full("B")?, full("A")?);
-    let [ftle_mean, traced, variance, samples, missing, queries] =
+    let [ftle_mean, traced, variance, samples, missing, queries, error] =
         LAYERS.map(|name| values(name).filter(|v| v.len() == pixels).unwrap_or_default());
     let rgba = (0..pixels).map(|i| [red[i], green[i], blue[i], alpha[i]]).collect();
-    Ok(Film { width, height, rgba, ftle_mean, traced, variance, samples, missing, queries })
+    Ok(Film { width, height, rgba, ftle_mean, traced, variance, samples, missing, queries, error })
 }
 
 type Part = Layer<AnyChannels<FlatSamples>>;
@@ -148,6 +148,7 @@ mod tests {
             samples: vec![16.0; pixels],
             missing: layer(0.02),
             queries: layer(3.0),
+            error: layer(0.03),
         }
     }
 
@@ -166,7 +167,7 @@ mod tests {
         // Compares bits, since NaN marks pixels without a collision.
         assert_eq!(bits(&back.ftle_mean), bits(&film.ftle_mean));
         assert_eq!((&back.traced, &back.variance, &back.samples), (&film.traced, &film.variance, &film.samples));
-        assert_eq!((&back.missing, &back.queries), (&film.missing, &film.queries));
+        assert_eq!((&back.missing, &back.queries, &back.error), (&film.missing, &film.queries, &film.error));
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1, "no temporary file stays");
     }
 
@@ -177,7 +178,7 @@ mod tests {
         let meta = MetaData::read_from_buffered(Cursor::new(&bytes), true).unwrap();
         assert_eq!(meta.headers.len(), 1);
         let names: Vec<String> = meta.headers[0].channels.list.iter().map(|c| c.name.to_string()).collect();
-        assert_eq!(names, ["A", "B", "G", "R", "ftle.mean", "missing.share", "queries.count", "samples.count", "trust.traced", "variance"]);
+        assert_eq!(names, ["A", "B", "G", "R", "error", "ftle.mean", "missing.share", "queries.count", "samples.count", "trust.traced", "variance"]);
         let other = &meta.headers[0].own_attributes.other;
         assert_eq!(other.get(&Text::from("ridgewatch.time")), Some(&AttributeValue::F64(1.5)));
         let AttributeValue::Text(json) = &other[&Text::from("ridgewatch.record")] else { panic!("text") };

@@ -24,6 +24,8 @@ pub struct Film {
     pub missing: Vec<f32>,
     /// Number of log-stretch queries.
     pub queries: Vec<f32>,
+    /// Stated error of the linear radiance, root mean square over the channels and the neighbourhood. Empty for tracked pictures.
+    pub error: Vec<f32>,
 }
 
 impl Film {
@@ -59,6 +61,7 @@ impl Film {
             samples: layer(0.0),
             missing: layer(0.0),
             queries: layer(0.0),
+            error: Vec::new(),
         }
     }
 

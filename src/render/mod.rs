@@ -2,7 +2,7 @@
 //!
 //! In: a scene and a [`LogStretch`] that answers queries in batches. Out: a linear HDR film. Calls only `field` (the domain) and `setting`.
 //!
-//! A picture is an unbiased estimate of single scattering in a box: free flights by delta tracking (Woodcock et al. 1965), transmittance to
+//! A tracked picture is an unbiased estimate of single scattering in a box: free flights by delta tracking (Woodcock et al. 1965), transmittance to
 //! the light by ratio tracking (Novak et al. 2014), both through a grid of majorants. All flights advance together as a wavefront, so that
 //! queries come in large batches.
 
@@ -16,6 +16,7 @@ mod parameters;
 mod renderer;
 mod scene;
 mod settings;
+pub mod smooth;
 mod space;
 mod tracking;
 mod transfer;
@@ -33,7 +34,7 @@ pub use parameters::FrameParameters;
 pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
 pub(crate) use settings::MAX_SAMPLES;
-pub use settings::{CameraSettings, LightSettings, Method, RenderSettings, TransferSettings};
+pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, TransferSettings};
 pub use space::overview_scale;
 pub use transfer::Transfer;
 

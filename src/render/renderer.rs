@@ -5,6 +5,7 @@ use super::film::Film;
 use super::majorant::{CellObservations, MajorantGrid};
 use super::parameters::FrameParameters;
 use super::rng::FrameRandom;
+use super::smooth::{Picture, PictureError, Refinement};
 use super::space::{SceneBox, length};
 use super::tracking::FrameScene;
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
@@ -206,6 +207,19 @@ impl Renderer {
             missing: settings.missing_color.map(|c| c as f32),
             inverse_tau: self.inverse_tau,
         }
+    }
+
+    /// Refines a picture by one round of rays and coupled samples, whose traced queries `answers` takes. The film is that of the whole picture.
+    /// `None` if the round was stopped; the picture then keeps its samples.
+    pub fn refine(
+        &mut self,
+        picture: &mut Picture,
+        round: &Refinement<'_>,
+        answers: &mut dyn LogStretch,
+    ) -> Option<(Film, RenderStats, PictureError)> {
+        self.majorants.commit(&self.transfer);
+        let scene = self.frame_scene(round.number);
+        picture.refine(&scene, &self.scene, round, self.wave_flights, answers)
     }
 
     /// Begins a frame whose paths a device tracks itself and returns its input. The device passes its observations to [`Self::absorb`].

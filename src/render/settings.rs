@@ -24,6 +24,39 @@ pub enum Method {
     Surrogate,
     /// The surrogate where it is trusted, RK4 elsewhere.
     Gated,
+    /// The surrogate's expected picture, marched; traced samples measure its error.
+    Marched,
+    /// The marched picture, corrected by traced samples.
+    #[serde(rename = "two_level")]
+    TwoLevel,
+}
+
+impl Method {
+    /// Name in scene files and records.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Reference => "reference",
+            Self::Surrogate => "surrogate",
+            Self::Gated => "gated",
+            Self::Marched => "marched",
+            Self::TwoLevel => "two_level",
+        }
+    }
+
+    /// True if the picture accumulates and its error is stated ([`super::smooth`]).
+    pub fn is_smooth(self) -> bool {
+        matches!(self, Self::Marched | Self::TwoLevel)
+    }
+}
+
+/// How the correction of a `two_level` picture is added.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Combine {
+    /// Shrunk: the smallest error. Biased by what it takes for noise; the bias vanishes as samples come.
+    Shrink,
+    /// As it is: noisier, and unbiased up to the error of marching.
+    Sum,
 }
 
 /// `[camera]` of a scene file. `half_width = |look_at - eye| tan(field_of_view/2)`, `half_height = |look_at - eye| tan(field_of_view/(2 aspect))`.
@@ -107,8 +140,10 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Samples per pixel and frame.
-    pub samples: usize,
+    /// Samples per pixel and frame. Smooth methods accept fractions.
+    pub samples: f64,
+    /// How the correction of `two_level` is added.
+    pub combine: Combine,
     /// Background colour, linear.
     pub background: [f64; 3],
     /// Colour (linear) of missing cells, seen by camera paths that leave the box through them.
@@ -125,7 +160,8 @@ impl Default for RenderSettings {
             method: Method::Gated,
             width: 320,
             height: 160,
-            samples: 8,
+            samples: 8.0,
+            combine: Combine::Shrink,
             background: [1.0; 3],
             missing_color: [0.3; 3],
             majorant_cells: None,
@@ -151,7 +187,14 @@ impl RenderSettings {
         require((1..=MAX_EDGE).contains(&settings.height), "render.height", settings.height, size)?;
         let pixels = settings.width * settings.height;
         require(pixels <= MAX_PIXELS, "render.width", settings.width, "at most 67108864 pixels in all")?;
-        require((1..=MAX_SAMPLES).contains(&settings.samples), "render.samples", settings.samples, "1 to 16777216")?;
+        let samples = settings.samples;
+        if settings.method.is_smooth() {
+            let accepted = "1/64 to 4096 with this render.method";
+            require((1.0 / 64.0..=4096.0).contains(&samples), "render.samples", samples, accepted)?;
+        } else {
+            let whole = samples.fract() == 0.0 && (1.0..=MAX_SAMPLES as f64).contains(&samples);
+            require(whole, "render.samples", samples, "a whole number from 1 to 16777216 with this render.method")?;
+        }
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
         require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;

@@ -64,6 +64,23 @@ impl SceneBox {
         self.cells.map(|n| n as usize)
     }
 
+    /// Edges in scene units.
+    pub(super) fn edges(&self) -> [f64; 3] {
+        std::array::from_fn(|k| self.max[k] - self.min[k])
+    }
+
+    /// Unit coordinates of grid coordinates.
+    #[inline]
+    pub(super) fn unit_of_grid(&self, grid: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| grid[k] / self.cells[k] as f32)
+    }
+
+    /// Grid coordinates of unit coordinates.
+    #[inline]
+    pub(super) fn grid_of_unit(&self, unit: [f32; 3]) -> [f32; 3] {
+        std::array::from_fn(|k| unit[k] * self.cells[k] as f32)
+    }
+
     /// Distances at which a ray enters and leaves the box; `None` if it misses the box or the box lies behind.
     pub(super) fn intersect(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<(f64, f64)> {
         let (mut enter, mut leave) = (0.0_f64, f64::INFINITY);

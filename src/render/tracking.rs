@@ -13,9 +13,9 @@ use super::space::SceneBox;
 use super::{Camera, Light, Transfer};
 
 /// Isotropic phase function.
-const PHASE: f32 = 1.0 / (4.0 * std::f32::consts::PI);
+pub(super) const PHASE: f32 = 1.0 / (4.0 * std::f32::consts::PI);
 /// Transmittance below which Russian roulette ends shadow flights. It is unbiased and saves expensive queries.
-const ROULETTE: f32 = 1.0 / 16.0;
+pub(super) const ROULETTE: f32 = 1.0 / 16.0;
 
 /// Everything that is constant during a frame.
 pub(super) struct FrameScene<'a> {
@@ -249,17 +249,17 @@ impl Flight {
 }
 
 /// The point at which the optical depth of a flight is used up.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Hit {
-    t: f32,
-    cell: u32,
-    majorant: f32,
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct Hit {
+    pub(super) t: f32,
+    pub(super) cell: u32,
+    pub(super) majorant: f32,
 }
 
 /// Traverses the grid from `t` along `origin + t direction` (grid coordinates) until the majorants integrate to `depth`; `None` if that is
 /// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 #[inline]
-fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
+pub(super) fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
     let cells = grid.cells();
     let majorants = grid.majorants();
     let strides = [1, cells[0] as isize, (cells[0] * cells[1]) as isize];

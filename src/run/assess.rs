@@ -17,7 +17,7 @@ use std::sync::atomic::Ordering;
 pub(super) struct Work<S> {
     pub(super) rendered: Rendered<S>,
     pub(super) audit: AuditFindings,
-    pub(super) samples_per_pixel: usize,
+    pub(super) samples_per_pixel: f64,
     pub(super) render_seconds: f64,
     pub(super) audit_seconds: f64,
 }

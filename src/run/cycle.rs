@@ -312,7 +312,7 @@ impl Recovering for Beginning<'_> {
 fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut Beginning<'_>) -> Result<Session<B>, RunEnd> {
     let pool = beginning.threads.render();
     let error = match pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time)) {
-        Ok(tracer) => return Ok(Session::Device(On { backend, tracer: Some(tracer), surrogate: None })),
+        Ok(tracer) => return Ok(Session::Device(On { backend, tracer: Some(tracer), surrogate: None, picture: B::Picture::default() })),
         Err(BackendError::Device(error)) => error,
         Err(error) => return Err(error.into()),
     };
@@ -323,7 +323,7 @@ fn begin<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide, beginning: &mut
     let mut backend = Cpu;
     let tracer = pool.install(|| backend.tracer(&slide.velocity, &plan.map, slide.time))?;
     beginning.warnings.push(format!("traced on the CPU: {error}"));
-    Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None }))
+    Ok(Session::Cpu(On { backend, tracer: Some(tracer), surrogate: None, picture: Default::default() }))
 }
 
 impl<'a> Run<'a> {
@@ -377,7 +377,10 @@ impl<B: Backend> Cycle<'_, B> {
             self.frames(&mut slide, begun, sink)?;
             transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
             // Tracer and slide both hold the window, on the host and on the device.
-            with!(&mut self.session, on => on.tracer = None);
+            with!(&mut self.session, on => {
+                on.tracer = None;
+                on.picture = Default::default();
+            });
             drop(slide);
             let next = slides.next_slide(self.run.stop)?;
             check_stop(self.run.stop)?;
@@ -524,7 +527,7 @@ fn max_live_nodes(scene: &Settings, device: &Device) -> usize {
     if device.is_gpu() {
         return usize::MAX;
     }
-    let frames = [scene.render.width, scene.render.height, scene.render.samples, scene.time.frames_per_slide];
+    let frames = [scene.render.width, scene.render.height, scene.render.samples.ceil() as usize, scene.time.frames_per_slide];
     frames.into_iter().fold(1, usize::saturating_mul)
 }
 

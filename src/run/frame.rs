@@ -9,9 +9,9 @@ use super::stop::RunEnd;
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
-use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Surrogate};
+use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, Surrogate};
 use crate::flow::VelocitySource;
-use crate::render::Method;
+use crate::render::{Combine, Method};
 use crate::surrogate::{Learned, Predict, Trace};
 use crate::trust::{Gate, Strata};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -49,7 +49,7 @@ impl Run<'_> {
         let preparation_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
         let gate = match scene.render.method {
-            Method::Gated => self.learning.trust.gate(),
+            Method::Gated | Method::Marched | Method::TwoLevel => self.learning.trust.gate(),
             Method::Reference => Gate::uniform(false),
             Method::Surrogate => Gate::uniform(true),
         };
@@ -84,6 +84,7 @@ impl Run<'_> {
         let mut record = self.record(on, slide, &work);
         record.surrogate = frozen.as_ref().map(|frozen| frozen.name().to_owned());
         record.verified_error = verified;
+        record.picture_error = work.rendered.error;
         let samples = work.rendered.samples.commit();
         if let Some(assessment) = assessment {
             self.take_in(on, assessment, &work.audit, samples, &mut record);
@@ -142,7 +143,7 @@ impl Run<'_> {
     ) -> Result<Work<B::Samples>, DeviceError> {
         self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
         let (extras, keep) = (self.label_extras(), self.labels_per_frame(on));
-        let On { backend, tracer, surrogate } = on;
+        let On { backend, tracer, surrogate, picture: accumulated } = on;
         let tracer = present(tracer);
         let scene = &self.plan.scene;
         let settings = &scene.training;
@@ -150,7 +151,17 @@ impl Run<'_> {
         let learns = surrogate.as_ref().is_some_and(Surrogate::learns);
         // Warm-up frames use separate random numbers, so that the first frame after them does not depend on their number.
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
-        let samples_per_pixel = scene.time.warmup_samples.filter(|_| picture.place.is_warmup).unwrap_or(scene.render.samples);
+        let samples_per_pixel = match scene.time.warmup_samples.filter(|_| picture.place.is_warmup) {
+            Some(samples) => samples as f64,
+            None => scene.render.samples,
+        };
+        let smooth = match scene.render.method {
+            method if method.is_smooth() => {
+                let nodes = self.learning.settings.nodes(&self.plan.domain).map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;
+                Some(Smooth { method, sum: scene.render.combine == Combine::Sum, nodes })
+            }
+            _ => None,
+        };
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
@@ -169,10 +180,11 @@ impl Run<'_> {
                 routing,
                 picture: number,
                 samples: samples_per_pixel,
+                smooth,
                 progress: Some(&report),
                 stop: &AtomicBool::new(false),
             };
-            let rendered = backend.render(&job, renderer)?;
+            let rendered = backend.render(&job, renderer, accumulated)?;
             let render_seconds = begin.elapsed().as_secs_f64();
             let auditing = Instant::now();
             let cells = trust.shape();
@@ -292,11 +304,7 @@ impl Run<'_> {
             source: self.plan.source.clone(),
             transfer: self.transfer,
             direction: self.plan.map.direction.name().into(),
-            method: match self.plan.scene.render.method {
-                Method::Reference => "reference".into(),
-                Method::Surrogate => "surrogate".into(),
-                Method::Gated => "gated".into(),
-            },
+            method: self.plan.scene.render.method.name().into(),
             device: on.backend.name(),
             size: [film.width, film.height],
             samples_per_pixel: work.samples_per_pixel,

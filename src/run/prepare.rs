@@ -43,7 +43,7 @@ impl Run<'_> {
             replay_buffer: scene.training.replay_buffer,
             stop: self.stop,
         };
-        let On { backend, tracer, surrogate } = on;
+        let On { backend, tracer, surrogate, .. } = on;
         let tracer = present(tracer);
         let built = self.threads.render().install(|| backend.surrogate(&request, tracer))?;
         check_stop(self.stop)?;
@@ -185,12 +185,14 @@ impl Run<'_> {
             surrogate: None,
             routing,
             picture: PILOT_PICTURE,
-            samples: 1,
+            samples: 1.0,
+            smooth: None,
             progress: None,
             stop: self.stop,
         };
         let mut renderer = self.renderer.clone();
-        let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer))?;
+        let mut picture = B::Picture::default();
+        let rendered = self.threads.render().install(|| backend.render(&job, &mut renderer, &mut picture))?;
         check_stop(self.stop)?;
         let Rendered { tally, samples, .. } = rendered;
         let residuals = self.residuals_of(on, samples.on_host())?;

@@ -1,5 +1,6 @@
 //! Record of a frame: a line of `records.jsonl`, and part of the header of a published frame.
 
+use crate::render::smooth::PictureError;
 use crate::trust::TrustedError;
 use serde::{Deserialize, Serialize};
 
@@ -30,7 +31,7 @@ pub struct FrameRecord {
     pub transfer: TransferRecord,
     /// `forward` or `backward`.
     pub direction: String,
-    /// `reference`, `surrogate` or `gated`.
+    /// `reference`, `surrogate`, `gated`, `marched` or `two_level`.
     pub method: String,
     /// Device that traces: `cpu`, or `cuda:N` with its name.
     #[serde(default)]
@@ -39,8 +40,8 @@ pub struct FrameRecord {
     pub surrogate: Option<String>,
     /// Width and height in pixels.
     pub size: [usize; 2],
-    /// Samples a pixel.
-    pub samples_per_pixel: usize,
+    /// Samples a pixel of this frame; for `two_level` the mean number of coupled samples.
+    pub samples_per_pixel: f64,
     /// Log-stretch queries of the renderer.
     pub queries: u64,
     /// Queries answered by RK4.
@@ -64,6 +65,9 @@ pub struct FrameRecord {
     pub trusted_volume: f64,
     /// `trusted_error` on new points with the same weights, measured after the frame (`--verify`).
     pub verified_error: Option<TrustedError>,
+    /// Error of the picture, against that of the traced field without noise. `None` if none is stated.
+    #[serde(default)]
+    pub picture_error: Option<PictureError>,
     /// Runge-Kutta steps a path. `None` for Dormand-Prince.
     pub integration_steps: Option<u64>,
     /// Difference of the log-stretch from twice as many steps: the error of the truth itself. `None` if the steps were given.

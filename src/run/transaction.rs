@@ -18,6 +18,8 @@ pub(super) struct On<B: Backend> {
     pub(super) tracer: Option<B::Tracer>,
     /// `None` for the method `reference`.
     pub(super) surrogate: Option<B::Surrogate>,
+    /// Picture of the slide, which accumulates over smooth frames.
+    pub(super) picture: B::Picture,
 }
 
 /// Returns the flow map of the slide in progress.
@@ -128,7 +130,7 @@ impl<B: Backend> Session<B> {
                 Some(host)
             }
         };
-        *self = Session::Cpu(On { backend, tracer: Some(tracer), surrogate });
+        *self = Session::Cpu(On { backend, tracer: Some(tracer), surrogate, picture: Default::default() });
         run.warn(format!("work on the GPU has ended, the CPU goes on: {error}"));
         Ok(())
     }

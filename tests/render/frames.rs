@@ -212,7 +212,7 @@ fn bad_scenes_name_the_key() {
     assert!(fault(|s| s.settings.height = 20_000).starts_with("`render.height` is 20000"));
     assert!(fault(|s| (s.settings.width, s.settings.height) = (16_384, 16_384)).contains("pixels in all"));
     assert!(fault(|s| s.transfer.extinction = Some(1e9)).starts_with("`transfer.extinction`"));
-    assert!(fault(|s| s.settings.samples = 0).starts_with("`render.samples` is 0"));
+    assert!(fault(|s| s.settings.samples = 0.0).starts_with("`render.samples` is 0"));
     assert!(fault(|s| s.settings.tone_map[2] = 0.0).starts_with("`render.tone_map`"));
     assert!(fault(|s| s.settings.background[1] = -1.0).starts_with("`render.background`"));
     assert!(fault(|s| s.settings.missing_color[1] = f64::NAN).starts_with("`render.missing_color`"));

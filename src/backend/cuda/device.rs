@@ -5,7 +5,7 @@ use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu};
 use super::rendering::{CudaSamples, GpuFrames};
 use super::tracing::{CudaTracer, Tuning};
 use super::window::SnapshotStore;
-use crate::backend::cpu::{HostFrame, render_on_cpu};
+use crate::backend::cpu::{HostFrame, HostPicture, render_on_cpu};
 use crate::backend::{
     AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
     Rendered, Surrogate, SurrogateRequest, WhenLost, audit,
@@ -95,6 +95,7 @@ impl Backend for Cuda {
     type Tracer = CudaTracer;
     type Surrogate = CudaSurrogate;
     type Samples = CudaSamples;
+    type Picture = HostPicture;
 
     fn name(&self) -> String {
         format!("cuda:{} {}", self.gpu.ordinal(), self.gpu.name())
@@ -127,14 +128,19 @@ impl Backend for Cuda {
         Ok(CudaSurrogate::Resident(Hybrid::new(request.settings.kind, nodes, request.network, request.seed, tracer, training)??))
     }
 
-    fn render(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
+    fn render(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut HostPicture,
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let resident = match job.surrogate {
             None => None,
             Some(CudaFrozen::Resident(frozen)) => Some(frozen),
-            Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer),
+            Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer, picture),
         };
-        if self.placement.frames == Place::Host || job.routing.extras.jacobian {
-            return self.render_on_cpu(job, renderer);
+        if self.placement.frames == Place::Host || job.routing.extras.jacobian || job.smooth.is_some() {
+            return self.render_on_cpu(job, renderer, picture);
         }
         self.frames()?.render(job, resident, renderer)
     }
@@ -194,10 +200,15 @@ impl Backend for Cuda {
 
 impl Cuda {
     /// Renders a frame on the CPU; the GPU traces its queries.
-    fn render_on_cpu(&mut self, job: &FrameJob<'_, Self>, renderer: &mut Renderer) -> Result<Rendered<CudaSamples>, DeviceError> {
+    fn render_on_cpu(
+        &mut self,
+        job: &FrameJob<'_, Self>,
+        renderer: &mut Renderer,
+        picture: &mut HostPicture,
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let surrogate = job.surrogate.map(|surrogate| surrogate as &dyn Predict);
-        let Rendered { film, stats, tally, samples } = render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer)?;
-        Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(samples) })
+        let Rendered { film, stats, tally, samples, error } = render_on_cpu(&HostFrame::of(job, job.tracer, surrogate), renderer, picture)?;
+        Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(samples), error })
     }
 }
 

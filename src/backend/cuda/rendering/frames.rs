@@ -110,14 +110,14 @@ impl GpuFrames {
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let (tracer, routing) = (job.tracer, job.routing);
         let progress = job.progress.map(|report| report as &dyn Fn(f32));
-        let samples = 0..u32::try_from(job.samples).unwrap_or(u32::MAX);
+        let samples = 0..(job.samples.ceil() as u32);
         let counts =
             |stats: &RenderStats| Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, ..Tally::default() };
         if surrogate.is_none() && tracer.missing_cells().is_none() && routing.keep <= 1 {
             let mut all = TraceAll(tracer.device());
             let (film, stats) = self.renderer.render_samples(renderer, job.picture, samples, &mut all, progress, job.stop)?;
             let tally = Tally { trace_seconds: stats.evaluate_seconds, ..counts(&stats) };
-            return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()) });
+            return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()), error: None });
         }
         let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
         let pool = surrogate.and_then(|frozen| frozen.network.as_ref()?.pool().cloned());
@@ -141,7 +141,7 @@ impl GpuFrames {
             ..counts(&stats)
         };
         labels.host = answers.labels();
-        Ok(Rendered { film, stats, tally, samples: labels })
+        Ok(Rendered { film, stats, tally, samples: labels, error: None })
     }
 
     /// Audits a frame.

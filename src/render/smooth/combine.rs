@@ -1,0 +1,305 @@
+//! Combination of the marched picture with its noisy correction, and the error of the result.
+//!
+//! The correction is shrunk before it is added, as Stein-type estimators combine a biased estimate with an unbiased one (James and Stein 1961; Back
+//! et al. 2020), here in the scales of an a-trous B3-spline transform (Starck and Murtagh 2006). The samples form two halves, and each half two
+//! quarters. The product of two quarters' details estimates the energy of the correction itself without noise, their squares that of correction
+//! and noise together; the ratio is the gain. Each half is shrunk by its own gains, so that the other half is independent of it and scores it:
+//! with d_A and d_B the means of the halves at a pixel, r = (a + b) / 2 the correction shown and c its expectation,
+//! r^2 - (a d_B + b d_A) + d_A d_B is an unbiased estimate of (r - c)^2. As samples come, gains go to 1 wherever there is anything to correct.
+
+use rayon::prelude::*;
+
+/// Scales of the transform.
+const LEVELS: usize = 5;
+/// Radius over which energies are averaged: `RADIUS` times the spacing of the scale, at most `MAX_RADIUS`.
+const RADIUS: usize = 4;
+const MAX_RADIUS: usize = 32;
+/// Rec. 709 luminance.
+const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
+
+/// Sums over the coupled samples of a pixel. Samples come in pairs, one of either half.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct PairSums {
+    /// By half and quarter.
+    pub(super) radiance: [[[f32; 3]; 2]; 2],
+    pub(super) alpha: f32,
+    /// Pairs by quarter.
+    pub(super) pairs: [u32; 2],
+    pub(super) queries: u32,
+    pub(super) traced: u32,
+}
+
+impl PairSums {
+    pub(super) fn pairs(&self) -> u32 {
+        self.pairs[0] + self.pairs[1]
+    }
+
+    /// Mean of a half over all its samples.
+    fn half(&self, half: usize) -> [f32; 3] {
+        let (count, [first, second]) = (self.pairs().max(1) as f32, &self.radiance[half]);
+        std::array::from_fn(|k| (first[k] + second[k]) / count)
+    }
+
+    fn quarter(&self, half: usize, quarter: usize) -> [f32; 3] {
+        self.radiance[half][quarter].map(|sum| sum / self.pairs[quarter].max(1) as f32)
+    }
+}
+
+/// Weighted colour: radiance times weight, and the weight.
+type Weighted = [f32; 4];
+
+/// Reflects an index at the borders of 0..n.
+fn reflected(mut i: isize, n: usize) -> usize {
+    let last = n as isize - 1;
+    if last == 0 {
+        return 0;
+    }
+    loop {
+        if i < 0 {
+            i = -i;
+        } else if i > last {
+            i = 2 * last - i;
+        } else {
+            return i as usize;
+        }
+    }
+}
+
+/// B3-spline filter with the given spacing along one axis of a picture with rows of `width`.
+fn b3(from: &[Weighted], width: usize, spacing: usize, along_rows: bool) -> Vec<Weighted> {
+    const KERNEL: [f32; 5] = [0.0625, 0.25, 0.375, 0.25, 0.0625];
+    let height = from.len() / width;
+    let mut to = vec![[0.0; 4]; from.len()];
+    to.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+        let rows: [usize; 5] = std::array::from_fn(|i| reflected(y as isize + (i as isize - 2) * spacing as isize, height) * width);
+        for (x, value) in row.iter_mut().enumerate() {
+            let mut sum = [0.0; 4];
+            for (i, weight) in KERNEL.iter().enumerate() {
+                let at = if along_rows { y * width + reflected(x as isize + (i as isize - 2) * spacing as isize, width) } else { rows[i] + x };
+                (0..4).for_each(|k| sum[k] += weight * from[at][k]);
+            }
+            *value = sum;
+        }
+    });
+    to
+}
+
+/// Sums over a square of the given radius, cut at the borders.
+fn box_sum(from: &[[f32; 2]], width: usize, radius: usize) -> Vec<[f32; 2]> {
+    let height = from.len() / width;
+    let mut rows = vec![[0.0; 2]; from.len()];
+    rows.par_chunks_mut(width).zip(from.par_chunks(width)).for_each(|(to, from)| {
+        let mut sums = vec![[0.0_f64; 2]; width + 1];
+        (0..width).for_each(|x| sums[x + 1] = std::array::from_fn(|k| sums[x][k] + f64::from(from[x][k])));
+        for (x, value) in to.iter_mut().enumerate() {
+            let (low, high) = (x.saturating_sub(radius), (x + radius + 1).min(width));
+            *value = std::array::from_fn(|k| (sums[high][k] - sums[low][k]) as f32);
+        }
+    });
+    let mut to = vec![[0.0; 2]; from.len()];
+    to.par_chunks_mut(width).enumerate().for_each(|(y, row)| {
+        let range = y.saturating_sub(radius)..(y + radius + 1).min(height);
+        for (x, value) in row.iter_mut().enumerate() {
+            *value = range.clone().fold([0.0; 2], |sum, y| std::array::from_fn(|k| sum[k] + rows[y * width + x][k]));
+        }
+    });
+    to
+}
+
+fn luminance(colour: [f32; 3]) -> f32 {
+    (0..3).map(|k| LUMINANCE[k] * colour[k]).sum()
+}
+
+/// Gains of the mean of two quarters: the share of its energy that is not noise.
+fn gains(details: &[Vec<[f32; 3]>; 2], width: usize, radius: usize) -> Vec<f32> {
+    let energies: Vec<[f32; 2]> = (details[0].par_iter())
+        .zip(&details[1])
+        .map(|(&a, &b)| {
+            let (a, b) = (luminance(a), luminance(b));
+            [a * b, 0.5 * (a * a + b * b)]
+        })
+        .collect();
+    let gain = |[signal, energy]: [f32; 2]| if energy > 0.0 { (2.0 * signal / (energy + signal)).clamp(0.0, 1.0) } else { 0.0 };
+    box_sum(&energies, width, radius).into_par_iter().map(gain).collect()
+}
+
+fn value(weighted: &Weighted) -> [f32; 3] {
+    if weighted[3] > 0.0 { std::array::from_fn(|k| weighted[k] / weighted[3]) } else { [0.0; 3] }
+}
+
+/// Shrinks the mean of two quarters of the samples.
+fn shrunk(mut quarters: [Vec<Weighted>; 2], width: usize) -> Vec<[f32; 3]> {
+    let mut result = vec![[0.0_f32; 3]; quarters[0].len()];
+    let add = |result: &mut [[f32; 3]], parts: &[Vec<[f32; 3]>; 2], weights: &[Vec<Weighted>; 2], gains: &[f32]| {
+        result.par_iter_mut().enumerate().with_min_len(1 << 12).for_each(|(i, result)| {
+            let [v, w] = [weights[0][i][3], weights[1][i][3]];
+            if v + w > 0.0 {
+                (0..3).for_each(|k| result[k] += gains[i] * (v * parts[0][i][k] + w * parts[1][i][k]) / (v + w));
+            }
+        });
+    };
+    for level in 0..LEVELS {
+        let spacing = 1 << level;
+        let coarse = quarters.each_ref().map(|quarter| b3(&b3(quarter, width, spacing, true), width, spacing, false));
+        let details: [Vec<[f32; 3]>; 2] = std::array::from_fn(|q| {
+            let detail = |(fine, coarse): (&Weighted, &Weighted)| {
+                let (fine_value, coarse_value) = (value(fine), value(coarse));
+                if fine[3] > 0.0 { std::array::from_fn(|k| fine_value[k] - coarse_value[k]) } else { [0.0; 3] }
+            };
+            quarters[q].par_iter().zip(&coarse[q]).with_min_len(1 << 12).map(detail).collect()
+        });
+        let gains = gains(&details, width, (RADIUS * spacing).min(MAX_RADIUS));
+        add(&mut result, &details, &quarters, &gains);
+        quarters = coarse;
+    }
+    let coarsest = quarters.each_ref().map(|quarter| quarter.par_iter().map(value).collect::<Vec<_>>());
+    let gains = gains(&coarsest, width, MAX_RADIUS);
+    add(&mut result, &coarsest, &quarters, &gains);
+    result
+}
+
+/// How the correction is added.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Correction {
+    /// Not at all; the samples only measure the error.
+    Left,
+    /// Shrunk.
+    Shrunk,
+    /// As it is.
+    Summed,
+}
+
+/// The correction that is shown, and its error.
+pub(super) struct Combined {
+    pub(super) correction: Vec<[f32; 3]>,
+    /// Per pixel and channel, estimates of the squared error: from all pairs, and from those of one quarter. NaN where there are none.
+    pub(super) squared: Vec<[[f32; 3]; 3]>,
+}
+
+pub(super) fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
+    let halves: [Vec<[f32; 3]>; 2] = std::array::from_fn(|half| match how {
+        Correction::Left => vec![[0.0; 3]; sums.len()],
+        Correction::Summed => sums.par_iter().map(|sums| sums.half(half)).collect(),
+        Correction::Shrunk => {
+            let quarter = |quarter: usize| -> Vec<Weighted> {
+                let weighted = |sums: &PairSums| {
+                    let [r, g, b] = sums.radiance[half][quarter];
+                    [r, g, b, sums.pairs[quarter] as f32]
+                };
+                sums.par_iter().map(weighted).collect()
+            };
+            shrunk([quarter(0), quarter(1)], width)
+        }
+    });
+    let [a, b] = &halves;
+    let correction: Vec<[f32; 3]> = a.par_iter().zip(b).map(|(a, b)| std::array::from_fn(|k| 0.5 * (a[k] + b[k]))).collect();
+    let squared = (0..sums.len())
+        .into_par_iter()
+        .with_min_len(1 << 10)
+        .map(|i| {
+            let (sums, a, b, r) = (&sums[i], a[i], b[i], correction[i]);
+            let score = |known: bool, d_a: [f32; 3], d_b: [f32; 3]| -> [f32; 3] {
+                if !known {
+                    return [f32::NAN; 3];
+                }
+                std::array::from_fn(|k| r[k] * r[k] - (a[k] * d_b[k] + b[k] * d_a[k]) + d_a[k] * d_b[k])
+            };
+            let quarter = |q: usize| score(sums.pairs[q] > 0, sums.quarter(0, q), sums.quarter(1, q));
+            [score(sums.pairs() > 0, sums.half(0), sums.half(1)), quarter(0), quarter(1)]
+        })
+        .collect();
+    Combined { correction, squared }
+}
+
+/// Mean of the known values over a square around each pixel; NaN where none is known.
+pub(super) fn smoothed(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
+    let known: Vec<[f32; 2]> = values.iter().map(|v| if v.is_finite() { [*v, 1.0] } else { [0.0; 2] }).collect();
+    box_sum(&known, width, radius).into_iter().map(|[sum, count]| if count > 0.5 { sum / count } else { f32::NAN }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::render::rng::{philox, unit};
+
+    /// Pairs of a picture whose correction is `truth`, with uniform noise of standard deviation `noise`.
+    fn sampled(truth: &[f32], noise: f32, pairs: u32, seed: u32) -> Vec<PairSums> {
+        let draw = |i: usize, pair: u32, half: u32| {
+            let words = philox([i as u32, pair, half, 0], [seed, 1]);
+            (unit(words[0]) - 0.5) * 12.0_f32.sqrt() * noise
+        };
+        let sums = |(i, &truth): (usize, &f32)| {
+            let mut sums = PairSums::default();
+            for pair in 0..pairs {
+                let quarter = ((i as u32 + pair) & 1) as usize;
+                for half in 0..2 {
+                    let value = truth + draw(i, pair, half as u32);
+                    sums.radiance[half][quarter].iter_mut().for_each(|sum| *sum += value);
+                }
+                sums.pairs[quarter] += 1;
+            }
+            sums
+        };
+        truth.iter().enumerate().map(sums).collect()
+    }
+
+    fn bump(width: usize, height: usize) -> Vec<f32> {
+        let at = |i: usize| {
+            let (x, y) = ((i % width) as f32 - width as f32 / 2.0, (i / width) as f32 - height as f32 / 2.0);
+            0.2 * (-(x * x + y * y) / 400.0).exp()
+        };
+        (0..width * height).map(at).collect()
+    }
+
+    fn mean_square(values: impl Iterator<Item = f32>) -> f64 {
+        let (mut sum, mut count) = (0.0, 0);
+        for value in values {
+            (sum, count) = (sum + f64::from(value).powi(2), count + 1);
+        }
+        sum / f64::from(count)
+    }
+
+    fn error_of(combined: &Combined, truth: &[f32]) -> f64 {
+        mean_square(combined.correction.iter().zip(truth).map(|(r, t)| r[0] - t))
+    }
+
+    #[test]
+    fn shrinking_removes_noise_and_keeps_what_is_there() {
+        let (width, height) = (128, 96);
+        let truth = bump(width, height);
+        let left = mean_square(truth.iter().copied());
+        let mut last = f64::INFINITY;
+        for pairs in [2, 8, 32, 128] {
+            let sums = sampled(&truth, 0.5, pairs, 3);
+            let shrunk = error_of(&combine(&sums, width, Correction::Shrunk), &truth);
+            let summed = error_of(&combine(&sums, width, Correction::Summed), &truth);
+            // 0.25 / samples is the variance of the plain mean.
+            assert!((summed / (0.25 / (2.0 * f64::from(pairs))) - 1.0).abs() < 0.1, "{pairs}: {summed}");
+            assert!(shrunk < 0.2 * summed && shrunk < left && shrunk < last, "{pairs}: {shrunk}, sum {summed}, none {left}");
+            last = shrunk;
+        }
+    }
+
+    #[test]
+    fn noise_without_a_correction_is_shrunk_to_almost_nothing() {
+        let sums = sampled(&vec![0.0; 128 * 96], 0.5, 4, 9);
+        let error = mean_square(combine(&sums, 128, Correction::Shrunk).correction.iter().map(|r| r[0]));
+        // The plain mean has 0.25 / 8.
+        assert!(error < 0.02 * 0.25 / 8.0, "{error}");
+    }
+
+    #[test]
+    fn the_stated_error_is_that_of_the_picture_shown() {
+        let (width, height) = (128, 96);
+        let truth = bump(width, height);
+        for how in [Correction::Left, Correction::Shrunk, Correction::Summed] {
+            let (mut stated, mut found) = (0.0, 0.0);
+            for seed in 0..24 {
+                let combined = combine(&sampled(&truth, 0.3, 3, 100 + seed), width, how);
+                stated += combined.squared.iter().map(|e| f64::from(e[0][0])).sum::<f64>() / truth.len() as f64;
+                found += error_of(&combined, &truth);
+            }
+            assert!((stated / found - 1.0).abs() < 0.05, "{how:?}: stated {stated}, found {found}");
+        }
+    }
+}

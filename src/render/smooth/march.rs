@@ -1,0 +1,164 @@
+//! Marching: the expected picture of the surrogate, by quadrature along camera rays (emission and absorption, Max 1995).
+//!
+//! The picture is the mean over the pixel's area, as it is for tracking. Ray `j` of a pixel goes through a point of the film, and its quadrature
+//! points start at an offset, that follow an additive recurrence in three dimensions (Roberts 2018), the same for every pixel: the first ray goes
+//! through the pixel's centre, later ones fill the pixel evenly, and their mean converges to the integral over pixel and ray.
+
+use super::light_volume::LightVolume;
+use super::nodes::Nodes;
+use crate::render::rng::unit;
+use crate::render::tracking::{FrameScene, PHASE};
+
+/// Transmittance below which the rest of a ray is not marched.
+const OPAQUE: f32 = 1e-4;
+/// Largest number of quadrature points on a ray.
+const MAX_POINTS: f32 = 65_536.0;
+/// Third counter word of the random shift of a pixel's rays, which no path reaches.
+const SHIFT_DIMENSION: u32 = u32::MAX - 1;
+
+/// Whether a domain point lies in a missing cell.
+pub type IsMissing<'a> = &'a (dyn Fn([f32; 3]) -> bool + Sync);
+
+/// What is marched through.
+#[derive(Clone, Copy)]
+pub(crate) struct Medium<'a> {
+    pub(crate) scene: &'a FrameScene<'a>,
+    pub(crate) nodes: &'a Nodes,
+    /// `None`: every cell has data.
+    pub(crate) missing: Option<IsMissing<'a>>,
+}
+
+/// How the transmittance to the light is found.
+#[derive(Clone, Copy)]
+pub(super) enum ToLight<'a> {
+    Volume(&'a LightVolume),
+    /// By marching from the point with this step, in scene units.
+    March(f32),
+}
+
+/// One ray, or a sum of rays.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub(super) struct RaySum {
+    pub(super) radiance: [f32; 3],
+    pub(super) alpha: f32,
+    /// Sum of weight times FTLE.
+    pub(super) ftle: f32,
+    pub(super) missing: f32,
+}
+
+impl RaySum {
+    pub(super) fn add(&mut self, ray: &Self) {
+        (0..3).for_each(|k| self.radiance[k] += ray.radiance[k]);
+        self.alpha += ray.alpha;
+        self.ftle += ray.ftle;
+        self.missing += ray.missing;
+    }
+}
+
+/// Offsets of ray `j`: across the pixel, down the pixel, along the step.
+fn offsets(j: u64) -> [f32; 3] {
+    const G: f64 = 1.220_744_084_605_759_6;
+    [1.0 / G, 1.0 / (G * G), 1.0 / (G * G * G)].map(|a| (0.5 + j as f64 * a).fract() as f32)
+}
+
+impl Medium<'_> {
+    /// Smallest distance between nodes, in scene units.
+    pub(super) fn spacing(&self) -> f64 {
+        let (edges, shape) = (self.scene.space.edges(), self.nodes.shape());
+        (0..3).filter(|&k| shape[k] > 1).map(|k| edges[k] / (shape[k] - 1) as f64).fold(f64::INFINITY, f64::min)
+    }
+
+    /// FTLE of the surrogate at a point in unit coordinates; `None` in missing cells.
+    #[inline]
+    pub(super) fn ftle(&self, unit: [f32; 3]) -> Option<f32> {
+        if self.missing.is_some_and(|missing| missing(self.scene.space.domain_point(self.scene.space.grid_of_unit(unit)))) {
+            return None;
+        }
+        Some(self.nodes.at(unit) * self.scene.inverse_tau)
+    }
+
+    /// Extinction at a point in unit coordinates, per scene length.
+    #[inline]
+    pub(super) fn extinction(&self, unit: [f32; 3]) -> f32 {
+        self.ftle(unit).map_or(0.0, |ftle| self.scene.transfer.extinction(ftle))
+    }
+
+    /// Optical depth from a point (grid coordinates) to the light, by the midpoint rule.
+    pub(super) fn depth_to_light(&self, point: [f32; 3], step: f32) -> f32 {
+        let space = self.scene.space;
+        let (direction, distance, _) = self.scene.light.seen_from(space.scene_point(point));
+        let direction = space.grid_direction(direction);
+        let length = space.exit(point, direction).min(distance as f32);
+        let count = (length / step).ceil().clamp(1.0, MAX_POINTS);
+        let step = length / count;
+        let at = |i: usize| space.unit_of_grid(std::array::from_fn(|k| point[k] + (i as f32 + 0.5) * step * direction[k]));
+        (0..count as usize).map(|i| self.extinction(at(i))).sum::<f32>() * step
+    }
+
+    /// Ray `j` of a pixel with steps of at most `step` scene units. `shift` draws a random shift of the ray for each pixel.
+    pub(super) fn ray(&self, pixel: u32, j: u64, step: f32, light: ToLight<'_>, shift: bool) -> RaySum {
+        let (scene, space) = (self.scene, self.scene.space);
+        let mut offset = offsets(j);
+        if shift {
+            let words = scene.random.words(pixel, j as u32, SHIFT_DIMENSION);
+            (0..3).for_each(|k| offset[k] = (offset[k] + unit(words[k])).fract());
+        }
+        let (column, row) = (pixel as usize % scene.width, pixel as usize / scene.width);
+        let x = (column as f64 + f64::from(offset[0])) / scene.width as f64 * 2.0 - 1.0;
+        let y = 1.0 - (row as f64 + f64::from(offset[1])) / scene.height as f64 * 2.0;
+        let (eye, toward) = scene.camera.ray(x, y);
+        let Some((enter, leave)) = space.intersect(eye, toward) else {
+            return RaySum { radiance: scene.background, ..RaySum::default() };
+        };
+        let origin = space.grid_point(std::array::from_fn(|k| eye[k] + enter * toward[k]));
+        let direction = space.grid_direction(toward);
+        let length = (leave - enter) as f32;
+        let count = (length / step).ceil().clamp(1.0, MAX_POINTS);
+        let (step, count) = (length / count, count as usize);
+        let (start, along) = (space.unit_of_grid(origin), space.unit_of_grid(direction));
+        let (mut sum, mut transmittance, mut in_missing, mut i) = (RaySum::default(), 1.0_f32, 0_usize, 0);
+        while i < count && transmittance >= OPAQUE {
+            let t = (i as f32 + offset[2]) * step;
+            let unit: [f32; 3] = std::array::from_fn(|k| start[k] + t * along[k]);
+            if self.missing.is_none()
+                && let Some((low, high)) = self.nodes.empty_brick(unit, scene.transfer, scene.inverse_tau)
+            {
+                let mut exit = f32::INFINITY;
+                for k in 0..3 {
+                    if along[k] != 0.0 {
+                        exit = exit.min(((if along[k] > 0.0 { high[k] } else { low[k] }) - start[k]) / along[k]);
+                    }
+                }
+                i = (i + 1).max(((exit / step - offset[2]).ceil().max(0.0) as usize).min(count));
+                continue;
+            }
+            i += 1;
+            let Some(ftle) = self.ftle(unit) else {
+                in_missing += 1;
+                continue;
+            };
+            let extinction = scene.transfer.extinction(ftle);
+            if extinction <= 0.0 {
+                continue;
+            }
+            let absorbed = 1.0 - (-extinction * step).exp();
+            let weight = transmittance * absorbed;
+            let grid = std::array::from_fn(|k| origin[k] + t * direction[k]);
+            let (_, _, radiance) = scene.light.seen_from(space.scene_point(grid));
+            let depth = match light {
+                ToLight::Volume(volume) => volume.at(unit),
+                ToLight::March(step) => self.depth_to_light(grid, step),
+            };
+            let scattered = weight * PHASE * (-depth).exp();
+            let albedo = scene.transfer.albedo(ftle);
+            (0..3).for_each(|k| sum.radiance[k] += scattered * albedo[k] * radiance[k]);
+            sum.alpha += weight;
+            sum.ftle += weight * ftle;
+            transmittance *= 1.0 - absorbed;
+        }
+        let share = in_missing as f32 / i.max(1) as f32;
+        sum.missing = transmittance * share;
+        (0..3).for_each(|k| sum.radiance[k] += transmittance * ((1.0 - share) * scene.background[k] + share * scene.missing[k]));
+        sum
+    }
+}
