@@ -10,18 +10,6 @@ namespace rw {
 // Planes of the sums over pairs: differences by half, quarter and channel, pairs by quarter, differences of alpha.
 constexpr int PAIR_COUNTS = 12, PAIR_ALPHA = 14;
 
-// Threads of a block that work in phases on shared memory. As host C++ a phase is a loop.
-struct Block {
-    template <class F> RW_FN void each(int count, F f) const {
-#if RW_DEVICE
-        for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) f(i);
-        __syncthreads();
-#else
-        for (int i = 0; i < count; ++i) f(i);
-#endif
-    }
-};
-
 // Mirrors an index at the borders of 0..n.
 RW_FN int reflected(int i, int n) {
     if (n == 1) return 0;

@@ -46,3 +46,20 @@ march_pixels(const __grid_constant__ FrameScene scene, const __grid_constant__ M
     if (column >= scene.width || row >= scene.height) return;
     march_pixel(scene, march, row * scene.width + column, sums, fresh != 0);
 }
+
+// A ray that is marched apart from the picture (see `check_ray`).
+struct Check {
+    uint32_t pixel;
+    uint32_t ray;
+    float step;
+    float shadow_step;
+};
+
+// A block a check. radiance: 3 floats a check.
+extern "C" __global__ void __launch_bounds__(1024)
+march_checks(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, const Check* __restrict__ checks,
+             float* __restrict__ radiance) {
+    __shared__ float memory[CHECK_MEMORY];
+    const Check check = checks[blockIdx.x];
+    check_ray(Block{}, scene, march, check.pixel, check.ray, check.step, check.shadow_step, radiance + 3 * blockIdx.x, memory);
+}

@@ -5,11 +5,31 @@
 #include "tracing/missing_cells.cuh"
 #include "tracing/table.cuh"
 
+// Kernels leave out what a scene does not need; 1: decided at run time.
+#ifndef RW_HOLES
+#define RW_HOLES 1  // cells may be missing
+#endif
+#ifndef RW_POINT_LIGHT
+#define RW_POINT_LIGHT 1
+#endif
+
 namespace rw {
 
 constexpr int BRICK = 8;                 // cells along the edge of a brick
 constexpr float OPAQUE = 1e-4f;          // transmittance below which a ray ends
 constexpr float MOST_POINTS = 65536.0f;  // of quadrature on a ray
+
+// Threads of a block that work in phases on shared memory. As host C++ a phase is a loop.
+struct Block {
+    template <class F> RW_FN void each(int count, F f) const {
+#if RW_DEVICE
+        for (int i = int(threadIdx.x); i < count; i += int(blockDim.x)) f(i);
+        __syncthreads();
+#else
+        for (int i = 0; i < count; ++i) f(i);
+#endif
+    }
+};
 
 // The largest node of each brick, faces included.
 struct Bricks {
@@ -91,7 +111,7 @@ RW_FN void unit_of_grid(const SceneBox& box, const float grid[3], float unit[3])
 
 // FTLE at a unit point. Returns false in missing cells.
 RW_FN bool ftle_at(const FrameScene& scene, const March& march, const float (&unit)[3], float& ftle) {
-    if (march.missing_cells.missing) {
+    if (RW_HOLES && march.missing_cells.missing) {
         float grid[3], point[3];
         for (int k = 0; k < 3; ++k) grid[k] = unit[k] * float(scene.box.cells[k]);
         domain_point(scene.box, grid, point);
@@ -205,7 +225,8 @@ RW_FN float light_depth(const LightVolume& volume, float plane, const float (&co
     float f[2];
     RW_UNROLL
     for (int side = 0; side < 2; ++side) {
-        const float low = max_(min_(floor_(column[side]), volume.last[side]), -volume.last[side]);
+        // Rounding may put a column of a plain grid just outside.
+        const float low = max_(min_(floor_(column[side]), volume.last[side]), volume.margin ? -volume.last[side] : 0.0f);
         first[side] = int(low) + volume.margin;
         f[side] = column[side] - low;
     }
@@ -313,14 +334,21 @@ RW_FN void add_light(const FrameScene& scene, float ftle, const float radiance[3
     for (int k = 0; k < 3; ++k) sum.radiance[k] += scattered * colour[k] * radiance[k];
 }
 
-// Adds ray `ray` of a pixel.
-RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel, uint32_t ray, RaySum& sum) {
-    const float isotropic = 0.25f / 3.14159274f;
+// A camera ray and its quadrature points, at (i + offset) * step.
+struct Ray {
+    float origin[3], direction[3];  // grid coordinates
+    UnitLine line;
+    float step, offset;
+    int points;
+};
+
+// Ray `number` of a pixel, with steps of at most `longest` scene units. Returns false if it misses the box.
+RW_FN bool begin_ray(const FrameScene& scene, bool shifted, uint32_t pixel, uint32_t number, float longest, Ray& ray) {
     float offset[3];
-    for (int k = 0; k < 3; ++k) offset[k] = ray_offset(ray, k);
-    if (march.shifted) {
+    for (int k = 0; k < 3; ++k) offset[k] = ray_offset(number, k);
+    if (shifted) {
         // No path draws in this dimension.
-        const Words random = words(scene.random, pixel, ray, 0xFFFFFFFEu);
+        const Words random = words(scene.random, pixel, number, 0xFFFFFFFEu);
         for (int k = 0; k < 3; ++k) {
             const float moved = offset[k] + unit(random.w[k]);
             offset[k] = moved - floor_(moved);
@@ -331,66 +359,150 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
     const double y = 1.0 - ((double)row + (double)offset[1]) / (double)scene.height * 2.0;
     double eye[3], toward[3], enter, leave, entry[3];
     camera_ray(scene.camera, x, y, eye, toward);
-    if (!intersect(scene.box, eye, toward, enter, leave)) {
+    if (!intersect(scene.box, eye, toward, enter, leave)) return false;
+    for (int k = 0; k < 3; ++k) entry[k] = eye[k] + enter * toward[k];
+    grid_point(scene.box, entry, ray.origin);
+    grid_direction(scene.box, toward, ray.direction);
+    unit_of_grid(scene.box, ray.origin, ray.line.start);
+    unit_of_grid(scene.box, ray.direction, ray.line.along);
+    const float length = float(leave - enter), count = min_(max_(ceilf(length / longest), 1.0f), MOST_POINTS);
+    ray.step = length / count;
+    ray.points = int(count);
+    ray.offset = offset[2];
+    return true;
+}
+
+// Unattenuated radiance at distance `t` along a ray.
+RW_FN void light_along(const FrameScene& scene, const Ray& ray, float t, float radiance[3]) {
+    if (!RW_POINT_LIGHT || !scene.light.is_point) {
+        for (int k = 0; k < 3; ++k) radiance[k] = scene.light.radiance[k];
+        return;
+    }
+    float grid[3];
+    double from[3], unused[3], distance;
+    for (int k = 0; k < 3; ++k) grid[k] = ray.origin[k] + t * ray.direction[k];
+    scene_point(scene.box, grid, from);
+    light_seen_from(scene.light, from, unused, distance, radiance);
+}
+
+constexpr float ISOTROPIC = 0.25f / 3.14159274f;
+
+// What lies behind the marched points, of which `in_missing` of `passed` were in missing cells.
+RW_FN void add_behind(const FrameScene& scene, float transmittance, int in_missing, int passed, RaySum& sum) {
+    const float share = float(in_missing) / float(max_(passed, 1));
+    sum.missing += transmittance * share;
+    for (int k = 0; k < 3; ++k) sum.radiance[k] += transmittance * ((1.0f - share) * scene.background[k] + share * scene.missing[k]);
+}
+
+// Adds ray `number` of a pixel.
+RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, RaySum& sum) {
+    Ray ray;
+    if (!begin_ray(scene, march.shifted != 0, pixel, number, march.step, ray)) {
         for (int k = 0; k < 3; ++k) sum.radiance[k] += scene.background[k];
         return;
     }
-    for (int k = 0; k < 3; ++k) entry[k] = eye[k] + enter * toward[k];
-    float origin[3], direction[3];
-    grid_point(scene.box, entry, origin);
-    grid_direction(scene.box, toward, direction);
-    const float length = float(leave - enter), count = min_(max_(ceilf(length / march.step), 1.0f), MOST_POINTS), step = length / count;
-    const int points = int(count);
-    UnitLine line;
-    unit_of_grid(scene.box, origin, line.start);
-    unit_of_grid(scene.box, direction, line.along);
-    const LightLine lit = light_line(march.light, line);
-
-    float transmittance = 1.0f, radiance[3] = {scene.light.radiance[0], scene.light.radiance[1], scene.light.radiance[2]};
+    const LightLine lit = light_line(march.light, ray.line);
+    float transmittance = 1.0f;
     int i = 0, in_missing = 0;
-    while (i < points && transmittance >= OPAQUE) {
+    while (i < ray.points && transmittance >= OPAQUE) {
         // The points before `stop` share a brick. Neighbouring rays then look up bricks together.
-        int stop = points;
+        int stop = ray.points;
         if (march.bricks.usable) {
-            const float t = (float(i) + offset[2]) * step;
+            const float t = (float(i) + ray.offset) * ray.step;
             float at[3], exit;
-            for (int k = 0; k < 3; ++k) at[k] = line.start[k] + t * line.along[k];
-            const bool empty = in_empty_brick(scene, march, line, at, exit);
-            stop = max_(i + 1, int(min_(max_(ceilf(exit / step - offset[2]), 0.0f), count)));
+            for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
+            const bool empty = in_empty_brick(scene, march, ray.line, at, exit);
+            stop = max_(i + 1, int(min_(max_(ceilf(exit / ray.step - ray.offset), 0.0f), float(ray.points))));
             if (empty) {
                 i = stop;
                 continue;
             }
         }
         for (; i < stop && transmittance >= OPAQUE; ++i) {
-            const float t = (float(i) + offset[2]) * step;
+            const float t = (float(i) + ray.offset) * ray.step;
             float at[3], ftle;
-            for (int k = 0; k < 3; ++k) at[k] = line.start[k] + t * line.along[k];
+            for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
             if (!ftle_at(scene, march, at, ftle)) {
                 ++in_missing;
                 continue;
             }
             const float sigma = extinction(scene.transfer, ftle);
             if (sigma <= 0.0f) continue;
-            const float absorbed = 1.0f - expf(-sigma * step), weight = transmittance * absorbed;
-            if (scene.light.is_point) {
-                float grid[3];
-                double from[3], unused[3], distance;
-                for (int k = 0; k < 3; ++k) grid[k] = origin[k] + t * direction[k];
-                scene_point(scene.box, grid, from);
-                light_seen_from(scene.light, from, unused, distance, radiance);
-            }
+            const float absorbed = 1.0f - expf(-sigma * ray.step), weight = transmittance * absorbed;
             const float columns[2] = {lit.column[0][0] + t * lit.column[0][1], lit.column[1][0] + t * lit.column[1][1]};
             const float depth = light_depth(march.light, lit.plane[0] + t * lit.plane[1], columns);
-            add_light(scene, ftle, radiance, weight * isotropic * expf(-depth), sum);
+            float radiance[3];
+            light_along(scene, ray, t, radiance);
+            add_light(scene, ftle, radiance, weight * ISOTROPIC * expf(-depth), sum);
             sum.alpha += weight;
             sum.ftle += weight * ftle;
             transmittance *= 1.0f - absorbed;
         }
     }
-    const float share = float(in_missing) / float(max_(i, 1)), missing = transmittance * share;
-    sum.missing += missing;
-    for (int k = 0; k < 3; ++k) sum.radiance[k] += transmittance * ((1.0f - share) * scene.background[k] + share * scene.missing[k]);
+    add_behind(scene, transmittance, in_missing, i, sum);
+}
+
+constexpr int CHECK_POINTS = 1024;
+constexpr int CHECK_MEMORY = 4 * CHECK_POINTS + 3;
+
+// Radiance of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light marched with
+// steps of `shadow_step`, or from the light volume if that is 0.
+RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, float step,
+                     float shadow_step, float* radiance, float* memory) {
+    float* absorbed = memory;                         // negative in missing cells
+    float* scattered = memory + CHECK_POINTS;         // three planes
+    float* state = memory + 4 * CHECK_POINTS;         // transmittance, missing points, points
+    Ray ray;
+    const bool hit = begin_ray(scene, march.shifted != 0, pixel, number, step, ray);
+    block.each(1, [&](int) {
+        state[0] = 1.0f, state[1] = state[2] = 0.0f;
+        for (int k = 0; k < 3; ++k) radiance[k] = hit ? 0.0f : scene.background[k];
+    });
+    if (!hit) return;
+    for (int first = 0; first < ray.points && state[0] >= OPAQUE; first += CHECK_POINTS) {
+        const int count = min_(ray.points - first, CHECK_POINTS);
+        block.each(count, [&](int i) {
+            const float t = (float(first + i) + ray.offset) * ray.step;
+            float at[3], ftle;
+            RaySum sum = {{0.0f, 0.0f, 0.0f}, 0.0f, 0.0f, 0.0f};
+            for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
+            const bool known = ftle_at(scene, march, at, ftle);
+            const float sigma = known ? extinction(scene.transfer, ftle) : 0.0f;
+            absorbed[i] = known ? 1.0f - expf(-sigma * ray.step) : -1.0f;
+            if (sigma > 0.0f) {
+                float depth, plane, column[2], grid[3], arriving[3];
+                if (shadow_step > 0.0f) {
+                    for (int k = 0; k < 3; ++k) grid[k] = ray.origin[k] + t * ray.direction[k];
+                    depth = depth_to_light(scene, march, grid, shadow_step);
+                } else {
+                    light_place(march.light, at, plane, column);
+                    depth = light_depth(march.light, plane, column);
+                }
+                light_along(scene, ray, t, arriving);
+                add_light(scene, ftle, arriving, ISOTROPIC * expf(-depth), sum);
+            }
+            for (int k = 0; k < 3; ++k) scattered[k * CHECK_POINTS + i] = sum.radiance[k];
+        });
+        block.each(1, [&](int) {
+            float transmittance = state[0];
+            for (int i = 0; i < count && transmittance >= OPAQUE; ++i) {
+                state[2] += 1.0f;
+                if (absorbed[i] < 0.0f) {
+                    state[1] += 1.0f;
+                    continue;
+                }
+                const float weight = transmittance * absorbed[i];
+                for (int k = 0; k < 3; ++k) radiance[k] += weight * scattered[k * CHECK_POINTS + i];
+                transmittance *= 1.0f - absorbed[i];
+            }
+            state[0] = transmittance;
+        });
+    }
+    block.each(1, [&](int) {
+        RaySum sum = {{radiance[0], radiance[1], radiance[2]}, 0.0f, 0.0f, 0.0f};
+        add_behind(scene, state[0], int(state[1]), int(state[2]), sum);
+        for (int k = 0; k < 3; ++k) radiance[k] = sum.radiance[k];
+    });
 }
 
 // Adds this pass's rays of a pixel to its sums: RAY_FIELDS planes of `pixels` values. `fresh`: the sums begin with this pass.

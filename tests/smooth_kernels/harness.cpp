@@ -110,6 +110,17 @@ int main(int, char** arguments) {
             out.push_back(depth_to_light(marched.scene, marched.march, grid, step));
         }
         give(out);
+    } else if (request == "checks") {
+        Marched marched;
+        marched.march.shifted = take_one<int>();
+        const int n = take_one<int>();
+        std::vector<float> radiance(3 * n, NAN), memory(CHECK_MEMORY, NAN);
+        for (int i = 0; i < n; ++i) {
+            const auto which = take<uint32_t>(2);
+            const auto steps = take<float>(2);
+            check_ray(Block{}, marched.scene, marched.march, which[0], which[1], steps[0], steps[1], &radiance[3 * i], memory.data());
+        }
+        give(radiance);
     } else if (request == "combine") {
         Combine c = {};
         c.width = take_one<int>();

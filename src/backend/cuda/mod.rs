@@ -21,8 +21,11 @@ pub use layout::Outputs;
 pub use network::{
     CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
 };
+#[cfg(test)]
+pub(crate) use rendering::LightArgument;
 pub use rendering::{
-    Audits, CudaSamples, DeviceAnswers, DeviceLearns, DevicePredict, FrameQueries, GpuFrames, GpuRenderer, LookAhead, QueryRouter,
+    Audits, CombineInput, CudaSamples, DeviceAnswers, DeviceLearns, DeviceNodes, DevicePredict, FilmPlanes, FrameQueries, GpuCombine, GpuFrames,
+    GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, QueryRouter, RayCheck, TileErrors, TileSums,
     RoutedQueries, Timeline, TraceAll, keeps_label,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};

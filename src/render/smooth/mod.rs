@@ -5,11 +5,17 @@
 
 mod combine;
 mod coupled;
+#[cfg(all(test, feature = "cuda"))]
+mod host_parity;
 mod light_volume;
 mod march;
 mod nodes;
 mod picture;
 
+#[cfg(feature = "cuda")]
+pub(crate) use light_volume::{LightGrid, MARGIN};
+#[cfg(feature = "cuda")]
+pub(crate) use march::node_spacing;
 pub use march::IsMissing;
 pub use nodes::{BRICK, Nodes};
 pub use picture::{ErrorEstimate, Picture, PictureError, Refinement};
