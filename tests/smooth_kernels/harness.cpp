@@ -36,18 +36,27 @@ struct TakenCells {
     }
 };
 
-// Scene, nodes, missing cells and the layout of the light volume, as the host gives them; bricks and light volume as the kernels fill them.
-struct Marched {
-    FrameScene scene = take_one<FrameScene>();
-    std::vector<float> values, highest, depth;
-    TakenCells cells;
-    March march = {};
-    Marched() {
-        Table& table = march.nodes;
+// Nodes from the input, with their memory.
+struct TakenNodes {
+    Table table = {};
+    std::vector<float> values;
+    TakenNodes() {
         for (int& n : table.nodes) n = take_one<int>();
         table.dimensions = take_one<int>();
         values = take<float>(size_t(table.nodes[0]) * table.nodes[1] * table.nodes[2]);
         table.values = values.data();
+    }
+};
+
+// Scene, nodes, missing cells and the layout of the light volume, as the host gives them; bricks and light volume as the kernels fill them.
+struct Marched {
+    FrameScene scene = take_one<FrameScene>();
+    TakenNodes nodes;
+    TakenCells cells;
+    std::vector<float> highest, depth;
+    March march = {};
+    Marched() {
+        const Table& table = march.nodes = nodes.table;
         march.missing_cells = cells.cells;
         size_t bricks = 1;
         for (int k = 0; k < 3; ++k) {
