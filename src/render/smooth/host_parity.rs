@@ -62,11 +62,11 @@ fn uniform(stream: u32) -> impl FnMut() -> f32 {
     }
 }
 
-/// Structure with empty bricks on one side.
+/// Structure whose outer bricks along x and z, as the camera sees them first, are empty up to their last nodes.
 fn some_nodes(shape: [usize; 3]) -> Nodes {
     let value = |i: usize| {
-        let [x, y, z] = Nodes::unit(shape, i);
-        (9.0 * x + 2.0 * z).sin() * (7.0 * y).cos() + 0.4 * z - if x > 0.6 { 1.5 } else { 0.0 }
+        let ([x, y, z], empty) = (Nodes::unit(shape, i), i % shape[0] >= 24 || i / (shape[0] * shape[1]) >= 16);
+        (9.0 * x + 2.0 * z).sin() * (7.0 * y).cos() + 0.4 * z - if empty { 2.0 } else { 0.0 }
     };
     Nodes::new(shape, Arc::new((0..shape.iter().product()).map(value).collect()))
 }
@@ -282,6 +282,114 @@ fn checked_rays_agree() {
     }
 }
 
+/// Runs the kernels themselves on the device, in the cases without missing cells.
+#[test]
+#[ignore = "needs a GPU"]
+fn a_device_agrees() {
+    use crate::backend::cuda::{
+        CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, RayCheck,
+    };
+    let gpu = Gpu::open(0, &GpuSettings { poison: true, ..GpuSettings::default() }).unwrap();
+    let (laid, mut march, mut combine) =
+        (DeviceNodes::new(&gpu).unwrap(), GpuMarch::new(&gpu).unwrap(), GpuCombine::new(&gpu).unwrap());
+    for case in cases().iter().filter(|case| !case.holes) {
+        case.with(|renderer, nodes, with_medium| {
+            let (step, pixels) = (0.03, 37 * 23);
+            let table = crate::surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
+            let table = DeviceTable::upload(&gpu, &case.domain, &table).unwrap();
+            let parameters = renderer.frame_setup(3, 0..1).unwrap().parameters;
+            let grid = laid.grid(Some(&table)).unwrap();
+            let medium = DeviceMedium { parameters: &parameters, nodes: grid, missing_cells: None };
+            march.prepare(renderer, &medium, case.values, 1).unwrap();
+            march.march(&medium, step, 3, case.shifted).unwrap();
+            march.march(&medium, step, 2, case.shifted).unwrap();
+            assert_eq!(march.rays(), 5);
+            let checks: Vec<RayCheck> = (0..40)
+                .map(|i| RayCheck { pixel: i * 20 + 7, ray: i % 3, step: 0.02, shadow_step: if i % 2 == 0 { 0.0 } else { 0.03 } })
+                .collect();
+            let checked = march.check(&medium, &checks, case.shifted).unwrap();
+            // Without pairs the film is the marched picture.
+            let pairs = gpu.upload("pairs", &vec![0.0_f32; 15 * pixels]).unwrap();
+            let input =
+                CombineInput { size: [37, 23], pairs: &pairs, march: &march, how: None, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
+            let tiles = combine.combine(&input).unwrap();
+            assert!(tiles.len() == 6 && tiles.iter().all(|tile| tile.all.pixels == [0.0; 3]));
+            let film = combine.finish(8, 0.0, 0.0).unwrap();
+            with_medium(renderer, &mut |medium| {
+                let volume = LightVolume::new(medium, case.values, 1);
+                for pixel in 0..pixels {
+                    let mut sum = RaySum::default();
+                    (0..5).for_each(|j| sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(&volume), case.shifted)));
+                    let [r, g, b] = sum.radiance;
+                    for (found, expected) in film.rgba[pixel].iter().zip([r, g, b, sum.alpha]) {
+                        let near = (found - expected / 5.0).abs() <= 3e-4 * (1.0 + expected);
+                        assert!(near, "{}, pixel {pixel}: {found} and {}", case.name, expected / 5.0);
+                    }
+                }
+                for (check, found) in checks.iter().zip(&checked) {
+                    let light = if check.shadow_step > 0.0 { ToLight::March(check.shadow_step) } else { ToLight::Volume(&volume) };
+                    let expected = medium.ray(check.pixel, u64::from(check.ray), check.step, light, case.shifted).radiance;
+                    let near = (0..3).all(|k| (found[k] - expected[k]).abs() <= 3e-4 * (1.0 + expected[k]));
+                    assert!(near, "{}, {check:?}: {found:?} and {expected:?}", case.name);
+                }
+            });
+        });
+    }
+    // The combination, with all three corrections, of the last picture's rays.
+    let (width, height) = (150, 141);
+    let sums = some_pairs(width, height);
+    let planes = pair_planes(&sums);
+    let case = &cases()[0];
+    let nodes = some_nodes(case.shape);
+    let mut renderer = case.renderer();
+    let mut scene = renderer.scene().clone();
+    (scene.settings.width, scene.settings.height) = (width, height);
+    renderer.set_scene(scene).unwrap();
+    let table = crate::surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
+    let table = DeviceTable::upload(&gpu, &case.domain, &table).unwrap();
+    let parameters = renderer.frame_setup(3, 0..1).unwrap().parameters;
+    let medium = DeviceMedium { parameters: &parameters, nodes: laid.grid(Some(&table)).unwrap(), missing_cells: None };
+    march.prepare(&renderer, &medium, case.values, 1).unwrap();
+    march.march(&medium, 0.05, 2, false).unwrap();
+    let pairs = gpu.upload("pairs", &planes).unwrap();
+    let mut base = Vec::new();
+    for (how, correction) in [
+        (None, Correction::Left),
+        (Some(crate::render::Combine::Shrink), Correction::Shrunk),
+        (Some(crate::render::Combine::Sum), Correction::Summed),
+    ] {
+        combine.poison().unwrap();
+        let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
+        let tiles = combine.combine(&input).unwrap();
+        let measured: f64 = tiles.iter().map(|tile| f64::from(tile.all.squared[0][0])).sum();
+        let film = combine.finish(8, 1e-4, 0.0).unwrap();
+        if how.is_none() {
+            base = film.rgba.to_vec();
+        }
+        let combined = super::combine::combine(&sums, width, correction);
+        let mean: Vec<f32> = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect();
+        let expected: f64 = mean.iter().filter(|e| e.is_finite()).map(|e| f64::from(*e)).sum();
+        assert!((measured - expected).abs() <= 1e-3 * expected.abs() + 1e-2, "{correction:?}: {measured} and {expected}");
+        let errors = smoothed(&mean, width, 8);
+        for i in 0..width * height {
+            for k in 0..3 {
+                let (found, expected) = (film.rgba[i][k] - base[i][k], combined.correction[i][k]);
+                assert!((found - expected).abs() <= 1e-4, "{correction:?}, pixel {i}: {found} and {expected}");
+            }
+            let expected = errors[i].max(1e-4).sqrt();
+            assert!((film.error[i] - expected).abs() <= 1e-4 * (1.0 + expected), "{correction:?}, pixel {i}");
+        }
+    }
+}
+
+/// The planes of the sums over pairs.
+fn pair_planes(sums: &[PairSums]) -> Vec<f32> {
+    let mut planes: Vec<f32> = (0..12).flat_map(|plane| sums.iter().map(move |s| s.radiance[plane / 6][plane / 3 % 2][plane % 3])).collect();
+    planes.extend((0..2).flat_map(|q| sums.iter().map(move |s| s.pairs[q] as f32)));
+    planes.extend(sums.iter().map(|s| s.alpha));
+    planes
+}
+
 /// Sums over pairs of a picture with structure, noise, and pixels with one quarter or none.
 fn some_pairs(width: usize, height: usize) -> Vec<PairSums> {
     let mut random = uniform(21);
@@ -323,13 +431,7 @@ fn combined_pictures_agree() {
             input.extend(bytes(&[contrast, brightness, gamma, lit]));
             input.extend(bytes(&[1.0 / rays]));
             input.extend(bytes(&[floor, added]));
-            for plane in 0..12 {
-                input.extend(sums.iter().flat_map(|s| s.radiance[plane / 6][plane / 3 % 2][plane % 3].to_ne_bytes()));
-            }
-            for q in 0..2 {
-                input.extend(sums.iter().flat_map(|s| (s.pairs[q] as f32).to_ne_bytes()));
-            }
-            input.extend(sums.iter().flat_map(|s| s.alpha.to_ne_bytes()));
+            input.extend(bytes(&pair_planes(&sums)));
             for k in 0..6 {
                 input.extend(base.iter().flat_map(|b| b[k].to_ne_bytes()));
             }
