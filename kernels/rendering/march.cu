@@ -39,7 +39,7 @@ march_points(const __grid_constant__ FrameScene scene, const __grid_constant__ M
 }
 
 // Blocks of 16 x 16 pixels, warps of 8 x 4. `fresh`: 1 on the first pass since the restart.
-extern "C" __global__ void __launch_bounds__(256)
+extern "C" __global__ void __launch_bounds__(256, 4)
 march_pixels(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, double* __restrict__ sums, int fresh) {
     const uint32_t lane = threadIdx.x & 31u, warp = threadIdx.x / 32u;
     const uint32_t column = blockIdx.x * 16u + (warp % 2u) * 8u + lane % 8u, row = blockIdx.y * 16u + (warp / 2u) * 4u + lane / 8u;

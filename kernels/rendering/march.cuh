@@ -50,7 +50,7 @@ struct LightVolume {
     int margin;
     int reversed;     // 1: plane 0 is at the high end of its axis
     float shift[2];
-    float last[2];    // largest column at which an interpolation may begin
+    float last[2];    // largest column at which an interpolation may begin, below 2^22
     float step;       // directional: scene length from plane to plane; point: step of the quadrature
     int parts;        // directional: quadrature points from plane to plane
     int first[2];     // directional: first column that any plane stores, and their number
@@ -79,6 +79,19 @@ struct RaySum {
 };
 constexpr int RAY_FIELDS = 6;
 
+// Largest whole number that is not above x, as a float and as an index, for |x| < 2^22. Conversions run at an eighth of the rate of additions.
+RW_FN float floor_of(float x, int& index) {
+#if RW_DEVICE
+    const float shifted = __fadd_rd(x, 12582912.0f);  // 3 * 2^22, at which floats are 1 apart
+    index = __float_as_int(shifted) - 0x4b400000;
+    return shifted - 12582912.0f;
+#else
+    const float low = floor_(x);
+    index = int(low);
+    return low;
+#endif
+}
+
 // As `look_up`, with 32-bit indices: tables have fewer than 2^32 nodes.
 RW_FN float node_value(const Table& table, const float (&unit)[3]) {
     const uint32_t row = uint32_t(table.nodes[0]);
@@ -88,8 +101,9 @@ RW_FN float node_value(const Table& table, const float (&unit)[3]) {
     for (int k = 0; k < 3; ++k) {
         const int cells = table.nodes[k] - 1;
         const float position = min_(max_(unit[k], 0.0f), 1.0f) * float(cells);
-        cell[k] = min_(int(position), cells - 1);
-        f[k] = position - float(cell[k]);
+        int low;
+        f[k] = position - min_(floor_of(position, low), float(cells - 1));
+        cell[k] = min_(low, cells - 1);
     }
     const bool flat = table.dimensions == 2;
     const uint32_t at = ((flat ? 0u : uint32_t(cell[2]) * uint32_t(table.nodes[1])) + uint32_t(cell[1])) * row + uint32_t(cell[0]);
@@ -150,10 +164,11 @@ RW_FN float highest_node(const Table& nodes, const Bricks& bricks, uint32_t bric
     return highest;
 }
 
-// A line in unit coordinates: start + t along.
+// A line in unit coordinates: start + t along. `inverse`: 1 / along.
 struct UnitLine {
     float start[3];
     float along[3];
+    float inverse[3];
 };
 
 // Returns true if the transfer function shows nothing of the brick around a unit point. `exit`: t at which the line leaves this brick.
@@ -165,13 +180,15 @@ RW_FN bool in_empty_brick(const FrameScene& scene, const March& march, const Uni
         const int cells = march.nodes.nodes[k] - 1;
         // A flow without z has one layer of bricks, and no walls across z.
         if (cells > 0) {
-            const int brick = min_(int(min_(max_(unit[k], 0.0f), 1.0f) * float(cells)), cells - 1) / BRICK;
+            int cell;
+            floor_of(min_(max_(unit[k], 0.0f), 1.0f) * float(cells), cell);
+            const int brick = int(uint32_t(min_(cell, cells - 1)) / uint32_t(BRICK));
             index += brick * stride;
             // The outermost bricks have no outer walls, so that rounding cannot leave the grid.
             const bool ahead = line.along[k] > 0.0f;
             const bool walled = line.along[k] != 0.0f && (ahead ? brick < march.bricks.count[k] - 1 : brick > 0);
-            const float wall = float((brick + (ahead ? 1 : 0)) * BRICK) / float(cells);
-            if (walled) exit = min_(exit, (wall - line.start[k]) / line.along[k]);
+            const float wall = float((brick + (ahead ? 1 : 0)) * BRICK) * (1.0f / float(cells));
+            if (walled) exit = min_(exit, (wall - line.start[k]) * line.inverse[k]);
         }
         stride *= march.bricks.count[k];
     }
@@ -179,7 +196,11 @@ RW_FN bool in_empty_brick(const FrameScene& scene, const March& march, const Uni
 }
 
 // Column offset of a plane: its stored columns begin at first column - margin - offset.
-RW_FN int plane_offset(const LightVolume& volume, int side, int plane) { return int(floor_(float(plane) * volume.shift[side])); }
+RW_FN int plane_offset(const LightVolume& volume, int side, float plane) {
+    int offset;
+    floor_of(plane * volume.shift[side], offset);
+    return offset;
+}
 
 // Plane coordinate and columns along a line: values at t = 0 and their change with t.
 struct LightLine {
@@ -220,28 +241,30 @@ RW_FN LightLine light_line(const LightVolume& volume, const UnitLine& line) {
 // Optical depth to the light at a plane coordinate and columns.
 RW_FN float light_depth(const LightVolume& volume, float plane, const float (&column)[2]) {
     const int planes = volume.nodes[volume.axes[0]];
-    const int near = max_(min_(int(floor_(plane)), planes - 2), 0);
-    int first[2];
+    int near, first[2];
     float f[2];
+    const float near_plane = max_(min_(floor_of(plane, near), float(planes - 2)), 0.0f);
+    near = max_(min_(near, planes - 2), 0);
     RW_UNROLL
     for (int side = 0; side < 2; ++side) {
         // Rounding may put a column of a plain grid just outside.
-        const float low = max_(min_(floor_(column[side]), volume.last[side]), volume.margin ? -volume.last[side] : 0.0f);
-        first[side] = int(low) + volume.margin;
+        const float least = volume.margin ? -volume.last[side] : 0.0f, most = volume.last[side];
+        const float low = floor_of(max_(min_(column[side], most), least), first[side]);
+        first[side] += volume.margin;
         f[side] = column[side] - low;
     }
-    auto at = [&](int i) {
+    auto at = [&](int i, float i_plane) {
         // The clamp guards against rounding at the outermost columns.
-        const int b = max_(min_(first[0] + plane_offset(volume, 0, i), volume.width[0] - 2), 0);
-        const int c = max_(min_(first[1] + plane_offset(volume, 1, i), volume.width[1] - 2), 0);
-        const float* low = volume.depth + (uint32_t(i) * uint32_t(volume.width[1]) + uint32_t(c)) * uint32_t(volume.width[0]) + uint32_t(b);
-        const float* high = low + volume.width[0];
+        const int b = max_(min_(first[0] + plane_offset(volume, 0, i_plane), volume.width[0] - 2), 0);
+        const int c = max_(min_(first[1] + plane_offset(volume, 1, i_plane), volume.width[1] - 2), 0);
+        const uint32_t start = (uint32_t(i) * uint32_t(volume.width[1]) + uint32_t(c)) * uint32_t(volume.width[0]) + uint32_t(b);
+        const float *low = volume.depth + start, *high = low + volume.width[0];
         const float p = load(low), q = load(low + 1), r = load(high), s = load(high + 1);
         const float one = fma_(q - p, f[0], p), two = fma_(s - r, f[0], r);
         return fma_(two - one, f[1], one);
     };
-    const float nearer = at(near);
-    return fma_(at(near + 1) - nearer, plane - float(near), nearer);
+    const float nearer = at(near, near_plane);
+    return fma_(at(near + 1, near_plane + 1.0f) - nearer, plane - near_plane, nearer);
 }
 
 // Sums the depth along column (v, w) of a directional light and stores it plane by plane.
@@ -249,11 +272,15 @@ RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w
     const LightVolume& volume = march.light;
     const int column[2] = {v, w}, planes = volume.nodes[volume.axes[0]];
     const float last = float(planes - 1), part = volume.step / float(volume.parts);
+    const float per_plane = 1.0f / last, per_part = 1.0f / float(volume.parts);
+    float cells_of[2], per_cell[2];
     // Planes between which the column may be in the box, with a plane to spare for rounding.
     float enter = 0.0f, leave = last;
     RW_UNROLL
     for (int side = 0; side < 2; ++side) {
         const float shift = volume.shift[side], cells = float(volume.nodes[volume.axes[1 + side]] - 1), begin = float(column[side]);
+        cells_of[side] = cells;
+        per_cell[side] = 1.0f / cells;
         const float to_low = -begin / shift, to_high = (cells - begin) / shift;
         if (shift == 0.0f) leave = begin < 0.0f || begin > cells ? -1.0f : leave;
         else enter = max_(enter, min_(to_low, to_high) - 1.0f), leave = min_(leave, max_(to_low, to_high) + 1.0f);
@@ -262,15 +289,15 @@ RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w
     for (int plane = 0; plane < planes; ++plane) {
         if (plane > 0 && float(plane) >= enter && float(plane - 1) <= leave) {
             for (int m = 0; m < volume.parts; ++m) {
-                const float x = float(plane - 1) + (float(m) + 0.5f) / float(volume.parts);
-                const float across = (volume.reversed ? last - x : x) / last;
+                const float x = float(plane - 1) + (float(m) + 0.5f) * per_part;
+                const float across = (volume.reversed ? last - x : x) * per_plane;
                 float lateral[2];
                 bool inside = true;
                 RW_UNROLL
                 for (int side = 0; side < 2; ++side) {
-                    const float cells = float(volume.nodes[volume.axes[1 + side]] - 1), place = float(column[side]) + x * volume.shift[side];
-                    inside = inside && place >= 0.0f && place <= cells;
-                    lateral[side] = place / cells;
+                    const float place = float(column[side]) + x * volume.shift[side];
+                    inside = inside && place >= 0.0f && place <= cells_of[side];
+                    lateral[side] = place * per_cell[side];
                 }
                 if (!inside) continue;
                 float unit[3];
@@ -279,7 +306,7 @@ RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w
                 depth += extinction_at(scene, march, unit) * part;
             }
         }
-        const int b = v + volume.margin + plane_offset(volume, 0, plane), c = w + volume.margin + plane_offset(volume, 1, plane);
+        const int b = v + volume.margin + plane_offset(volume, 0, float(plane)), c = w + volume.margin + plane_offset(volume, 1, float(plane));
         if (b >= 0 && b < volume.width[0] && c >= 0 && c < volume.width[1]) {
             volume.depth[(size_t(plane) * volume.width[1] + c) * volume.width[0] + b] = depth;
         }
@@ -338,7 +365,7 @@ RW_FN void add_light(const FrameScene& scene, float ftle, const float radiance[3
 struct Ray {
     float origin[3], direction[3];  // grid coordinates
     UnitLine line;
-    float step, offset;
+    float step, per_step, offset;
     int points;
 };
 
@@ -365,8 +392,10 @@ RW_FN bool begin_ray(const FrameScene& scene, bool shifted, uint32_t pixel, uint
     grid_direction(scene.box, toward, ray.direction);
     unit_of_grid(scene.box, ray.origin, ray.line.start);
     unit_of_grid(scene.box, ray.direction, ray.line.along);
+    for (int k = 0; k < 3; ++k) ray.line.inverse[k] = 1.0f / ray.line.along[k];
     const float length = float(leave - enter), count = min_(max_(ceilf(length / longest), 1.0f), MOST_POINTS);
     ray.step = length / count;
+    ray.per_step = 1.0f / ray.step;
     ray.points = int(count);
     ray.offset = offset[2];
     return true;
@@ -412,7 +441,7 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
             float at[3], exit;
             for (int k = 0; k < 3; ++k) at[k] = ray.line.start[k] + t * ray.line.along[k];
             const bool empty = in_empty_brick(scene, march, ray.line, at, exit);
-            stop = max_(i + 1, int(min_(max_(ceilf(exit / ray.step - ray.offset), 0.0f), float(ray.points))));
+            stop = max_(i + 1, int(min_(max_(ceilf(exit * ray.per_step - ray.offset), 0.0f), float(ray.points))));
             if (empty) {
                 i = stop;
                 continue;

@@ -76,7 +76,7 @@ impl LightArgument {
             reversed: i32::from(shear.from_above),
             shift: shear.slope,
             // Any column may begin an interpolation; the bound keeps the conversion to integers defined.
-            last: [1e9; 2],
+            last: [1e6; 2],
             step: shear.length,
             first: columns.each_ref().map(|columns| *columns.start()),
             columns: columns.each_ref().map(|columns| columns.end() - columns.start() + 1),
