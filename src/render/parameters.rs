@@ -54,9 +54,9 @@ impl FrameParameters {
         unsafe { std::slice::from_raw_parts(std::ptr::from_ref(self).cast(), size_of::<Self>()) }
     }
 
-    /// Pixels along x.
-    pub fn width(&self) -> u32 {
-        self.width
+    /// Pixels across and down.
+    pub fn size(&self) -> [usize; 2] {
+        [self.width as usize, self.height as usize]
     }
 
     /// Number of pixels.

@@ -6,6 +6,8 @@ use super::majorant::{CellObservations, MajorantGrid};
 use super::parameters::FrameParameters;
 use super::rng::FrameRandom;
 use super::smooth::{CoupledPath, IsMissing, Nodes, Picture, PictureError, Refinement, coupled_paths};
+#[cfg(feature = "cuda")]
+use super::smooth::{LightGrid, node_spacing};
 use super::space::{SceneBox, length};
 use super::tracking::FrameScene;
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
@@ -192,7 +194,7 @@ impl Renderer {
     }
 
     /// The scene of a frame, with the current majorants.
-    fn frame_scene(&self, frame: u64) -> FrameScene<'_> {
+    pub(super) fn frame_scene(&self, frame: u64) -> FrameScene<'_> {
         let settings = &self.scene.settings;
         FrameScene {
             camera: &self.camera,
@@ -257,6 +259,18 @@ impl Renderer {
             majorants: self.majorants.majorants(),
             may_be_missing: self.majorants.may_be_missing_all(),
         })
+    }
+
+    /// Where the light volume of a surrogate with `shape` nodes lies, with at most about `max_values` values.
+    #[cfg(feature = "cuda")]
+    pub(crate) fn light_grid(&self, shape: [usize; 3], max_values: usize, refine: usize) -> LightGrid {
+        LightGrid::new(self.space.edges(), shape, &self.light, max_values, refine)
+    }
+
+    /// Smallest distance between nodes of a surrogate, in scene units.
+    #[cfg(feature = "cuda")]
+    pub fn node_spacing(&self, shape: [usize; 3]) -> f64 {
+        node_spacing(self.space.edges(), shape)
     }
 
     /// Adds the observations of a device that tracked a frame; they take effect in the next. Returns false if they belong to another grid.

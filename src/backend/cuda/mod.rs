@@ -21,9 +21,12 @@ pub use layout::Outputs;
 pub use network::{
     CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
 };
+#[cfg(test)]
+pub(crate) use rendering::LightArgument;
 pub use rendering::{
-    Audits, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries,
-    GpuFrames, GpuRenderer, LookAhead, PairTiles, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll, bayer_rank,
+    Audits, CombineInput, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DeviceNodes, DevicePredict,
+    DeviceQueryRouter, FilmPlanes, FrameQueries, GpuCombine, GpuFrames, GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, PairTiles,
+    RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, TileErrors, TileSums, Timeline, TraceAll, bayer_rank,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};

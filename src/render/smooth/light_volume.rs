@@ -4,38 +4,51 @@
 //! light, so that it is exact along the light up to quadrature, and interpolation acts across the rays only. For a point light each node of a
 //! plain grid is marched by itself.
 
-use super::march::Medium;
+use super::march::{Medium, node_spacing};
 use crate::render::Light;
 use rayon::prelude::*;
+use std::ops::RangeInclusive;
 
 /// Optical depth to the light at any point of the box.
 #[derive(Debug, Clone)]
 pub(crate) struct LightVolume {
+    grid: LightGrid,
     /// Grid positions along x, y, z are unit coordinates times `cells`.
     cells: [f32; 3],
-    /// `Some` for a directional light.
-    shear: Option<Shear>,
-    /// Stored values along the first lateral axis, the second, and the planes.
-    size: [usize; 3],
     depth: Vec<f32>,
+}
+
+/// Where the values of a light volume lie.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct LightGrid {
+    /// Nodes along x, y, z.
+    pub(crate) nodes: [usize; 3],
+    /// `Some` for a directional light.
+    pub(crate) shear: Option<Shear>,
+    /// Stored values along the first lateral axis, the second, and the planes; x, y, z for a point light.
+    pub(crate) size: [usize; 3],
+    /// Quadrature points from plane to plane.
+    pub(crate) samples: usize,
+    /// Step of the quadrature to a point light, scene units.
+    pub(crate) step: f32,
 }
 
 /// Axes and slopes of the columns.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Shear {
+pub(crate) struct Shear {
     /// Axis across the planes, and the two others.
-    major: usize,
-    lateral: [usize; 2],
+    pub(crate) major: usize,
+    pub(crate) lateral: [usize; 2],
     /// True if the light is on the high side of the major axis.
-    from_above: bool,
+    pub(crate) from_above: bool,
     /// Lateral shift per plane, walking away from the light.
-    slope: [f32; 2],
+    pub(crate) slope: [f32; 2],
     /// Scene length along the light per plane.
-    length: f32,
+    pub(crate) length: f32,
 }
 
 /// Stored columns beyond the box on either side.
-const MARGIN: i32 = 2;
+pub(crate) const MARGIN: i32 = 2;
 
 impl Shear {
     fn offset(&self, lateral: usize, plane: usize) -> i32 {
@@ -43,16 +56,12 @@ impl Shear {
     }
 }
 
-impl LightVolume {
-    /// Tabulates the depth at distances that are those of the nodes divided by `refine`, or larger ones if there would be more than about
-    /// `max_values` values.
-    pub(super) fn new(medium: &Medium<'_>, max_values: usize, refine: usize) -> Self {
-        let space = medium.scene.space;
-        let edges = space.edges();
-        let shape = medium.nodes.shape();
-        let spacing = medium.spacing();
-        // Quarters of the distance between nodes, from the finest on.
-        let quarters = (1..=256_usize).map(|i| (4 * i).div_ceil(refine.max(1)).max(1));
+impl LightGrid {
+    /// The finest grid over a box with these edges (scene units) and a surrogate of `shape` nodes that has at most about `max_values` values.
+    /// The distance between its values is that of the nodes divided by `refine`, if the limit allows.
+    pub(crate) fn new(edges: [f64; 3], shape: [usize; 3], light: &Light, max_values: usize, refine: usize) -> Self {
+        let spacing = node_spacing(edges, shape);
+        // Quarters of the distance between nodes, from the finest that is asked for.
         let grid_of = |quarter: usize| -> [usize; 3] {
             std::array::from_fn(|k| {
                 if shape[k] > 1 {
@@ -63,32 +72,15 @@ impl LightVolume {
             })
         };
         let fits = |quarter: &usize| grid_of(*quarter).iter().map(|n| n + 4).product::<usize>() <= max_values;
-        let quarter = quarters.clone().find(fits).unwrap_or(1024);
-        let grid = grid_of(quarter);
-        let cells = grid.map(|n| (n - 1) as f32);
-        // Two quadrature points in the distance of two nodes at least, more if `refine` asks for them.
-        let samples = (quarter * refine).div_ceil(4).max(1) * 2;
-        match medium.scene.light {
-            Light::Directional { toward, .. } => {
-                let delta: [f64; 3] = std::array::from_fn(|k| toward[k] / edges[k] * f64::from(cells[k]));
-                Self::sheared(medium, grid, delta, samples)
-            }
-            Light::Point { .. } => {
-                let step = (spacing * quarter as f64 / 4.0) as f32;
-                let depth = (0..grid.iter().product::<usize>())
-                    .into_par_iter()
-                    .map(|i| {
-                        let node = [i % grid[0], i / grid[0] % grid[1], i / (grid[0] * grid[1])];
-                        let unit = std::array::from_fn(|k| node[k] as f32 / cells[k]);
-                        medium.depth_to_light(space.grid_of_unit(unit), step / samples as f32)
-                    })
-                    .collect();
-                Self { cells, shear: None, size: grid, depth }
-            }
-        }
-    }
-
-    fn sheared(medium: &Medium<'_>, grid: [usize; 3], delta: [f64; 3], samples: usize) -> Self {
+        let quarter = (1..=256_usize).map(|i| (4 * i).div_ceil(refine.max(1))).find(fits).unwrap_or(1024);
+        let nodes = grid_of(quarter);
+        // Two quadrature points in the distance of two nodes at least.
+        let samples = 2 * (quarter * refine).div_ceil(4);
+        let step = (spacing * quarter as f64 / 4.0) as f32 / samples as f32;
+        let Light::Directional { toward, .. } = light else {
+            return Self { nodes, shear: None, size: nodes, samples, step };
+        };
+        let delta: [f64; 3] = std::array::from_fn(|k| toward[k] / edges[k] * (nodes[k] - 1) as f64);
         let major = (0..3).fold(0, |best, k| if delta[k].abs() > delta[best].abs() { k } else { best });
         let lateral = [usize::from(major == 0), if major == 2 { 1 } else { 2 }];
         let shear = Shear {
@@ -98,14 +90,47 @@ impl LightVolume {
             slope: lateral.map(|k| (-delta[k] / delta[major].abs()) as f32),
             length: (1.0 / delta[major].abs()) as f32,
         };
-        let cells = grid.map(|n| (n - 1) as f32);
-        let planes = grid[major];
-        let size = [grid[lateral[0]] + 2 * MARGIN as usize, grid[lateral[1]] + 2 * MARGIN as usize, planes];
-        let columns = |side: usize| {
-            let ends = [shear.offset(side, 0), shear.offset(side, planes - 1)];
-            -MARGIN - ends[0].max(ends[1])..=size[side] as i32 - 1 - MARGIN - ends[0].min(ends[1])
+        let size = [nodes[lateral[0]] + 2 * MARGIN as usize, nodes[lateral[1]] + 2 * MARGIN as usize, nodes[major]];
+        Self { nodes, shear: Some(shear), size, samples, step }
+    }
+
+    /// Number of stored values.
+    pub(crate) fn values(&self) -> usize {
+        self.size.iter().product()
+    }
+
+    /// Numbers of the columns along a lateral axis that any plane stores.
+    pub(crate) fn columns(&self, shear: &Shear, side: usize) -> RangeInclusive<i32> {
+        let ends = [shear.offset(side, 0), shear.offset(side, self.size[2] - 1)];
+        -MARGIN - ends[0].max(ends[1])..=self.size[side] as i32 - 1 - MARGIN - ends[0].min(ends[1])
+    }
+}
+
+impl LightVolume {
+    /// Tabulates the depth on the grid of [`LightGrid::new`].
+    pub(super) fn new(medium: &Medium<'_>, max_values: usize, refine: usize) -> Self {
+        let space = medium.scene.space;
+        let grid = LightGrid::new(space.edges(), medium.nodes.shape(), medium.scene.light, max_values, refine);
+        let cells = grid.nodes.map(|n| (n - 1) as f32);
+        let depth = match grid.shear {
+            Some(shear) => Self::sheared(medium, &grid, &shear),
+            None => (0..grid.values())
+                .into_par_iter()
+                .map(|i| {
+                    let [nx, ny, _] = grid.nodes;
+                    let node = [i % nx, i / nx % ny, i / (nx * ny)];
+                    let unit = std::array::from_fn(|k| node[k] as f32 / cells[k]);
+                    medium.depth_to_light(space.grid_of_unit(unit), grid.step)
+                })
+                .collect(),
         };
-        let (across, down) = (columns(0), columns(1));
+        Self { grid, cells, depth }
+    }
+
+    fn sheared(medium: &Medium<'_>, grid: &LightGrid, shear: &Shear) -> Vec<f32> {
+        let cells = grid.nodes.map(|n| (n - 1) as f32);
+        let (size, planes, samples) = (grid.size, grid.size[2], grid.samples);
+        let (across, down) = (grid.columns(shear, 0), grid.columns(shear, 1));
         let width = (across.end() - across.start() + 1) as usize;
         let starts: Vec<[i32; 2]> = down.flat_map(|w| across.clone().map(move |v| [v, w])).collect();
         let sums: Vec<f32> = starts
@@ -117,7 +142,7 @@ impl LightVolume {
                     if plane > 0 {
                         for m in 0..samples {
                             let x = (plane - 1) as f32 + (m as f32 + 0.5) / samples as f32;
-                            depth += Self::extinction_at(medium, &shear, &cells, *start, x) * (shear.length / samples as f32);
+                            depth += Self::extinction_at(medium, shear, &cells, *start, x) * (shear.length / samples as f32);
                         }
                     }
                     depth
@@ -125,7 +150,7 @@ impl LightVolume {
             })
             .collect();
         // From one run of planes per column to the planes' own arrays.
-        let mut depth = vec![0.0; size.iter().product()];
+        let mut depth = vec![0.0; grid.values()];
         let first = starts[0];
         depth.par_chunks_mut(size[0]).enumerate().for_each(|(row, values)| {
             let (plane, c) = (row / size[1], row % size[1]);
@@ -135,7 +160,7 @@ impl LightVolume {
                 *value = sums[(w as usize * width + v as usize) * planes + plane];
             }
         });
-        Self { cells, shear: Some(shear), size, depth }
+        depth
     }
 
     /// Extinction on a column at plane coordinate `x`; 0 outside of the box.
@@ -158,26 +183,27 @@ impl LightVolume {
         let place: [f32; 3] = std::array::from_fn(|k| unit[k].clamp(0.0, 1.0) * self.cells[k]);
         let lower = |x: f32, n: usize| (x.floor() as usize).min(n - 2);
         let between = |a: f32, b: f32, f: f32| (b - a).mul_add(f, a);
-        let Some(shear) = &self.shear else {
-            let cell: [usize; 3] = std::array::from_fn(|k| lower(place[k], self.size[k]));
+        let size = self.grid.size;
+        let Some(shear) = &self.grid.shear else {
+            let cell: [usize; 3] = std::array::from_fn(|k| lower(place[k], size[k]));
             let f: [f32; 3] = std::array::from_fn(|k| place[k] - cell[k] as f32);
-            let value =
-                |x: usize, y: usize, z: usize| self.depth[((cell[2] + z) * self.size[1] + cell[1] + y) * self.size[0] + cell[0] + x];
+            let value = |x: usize, y: usize, z: usize| self.depth[((cell[2] + z) * size[1] + cell[1] + y) * size[0] + cell[0] + x];
             let plane = |z| between(between(value(0, 0, z), value(1, 0, z), f[0]), between(value(0, 1, z), value(1, 1, z), f[0]), f[1]);
             return between(plane(0), plane(1), f[2]);
         };
         let x = if shear.from_above { self.cells[shear.major] - place[shear.major] } else { place[shear.major] };
         let column: [f32; 2] = std::array::from_fn(|side| place[shear.lateral[side]] - x * shear.slope[side]);
-        let plane = lower(x, self.size[2]);
+        let plane = lower(x, size[2]);
         let first = column.map(f32::floor);
         let f: [f32; 2] = std::array::from_fn(|side| column[side] - first[side]);
         let at = |plane: usize| {
             // The clamp guards against rounding at the outermost columns.
-            let index =
-                |side: usize| (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, self.size[side] as i32 - 2) as usize;
-            let start = (plane * self.size[1] + index(1)) * self.size[0] + index(0);
-            let near = &self.depth[start..start + self.size[0] + 2];
-            let row = self.size[0];
+            let index = |side: usize| {
+                (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, size[side] as i32 - 2) as usize
+            };
+            let start = (plane * size[1] + index(1)) * size[0] + index(0);
+            let near = &self.depth[start..start + size[0] + 2];
+            let row = size[0];
             between(between(near[0], near[1], f[0]), between(near[row], near[row + 1], f[0]), f[1])
         };
         between(at(plane), at(plane + 1), x - plane as f32)

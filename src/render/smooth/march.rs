@@ -62,11 +62,15 @@ fn offsets(j: u64) -> [f32; 3] {
     [x, y, 0.5]
 }
 
+/// Smallest distance between nodes, in scene units.
+pub(crate) fn node_spacing(edges: [f64; 3], shape: [usize; 3]) -> f64 {
+    (0..3).filter(|&k| shape[k] > 1).map(|k| edges[k] / (shape[k] - 1) as f64).fold(f64::INFINITY, f64::min)
+}
+
 impl Medium<'_> {
     /// Smallest distance between nodes, in scene units.
     pub(super) fn spacing(&self) -> f64 {
-        let (edges, shape) = (self.scene.space.edges(), self.nodes.shape());
-        (0..3).filter(|&k| shape[k] > 1).map(|k| edges[k] / (shape[k] - 1) as f64).fold(f64::INFINITY, f64::min)
+        node_spacing(self.scene.space.edges(), self.nodes.shape())
     }
 
     /// FTLE of the surrogate at a point in unit coordinates; `None` in missing cells.

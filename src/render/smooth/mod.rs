@@ -5,6 +5,8 @@
 
 mod combine;
 mod coupled;
+#[cfg(all(test, feature = "cuda"))]
+mod host_parity;
 mod light_volume;
 mod march;
 mod nodes;
@@ -12,6 +14,10 @@ mod picture;
 
 pub use coupled::CoupledPath;
 pub(in crate::render) use coupled::coupled_paths;
+#[cfg(feature = "cuda")]
+pub(crate) use light_volume::{LightGrid, MARGIN};
+#[cfg(feature = "cuda")]
+pub(crate) use march::node_spacing;
 pub use march::IsMissing;
 pub use nodes::{BRICK, Nodes};
 pub use picture::{ErrorEstimate, Picture, PictureError, Refinement};

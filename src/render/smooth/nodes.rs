@@ -51,6 +51,12 @@ impl Nodes {
         &self.values
     }
 
+    /// Largest value at the nodes of each brick, x fastest.
+    #[cfg(all(test, feature = "cuda"))]
+    pub(super) fn brick_max(&self) -> &[f32] {
+        &self.brick_max
+    }
+
     /// Unit coordinates of a node. A flow without z is asked in the middle of its slab.
     pub fn unit(shape: [usize; 3], index: usize) -> [f32; 3] {
         let node = [index % shape[0], index / shape[0] % shape[1], index / (shape[0] * shape[1])];

@@ -561,7 +561,7 @@ impl Memory {
                 sums,
                 found: self.at(l.found),
                 traced: self.at(l.traced),
-                width: parameters.width(),
+                width: parameters.size()[0] as u32,
                 pixels: parameters.pixels() as u32,
                 entries: entries as u32,
                 first: 0,

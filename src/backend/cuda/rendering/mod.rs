@@ -1,16 +1,22 @@
 //! Frames on the GPU: wavefront path tracing, query routing, labels and audits.
 
 mod audit;
+mod combine;
 mod coupled;
 mod frames;
 mod labels;
+mod march;
 mod memory;
 mod renderer;
 mod router;
 
 pub use audit::Audits;
+pub use combine::{CombineInput, FilmPlanes, GpuCombine, TileErrors, TileSums};
 pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes, bayer_rank};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
+#[cfg(test)]
+pub(crate) use march::LightArgument;
+pub use march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 pub use renderer::{GpuRenderer, LookAhead, Timeline};
 pub use router::{DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries, RoutedQueries, TraceAll};

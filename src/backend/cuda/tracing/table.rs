@@ -139,6 +139,11 @@ impl DeviceTable {
     pub fn address(&self) -> u64 {
         self.values.address()
     }
+    /// Kernel argument, the struct `Table` of `table.cuh`.
+    pub(in crate::backend::cuda) fn argument(&self) -> TableArgument {
+        let TableFrame { nodes, dimensions, .. } = self.frame;
+        TableArgument { nodes, dimensions, values: self.values.address() }
+    }
     /// Reads the values back, while later work continues on the device.
     ///
     /// # Errors
@@ -153,8 +158,7 @@ impl DevicePredict for DeviceTable {
         if count == 0 {
             return Ok(());
         }
-        let TableFrame { nodes, dimensions, .. } = self.frame;
-        let (table, n) = (TableArgument { nodes, dimensions, values: self.values.address() }, count as u32);
+        let (table, n) = (self.argument(), count as u32);
         let stream = self.gpu.work();
         let mut call = stream.launch_builder(&self.lookup);
         call.arg(&table).arg(&points).arg(&n).arg(&out);

@@ -1,0 +1,56 @@
+// Combines the marched picture with the correction. For each half: per level combine_rows, combine_columns, combine_box (energies) and
+// combine_gains; combine_last stands in for the first two on the last level. Then combine_tiles, and, once the host has the tiles' sums,
+// combine_box (squared errors) and combine_errors.
+#include "rendering/combine.cuh"
+
+using namespace rw;
+
+// Blocks of 32 x 8 pixels. rows: 8 planes, those of `fine` filtered along rows.
+extern "C" __global__ void __launch_bounds__(256)
+combine_rows(const Quarters fine, float* __restrict__ rows, int width, int height, int spacing) {
+    const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
+    if (x >= width || y >= height) return;
+    const size_t pixels = size_t(width) * height, at = size_t(y) * width + x;
+    RW_UNROLL
+    for (int k = 0; k < 8; ++k) rows[k * pixels + at] = b3(fine.planes[k / 4][k % 4], width, height, x, y, spacing, true);
+}
+
+// Blocks of 32 x 8 pixels.
+extern "C" __global__ void __launch_bounds__(256)
+combine_columns(const Quarters fine, const float* __restrict__ rows, float* coarse, const Level level, int spacing) {
+    const int x = int(blockIdx.x * 32u + (threadIdx.x & 31u)), y = int(blockIdx.y * 8u + threadIdx.x / 32u);
+    if (x < level.width && y < level.height) split_level(fine, rows, coarse, level, x, y, spacing);
+}
+
+extern "C" __global__ void __launch_bounds__(256) combine_last(const Quarters coarse, const Level level) {
+    const int at = int(blockIdx.x * 256u + threadIdx.x);
+    if (at < level.width * level.height) last_level(coarse, level, at);
+}
+
+// Sums along rows of the planes 0 and 1. Blocks of BOX_ROW pixels; grid: along the row, rows, planes.
+extern "C" __global__ void __launch_bounds__(256)
+combine_box(const float* __restrict__ from, float* __restrict__ to, int width, int height, int radius) {
+    __shared__ float memory[BOX_ROW_MEMORY];
+    const size_t plane = size_t(blockIdx.z) * width * height;
+    box_row(Block{}, from + plane, to + plane, width, int(blockIdx.x) * BOX_ROW, int(blockIdx.y), radius, memory);
+}
+
+// Blocks of BOX_LINES x BOX_COLUMN pixels.
+extern "C" __global__ void __launch_bounds__(256)
+combine_gains(const Level level, const float* __restrict__ sums, int radius, float* __restrict__ half, int fresh) {
+    __shared__ float memory[BOX_COLUMN_MEMORY];
+    add_level(Block{}, level, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, half, fresh != 0, memory);
+}
+
+// A block a tile.
+extern "C" __global__ void __launch_bounds__(256) combine_tiles(const Combine combine) {
+    __shared__ float memory[TILE_MEMORY];
+    finish_tile(Block{}, combine, int(blockIdx.x), int(blockIdx.y), memory);
+}
+
+// Blocks of BOX_LINES x BOX_COLUMN pixels. sums: the planes `squared` after combine_box.
+extern "C" __global__ void __launch_bounds__(256)
+combine_errors(const Combine combine, const float* __restrict__ sums, int radius, float floor, float added) {
+    __shared__ float memory[BOX_COLUMN_MEMORY];
+    finish_errors(Block{}, combine, sums, int(blockIdx.x) * BOX_LINES, int(blockIdx.y) * BOX_COLUMN, radius, floor, added, memory);
+}

@@ -1,0 +1,293 @@
+// Combination of the marched picture with its noisy correction, and the error of the result. Mirrors src/render/smooth/combine.rs, which says why.
+//
+// The correction of each half of the samples is shrunk, scale by scale (a-trous B3 splines, Starck and Murtagh 2006). Pictures are planes of
+// width * height floats.
+#pragma once
+#include "rendering/march.cuh"
+
+namespace rw {
+
+// Planes of the sums over pairs: differences by half, quarter and channel, pairs by quarter, differences of alpha.
+constexpr int PAIR_COUNTS = 12, PAIR_ALPHA = 14;
+
+// Mirrors an index at the borders of 0..n.
+RW_FN int reflected(int i, int n) {
+    if (n == 1) return 0;
+    while (i < 0 || i >= n) i = i < 0 ? -i : 2 * (n - 1) - i;
+    return i;
+}
+
+// Both quarters of a half: radiance times weight of three channels, and weight.
+struct Quarters {
+    const float* planes[2][4];
+};
+static_assert(sizeof(Quarters) == 64, "layout");
+
+// B3 filter at (x, y) of a plane, along the rows or the columns.
+RW_FN float b3(const float* plane, int width, int height, int x, int y, int spacing, bool along_rows) {
+    const float kernel[5] = {0.0625f, 0.25f, 0.375f, 0.25f, 0.0625f};
+    float sum = 0.0f;
+    RW_UNROLL
+    for (int i = 0; i < 5; ++i) {
+        const int apart = (i - 2) * spacing;
+        const int at = along_rows ? y * width + reflected(x + apart, width) : reflected(y + apart, height) * width + x;
+        sum += kernel[i] * plane[at];
+    }
+    return sum;
+}
+
+RW_FN float luminance(const float (&c)[3]) { return 0.2126f * c[0] + 0.7152f * c[1] + 0.0722f * c[2]; }
+
+// Pictures of one half and one level.
+struct Level {
+    float* mean;    // 3 planes: mean of the quarters' details
+    float* energy;  // 2 planes: product of the quarters' luminance, mean of its squares
+    int width;
+    int height;
+};
+static_assert(sizeof(Level) == 24, "layout");
+
+RW_FN void put_details(const Level& level, int at, const float (&details)[2][3], const float (&weights)[2]) {
+    const size_t pixels = size_t(level.width) * level.height;
+    const float both = weights[0] + weights[1];
+    for (int k = 0; k < 3; ++k) {
+        level.mean[k * pixels + at] = both > 0.0f ? (weights[0] * details[0][k] + weights[1] * details[1][k]) / both : 0.0f;
+    }
+    const float a = luminance(details[0]), b = luminance(details[1]);
+    level.energy[at] = a * b;
+    level.energy[pixels + at] = 0.5f * (a * a + b * b);
+}
+
+// Details of a level at a pixel from the fine picture and its row-filtered planes, 8 as in `Quarters`. `coarse`, 8 planes, may be the fine ones.
+RW_FN void split_level(const Quarters& fine, const float* rows, float* coarse, const Level& level, int x, int y, int spacing) {
+    const size_t pixels = size_t(level.width) * level.height;
+    const int at = y * level.width + x;
+    float details[2][3], weights[2];
+    RW_UNROLL
+    for (int q = 0; q < 2; ++q) {
+        float smooth[4], own[4];
+        RW_UNROLL
+        for (int k = 0; k < 4; ++k) {
+            smooth[k] = b3(rows + (4 * q + k) * pixels, level.width, level.height, x, y, spacing, false);
+            own[k] = fine.planes[q][k][at];
+        }
+        RW_UNROLL
+        for (int k = 0; k < 4; ++k) coarse[(4 * q + k) * pixels + at] = smooth[k];
+        weights[q] = own[3];
+        for (int k = 0; k < 3; ++k) details[q][k] = own[3] > 0.0f ? own[k] / own[3] - (smooth[3] > 0.0f ? smooth[k] / smooth[3] : 0.0f) : 0.0f;
+    }
+    put_details(level, at, details, weights);
+}
+
+// The coarsest picture as the details of a last level.
+RW_FN void last_level(const Quarters& coarse, const Level& level, int at) {
+    float details[2][3], weights[2];
+    for (int q = 0; q < 2; ++q) {
+        weights[q] = coarse.planes[q][3][at];
+        for (int k = 0; k < 3; ++k) details[q][k] = weights[q] > 0.0f ? coarse.planes[q][k][at] / weights[q] : 0.0f;
+    }
+    put_details(level, at, details, weights);
+}
+
+// The share of the energy of a mean of quarters that is not noise.
+RW_FN float gain_of(float signal, float energy) {
+    return energy > 0.0f ? min_(max_(2.0f * signal / (energy + signal), 0.0f), 1.0f) : 0.0f;
+}
+
+constexpr int BOX_RADIUS = 32;  // largest radius; radii are powers of two
+constexpr int BOX_ROW = 512;    // pixels of a row that one block sums
+constexpr int BOX_LINES = 16, BOX_COLUMN = 128;  // columns and rows that one block sums
+constexpr int BOX_ROW_MEMORY = 3 * (BOX_ROW + 2 * BOX_RADIUS);
+constexpr int BOX_COLUMN_MEMORY = (3 * (BOX_COLUMN + 2 * BOX_RADIUS) + BOX_COLUMN) * BOX_LINES;
+
+// Sums of 2 radius + 1 neighbours along LINES parallel lines, `count` each. Pairs, pairs of pairs and so on are summed, which takes few steps and
+// keeps small sums exact beside large ones. load(line, position): positions from -radius on. keep(line, position, sum). memory: 3 * LINES *
+// (count + 2 * radius) floats.
+template <int LINES, class Load, class Keep> RW_FN void box_lines(const Block& block, int count, int radius, float* memory, Load load, Keep keep) {
+    const int length = count + 2 * radius, size = length * LINES;
+    const float* from = memory;
+    block.each(size, [&](int i) { memory[i] = load(i % LINES, i / LINES - radius); });
+    for (int summed = 1; summed < 2 * radius; summed *= 2) {
+        float* to = memory + (from == memory + size ? 2 * size : size);
+        block.each((length - 2 * summed + 1) * LINES, [&](int i) { to[i] = from[i] + from[i + summed * LINES]; });
+        from = to;
+    }
+    block.each(count * LINES, [&](int i) { keep(i % LINES, i / LINES, from[i] + memory[i + 2 * radius * LINES]); });
+}
+
+// Sums of `from` along row y, for pixels from x on.
+RW_FN void box_row(const Block& block, const float* from, float* to, int width, int x, int y, int radius, float* memory) {
+    const size_t row = size_t(y) * width;
+    box_lines<1>(
+        block, BOX_ROW, radius, memory,
+        [&](int, int i) { return x + i >= 0 && x + i < width ? from[row + x + i] : 0.0f; },
+        [&](int, int i, float sum) {
+            if (x + i < width) to[row + x + i] = sum;
+        });
+}
+
+// Sums of two planes along columns, for a block of pixels with its corner at (x, y). use(pixel, sum of the first plane, of the second).
+template <class Use>
+RW_FN void box_columns(const Block& block, const float* from, int width, int height, int x, int y, int radius, float* memory, Use use) {
+    const float* second = from + size_t(width) * height;
+    float* first_sums = memory + 3 * (BOX_COLUMN + 2 * BOX_RADIUS) * BOX_LINES;
+    auto load = [&](const float* plane, int line, int i) {
+        return x + line < width && y + i >= 0 && y + i < height ? plane[size_t(y + i) * width + x + line] : 0.0f;
+    };
+    box_lines<BOX_LINES>(
+        block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(from, line, i); },
+        [&](int line, int i, float sum) { first_sums[i * BOX_LINES + line] = sum; });
+    box_lines<BOX_LINES>(
+        block, BOX_COLUMN, radius, memory, [&](int line, int i) { return load(second, line, i); },
+        [&](int line, int i, float sum) {
+            if (x + line < width && y + i < height) use(size_t(y + i) * width + x + line, first_sums[i * BOX_LINES + line], sum);
+        });
+}
+
+// Adds a level, times its gains, to the shrunk correction of a half (3 planes). `sums`: energies summed along rows.
+RW_FN void add_level(const Block& block, const Level& level, const float* sums, int x, int y, int radius, float* half, bool fresh, float* memory) {
+    const size_t pixels = size_t(level.width) * level.height;
+    box_columns(block, sums, level.width, level.height, x, y, radius, memory, [&](size_t at, float signal, float energy) {
+        const float gain = gain_of(signal, energy);
+        for (int k = 0; k < 3; ++k) {
+            const float part = gain * level.mean[k * pixels + at];
+            half[k * pixels + at] = fresh ? part : half[k * pixels + at] + part;
+        }
+    });
+}
+
+enum Correction {
+    LEFT = 0,    // the samples only measure the error
+    SHRUNK = 1,
+    SUMMED = 2
+};
+
+struct Combine {
+    const float* sums;    // planes as above
+    const double* base;   // RAY_FIELDS planes of sums over rays
+    const float* halves;  // SHRUNK: 3 planes of each half
+    float* film;          // rgba of each pixel, then planes: mean FTLE, error, missing, samples
+    float* squared;       // 2 planes: squared error, mean over the channels, and 1 where it is known, otherwise 0 and 0
+    float* tiles;         // TILE_FIELDS a tile, rows of tiles from the top
+    double per_ray;       // 1 / rays of a pixel
+    int width;
+    int height;
+    int how;  // Correction
+    float contrast, brightness, gamma;
+    float lit;  // pixels of a larger alpha are lit
+    int pad;
+};
+static_assert(sizeof(Combine) == 88, "layout");
+
+constexpr int TILE = 16, TILE_PIXELS = TILE * TILE;
+// Squared errors from all pairs and from those of either quarter, each without weight, relative and tone-mapped, and the pixels that have them; over
+// all pixels and over the lit ones. Then the variance of one sample, summed over the pixels that have pairs.
+constexpr int ERROR_FIELDS = 12, TILE_FIELDS = 2 * ERROR_FIELDS + 1;
+constexpr int TILE_STRIDE = TILE_PIXELS + 1, TILE_PARTS = 8;
+constexpr int TILE_MEMORY = TILE_FIELDS * (TILE_STRIDE + TILE_PARTS);
+
+// Square of the slope of the tone map.
+RW_FN float tone_weight(const Combine& c, float colour) {
+    const float value = (colour - 0.5f) * c.contrast + c.brightness;
+    if (value <= 0.0f || value >= 1.0f) return 0.0f;
+    // Steep without bound at black; one 8-bit step bounds it.
+    const float slope = c.contrast / c.gamma * powf(max_(value, 1.0f / 255.0f), 1.0f / c.gamma - 1.0f);
+    return slope * slope;
+}
+
+// Writes a pixel of the film and its squared error. `fields`: what it adds to its tile, TILE_FIELDS values `stride` apart.
+RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int stride) {
+    const size_t pixels = size_t(c.width) * c.height, at = size_t(y) * c.width + x;
+    const float pairs[2] = {c.sums[PAIR_COUNTS * pixels + at], c.sums[(PAIR_COUNTS + 1) * pixels + at]};
+    const float all = pairs[0] + pairs[1], most = max_(all, 1.0f);
+    double base[RAY_FIELDS];
+    for (int k = 0; k < RAY_FIELDS; ++k) base[k] = c.base[k * pixels + at];
+    float alpha = float(base[3] * c.per_ray);
+    if (c.how == SUMMED) alpha += c.sums[PAIR_ALPHA * pixels + at] / (2.0f * most);
+    float colour[3], squared[3][3], difference = 0.0f;
+    for (int k = 0; k < 3; ++k) {
+        // Means of the halves over all pairs, and over those of either quarter.
+        float means[2][3];
+        for (int half = 0; half < 2; ++half) {
+            const float first = c.sums[(6 * half + k) * pixels + at], second = c.sums[(6 * half + 3 + k) * pixels + at];
+            means[half][0] = (first + second) / most;
+            means[half][1] = first / max_(pairs[0], 1.0f);
+            means[half][2] = second / max_(pairs[1], 1.0f);
+        }
+        float a = 0.0f, b = 0.0f;
+        if (c.how == SUMMED) a = means[0][0], b = means[1][0];
+        if (c.how == SHRUNK) a = c.halves[k * pixels + at], b = c.halves[(3 + k) * pixels + at];
+        const float r = 0.5f * (a + b);
+        for (int which = 0; which < 3; ++which) {
+            const float d_a = means[0][which], d_b = means[1][which];
+            squared[which][k] = r * r - (a * d_b + b * d_a) + d_a * d_b;
+        }
+        const float apart = (means[0][0] - means[1][0]) * all;
+        difference += apart * apart;
+        colour[k] = float(base[k] * c.per_ray) + r;
+    }
+    reinterpret_cast<Float4*>(c.film)[at] = {colour[0], colour[1], colour[2], alpha};
+    float* planes = c.film + 4 * pixels + at;
+    planes[0] = base[3] > 0.0 ? float(base[4] / base[3]) : not_a_number();
+    planes[2 * pixels] = float(base[5] * c.per_ray);
+    planes[3 * pixels] = 2.0f * all;
+    const bool known[3] = {all > 0.0f, pairs[0] > 0.0f, pairs[1] > 0.0f}, is_lit = alpha > c.lit;
+    c.squared[at] = known[0] ? (squared[0][0] + squared[0][1] + squared[0][2]) / 3.0f : 0.0f;
+    c.squared[pixels + at] = known[0] ? 1.0f : 0.0f;
+    for (int which = 0; which < 3; ++which) {
+        float sums[3] = {0.0f, 0.0f, 0.0f};
+        for (int k = 0; known[which] && k < 3; ++k) {
+            const float third = squared[which][k] / 3.0f;
+            sums[0] += third;
+            sums[1] += third / (colour[k] * colour[k] + 0.01f);
+            sums[2] += third * tone_weight(c, colour[k]);
+        }
+        const float one = known[which] ? 1.0f : 0.0f;
+        for (int weighting = 0; weighting < 3; ++weighting) {
+            fields[(3 * which + weighting) * stride] = sums[weighting];
+            fields[(ERROR_FIELDS + 3 * which + weighting) * stride] = is_lit ? sums[weighting] : 0.0f;
+        }
+        fields[(9 + which) * stride] = one;
+        fields[(ERROR_FIELDS + 9 + which) * stride] = is_lit ? one : 0.0f;
+    }
+    // Sums of the halves differ by twice the pairs times the variance of one sample.
+    fields[2 * ERROR_FIELDS * stride] = known[0] ? difference / (6.0f * all) : 0.0f;
+}
+
+// Finishes the pixels of a tile and sums over it.
+RW_FN void finish_tile(const Block& block, const Combine& c, int column, int row, float* memory) {
+    float* parts = memory + TILE_FIELDS * TILE_STRIDE;
+    block.each(TILE_PIXELS, [&](int i) {
+        const int x = column * TILE + i % TILE, y = row * TILE + i / TILE;
+        if (x < c.width && y < c.height) {
+            finish_pixel(c, x, y, memory + i, TILE_STRIDE);
+        } else {
+            for (int field = 0; field < TILE_FIELDS; ++field) memory[field * TILE_STRIDE + i] = 0.0f;
+        }
+    });
+    block.each(TILE_FIELDS * TILE_PARTS, [&](int i) {
+        const float* from = memory + i / TILE_PARTS * TILE_STRIDE + i % TILE_PARTS;
+        float sum = 0.0f;
+        for (int k = 0; k < TILE_PIXELS; k += TILE_PARTS) sum += from[k];
+        parts[i] = sum;
+    });
+    block.each(TILE_FIELDS, [&](int field) {
+        float sum = 0.0f;
+        for (int part = 0; part < TILE_PARTS; ++part) sum += parts[field * TILE_PARTS + part];
+        const int across = (c.width + TILE - 1) / TILE;
+        c.tiles[(size_t(row) * across + column) * TILE_FIELDS + field] = sum;
+    });
+}
+
+// The error of each pixel from squared errors summed along rows: the root of their mean over a square, at least `floor`, plus `added`. NaN where
+// no pixel of the square has pairs.
+RW_FN void finish_errors(const Block& block, const Combine& c, const float* sums, int x, int y, int radius, float floor, float added, float* memory) {
+    const size_t pixels = size_t(c.width) * c.height;
+    box_columns(block, sums, c.width, c.height, x, y, radius, memory, [&](size_t at, float sum, float count) {
+        // As in Rust, the larger one of NaN and a number is the number.
+        const float mean = count > 0.5f ? sum / count : not_a_number();
+        c.film[5 * pixels + at] = sqrtf(max_(mean, floor) + added);
+    });
+}
+
+}  // namespace rw

@@ -1,0 +1,345 @@
+//! Combination of a marched picture with its correction on the GPU, and the error of the result (see `render::smooth::combine`, the reference).
+//!
+//! All pictures are planes of f32. The halves of the samples are shrunk one after the other in the same memory, so that the planes of one half stay
+//! in L2 as far as possible. The film leaves the device as whole planes.
+
+use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
+use crate::backend::cuda::driver::pinned::Pinned;
+use crate::backend::cuda::layout::device_repr;
+use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
+use crate::render::Combine as Combination;
+use bytemuck::{Pod, Zeroable};
+use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
+use std::sync::Arc;
+
+/// Scales of the transform, and the radius over which energies are summed: `RADIUS` times the spacing of the scale, at most `MAX_RADIUS`.
+const LEVELS: u32 = 5;
+const RADIUS: i32 = 4;
+const MAX_RADIUS: i32 = 32;
+/// Edge of a tile, in pixels.
+const TILE: usize = 16;
+/// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
+const BOX_ROW: usize = 512;
+const BOX_COLUMNS: [usize; 2] = [16, 128];
+/// Planes of the sums over pairs: differences by half, quarter and channel; pairs by quarter; differences of alpha.
+pub(in crate::backend::cuda) const PAIR_PLANES: usize = 15;
+const PAIR_COUNTS: usize = 12;
+/// Floats of a pixel of the film.
+const FILM_PLANES: usize = 8;
+
+/// `Quarters` of `combine.cuh`.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct QuartersArgument {
+    planes: [[u64; 4]; 2],
+}
+
+/// `Level` of `combine.cuh`.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct LevelArgument {
+    mean: u64,
+    energy: u64,
+    width: i32,
+    height: i32,
+}
+
+/// `Combine` of `combine.cuh`.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct CombineArgument {
+    sums: u64,
+    base: u64,
+    halves: u64,
+    film: u64,
+    squared: u64,
+    tiles: u64,
+    per_ray: f64,
+    width: i32,
+    height: i32,
+    how: i32,
+    tone_map: [f32; 3],
+    lit: f32,
+    pad: i32,
+}
+
+const _: () = assert!(size_of::<QuartersArgument>() == 64 && size_of::<LevelArgument>() == 24 && size_of::<CombineArgument>() == 88);
+
+/// Sums of squared errors over pixels of a tile. The outer index says which pairs they are from: all, or those of one quarter.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub struct TileErrors {
+    /// Squared error, mean over the channels: without weight, divided by radiance^2 + 0.01, and times the squared slope of the tone map.
+    pub squared: [[f32; 3]; 3],
+    /// Pixels that have such pairs.
+    pub pixels: [f32; 3],
+}
+
+/// Sums over a tile of 16x16 pixels.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
+pub struct TileSums {
+    /// Over all pixels.
+    pub all: TileErrors,
+    /// Over the lit pixels.
+    pub lit: TileErrors,
+    /// Variance of one sample (mean over the channels), summed over the pixels that have pairs, `all.pixels[0]`.
+    pub variance: f32,
+}
+
+const TILE_FIELDS: usize = size_of::<TileSums>() / size_of::<f32>();
+const _: () = assert!(TILE_FIELDS == 25);
+
+device_repr!(QuartersArgument, LevelArgument, CombineArgument);
+
+/// What is combined.
+pub struct CombineInput<'a> {
+    /// Pixels across and down.
+    pub size: [usize; 2],
+    /// Sums over pairs, 15 planes: differences by half, quarter and channel; numbers of pairs by quarter; differences of alpha.
+    pub pairs: &'a Buffer<f32>,
+    /// The marched picture, of the same size.
+    pub march: &'a GpuMarch,
+    /// How the correction is added. `None`: not at all; the pairs only measure the error.
+    pub how: Option<Combination>,
+    /// `[contrast, brightness, gamma]` of the tone map.
+    pub tone_map: [f64; 3],
+    /// Alpha above which a pixel is lit.
+    pub lit: f32,
+}
+
+/// A finished film in pinned memory; one value a pixel, rows from the top.
+pub struct FilmPlanes<'a> {
+    /// Linear radiance and alpha.
+    pub rgba: &'a [[f32; 4]],
+    /// Mean FTLE; NaN where alpha is 0.
+    pub ftle_mean: &'a [f32],
+    /// Stated error of the radiance; see [`GpuCombine::finish`].
+    pub error: &'a [f32],
+    /// Share seen through missing cells.
+    pub missing: &'a [f32],
+    /// Samples, two a pair.
+    pub samples: &'a [f32],
+}
+
+/// Offsets of the planes of the working memory. The film overwrites planes that only the shrinkage needs.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Planes {
+    coarse: usize,
+    rows: usize,
+    energy: usize,
+    boxed: usize,
+    mean: usize,
+    halves: usize,
+    film: usize,
+    squared: usize,
+    count: usize,
+}
+
+const PLANES: Planes = Planes { coarse: 0, rows: 8, energy: 16, boxed: 18, mean: 20, halves: 23, film: 0, squared: 8, count: 29 };
+
+/// Combines pictures. It reuses its memory between frames: 29 planes, and the film in pinned memory.
+pub struct GpuCombine {
+    gpu: Arc<Gpu>,
+    rows: CudaFunction,
+    columns: CudaFunction,
+    last: CudaFunction,
+    boxes: CudaFunction,
+    gains: CudaFunction,
+    tiles: CudaFunction,
+    errors: CudaFunction,
+    planes: Option<Buffer<f32>>,
+    tile_sums: Option<Buffer<f32>>,
+    tiles_read: Option<Pinned<f32>>,
+    film_read: Option<Pinned<f32>>,
+    /// Argument of the picture that [`Self::finish`] completes.
+    begun: Option<CombineArgument>,
+}
+
+impl GpuCombine {
+    /// Compiles the kernels or loads them from the cache.
+    ///
+    /// # Errors
+    /// A kernel does not compile, or the device fails.
+    pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
+        let kernel = |name| gpu.kernel("combine.cu", &[], name);
+        Ok(Self {
+            rows: kernel("combine_rows")?,
+            columns: kernel("combine_columns")?,
+            last: kernel("combine_last")?,
+            boxes: kernel("combine_box")?,
+            gains: kernel("combine_gains")?,
+            tiles: kernel("combine_tiles")?,
+            errors: kernel("combine_errors")?,
+            gpu: gpu.clone(),
+            planes: None,
+            tile_sums: None,
+            tiles_read: None,
+            film_read: None,
+            begun: None,
+        })
+    }
+
+    /// For tests: fills the memory between frames with bytes that are NaN as floats.
+    ///
+    /// # Errors
+    /// A driver call fails.
+    pub fn poison(&mut self) -> Result<(), DeviceError> {
+        self.planes.as_mut().map_or(Ok(()), |planes| planes.fill_bytes(0xFF))
+    }
+
+    /// Adds the correction to the picture, and returns the sums of each tile, rows of tiles from the top. Waits for them. The film is then complete
+    /// but for its error.
+    ///
+    /// # Errors
+    /// The picture has no rays or another size, or the device fails or lacks memory.
+    pub fn combine(&mut self, input: &CombineInput<'_>) -> Result<&[TileSums], DeviceError> {
+        self.begun = None;
+        let [width, height] = input.size;
+        let pixels = width * height;
+        let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
+        let Some(base) = input.march.sums().filter(|_| input.march.pixels() == pixels) else { return refused("a picture without rays") };
+        if input.pairs.len() < PAIR_PLANES * pixels {
+            return refused("sums over pairs of a smaller picture");
+        }
+        debug_assert!(RAY_FIELDS == 6);
+        let gpu = self.gpu.clone();
+        let at = room(&gpu, &mut self.planes, "combining pictures", PLANES.count * pixels)?.address();
+        let plane = |number: usize| at + (number * pixels * size_of::<f32>()) as u64;
+        if input.how == Some(Combination::Shrink) {
+            for half in 0..2 {
+                self.shrink(input, half, plane)?;
+            }
+        }
+        let tiles = [width.div_ceil(TILE), height.div_ceil(TILE)];
+        let count = tiles[0] * tiles[1] * TILE_FIELDS;
+        let tile_sums = room(&gpu, &mut self.tile_sums, "errors of tiles", count)?.address();
+        let argument = CombineArgument {
+            sums: input.pairs.address(),
+            base,
+            halves: plane(PLANES.halves),
+            film: plane(PLANES.film),
+            squared: plane(PLANES.squared),
+            tiles: tile_sums,
+            per_ray: 1.0 / f64::from(input.march.rays()),
+            width: width as i32,
+            height: height as i32,
+            how: match input.how {
+                None => 0,
+                Some(Combination::Shrink) => 1,
+                Some(Combination::Sum) => 2,
+            },
+            tone_map: input.tone_map.map(|v| v as f32),
+            lit: input.lit,
+            pad: 0,
+        };
+        let mut call = gpu.work().launch_builder(&self.tiles);
+        call.arg(&argument);
+        // SAFETY: the argument of `combine_tiles`; pairs, base and planes are as large as checked above, `tile_sums` holds the fields of all tiles, and
+        // all of them are freed in the order of the stream.
+        unsafe { launch(&mut call, blocks(tiles[0], tiles[1])) }?;
+        let read = pinned_room(&gpu, &mut self.tiles_read, count)?;
+        // SAFETY: `tile_sums` holds `count` values.
+        unsafe { read.copy_from(gpu.work(), tile_sums, count) }?;
+        gpu.synchronize()?;
+        self.begun = Some(argument);
+        Ok(bytemuck::cast_slice(&read.values()[..count]))
+    }
+
+    /// Shrinks the correction of a half.
+    fn shrink(&self, input: &CombineInput<'_>, half: usize, plane: impl Fn(usize) -> u64) -> Result<(), DeviceError> {
+        let [width, height] = input.size;
+        let pixels = width * height;
+        let stream = self.gpu.work();
+        let (across, down) = (width as i32, height as i32);
+        let level = LevelArgument { mean: plane(PLANES.mean), energy: plane(PLANES.energy), width: across, height: down };
+        let (rows, coarse, boxed) = (plane(PLANES.rows), plane(PLANES.coarse), plane(PLANES.boxed));
+        let shrunk = plane(PLANES.halves + 3 * half);
+        let sums = |number: usize| input.pairs.address() + (number * pixels * size_of::<f32>()) as u64;
+        let mut fine = QuartersArgument {
+            planes: [0, 1].map(|q| std::array::from_fn(|k| sums(if k == 3 { PAIR_COUNTS + q } else { 6 * half + 3 * q + k }))),
+        };
+        let filtered = QuartersArgument { planes: [0, 1].map(|q| std::array::from_fn(|k| plane(PLANES.coarse + 4 * q + k))) };
+        for number in 0..=LEVELS {
+            let (spacing, fresh) = (1_i32 << number, i32::from(number == 0));
+            let radius = (RADIUS * spacing).min(MAX_RADIUS);
+            // SAFETY: the arguments of the kernels of combine.cu; each address is that of as many planes as the kernel expects, in memory that is freed
+            // in the order of the stream.
+            unsafe {
+                if number == LEVELS {
+                    launch(stream.launch_builder(&self.last).arg(&fine).arg(&level), threads(pixels, 256))?;
+                } else {
+                    let config = blocks(width.div_ceil(32), height.div_ceil(8));
+                    let mut call = stream.launch_builder(&self.rows);
+                    launch(call.arg(&fine).arg(&rows).arg(&across).arg(&down).arg(&spacing), config)?;
+                    let mut call = stream.launch_builder(&self.columns);
+                    launch(call.arg(&fine).arg(&rows).arg(&coarse).arg(&level).arg(&spacing), config)?;
+                }
+                self.box_rows(level.energy, boxed, input.size, radius)?;
+                let mut call = stream.launch_builder(&self.gains);
+                launch(call.arg(&level).arg(&boxed).arg(&radius).arg(&shrunk).arg(&fresh), box_columns(input.size))?;
+            }
+            fine = filtered;
+        }
+        Ok(())
+    }
+
+    /// Sums two planes along their rows.
+    ///
+    /// # Safety
+    /// Both addresses are those of two planes of this size.
+    unsafe fn box_rows(&self, from: u64, to: u64, [width, height]: [usize; 2], radius: i32) -> Result<(), DeviceError> {
+        let (across, down) = (width as i32, height as i32);
+        let config = LaunchConfig { grid_dim: (width.div_ceil(BOX_ROW) as u32, height as u32, 2), ..blocks(1, 1) };
+        let mut call = self.gpu.work().launch_builder(&self.boxes);
+        // SAFETY: the arguments of `combine_box`, guaranteed by the caller.
+        unsafe { launch(call.arg(&from).arg(&to).arg(&across).arg(&down).arg(&radius), config) }
+    }
+
+    /// Completes the film of the latest [`Self::combine`] and copies it to the host. The error of a pixel is the root of the mean squared error over
+    /// a square of `radius` pixels (a power of two, at most 32), which is at least `floor`, plus `added`.
+    ///
+    /// # Errors
+    /// Nothing was combined, or the device fails or lacks memory.
+    ///
+    /// # Panics
+    /// If the radius is not one of those.
+    pub fn finish(&mut self, radius: u32, floor: f32, added: f32) -> Result<FilmPlanes<'_>, DeviceError> {
+        assert!(radius.is_power_of_two() && radius <= MAX_RADIUS as u32, "a radius that the kernels can sum");
+        let (Some(argument), Some(planes)) = (self.begun.take(), &self.planes) else {
+            return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
+        };
+        let size = [argument.width as usize, argument.height as usize];
+        let pixels = size[0] * size[1];
+        let (gpu, radius) = (self.gpu.clone(), radius as i32);
+        let boxed = planes.address_of(PLANES.boxed * pixels);
+        let mut call = gpu.work().launch_builder(&self.errors);
+        call.arg(&argument).arg(&boxed).arg(&radius).arg(&floor).arg(&added);
+        // SAFETY: the arguments of the kernels; the planes are those of `combine`, for the same picture.
+        unsafe {
+            self.box_rows(argument.squared, boxed, size, radius)?;
+            launch(&mut call, box_columns(size))?;
+        }
+        let read = pinned_room(&gpu, &mut self.film_read, FILM_PLANES * pixels)?;
+        // SAFETY: the planes hold the film.
+        unsafe { read.copy_from(gpu.work(), argument.film, FILM_PLANES * pixels) }?;
+        gpu.synchronize()?;
+        let (rgba, rest) = read.values().split_at(4 * pixels);
+        let plane = |number: usize| &rest[number * pixels..(number + 1) * pixels];
+        Ok(FilmPlanes { rgba: bytemuck::cast_slice(rgba), ftle_mean: plane(0), error: plane(1), missing: plane(2), samples: plane(3) })
+    }
+
+    /// Frees the memory.
+    pub fn release(&mut self) {
+        (self.planes, self.tile_sums, self.tiles_read, self.film_read, self.begun) = (None, None, None, None, None);
+    }
+}
+
+/// A grid of blocks of 256 threads.
+fn blocks(x: usize, y: usize) -> LaunchConfig {
+    LaunchConfig { grid_dim: (x as u32, y as u32, 1), block_dim: (256, 1, 1), shared_mem_bytes: 0 }
+}
+
+fn box_columns([width, height]: [usize; 2]) -> LaunchConfig {
+    blocks(width.div_ceil(BOX_COLUMNS[0]), height.div_ceil(BOX_COLUMNS[1]))
+}
