@@ -40,6 +40,13 @@ impl PairSums {
         std::array::from_fn(|k| (first[k] + second[k]) / count)
     }
 
+    /// Variance of one sample, mean over the channels, from the difference between the halves; 0 without pairs.
+    pub(super) fn sample_variance(&self) -> f32 {
+        let difference = |k: usize| (0..2).map(|q| self.radiance[0][q][k] - self.radiance[1][q][k]).sum::<f32>();
+        // The sums of the halves differ by twice the pairs times the variance of one sample.
+        (0..3).map(|k| difference(k).powi(2)).sum::<f32>() / (6.0 * self.pairs().max(1) as f32)
+    }
+
     fn quarter(&self, half: usize, quarter: usize) -> [f32; 3] {
         self.radiance[half][quarter].map(|sum| sum / self.pairs[quarter].max(1) as f32)
     }

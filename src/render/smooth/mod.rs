@@ -3,14 +3,17 @@
 //! In: nodes of the surrogate and a [`LogStretch`](super::LogStretch) that traces. Out: films whose error is stated. A [`Picture`] accumulates
 //! while window, camera, light and transfer function stand still.
 
+mod allocation;
 mod combine;
 mod coupled;
 #[cfg(all(test, feature = "cuda"))]
 mod host_parity;
 mod light_volume;
 mod march;
+mod march_control;
 mod nodes;
 mod picture;
+mod statement;
 
 pub use coupled::CoupledPath;
 pub(in crate::render) use coupled::coupled_paths;
@@ -20,4 +23,12 @@ pub(crate) use light_volume::{LightGrid, MARGIN};
 pub(crate) use march::node_spacing;
 pub use march::IsMissing;
 pub use nodes::{BRICK, Nodes};
-pub use picture::{ErrorEstimate, Picture, PictureError, Refinement};
+pub use picture::{Picture, Refinement};
+pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
+#[cfg(feature = "cuda")]
+pub(crate) use {
+    allocation::{Allocation, TILE, rank},
+    march_control::{FIRST_RAYS, MarchControl, Marching},
+    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
+    statement::LIT,
+};

@@ -8,7 +8,7 @@ use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::device_repr;
 use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use crate::render::Combine as Combination;
-use bytemuck::{Pod, Zeroable};
+use crate::render::smooth::{TILE, TileSums};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
 use std::sync::Arc;
 
@@ -16,8 +16,6 @@ use std::sync::Arc;
 const LEVELS: u32 = 5;
 const RADIUS: i32 = 4;
 const MAX_RADIUS: i32 = 32;
-/// Edge of a tile, in pixels.
-const TILE: usize = 16;
 /// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
 const BOX_ROW: usize = 512;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
@@ -64,28 +62,6 @@ struct CombineArgument {
 }
 
 const _: () = assert!(size_of::<QuartersArgument>() == 64 && size_of::<LevelArgument>() == 24 && size_of::<CombineArgument>() == 88);
-
-/// Sums of squared errors over pixels of a tile. The outer index says which pairs they are from: all, or those of one quarter.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
-pub struct TileErrors {
-    /// Squared error, mean over the channels: without weight, divided by radiance^2 + 0.01, and times the squared slope of the tone map.
-    pub squared: [[f32; 3]; 3],
-    /// Pixels that have such pairs.
-    pub pixels: [f32; 3],
-}
-
-/// Sums over a tile of 16x16 pixels.
-#[repr(C)]
-#[derive(Debug, Clone, Copy, Default, PartialEq, Pod, Zeroable)]
-pub struct TileSums {
-    /// Over all pixels.
-    pub all: TileErrors,
-    /// Over the lit pixels.
-    pub lit: TileErrors,
-    /// Variance of one sample (mean over the channels), summed over the pixels that have pairs, `all.pixels[0]`.
-    pub variance: f32,
-}
 
 const TILE_FIELDS: usize = size_of::<TileSums>() / size_of::<f32>();
 const _: () = assert!(TILE_FIELDS == 25);

@@ -11,7 +11,7 @@ mod renderer;
 mod router;
 
 pub use audit::Audits;
-pub use combine::{CombineInput, FilmPlanes, GpuCombine, TileErrors, TileSums};
+pub use combine::{CombineInput, FilmPlanes, GpuCombine};
 pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes, bayer_rank};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
