@@ -16,11 +16,25 @@ use crate::source::Listener;
 use crate::surrogate::network::{Architecture, NetworkSettings, Objective};
 use crate::surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostNetwork, HostSurrogate, Hybrid, Kind, Learned, NetworkFrom, Predict,
-    ReplayBuffer, build,
+    ReplayBuffer, build, fresh_stamp,
 };
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+
+/// A picture of the CUDA backend.
+pub struct CudaPicture {
+    /// Accumulates where the placement puts frames on the CPU.
+    host: HostPicture,
+    /// Number of the picture that the GPU accumulates.
+    number: u64,
+}
+
+impl Default for CudaPicture {
+    fn default() -> Self {
+        Self { host: HostPicture::default(), number: fresh_stamp() }
+    }
+}
 
 /// A GPU as a backend, with the snapshots in its memory.
 pub struct Cuda {
@@ -95,7 +109,7 @@ impl Backend for Cuda {
     type Tracer = CudaTracer;
     type Surrogate = CudaSurrogate;
     type Samples = CudaSamples;
-    type Picture = HostPicture;
+    type Picture = CudaPicture;
 
     fn name(&self) -> String {
         format!("cuda:{} {}", self.gpu.ordinal(), self.gpu.name())
@@ -132,17 +146,17 @@ impl Backend for Cuda {
         &mut self,
         job: &FrameJob<'_, Self>,
         renderer: &mut Renderer,
-        picture: &mut HostPicture,
+        picture: &mut CudaPicture,
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let resident = match job.surrogate {
             None => None,
             Some(CudaFrozen::Resident(frozen)) => Some(frozen),
-            Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer, picture),
+            Some(CudaFrozen::OnHost(_)) => return self.render_on_cpu(job, renderer, &mut picture.host),
         };
-        if self.placement.frames == Place::Host || job.routing.extras.jacobian || job.smooth.is_some() {
-            return self.render_on_cpu(job, renderer, picture);
+        if self.placement.frames == Place::Host || job.routing.extras.jacobian {
+            return self.render_on_cpu(job, renderer, &mut picture.host);
         }
-        self.frames()?.render(job, resident, renderer)
+        self.frames()?.render(job, resident, renderer, picture.number)
     }
 
     fn audit(

@@ -27,7 +27,7 @@ pub use picture::{Picture, Refinement};
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 #[cfg(feature = "cuda")]
 pub(crate) use {
-    allocation::{Allocation, TILE, rank},
+    allocation::{Allocation, TILE},
     march_control::{FIRST_RAYS, MarchControl, Marching},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
     statement::LIT,

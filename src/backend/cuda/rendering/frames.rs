@@ -2,13 +2,15 @@
 
 use super::audit::Audits;
 use super::renderer::GpuRenderer;
+use super::smooth::{GpuSmooth, SmoothRound};
 use super::router::{DeviceLearns, DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
 use crate::backend::cuda::driver::Gpu;
 use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
 use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
-use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Tally};
+use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
 use crate::render::{RenderStats, Renderer};
 use crate::surrogate::{FrozenHybrid, Samples};
+use crate::trust::Gate;
 use std::sync::Arc;
 
 /// Renders and audits frames. It reuses kernels and memory between frames.
@@ -16,6 +18,9 @@ pub struct GpuFrames {
     renderer: GpuRenderer,
     router: DeviceQueryRouter,
     audits: Audits,
+    /// The picture that accumulates. `None` before the first smooth frame.
+    smooth: Option<GpuSmooth>,
+    gpu: Arc<Gpu>,
 }
 
 /// Device-side predictor of one frame.
@@ -95,10 +100,10 @@ impl GpuFrames {
     /// # Errors
     /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
-        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: DeviceQueryRouter::new(gpu)?, audits: Audits::new(gpu)? })
+        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: DeviceQueryRouter::new(gpu)?, audits: Audits::new(gpu)?, smooth: None, gpu: gpu.clone() })
     }
 
-    /// Renders a frame. Every query is traced if `surrogate` is `None`.
+    /// Renders a frame. Every query is traced if `surrogate` is `None`. A smooth frame refines the picture with the number `picture`.
     ///
     /// # Errors
     /// The device fails or lacks memory, or the renderer rejects the number of samples.
@@ -107,6 +112,7 @@ impl GpuFrames {
         job: &FrameJob<'_, B>,
         surrogate: Option<&FrozenHybrid<OnGpu>>,
         renderer: &mut Renderer,
+        picture: u64,
     ) -> Result<Rendered<CudaSamples>, DeviceError> {
         let (tracer, routing) = (job.tracer, job.routing);
         let progress = job.progress.map(|report| report as &dyn Fn(f32));
@@ -120,6 +126,9 @@ impl GpuFrames {
             return Ok(Rendered { film, stats, tally, samples: CudaSamples::on_host(Samples::default()), error: None });
         }
         let predictor = surrogate.map(|frozen| Predictor::of(frozen, tracer)).transpose()?;
+        if let (Some(smooth), Some(frozen), Some(predictor)) = (job.smooth, surrogate, &predictor) {
+            return self.refine(job, smooth, frozen, predictor, renderer, picture);
+        }
         let pool = surrogate.and_then(|frozen| frozen.network.as_ref()?.pool().cloned());
         let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
         let mut answers = self.router.begin(FrameQueries {
@@ -142,6 +151,59 @@ impl GpuFrames {
         };
         labels.host = answers.labels();
         Ok(Rendered { film, stats, tally, samples: labels, error: None })
+    }
+
+    /// Renders a smooth frame.
+    fn refine<B: Backend<Tracer = CudaTracer>>(
+        &mut self,
+        job: &FrameJob<'_, B>,
+        smooth: Smooth,
+        frozen: &FrozenHybrid<OnGpu>,
+        predictor: &Predictor<'_>,
+        renderer: &mut Renderer,
+        picture: u64,
+    ) -> Result<Rendered<CudaSamples>, DeviceError> {
+        let (tracer, routing) = (job.tracer, job.routing);
+        let own = match self.smooth.take() {
+            Some(own) => own,
+            None => GpuSmooth::new(&self.gpu)?,
+        };
+        let own = self.smooth.insert(own);
+        let table = match predictor {
+            Predictor::Table(table) => Some(*table),
+            Predictor::Network(..) => None,
+        };
+        let round =
+            SmoothRound { smooth, picture, frame: job.picture, samples: job.samples, tracer, table, predictor, stop: job.stop };
+        let pool = frozen.network.as_ref().and_then(|network| network.pool().cloned());
+        let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
+        let nothing_trusted = Gate::uniform(false);
+        let ((film, stats, error), trace_seconds) = if routing.keep <= 1 && predictor.label_sink().is_none() {
+            let refined = own.refine(&round, renderer, &mut TraceAll(tracer.device()))?;
+            let seconds = refined.1.evaluate_seconds;
+            (refined, seconds)
+        } else {
+            let mut answers = self.router.begin(FrameQueries {
+                tracer: tracer.device(),
+                domain: tracer.host().domain(),
+                missing_cells: tracer.missing_cells(),
+                surrogate: None,
+                label_sink: predictor.label_sink(),
+                gate: &nothing_trusted,
+                trace_budget: None,
+                keep: routing.keep,
+                arrivals: routing.extras.arrival,
+            })?;
+            let refined = own.refine(&round, renderer, &mut answers)?;
+            labels.host = answers.labels();
+            (refined, answers.trace_seconds())
+        };
+        if let Some(report) = job.progress {
+            report(1.0);
+        }
+        let tally =
+            Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
+        Ok(Rendered { film, stats, tally, samples: labels, error: Some(error) })
     }
 
     /// Audits a frame.

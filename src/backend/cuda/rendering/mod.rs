@@ -9,6 +9,7 @@ mod march;
 mod memory;
 mod renderer;
 mod router;
+mod smooth;
 
 pub use audit::Audits;
 pub use combine::{CombineInput, FilmPlanes, GpuCombine};

@@ -1,0 +1,263 @@
+//! Smooth frames on the GPU: marches the surrogate, tracks pairs of coupled paths where the variance is, combines both, and states the error of the
+//! result. The algorithm and its reference are in [`crate::render::smooth`]; how finely to march and where to sample is decided there as well.
+
+use super::combine::{CombineInput, FilmPlanes, GpuCombine};
+use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
+use super::frames::Predictor;
+use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
+use super::router::DeviceLogStretch;
+use crate::backend::Smooth;
+use crate::backend::cuda::driver::Gpu;
+use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::backend::cuda::{Buffer, DeviceError};
+use crate::render::rng::FrameRandom;
+use crate::render::smooth::{
+    AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
+};
+use crate::render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+/// Largest number of values of the light volume, 512 MiB, and the share of the free memory that it takes at most.
+const LIGHT_VALUES: u64 = 1 << 27;
+const LIGHT_SHARE: u64 = 8;
+/// Pairs of a tile in one call of the tracker.
+const MAX_PAIRS: usize = 256;
+
+/// One picture that accumulates on the GPU. It reuses kernels and memory from picture to picture.
+pub(in crate::backend::cuda) struct GpuSmooth {
+    gpu: Arc<Gpu>,
+    march: GpuMarch,
+    nodes: DeviceNodes,
+    tracker: CoupledTracker,
+    combine: GpuCombine,
+    sums: Option<Buffer<f32>>,
+    /// Number of the picture and the scene that it shows. `None` before the first round.
+    shows: Option<(u64, Scene)>,
+    /// Random stream: the number of the frame at which the picture started.
+    number: u64,
+    control: MarchControl,
+    allocation: Allocation,
+    pairs: u64,
+}
+
+/// One round of refinement.
+pub(super) struct SmoothRound<'a> {
+    pub(super) smooth: Smooth,
+    /// Number of the picture; another number starts anew.
+    pub(super) picture: u64,
+    /// Number of the frame.
+    pub(super) frame: u64,
+    /// Coupled samples per pixel.
+    pub(super) samples: f64,
+    pub(super) tracer: &'a CudaTracer,
+    /// Table of the surrogate; `None`: `predictor` is laid out on nodes.
+    pub(super) table: Option<&'a DeviceTable>,
+    pub(super) predictor: &'a Predictor<'a>,
+    pub(super) stop: &'a AtomicBool,
+}
+
+impl GpuSmooth {
+    /// Compiles the kernels or loads them from the cache.
+    ///
+    /// # Errors
+    /// A kernel does not compile, or the device fails.
+    pub(super) fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
+        Ok(Self {
+            march: GpuMarch::new(gpu)?,
+            nodes: DeviceNodes::new(gpu)?,
+            tracker: CoupledTracker::new(gpu)?,
+            combine: GpuCombine::new(gpu)?,
+            gpu: gpu.clone(),
+            sums: None,
+            shows: None,
+            number: 0,
+            control: MarchControl::default(),
+            allocation: Allocation::default(),
+            pairs: 0,
+        })
+    }
+
+    /// Starts anew if the round shows anything else than the picture so far.
+    fn settle(&mut self, round: &SmoothRound<'_>, renderer: &mut Renderer) -> Result<(), DeviceError> {
+        let scene = renderer.scene();
+        if self.shows.as_ref().is_some_and(|(picture, shown)| *picture == round.picture && shown == scene) {
+            return Ok(());
+        }
+        self.shows = None;
+        let (width, height) = (scene.settings.width, scene.settings.height);
+        if round.table.is_none() {
+            self.nodes.lay_out(round.predictor, round.smooth.nodes, round.tracer.host().domain().dimensions)?;
+        }
+        let planes = SUM_PLANES * width * height;
+        match &mut self.sums {
+            Some(sums) if sums.len() == planes => sums.fill_bytes(0)?,
+            slot => {
+                *slot = None;
+                slot.insert(self.gpu.alloc("sums over coupled paths", planes)?).fill_bytes(0)?;
+            }
+        }
+        (self.number, self.pairs) = (round.frame, 0);
+        self.control = self.control.restarted();
+        self.allocation = Allocation::new(width, height);
+        let shown = (round.picture, scene.clone());
+        self.prepare(round, renderer)?;
+        self.shows = Some(shown);
+        Ok(())
+    }
+
+    /// Computes the light volume for the present step. The march starts anew.
+    fn prepare(&mut self, round: &SmoothRound<'_>, renderer: &mut Renderer) -> Result<(), DeviceError> {
+        let parameters = renderer.round_setup(self.number).parameters;
+        let most = LIGHT_VALUES.min(self.gpu.memory_left() / LIGHT_SHARE / size_of::<f32>() as u64);
+        let medium = medium(&self.nodes, round, &parameters)?;
+        self.march.prepare(renderer, &medium, most as usize, self.control.refine())
+    }
+
+    /// Adds rays and pairs to the picture and returns it with its error.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory. The samples of the round may be lost then.
+    pub(super) fn refine(
+        &mut self,
+        round: &SmoothRound<'_>,
+        renderer: &mut Renderer,
+        answers: &mut dyn DeviceLogStretch,
+    ) -> Result<(Film, RenderStats, PictureError), DeviceError> {
+        self.settle(round, renderer)?;
+        let parameters = renderer.round_setup(self.number).parameters;
+        self.march(round, renderer, &parameters)?;
+        let mut stats = self.track(round, renderer, answers)?;
+        let settings = &renderer.scene().settings;
+        let (width, height, tone_map) = (settings.width, settings.height, settings.tone_map);
+        let how = match (round.smooth.method, round.smooth.sum) {
+            (Method::Marched, _) => None,
+            (_, true) => Some(Combine::Sum),
+            (_, false) => Some(Combine::Shrink),
+        };
+        let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
+        let error = loop {
+            let Some(pairs) = &self.sums else { return Err(unsupported("a picture without sums")) };
+            let input = CombineInput { size: [width, height], pairs, march: &self.march, how, tone_map, lit: LIT };
+            let tiles = self.combine.combine(&input)?;
+            let error = PictureError::of(tiles, self.control.error(), samples_per_pixel, self.control.rays);
+            self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
+            match self.control.decide(error.rms.value.powi(2) - self.control.error()) {
+                Marching::Enough => break error,
+                Marching::Anew => self.prepare(round, renderer)?,
+                Marching::More => {}
+            }
+            self.march(round, renderer, &parameters)?;
+        };
+        let march = self.control.error();
+        let floor = ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0);
+        let film = film(&self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?, width, height);
+        stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
+        Ok((film, stats, error))
+    }
+
+    /// Marches the rays that are due, and compares some pixels with a finer march.
+    fn march(&mut self, round: &SmoothRound<'_>, renderer: &Renderer, parameters: &FrameParameters) -> Result<(), DeviceError> {
+        let due = self.control.next_rays;
+        if due == 0 {
+            return Ok(());
+        }
+        let medium = medium(&self.nodes, round, parameters)?;
+        let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
+        self.march.march(&medium, step, due as u32, round.smooth.sum)?;
+        let random = FrameRandom::new(renderer.scene().seed, self.number);
+        let pixels = self.control.audit_pixels(&random, parameters.pixels());
+        self.control.rays += due;
+        let rays = |pixel: u32, first: u64, step: f32, shadow_step: f32| {
+            (first..first + FIRST_RAYS).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
+        };
+        let checks: Vec<RayCheck> = pixels
+            .iter()
+            .flat_map(|&pixel| {
+                let coarse = rays(pixel, 0, step, 0.0).chain(rays(pixel, FIRST_RAYS, step, 0.0));
+                coarse.chain(rays(pixel, 0, 0.25 * step, 0.5 * step))
+            })
+            .collect();
+        let radiance = self.march.check(&medium, &checks, round.smooth.sum)?;
+        let per_mean = FIRST_RAYS as usize;
+        for pixel in radiance.chunks_exact(3 * per_mean) {
+            let mean = |part: usize| -> [f64; 3] {
+                let rays = &pixel[part * per_mean..(part + 1) * per_mean];
+                std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / per_mean as f64)
+            };
+            self.control.audit(mean(0), mean(1), mean(2));
+        }
+        Ok(())
+    }
+
+    /// Tracks the pairs of a round.
+    fn track(
+        &mut self,
+        round: &SmoothRound<'_>,
+        renderer: &mut Renderer,
+        answers: &mut dyn DeviceLogStretch,
+    ) -> Result<RenderStats, DeviceError> {
+        let pairs_per_pixel = if round.smooth.method == Method::Marched { AUDIT_PAIRS } else { round.samples / 2.0 };
+        let plan = self.allocation.next(pairs_per_pixel);
+        let grid = node_grid(&self.nodes, round)?;
+        let argument = grid.argument();
+        let nodes = SurrogateNodes { values: argument.values, shape: grid.shape(), dimensions: argument.dimensions as usize };
+        let Some(sums) = &mut self.sums else { return Err(unsupported("a picture without sums")) };
+        let cursors: Vec<u16> = plan.iter().map(|tile| u16::from(tile.cursor)).collect();
+        let most = plan.iter().map(|tile| tile.pairs).max().unwrap_or(0);
+        let mut stats = RenderStats::default();
+        // A tile whose pixels all get a pair ends where it began.
+        for first in (0..most).step_by(MAX_PAIRS) {
+            let pairs: Vec<u16> = plan.iter().map(|tile| tile.pairs.saturating_sub(first).min(MAX_PAIRS) as u16).collect();
+            let tiles = PairTiles { pairs: &pairs, cursors: &cursors };
+            let missing = round.tracer.missing_cells();
+            // SAFETY: the nodes are those of the table, which `round` borrows, or of `self.nodes`; both live until the call returns.
+            let found = unsafe { self.tracker.track(renderer, self.number, nodes, missing, tiles, answers, sums, round.stop) }?;
+            self.pairs += found.pairs;
+            stats.paths += found.paths;
+            stats.queries += found.queries;
+            stats.traced += found.traced;
+            stats.missing += found.missing;
+            stats.majorant_exceeded += found.majorant_exceeded;
+            stats.speculative_queries += found.points.saturating_sub(found.traced);
+            stats.waves += found.waves;
+            stats.walk_seconds += found.walk_seconds;
+            stats.evaluate_seconds += found.answer_seconds;
+            stats.stopped |= found.stopped;
+        }
+        Ok(stats)
+    }
+}
+
+fn unsupported(what: &str) -> DeviceError {
+    DeviceError::Unsupported { what: what.into() }
+}
+
+fn node_grid<'a>(nodes: &'a DeviceNodes, round: &SmoothRound<'a>) -> Result<NodeGrid<'a>, DeviceError> {
+    nodes.grid(round.table).ok_or_else(|| unsupported("a surrogate that is not on nodes"))
+}
+
+fn medium<'a>(nodes: &'a DeviceNodes, round: &SmoothRound<'a>, parameters: &'a FrameParameters) -> Result<Medium<'a>, DeviceError> {
+    Ok(Medium { parameters, nodes: node_grid(nodes, round)?, missing_cells: round.tracer.missing_cells() })
+}
+
+/// Copies the planes, with all threads.
+fn film(planes: &FilmPlanes<'_>, width: usize, height: usize) -> Film {
+    use rayon::prelude::*;
+    const CHUNK: usize = 1 << 16;
+    fn copied(from: &[f32]) -> Vec<f32> {
+        from.par_iter().with_min_len(CHUNK).copied().collect()
+    }
+    let traced = |samples: &f32| if *samples > 0.0 { 1.0 } else { 0.0 };
+    Film {
+        width,
+        height,
+        rgba: planes.rgba.par_iter().with_min_len(CHUNK).copied().collect(),
+        ftle_mean: copied(planes.ftle_mean),
+        traced: planes.samples.par_iter().with_min_len(CHUNK).map(traced).collect(),
+        missing: copied(planes.missing),
+        samples: copied(planes.samples),
+        error: copied(planes.error),
+        ..Film::default()
+    }
+}
