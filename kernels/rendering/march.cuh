@@ -341,10 +341,9 @@ RW_FN void fill_node(const FrameScene& scene, const March& march, uint32_t index
     volume.depth[index] = depth_to_light(scene, march, point, volume.step);
 }
 
-// Offset of ray `ray` along axis 0 (across the pixel), 1 (down) or 2 (along the step): an additive recurrence in three dimensions (Roberts 2018).
+// Offset of a ray across (axis 0) or down (1) its pixel: an additive recurrence in two dimensions (Roberts 2018).
 RW_FN float ray_offset(uint32_t ray, int axis) {
-    const double g = 1.2207440846057596, a = axis == 0 ? 1.0 / g : (axis == 1 ? 1.0 / (g * g) : 1.0 / (g * g * g));
-    const double x = 0.5 + double(ray) * a;
+    const double plastic = 1.324717957244746, x = 0.5 + double(ray) * (axis == 0 ? 1.0 / plastic : 1.0 / (plastic * plastic));
     return float(x - floor_(x));
 }
 
@@ -371,8 +370,8 @@ struct Ray {
 
 // Ray `number` of a pixel, with steps of at most `longest` scene units. Returns false if it misses the box.
 RW_FN bool begin_ray(const FrameScene& scene, bool shifted, uint32_t pixel, uint32_t number, float longest, Ray& ray) {
-    float offset[3];
-    for (int k = 0; k < 3; ++k) offset[k] = ray_offset(number, k);
+    // Quadrature points are in the middle of their steps.
+    float offset[3] = {ray_offset(number, 0), ray_offset(number, 1), 0.5f};
     if (shifted) {
         // No path draws in this dimension.
         const Words random = words(scene.random, pixel, number, 0xFFFFFFFEu);
