@@ -29,7 +29,7 @@ pub enum Method {
     Gated,
     /// The surrogate's expected picture, marched; traced samples measure its error.
     Marched,
-    /// The marched picture, corrected by traced samples.
+    /// The marched picture, corrected by traced samples. The default.
     #[serde(rename = "two_level")]
     TwoLevel,
 }
@@ -221,7 +221,7 @@ pub struct RenderSettings {
 impl Default for RenderSettings {
     fn default() -> Self {
         Self {
-            method: Method::Gated,
+            method: Method::TwoLevel,
             width: 320,
             height: 160,
             samples: 8.0,

@@ -354,7 +354,10 @@ impl<'a> Run<'a> {
             }
             VelocitySource::Analytic(..) => None,
         };
-        let settings = settings.unwrap_or_else(|| scene.surrogate.clone());
+        let settings = settings.unwrap_or_else(|| {
+            let pixels = [scene.render.width, scene.render.height];
+            scene.surrogate.for_picture(scene.render.method.is_smooth(), pixels, &plan.domain)
+        });
         let sized = scene.render.method != Method::Reference && scene.network.size == Size::Auto;
         let sizing = sized.then(|| Sizing::new(&settings, &scene.network, &plan.domain)).transpose()?;
         let times = Times::new(&scene.network, flow.tau());

@@ -19,9 +19,18 @@ pub const SMALL_NETWORK: &str = "
     network.batch = 512
 ";
 
-/// A scene of this source with pictures of this width, height and number of samples.
+/// A scene of this source with pictures of this width, height and number of samples, `gated` with a network above a table unless `keys` say
+/// otherwise.
 pub fn scene(kind: &str, [width, height, samples]: [usize; 3], keys: &str) -> String {
-    format!("source.kind = \"{kind}\"\nrender.width = {width}\nrender.height = {height}\nrender.samples = {samples}\n{keys}\n")
+    let mut text =
+        format!("source.kind = \"{kind}\"\nrender.width = {width}\nrender.height = {height}\nrender.samples = {samples}\n{keys}\n");
+    // Most tests are about the loop of training and trust.
+    for (key, value) in [("render.method", "gated"), ("surrogate.kind", "residual")] {
+        if !text.contains(key) {
+            text += &format!("{key} = \"{value}\"\n");
+        }
+    }
+    text
 }
 
 /// The double gyre in its box.
