@@ -4,11 +4,11 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
 use ridgewatch::backend::cuda::{
-    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, RayCheck, SnapshotStore,
-    Tuning,
+    CombineInput, CudaTracer, DeviceError, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium, RayCheck,
+    SnapshotStore, Tuning,
 };
-use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::field::Window;
+use ridgewatch::field::turbulence::Turbulence;
 use ridgewatch::flow::{Boundary, Direction, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, VelocitySource};
 use ridgewatch::render::{Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Arc;
@@ -84,7 +84,12 @@ fn main() {
             });
             let pixel = |i: usize| (i * 7919 % (width * height)) as u32;
             let checks: Vec<RayCheck> = (0..48)
-                .map(|i| RayCheck { pixel: pixel(i / 4), ray: i as u32 % 4, step: 0.25 * cells * spacing, shadow_step: 0.5 * cells * spacing })
+                .map(|i| RayCheck {
+                    pixel: pixel(i / 4),
+                    ray: i as u32 % 4,
+                    step: 0.25 * cells * spacing,
+                    shadow_step: 0.5 * cells * spacing,
+                })
                 .collect();
             let checked = median(&gpu, || march.check(&medium, &checks, false).map(drop));
             println!("| {name} | {preparation:.3} | {cells} | {:.3} | {:.3} | {checked:.3} |", rays[0], rays[1]);
@@ -103,13 +108,11 @@ fn main() {
     for (name, how) in [("left out", None), ("shrunk", Some(Combine::Shrink)), ("summed", Some(Combine::Sum))] {
         let mut finished = f32::INFINITY;
         let combined = median(&gpu, || {
-            let input =
-                CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
+            let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             combine.combine(&input).map(drop)
         });
         for _ in 0..5 {
-            let input =
-                CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
+            let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             combine.combine(&input).unwrap();
             let began = gpu.mark().unwrap();
             combine.finish(8, 1e-4, 1e-5).unwrap();

@@ -6,7 +6,7 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::backend::{Device, DeviceSettings, TracedOnce, stratified_points};
+use ridgewatch::backend::{Device, DeviceChoice, DeviceSettings, TracedOnce, stratified_points};
 use ridgewatch::config::SceneFile;
 use ridgewatch::render::{Film, Method, TransferSettings};
 use ridgewatch::run::{Event, Frame, RunOptions, Settings, Setup, run};
@@ -71,7 +71,7 @@ fn main() {
     let (truth_samples, count) = (number(1, 1024), number(2, 12));
     let text = std::fs::read_to_string(file).unwrap();
     let mut scene = SceneFile::parse(file, &text, &keys).unwrap().settings();
-    let device = Device::open(&DeviceSettings::default(), 0).unwrap();
+    let device = Device::open(DeviceChoice::Auto, &DeviceSettings::default()).unwrap();
     scene.transfer = Some(colours(&scene, &device));
     (scene.time.warmup_frames, scene.time.slides) = (0, Some(1));
     let truth = [77, 78].map(|seed| {
@@ -91,15 +91,19 @@ fn main() {
         }
         let mut scene = scene.clone();
         (scene.render.method, scene.time.frames_per_slide) = (method, count);
-        println!("\n| {}: seconds | frame ms | samples | rays | PSNR lit | all | rms | stated PSNR | stated rms | march rms |", method.name());
+        println!(
+            "\n| {}: seconds | frame, ms: picture, trace, audit | samples | rays | PSNR lit | all | rms | stated PSNR | stated rms | march rms |",
+            method.name()
+        );
         println!("|{}", "---|".repeat(10));
-        let (mut sum, mut began) = (Film::new(size[0], size[1]), None);
-        let mut seconds = 0.0;
+        let mut sum = Film::new(size[0], size[1]);
+        // The measurement itself takes time between the frames.
+        let mut since = 0.0;
         frames(&scene, &device, |frame| {
             let record = &frame.record;
-            let start = *began.get_or_insert(record.seconds.elapsed - record.seconds.total - record.seconds.slide);
-            let (since, took) = (record.seconds.elapsed - start, record.seconds.total);
-            seconds += took;
+            let stages = &record.seconds;
+            let took = stages.total;
+            since += took + stages.slide;
             let stated = record.picture_error;
             if stated.is_none() {
                 sum.accumulate(&frame.film).unwrap();
@@ -109,8 +113,11 @@ fn main() {
             let samples = stated.map_or(record.samples_per_pixel * (record.frame + 1) as f64, |s| s.samples_per_pixel);
             let stated = stated.unwrap_or_default();
             println!(
-                "| {since:.3} | {:.1} | {samples:.2} | {} | {:.2} | {:.2} | {:.5} | {:.2} ({:.2} to {:.2}) | {:.5} ({:.5} to {:.5}) | {:.5} |",
+                "| {since:.3} | {:.1} = {:.1} + {:.1} + {:.1} | {samples:.2} | {} | {:.2} | {:.2} | {:.5} | {:.2} ({:.2} to {:.2}) | {:.5} ({:.5} to {:.5}) | {:.5} |",
                 1e3 * took,
+                1e3 * stages.render,
+                1e3 * stages.trace,
+                1e3 * (stages.audit + stages.train),
                 stated.rays_per_pixel,
                 true_error.psnr[0],
                 true_error.psnr[1],

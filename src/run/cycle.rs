@@ -19,7 +19,7 @@ use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
-use crate::surrogate::{Learned, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
+use crate::surrogate::{Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
 use crate::trust::TrustMap;
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -349,7 +349,8 @@ impl<'a> Run<'a> {
         let transfer = TransferRecord { low: range.0, high: range.1, extinction: f64::from(renderer.transfer().extinction_max()) };
         let settings = match &first.velocity {
             VelocitySource::Window(window) => {
-                let most = if first.live.is_some() { max_live_nodes(scene, &options.device) } else { usize::MAX };
+                let own = if options.device.is_gpu() { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
+                let most = if first.live.is_some() { max_live_nodes(scene, &options.device).min(own) } else { own };
                 window.grid().map(|grid| scene.surrogate.at_resolution_of(grid.shape(), most))
             }
             VelocitySource::Analytic(..) => None,

@@ -145,13 +145,15 @@ impl Run<'_> {
         sink: &mut Sink<'_>,
     ) -> Result<Work<B::Samples>, DeviceError> {
         self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
-        let (extras, keep) = (self.label_extras(), self.labels_per_frame(on));
+        let learns = on.surrogate.as_ref().is_some_and(Surrogate::learns);
+        let is_smooth = self.plan.scene.render.method.is_smooth();
+        // A smooth picture measures its own error, so that labels of a table have no use.
+        let (extras, keep) = (self.label_extras(), if is_smooth && !learns { 0 } else { self.labels_per_frame(on) });
         let On { backend, tracer, surrogate, picture: accumulated } = on;
         let tracer = present(tracer);
         let scene = &self.plan.scene;
         let settings = &scene.training;
         let waits = !picture.is_live || settings.steps_per_frame.is_some();
-        let learns = surrogate.as_ref().is_some_and(Surrogate::learns);
         // Warm-up frames use separate random numbers, so that the first frame after them does not depend on their number.
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
         let samples_per_pixel = match scene.time.warmup_samples.filter(|_| picture.place.is_warmup) {

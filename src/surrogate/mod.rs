@@ -253,7 +253,9 @@ impl Default for SurrogateSettings {
 /// Default nodes along the longest edge of a table for closed forms: of a table alone, and of a table below a network.
 const DEFAULT_NODES: [usize; 2] = [256, 128];
 /// Maximum nodes of a table with the nodes of the data. Every slide traces them again, which takes two cores about ten seconds.
-const MAX_OWN_NODES: usize = 1 << 21;
+pub(crate) const MAX_OWN_NODES: usize = 1 << 21;
+/// The same if a GPU traces them: 128 MiB.
+pub(crate) const MAX_DEVICE_NODES: usize = 1 << 25;
 /// Maximum nodes of a table: 4 GiB of f32.
 const MAX_NODES: usize = 1 << 30;
 
@@ -297,11 +299,11 @@ impl SurrogateSettings {
     }
 
     /// Returns the settings with the nodes of the gridded velocity (`shape`, along x, y, z) for a table whose nodes are not set. All axes are
-    /// reduced by the same factor if that gives more than 2^21 nodes, or more than `most`.
+    /// reduced by the same factor if that gives more than `most` nodes.
     pub fn at_resolution_of(&self, shape: [usize; 3], most: usize) -> Self {
         let all: f64 = shape.iter().map(|&n| n as f64).product();
         let axes = shape.iter().filter(|&&n| n > 1).count().max(1);
-        let share = (most.min(MAX_OWN_NODES) as f64 / all).min(1.0).powf(1.0 / axes as f64);
+        let share = (most as f64 / all).min(1.0).powf(1.0 / axes as f64);
         let own = shape.map(|n| ((n as f64 * share) as usize).max(2));
         Self { table_nodes: self.table_nodes.or(Some(own)), ..self.clone() }
     }
@@ -344,7 +346,7 @@ mod tests {
         assert_eq!(open.at_resolution_of([81, 41, 1], usize::MAX).table_nodes, Some([81, 41, 2]));
         let set = SurrogateSettings { table_nodes: Some([5, 6, 7]), ..open.clone() };
         assert_eq!(set.at_resolution_of([81, 41, 1], usize::MAX), set);
-        let [x, y, z] = open.at_resolution_of([3000, 1500, 100], usize::MAX).table_nodes.unwrap();
+        let [x, y, z] = open.at_resolution_of([3000, 1500, 100], MAX_OWN_NODES).table_nodes.unwrap();
         assert!(x * y * z <= MAX_OWN_NODES && x * y * z > MAX_OWN_NODES * 9 / 10, "{x} x {y} x {z}");
         assert!(x.abs_diff(2 * y) <= 2, "{x} x {y}: all axes are divided alike");
         assert_eq!(open.at_resolution_of([128, 128, 128], 64 * 64 * 64).table_nodes, Some([64, 64, 64]));

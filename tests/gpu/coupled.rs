@@ -3,7 +3,8 @@
 use crate::render::{OnHost, ThroughHost, domain, scene, waves};
 use crate::scenes::{gpu, opened};
 use ridgewatch::backend::cuda::{
-    Buffer, CoupledStats, CoupledTracker, DeviceLogStretch, DeviceError, Gpu, GpuSettings, PairTiles, SUM_PLANES, SurrogateNodes, bayer_rank,
+    Buffer, CoupledStats, CoupledTracker, DeviceError, DeviceLogStretch, Gpu, GpuSettings, PairTiles, SUM_PLANES, SurrogateNodes,
+    bayer_rank,
 };
 use ridgewatch::render::Renderer;
 use ridgewatch::render::smooth::Nodes;

@@ -198,9 +198,7 @@ impl LightVolume {
         let f: [f32; 2] = std::array::from_fn(|side| column[side] - first[side]);
         let at = |plane: usize| {
             // The clamp guards against rounding at the outermost columns.
-            let index = |side: usize| {
-                (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, size[side] as i32 - 2) as usize
-            };
+            let index = |side: usize| (first[side] as i32 + MARGIN + shear.offset(side, plane)).clamp(0, size[side] as i32 - 2) as usize;
             let start = (plane * size[1] + index(1)) * size[0] + index(0);
             let near = &self.depth[start..start + size[0] + 2];
             let row = size[0];

@@ -5,6 +5,7 @@
 
 use super::light_volume::LightVolume;
 use super::nodes::Nodes;
+use crate::render::Light;
 use crate::render::rng::unit;
 use crate::render::tracking::{FrameScene, PHASE};
 
@@ -149,7 +150,10 @@ impl Medium<'_> {
             let absorbed = 1.0 - (-extinction * step).exp();
             let weight = transmittance * absorbed;
             let grid = std::array::from_fn(|k| origin[k] + t * direction[k]);
-            let (_, _, radiance) = scene.light.seen_from(space.scene_point(grid));
+            let radiance = match scene.light {
+                Light::Directional { radiance, .. } => *radiance,
+                Light::Point { .. } => scene.light.seen_from(space.scene_point(grid)).2,
+            };
             let depth = match light {
                 ToLight::Volume(volume) => volume.at(unit),
                 ToLight::March(step) => self.depth_to_light(grid, step),

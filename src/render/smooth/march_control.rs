@@ -6,7 +6,7 @@ use crate::render::rng::FrameRandom;
 pub(crate) const FIRST_RAYS: u64 = 2;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
-const FIRST_STEP: f32 = 0.5;
+const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
@@ -90,8 +90,12 @@ impl MarchControl {
         self.quadrature() + self.filter()
     }
 
-    /// Decides how to go on if the rest of the picture has the mean square error `others`.
-    pub(crate) fn decide(&mut self, others: f64) -> Marching {
+    /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
+    pub(crate) fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
+        if !may_go_on {
+            self.next_rays = u64::from(self.rays < MAX_RAYS);
+            return Marching::Enough;
+        }
         let allowed = SHARE * others.max(0.0);
         if self.quadrature() > allowed && self.step > MIN_STEP {
             *self = Self { step: 0.5 * self.step, next_rays: self.rays.max(FIRST_RAYS), ..Self::default() };

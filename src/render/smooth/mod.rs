@@ -19,9 +19,9 @@ pub use coupled::CoupledPath;
 pub(in crate::render) use coupled::coupled_paths;
 #[cfg(feature = "cuda")]
 pub(crate) use light_volume::{LightGrid, MARGIN};
+pub use march::IsMissing;
 #[cfg(feature = "cuda")]
 pub(crate) use march::node_spacing;
-pub use march::IsMissing;
 pub use nodes::{BRICK, Nodes};
 pub use picture::{Picture, Refinement};
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};

@@ -21,6 +21,8 @@ use std::time::Instant;
 const LIGHT_VALUES: usize = 1 << 24;
 /// Pairs per pixel that measure the error of a marched picture.
 pub(crate) const AUDIT_PAIRS: f64 = 1.0 / 16.0;
+/// Seconds of marching that a round may take at least. It may also take as long as its samples.
+const MIN_MARCH_SECONDS: f64 = 0.1;
 /// Radius over which the squared error of a pixel is averaged, and its floor as a share of the frame's mean.
 pub(crate) const ERROR_RADIUS: usize = 8;
 pub(crate) const ERROR_FLOOR: f64 = 0.05;
@@ -62,9 +64,8 @@ pub struct Picture {
 impl Picture {
     /// Starts anew if the picture shows anything else.
     fn settle(&mut self, scene: &Scene, inverse_tau: f32, nodes: &Nodes, number: u64) {
-        let same = |(shown, tau, old): &(Scene, f32, Nodes)| {
-            shown == scene && *tau == inverse_tau && std::ptr::eq(old.values(), nodes.values())
-        };
+        let same =
+            |(shown, tau, old): &(Scene, f32, Nodes)| shown == scene && *tau == inverse_tau && std::ptr::eq(old.values(), nodes.values());
         if self.shows.as_ref().is_some_and(same) {
             return;
         }
@@ -95,8 +96,10 @@ impl Picture {
         self.settle(scene, frame.inverse_tau, round.nodes, round.number);
         let frame = &FrameScene { random: FrameRandom::new(scene.seed, self.number), ..*frame };
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
-        self.march(&medium, round.sum);
+        let mut marching = self.march(&medium, round.sum);
+        let sampling = Instant::now();
         let mut stats = self.sample(&medium, round, wave_flights, answers)?;
+        let allowed = sampling.elapsed().as_secs_f64().max(MIN_MARCH_SECONDS);
         let how = match (round.method, round.sum) {
             (Method::Marched, _) => Correction::Left,
             (_, true) => Correction::Summed,
@@ -110,7 +113,7 @@ impl Picture {
             if round.stop.load(Ordering::Relaxed) {
                 return None;
             }
-            match self.march.decide(others) {
+            match self.march.decide(others, marching < allowed) {
                 Marching::Enough => break (film, error),
                 Marching::Anew => {
                     self.light = None;
@@ -118,17 +121,18 @@ impl Picture {
                 }
                 Marching::More => {}
             }
-            self.march(&medium, round.sum);
+            marching += self.march(&medium, round.sum);
         };
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
     }
 
-    /// Marches more rays, and compares some pixels with a finer march.
-    fn march(&mut self, medium: &Medium<'_>, shift: bool) {
+    /// Marches more rays, and compares some pixels with a finer march. Returns the seconds that it took.
+    fn march(&mut self, medium: &Medium<'_>, shift: bool) -> f64 {
         if self.march.next_rays == 0 {
-            return;
+            return 0.0;
         }
+        let began = Instant::now();
         let refine = self.march.refine();
         let light = &*self.light.get_or_insert_with(|| LightVolume::new(medium, LIGHT_VALUES, refine));
         let step = medium.spacing() as f32 * self.march.step;
@@ -154,6 +158,7 @@ impl Picture {
             })
             .collect();
         compared.into_iter().for_each(|[coarse, following, fine]| self.march.audit(coarse, following, fine));
+        began.elapsed().as_secs_f64()
     }
 
     /// Tracks pairs of coupled paths. `None` if `stop` ended it early.

@@ -9,7 +9,7 @@
 use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::{MissingCellsArgument, TableArgument};
 use crate::backend::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument};
-use crate::backend::cuda::{Buffer, DeviceLogStretch, DeviceError, DeviceMissingCells, Gpu, launch, threads};
+use crate::backend::cuda::{Buffer, DeviceError, DeviceLogStretch, DeviceMissingCells, Gpu, launch, threads};
 use crate::render::{CellObservations, FrameParameters, Renderer};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};

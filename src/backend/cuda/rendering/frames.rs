@@ -2,8 +2,8 @@
 
 use super::audit::Audits;
 use super::renderer::GpuRenderer;
-use super::smooth::{GpuSmooth, SmoothRound};
 use super::router::{DeviceLearns, DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
+use super::smooth::{GpuSmooth, SmoothRound};
 use crate::backend::cuda::driver::Gpu;
 use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
 use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
@@ -100,7 +100,13 @@ impl GpuFrames {
     /// # Errors
     /// A kernel does not compile, or the device fails.
     pub fn new(gpu: &Arc<Gpu>) -> Result<Self, DeviceError> {
-        Ok(Self { renderer: GpuRenderer::new(gpu)?, router: DeviceQueryRouter::new(gpu)?, audits: Audits::new(gpu)?, smooth: None, gpu: gpu.clone() })
+        Ok(Self {
+            renderer: GpuRenderer::new(gpu)?,
+            router: DeviceQueryRouter::new(gpu)?,
+            audits: Audits::new(gpu)?,
+            smooth: None,
+            gpu: gpu.clone(),
+        })
     }
 
     /// Renders a frame. Every query is traced if `surrogate` is `None`. A smooth frame refines the picture with the number `picture`.
@@ -173,8 +179,7 @@ impl GpuFrames {
             Predictor::Table(table) => Some(*table),
             Predictor::Network(..) => None,
         };
-        let round =
-            SmoothRound { smooth, picture, frame: job.picture, samples: job.samples, tracer, table, predictor, stop: job.stop };
+        let round = SmoothRound { smooth, picture, frame: job.picture, samples: job.samples, tracer, table, predictor, stop: job.stop };
         let pool = frozen.network.as_ref().and_then(|network| network.pool().cloned());
         let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
         let nothing_trusted = Gate::uniform(false);
@@ -201,8 +206,7 @@ impl GpuFrames {
         if let Some(report) = job.progress {
             report(1.0);
         }
-        let tally =
-            Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
+        let tally = Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
         Ok(Rendered { film, stats, tally, samples: labels, error: Some(error) })
     }
 

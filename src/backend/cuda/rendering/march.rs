@@ -121,7 +121,12 @@ device_repr!(BricksArgument, MarchArgument, RayCheck);
 unsafe impl bytemuck::NoUninit for LightArgument {}
 
 /// Returns memory for at least `len` values, of which `slot` keeps the ownership. Allocates only if `slot` holds less.
-pub(super) fn room<'a, T: DeviceRepr>(gpu: &Gpu, slot: &'a mut Option<Buffer<T>>, what: &str, len: usize) -> Result<&'a mut Buffer<T>, DeviceError> {
+pub(super) fn room<'a, T: DeviceRepr>(
+    gpu: &Gpu,
+    slot: &'a mut Option<Buffer<T>>,
+    what: &str,
+    len: usize,
+) -> Result<&'a mut Buffer<T>, DeviceError> {
     if slot.as_ref().is_none_or(|held| held.len() < len) {
         // The old memory is freed first, so that both need not fit.
         *slot = None;
@@ -133,7 +138,11 @@ pub(super) fn room<'a, T: DeviceRepr>(gpu: &Gpu, slot: &'a mut Option<Buffer<T>>
 }
 
 /// The same for pinned memory.
-pub(super) fn pinned_room<'a, T: Copy + Default>(gpu: &Gpu, slot: &'a mut Option<Pinned<T>>, len: usize) -> Result<&'a mut Pinned<T>, DeviceError> {
+pub(super) fn pinned_room<'a, T: Copy + Default>(
+    gpu: &Gpu,
+    slot: &'a mut Option<Pinned<T>>,
+    len: usize,
+) -> Result<&'a mut Pinned<T>, DeviceError> {
     if slot.as_ref().is_none_or(|held| held.len() < len) {
         *slot = None;
     }

@@ -17,10 +17,13 @@ use crate::render::smooth::{
 use crate::render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
+use std::time::Instant;
 
 /// Largest number of values of the light volume, 512 MiB, and the share of the free memory that it takes at most.
 const LIGHT_VALUES: u64 = 1 << 27;
 const LIGHT_SHARE: u64 = 8;
+/// Seconds of marching that a round may take at least. It may also take as long as its samples.
+const MIN_MARCH_SECONDS: f64 = 0.005;
 /// Pairs of a tile in one call of the tracker.
 const MAX_PAIRS: usize = 256;
 
@@ -126,8 +129,9 @@ impl GpuSmooth {
     ) -> Result<(Film, RenderStats, PictureError), DeviceError> {
         self.settle(round, renderer)?;
         let parameters = renderer.round_setup(self.number).parameters;
-        self.march(round, renderer, &parameters)?;
+        let mut marching = self.march(round, renderer, &parameters)?;
         let mut stats = self.track(round, renderer, answers)?;
+        let allowed = (stats.walk_seconds + stats.evaluate_seconds).max(MIN_MARCH_SECONDS);
         let settings = &renderer.scene().settings;
         let (width, height, tone_map) = (settings.width, settings.height, settings.tone_map);
         let how = match (round.smooth.method, round.smooth.sum) {
@@ -142,12 +146,12 @@ impl GpuSmooth {
             let tiles = self.combine.combine(&input)?;
             let error = PictureError::of(tiles, self.control.error(), samples_per_pixel, self.control.rays);
             self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
-            match self.control.decide(error.rms.value.powi(2) - self.control.error()) {
+            match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
                 Marching::Enough => break error,
                 Marching::Anew => self.prepare(round, renderer)?,
                 Marching::More => {}
             }
-            self.march(round, renderer, &parameters)?;
+            marching += self.march(round, renderer, &parameters)?;
         };
         let march = self.control.error();
         let floor = ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0);
@@ -156,12 +160,13 @@ impl GpuSmooth {
         Ok((film, stats, error))
     }
 
-    /// Marches the rays that are due, and compares some pixels with a finer march.
-    fn march(&mut self, round: &SmoothRound<'_>, renderer: &Renderer, parameters: &FrameParameters) -> Result<(), DeviceError> {
+    /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
+    fn march(&mut self, round: &SmoothRound<'_>, renderer: &Renderer, parameters: &FrameParameters) -> Result<f64, DeviceError> {
         let due = self.control.next_rays;
         if due == 0 {
-            return Ok(());
+            return Ok(0.0);
         }
+        let began = Instant::now();
         let medium = medium(&self.nodes, round, parameters)?;
         let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
         self.march.march(&medium, step, due as u32, round.smooth.sum)?;
@@ -187,7 +192,7 @@ impl GpuSmooth {
             };
             self.control.audit(mean(0), mean(1), mean(2));
         }
-        Ok(())
+        Ok(began.elapsed().as_secs_f64())
     }
 
     /// Tracks the pairs of a round.
