@@ -439,10 +439,17 @@ RW_FN bool advance_coupled(const CoupledFrame& frame, const CoupledWork& work, c
     }
 }
 
-// Adds the two paths of an entry to the sums of its pixel. Pairs alternate between the quarters, in neighbouring pixels the other way round.
+RW_FN uint32_t bit_parity(uint32_t bits) {
+    for (uint32_t shift = 16; shift > 0; shift >>= 1) bits ^= bits >> shift;
+    return bits & 1u;
+}
+
+// Adds the two paths of an entry to the sums of its pixel. The parity of the bits of both coordinates halves the pixels of every level of the Bayer
+// order between the quarters; pairs of a pixel alternate.
 RW_FN void add_pair(const CoupledWork& work, float* sums, uint32_t entry) {
     const uint32_t pixel = work.list[entry];
-    const uint32_t quarter = (pairs_before(sums, work.pixels, pixel) + pixel % work.width + pixel / work.width) & 1u;
+    const uint32_t pair = pairs_before(sums, work.pixels, pixel);
+    const uint32_t quarter = (bit_parity(pixel % work.width) + bit_parity(pixel / work.width) + pair) & 1u;
     float alpha = 0.0f, traced = 0.0f;
     for (uint32_t half = 0; half < 2; ++half) {
         const Float4 found = work.found[2 * entry + half];

@@ -242,7 +242,13 @@ pub fn line(record: &FrameRecord) -> String {
     if record.audited > 0 && record.mean_lifetime_share < 0.9995 {
         text += &format!(", particles live {:.1} % of tau", 100.0 * record.mean_lifetime_share);
     }
-    if let Some(error) = &record.trusted_error {
+    if let Some(error) = &record.picture_error {
+        let (psnr, rms) = (error.psnr, error.rms);
+        text += &format!(
+            ", picture {:.1} dB [{:.1}, {:.1}], error {:.4} [{:.4}, {:.4}] rms",
+            psnr.value, psnr.low, psnr.high, rms.value, rms.low, rms.high
+        );
+    } else if let Some(error) = &record.trusted_error {
         text += &format!(
             ", error where trusted {:.4} [{:.4}, {:.4}] rms",
             error.optical_rms, error.optical_rms_interval[0], error.optical_rms_interval[1]

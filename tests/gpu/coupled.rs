@@ -101,7 +101,8 @@ fn the_same_answers_give_the_cpu_s_sums() {
         let paths: Vec<(u32, u32)> = list.iter().flat_map(|&pixel| [0, 1].map(|half| (pixel, 2 * pair(&expected, pixel) + half))).collect();
         let reference = cpu.coupled_paths(STREAM, &nodes(), None, &paths, &mut OnHost);
         for (&pixel, halves) in list.iter().zip(reference.chunks_exact(2)) {
-            let quarter = (pair(&expected, pixel) as usize + pixel as usize % WIDTH + pixel as usize / WIDTH) & 1;
+            let bits = (pixel as usize % WIDTH).count_ones() + (pixel as usize / WIDTH).count_ones();
+            let quarter = (pair(&expected, pixel) + bits) as usize & 1;
             let mut add = |plane: usize, value: f32| expected[plane * pixels + pixel as usize] += value;
             for (half, path) in halves.iter().enumerate() {
                 (0..3).for_each(|k| add(3 * (2 * half + quarter) + k, path.radiance[k]));

@@ -166,7 +166,7 @@ fn coupled_paths_are_the_same_bits() {
 /// Adds pair `pair` of each listed pixel to the sums, in the order of the kernels.
 fn add(sums: &mut [f32], list: &[u32], paths: &[CoupledPath], pair: u32) {
     for (&pixel, halves) in list.iter().zip(paths.chunks_exact(2)) {
-        let quarter = ((pair + pixel % 37 + pixel / 37) & 1) as usize;
+        let quarter = ((pair + (pixel % 37).count_ones() + (pixel / 37).count_ones()) & 1) as usize;
         let mut at = |plane: usize, value: f32| sums[plane * PIXELS + pixel as usize] += value;
         for (half, path) in halves.iter().enumerate() {
             (0..3).for_each(|k| at(3 * (2 * half + quarter) + k, path.radiance[k]));

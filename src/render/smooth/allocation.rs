@@ -29,6 +29,12 @@ pub(crate) fn rank(x: usize, y: usize) -> u8 {
     (0..4).fold(0, |rank, bit| (rank << 2) | ((((a >> bit) & 1) << 1) | ((b >> bit) & 1)) as u8)
 }
 
+/// Quarter of a pixel's pair with this number: the parity of the bits of both coordinates, which halves the pixels of every range of ranks that
+/// starts at a multiple of its length, and alternates from pair to pair.
+pub(crate) fn quarter(x: usize, y: usize, pair: usize) -> usize {
+    (x.count_ones() as usize + y.count_ones() as usize + pair) & 1
+}
+
 /// Tiles across and down.
 pub(crate) fn tiles(width: usize, height: usize) -> [usize; 2] {
     [width.div_ceil(TILE), height.div_ceil(TILE)]
@@ -98,6 +104,19 @@ mod tests {
             pixels(&allocation.next(0.375), width, height).iter().for_each(|&pixel| pairs[pixel as usize] += 1);
         }
         assert!(pairs.iter().all(|&n| (11..=13).contains(&n)), "{:?} of 12", (pairs.iter().min(), pairs.iter().max()));
+    }
+
+    #[test]
+    fn quarters_halve_every_level_of_the_order() {
+        for range in [0..4, 0..16, 16..32, 0..64, 0..128, 128..256_usize] {
+            let mut quarters = [0; 2];
+            for (y, x) in (0..TILE).flat_map(|y| (0..TILE).map(move |x| (y, x))) {
+                if range.contains(&usize::from(rank(x, y))) {
+                    quarters[quarter(x, y, 0)] += 1;
+                }
+            }
+            assert_eq!(quarters[0], quarters[1], "{range:?}");
+        }
     }
 
     #[test]

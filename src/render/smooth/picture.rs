@@ -1,6 +1,6 @@
 //! A picture that accumulates on the CPU: rays marched through the surrogate, and pairs of coupled samples where the variance is.
 
-use super::allocation::{Allocation, TILE, pixels, tiles};
+use super::allocation::{Allocation, TILE, pixels, quarter, tiles};
 use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
@@ -196,7 +196,7 @@ impl Picture {
         for (paths, halves) in paths.chunks_exact(2).zip(found.chunks_exact(2)) {
             let (pixel, pair) = (paths[0].0 as usize, paths[0].1 as usize / 2);
             let sums = &mut self.sums[pixel];
-            let quarter = (pair + pixel % width + pixel / width) & 1;
+            let quarter = quarter(pixel % width, pixel / width, pair);
             for (half, difference) in halves.iter().enumerate() {
                 (0..3).for_each(|k| sums.radiance[half][quarter][k] += difference.radiance[k]);
                 sums.alpha += difference.alpha;

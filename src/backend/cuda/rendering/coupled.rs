@@ -231,7 +231,7 @@ impl CoupledTracker {
 
     /// Tracks one pair of paths for each listed pixel and adds the results to `sums`, which hold [`SUM_PLANES`] planes of the picture's pixels.
     /// The pair of a pixel (x, y) that has had v pairs are its samples 2 v (half A) and 2 v + 1 (half B) of the random stream `number`, which
-    /// stays the same while a picture accumulates; they go to quarter (v + x + y) mod 2. If this fails or stops, the sums are unchanged.
+    /// stays the same while a picture accumulates; they go to quarter (v + bits of x + bits of y) mod 2. If this fails or stops, the sums are unchanged.
     ///
     /// No query lies in a missing cell, so [`super::TraceAll`] answers all of them unless traced values are wanted as labels.
     ///
