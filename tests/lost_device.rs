@@ -477,7 +477,7 @@ const TINY_NETWORK: &str = "
 fn sliding(kind: Kind, frames_per_slide: usize) -> SceneFile {
     let surrogate = format!("surrogate.kind = \"{}\"", kind.name());
     let table = if kind == Kind::Network { "" } else { "surrogate.table_nodes = [16, 8, 8]" };
-    let network = if kind == Kind::Table { "" } else { TINY_NETWORK };
+    let network = if kind == Kind::Table { String::new() } else { format!("{TINY_NETWORK}\n        training.steps_per_frame = {STEPS}") };
     let keys = format!(
         "
         source.nodes = [16, 8, 8]
@@ -486,7 +486,6 @@ fn sliding(kind: Kind, frames_per_slide: usize) -> SceneFile {
         time.frames_per_slide = {frames_per_slide}
         flow.steps = 8
         trust.cells = [2, 2, 2]
-        training.steps_per_frame = {STEPS}
         {surrogate}
         {table}
         {network}"

@@ -117,7 +117,7 @@ fn while_cells_are_probed() {
 fn while_the_first_window_fills() {
     // Each snapshot is a sum of 4096 modes at two million nodes.
     let scene = "source.kind = \"turbulence\"\nsource.nodes = [128, 128, 128]\nsource.modes = 4096\ntime.tau = 11\n";
-    let mut run = Run::start(scene, &[], None);
+    let mut run = Run::start(scene, &["surrogate.kind=table"], None);
     run.process().signal(libc::SIGINT);
     assert_eq!(run.ended_in_order(130), 0);
 }

@@ -68,12 +68,14 @@ fn a_fault_in_any_section_points_at_its_line() {
         ("time", "frames_per_slide = 0", "time.frames_per_slide", "0", "from 1 to"),
         ("flow", "difference_step = 0.0", "flow.difference_step", "0", "above 0"),
         ("surrogate", "table_nodes = [1, 8, 8]", "surrogate.table_nodes", "[1, 8, 8]", "at least 2"),
-        ("network", "features = 3", "network.features", "3", "1, 2, 4 or 8"),
-        ("network", "growth = 0.5", "network.growth", "0.5", "1 to 4"),
-        ("network", "loss = \"published\"", "network.loss", "published", "mean_square"),
-        ("training", "share = 1.0", "training.share", "1", "not including, 1"),
+        ("network", "features = 3\n[surrogate]\nkind = \"residual\"", "network.features", "3", "1, 2, 4 or 8"),
+        ("network", "growth = 0.5\n[surrogate]\nkind = \"residual\"", "network.growth", "0.5", "1 to 4"),
+        ("network", "loss = \"published\"\n[surrogate]\nkind = \"residual\"", "network.loss", "published", "mean_square"),
+        ("training", "share = 1.0\n[surrogate]\nkind = \"residual\"", "training.share", "1", "not including, 1"),
         ("trust", "min_samples = 1", "trust.min_samples", "1", "4 to 4096"),
-        ("render", "samples = 0", "render.samples", "0", "1 to 16777216"),
+        ("render", "samples = 0", "render.samples", "0", "1/64 to 4096"),
+        ("render", "samples = 1.5\nmethod = \"reference\"", "render.samples", "1.5", "1 to 16777216"),
+        ("render", "until = \"40\"", "render.until", "40", "decibels such as"),
         ("render", "tone_map = [1, 1, 0]", "render.tone_map", "0.0", "gamma above 0"),
         ("camera", &format!("field_of_view = 200\neye = [1, 0.5, 2]\n{camera}"), "camera.field_of_view", "200", "below 180"),
         ("light", "direction = [0, 0, 0]\nradiance = [1, 1, 1]", "light.direction", "0.0", "not zero"),
@@ -104,7 +106,8 @@ fn a_fault_found_later_is_located_and_options_are_blamed_for_theirs() {
 fn paths_in_a_scene_are_relative_to_it_and_those_of_the_command_line_are_not() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("scene.toml");
-    std::fs::write(&path, "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[training]\nresume = \"w.safetensors\"\n").unwrap();
+    std::fs::write(&path, "[source]\nkind = \"archive\"\n[archive]\nfiles = \"a.nc\"\n[training]\nresume = \"w.safetensors\"\n[surrogate]\nkind = \"residual\"\n")
+        .unwrap();
     let scene = SceneFile::read(&path, &[]).unwrap();
     assert_eq!(
         (&scene.archive.files[0], scene.training.resume.as_ref().unwrap()),
@@ -157,9 +160,9 @@ fn an_old_key_is_refused_with_its_new_name() {
 #[test]
 fn types_are_said_in_plain_words() {
     for (set, words) in [
-        ("render.samples=many", "is \"many\"; accepted: a whole number, 0 or above"),
-        ("render.samples=1.5", "is 1.5; accepted: a whole number, 0 or above"),
-        ("render.samples=-1", "is -1; accepted: a whole number, 0 or above"),
+        ("render.width=many", "is \"many\"; accepted: a whole number, 0 or above"),
+        ("render.width=1.5", "is 1.5; accepted: a whole number, 0 or above"),
+        ("render.width=-1", "is -1; accepted: a whole number, 0 or above"),
         ("trust.tolerance=low", "is \"low\"; accepted: a number"),
         ("trust.cells=[8, 8]", "is a list of 2; accepted: a list of 3"),
         ("trust.cells=8", "is 8; accepted: a list of 3"),
@@ -191,11 +194,11 @@ fn keys_that_do_nothing_are_refused_where_they_stand() {
         ("surrogate", "table_nodes = [8, 8, 8]\nkind = \"network\"", "surrogate.table_nodes"),
         ("network", "width = 32\n[surrogate]\nkind = \"table\"", "network.width"),
         ("training", "steps_per_frame = 9\n[surrogate]\nkind = \"table\"", "training.steps_per_frame"),
-        ("training", "seconds_per_frame = 0.1\nsteps_per_frame = 9", "training.seconds_per_frame"),
-        ("network", "growth = 2.0\nencoding = \"frequency\"", "network.growth"),
-        ("network", "octaves = 8", "network.octaves"),
-        ("network", "mean_penalty = 0.5", "network.mean_penalty"),
-        ("network", "jacobian_weight = 0.5", "network.jacobian_weight"),
+        ("training", "seconds_per_frame = 0.1\nsteps_per_frame = 9\n[surrogate]\nkind = \"residual\"", "training.seconds_per_frame"),
+        ("network", "growth = 2.0\nencoding = \"frequency\"\n[surrogate]\nkind = \"residual\"", "network.growth"),
+        ("network", "octaves = 8\n[surrogate]\nkind = \"residual\"", "network.octaves"),
+        ("network", "mean_penalty = 0.5\n[surrogate]\nkind = \"residual\"", "network.mean_penalty"),
+        ("network", "jacobian_weight = 0.5\n[surrogate]\nkind = \"residual\"", "network.jacobian_weight"),
     ] {
         let (text, at) = with_fault(section, line);
         let said = error(&text, &[]);

@@ -203,10 +203,8 @@ pub struct RenderSettings {
     /// How the correction of `two_level` is added.
     pub combine: Combine,
     /// Smooth methods: stated error at which a slide needs no further frames. A slide gets frames until then, at most `MAX_FRAMES_UNTIL`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub until: Option<Target>,
     /// Smooth methods: milliseconds of coupled samples per frame, instead of `samples`.
-    #[serde(skip_serializing_if = "Option::is_none")]
     pub budget: Option<f64>,
     /// Background colour, linear.
     pub background: [f64; 3],

@@ -162,6 +162,8 @@ pub(super) struct RunProgress {
     /// True once the warning about short particle lifetimes was given.
     pub(super) has_warned_of_deaths: bool,
     pub(super) warnings: Vec<String>,
+    /// Optimizer steps of the surrogate that the accumulating picture shows.
+    pub(super) steps_shown: u64,
     /// Seconds of a coupled sample a pixel in the last smooth frame; `None` before it.
     pub(super) seconds_per_sample: Option<f64>,
     /// Seconds that the loop paused since the last frame for a checkpoint.

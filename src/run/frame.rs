@@ -150,6 +150,12 @@ impl Run<'_> {
         // A smooth picture measures its own error, so that labels of a table have no use.
         let (extras, keep) = (self.label_extras(), if is_smooth && !learns { 0 } else { self.labels_per_frame(on) });
         let On { backend, tracer, surrogate, picture: accumulated } = on;
+        // A picture shows the surrogate as it was when the picture started. It starts anew whenever the training has doubled.
+        let steps = self.report.train_steps + self.learning.unreported.steps;
+        if is_smooth && learns && steps >= 2 * self.progress.steps_shown.max(1) {
+            *accumulated = B::Picture::default();
+            self.progress.steps_shown = steps;
+        }
         let tracer = present(tracer);
         let scene = &self.plan.scene;
         let settings = &scene.training;

@@ -3,6 +3,7 @@
 use crate::network_support::{DoubleGyre, traced, uniform_points};
 use crate::page;
 use ridgewatch::flow::Tracer;
+use ridgewatch::render::smooth::PictureError;
 use ridgewatch::run::{CheckpointRecord, FrameRecord, StageSeconds};
 use ridgewatch::source::live::LiveRecord;
 use ridgewatch::surrogate::network::{Encoding, Input, NetworkSettings};
@@ -34,6 +35,7 @@ fn the_page_names_every_key_of_a_record_and_no_other() {
         let text = rest.split("\n\n").map(str::trim).find(|text| text.starts_with(start)).unwrap();
         quoted(text.strip_prefix(start).unwrap(), false)
     };
+    assert_eq!(paragraph("`picture_error`:"), keys(&PictureError::default()));
     assert_eq!(paragraph("`training`:"), keys(&Learned::default()));
     assert_eq!(paragraph("`checkpoint`:"), keys(&CheckpointRecord::default()));
     assert_eq!(paragraph("`seconds`:"), keys(&StageSeconds::default()));

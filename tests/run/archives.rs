@@ -41,7 +41,8 @@ fn eddy(folder: &Path) -> PathBuf {
 fn an_archive_with_land_goes_through_the_whole_loop() {
     let folder = tempfile::tempdir().unwrap();
     let run = folder.path().join("run");
-    let keys = set(&["time.tau=6 days", "training.steps_per_frame=20", "trust.cells=[8, 8, 1]"]);
+    let keys =
+        set(&["time.tau=6 days", "render.method=gated", "surrogate.kind=residual", "training.steps_per_frame=20", "trust.cells=[8, 8, 1]"]);
     replay(text(&eddy(folder.path())), &run, &keys);
     let records = records(&run);
     // Ten days, a window of six: the newest time is day 6, 7, 8, 9.

@@ -102,7 +102,7 @@ fn what_an_option_makes_idle_is_left_out() {
 fn paths_are_absolute_wherever_they_were_said() {
     let folder = tempfile::tempdir().unwrap();
     let written = |text: &str, keys: &[String]| read_back(&SceneFile::read(Path::new(&scene::write(folder.path(), text)), keys).unwrap());
-    let archive = "source.kind = \"archive\"\narchive.files = [\"a/*.nc\", \"/b.nc\"]\ntraining.resume = \"w.safetensors\"\n";
+    let archive = "source.kind = \"archive\"\narchive.files = [\"a/*.nc\", \"/b.nc\"]\ntraining.resume = \"w.safetensors\"\nsurrogate.kind = \"residual\"\n";
     let again = written(archive, &["training.resume=v.safetensors".to_owned()]);
     assert_eq!(again.archive.files, [folder.path().join("a/*.nc"), "/b.nc".into()]);
     assert_eq!(again.training.resume, Some(std::env::current_dir().unwrap().join("v.safetensors")));

@@ -1,5 +1,7 @@
 //! Compares the kernels that march and combine, compiled as host C++, with this room. Needs no GPU but a C++ compiler (`c++`, or the one in CXX).
 
+#![allow(clippy::unwrap_used)] // Tests: a panic is the report.
+
 use super::combine::{Correction, PairSums, combine, smoothed};
 use super::light_volume::{LightGrid, LightVolume};
 use super::march::{Medium, RaySum, ToLight};

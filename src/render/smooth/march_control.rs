@@ -10,8 +10,9 @@ const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
-/// Pixels per call that are compared with a finer march.
-const AUDITED_PIXELS: u64 = 24;
+/// Pixels per call whose rays are compared with others of the same pixel, and the first of them that are compared with a finer march as well.
+const AUDITED_PIXELS: u64 = 256;
+pub(crate) const FINELY_AUDITED: usize = 24;
 /// Counter word of the draw of these pixels, which no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX - 2;
 
@@ -25,7 +26,7 @@ pub(crate) struct MarchControl {
     /// Step, as a share of the distance between nodes.
     pub(crate) step: f32,
     /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `FIRST_RAYS` rays.
-    audited: f64,
+    audited: [f64; 2],
     quadrature: f64,
     filter: f64,
 }
@@ -43,7 +44,7 @@ pub(crate) enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: 0.0, quadrature: 0.0, filter: 0.0 }
+        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0 }
     }
 }
 
@@ -68,21 +69,24 @@ impl MarchControl {
     }
 
     /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
-    pub(crate) fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: [f64; 3]) {
+    pub(crate) fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
         let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
-        self.audited += 1.0;
-        self.quadrature += square(coarse, fine);
         // Both means have the error of the filter.
+        self.audited[0] += 1.0;
         self.filter += 0.5 * square(coarse, following);
+        if let Some(fine) = fine {
+            self.audited[1] += 1.0;
+            self.quadrature += square(coarse, fine);
+        }
     }
 
     fn quadrature(&self) -> f64 {
-        self.quadrature / self.audited.max(1.0)
+        self.quadrature / self.audited[1].max(1.0)
     }
 
     /// Error of the pixel filter, which falls at least as fast as with independent rays.
     fn filter(&self) -> f64 {
-        self.filter / self.audited.max(1.0) * FIRST_RAYS as f64 / self.rays.max(1) as f64
+        self.filter / self.audited[0].max(1.0) * FIRST_RAYS as f64 / self.rays.max(1) as f64
     }
 
     /// Mean square error of marching, mean over channels.

@@ -28,7 +28,7 @@ pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 #[cfg(feature = "cuda")]
 pub(crate) use {
     allocation::{Allocation, TILE},
-    march_control::{FIRST_RAYS, MarchControl, Marching},
+    march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
     statement::LIT,
 };

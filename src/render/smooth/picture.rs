@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{IsMissing, Medium, RaySum, ToLight};
-use super::march_control::{FIRST_RAYS, MarchControl, Marching};
+use super::march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
 use crate::render::renderer::RenderStats;
@@ -144,9 +144,10 @@ impl Picture {
             }
         });
         self.march.rays = rays.end;
-        let compared: Vec<[[f64; 3]; 3]> = audited
+        let compared: Vec<([f64; 3], [f64; 3], Option<[f64; 3]>)> = audited
             .into_par_iter()
-            .map(|pixel| {
+            .enumerate()
+            .map(|(number, pixel)| {
                 let mean = |rays: Range<u64>, step: f32, light: ToLight<'_>| {
                     let mut sum = RaySum::default();
                     rays.for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
@@ -154,10 +155,11 @@ impl Picture {
                 };
                 let coarse = mean(0..FIRST_RAYS, step, ToLight::Volume(light));
                 let following = mean(FIRST_RAYS..2 * FIRST_RAYS, step, ToLight::Volume(light));
-                [coarse, following, mean(0..FIRST_RAYS, 0.25 * step, ToLight::March(0.5 * step))]
+                let fine = (number < FINELY_AUDITED).then(|| mean(0..FIRST_RAYS, 0.25 * step, ToLight::March(0.5 * step)));
+                (coarse, following, fine)
             })
             .collect();
-        compared.into_iter().for_each(|[coarse, following, fine]| self.march.audit(coarse, following, fine));
+        compared.into_iter().for_each(|(coarse, following, fine)| self.march.audit(coarse, following, fine));
         began.elapsed().as_secs_f64()
     }
 

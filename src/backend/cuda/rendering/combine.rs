@@ -178,7 +178,7 @@ impl GpuCombine {
         if input.pairs.len() < PAIR_PLANES * pixels {
             return refused("sums over pairs of a smaller picture");
         }
-        debug_assert!(RAY_FIELDS == 6);
+        const { assert!(RAY_FIELDS == 6) };
         let gpu = self.gpu.clone();
         let at = room(&gpu, &mut self.planes, "combining pictures", PLANES.count * pixels)?.address();
         let plane = |number: usize| at + (number * pixels * size_of::<f32>()) as u64;

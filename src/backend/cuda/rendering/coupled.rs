@@ -638,7 +638,7 @@ mod tests {
                 let plan = Plan::new(entries, 8160, 4096, memory);
                 let end = Layout::new(&plan).end;
                 assert!(end <= memory.max(fixed), "{plan:?} takes {end} bytes");
-                assert!(plan.slots % 2 == 0 && plan.slots >= 2 && plan.queue >= 2 * plan.slots, "{plan:?}");
+                assert!(plan.slots.is_multiple_of(2) && plan.slots >= 2 && plan.queue >= 2 * plan.slots, "{plan:?}");
                 assert!(ample.covers(&plan));
             }
         }

@@ -12,7 +12,7 @@ use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::backend::cuda::{Buffer, DeviceError};
 use crate::render::rng::FrameRandom;
 use crate::render::smooth::{
-    AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
+    AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FINELY_AUDITED, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
 };
 use crate::render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
@@ -178,19 +178,18 @@ impl GpuSmooth {
         };
         let checks: Vec<RayCheck> = pixels
             .iter()
-            .flat_map(|&pixel| {
-                let coarse = rays(pixel, 0, step, 0.0).chain(rays(pixel, FIRST_RAYS, step, 0.0));
-                coarse.chain(rays(pixel, 0, 0.25 * step, 0.5 * step))
-            })
+            .flat_map(|&pixel| rays(pixel, 0, step, 0.0).chain(rays(pixel, FIRST_RAYS, step, 0.0)))
+            .chain(pixels[..FINELY_AUDITED].iter().flat_map(|&pixel| rays(pixel, 0, 0.25 * step, 0.5 * step)))
             .collect();
         let radiance = self.march.check(&medium, &checks, round.smooth.sum)?;
         let per_mean = FIRST_RAYS as usize;
-        for pixel in radiance.chunks_exact(3 * per_mean) {
-            let mean = |part: usize| -> [f64; 3] {
-                let rays = &pixel[part * per_mean..(part + 1) * per_mean];
-                std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / per_mean as f64)
-            };
-            self.control.audit(mean(0), mean(1), mean(2));
+        let mean = |part: usize| -> [f64; 3] {
+            let rays = &radiance[part * per_mean..(part + 1) * per_mean];
+            std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / per_mean as f64)
+        };
+        for pixel in 0..pixels.len() {
+            let fine = (pixel < FINELY_AUDITED).then(|| mean(2 * pixels.len() + pixel));
+            self.control.audit(mean(2 * pixel), mean(2 * pixel + 1), fine);
         }
         Ok(began.elapsed().as_secs_f64())
     }
