@@ -137,8 +137,8 @@ fn a_marched_picture_is_the_mean_of_tracked_ones() {
             // No difference between the fields: all that is left is the march.
             let (film, stated) = Smooth::new(&scene, &domain).round(&nodes, missing.then_some(gone), (Method::Marched, false, 2.0), of);
             let found = true_error(&film, &truth);
-            // The noise of the truth leaves some 1e-6 of its product.
-            let allowed = 2.0 * stated.march_rms.powi(2) + 3e-6;
+            // The noise of the truth leaves some 1e-6 of its product. The march is audited on a few pixels, and its errors at edges are rare and large.
+            let allowed = 4.0 * stated.march_rms.powi(2) + 3e-6;
             assert!(found < allowed, "{what}, missing cells: {missing}: mean square {found}, stated {}", stated.march_rms.powi(2));
             assert!(stated.march_rms < 0.02, "{what}, missing cells: {missing}: {stated:?}");
             let mean = |film: &Film| film.rgba.iter().flatten().map(|&c| f64::from(c)).sum::<f64>() / film.rgba.len() as f64;

@@ -71,12 +71,17 @@ impl MarchControl {
     /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
     pub(crate) fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
         let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
-        // Both means have the error of the filter.
-        self.audited[0] += 1.0;
-        self.filter += 0.5 * square(coarse, following);
-        if let Some(fine) = fine {
+        // Pixels that show the background alone agree exactly. They do not count, since errors are stated over lit pixels.
+        let filter = square(coarse, following);
+        if filter > 0.0 {
+            self.audited[0] += 1.0;
+            // Both means have the error of the filter.
+            self.filter += 0.5 * filter;
+        }
+        let quadrature = fine.map_or(0.0, |fine| square(coarse, fine));
+        if quadrature > 0.0 {
             self.audited[1] += 1.0;
-            self.quadrature += square(coarse, fine);
+            self.quadrature += quadrature;
         }
     }
 
