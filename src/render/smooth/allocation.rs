@@ -5,6 +5,8 @@ pub(crate) const TILE: usize = 16;
 const TILE_PIXELS: usize = TILE * TILE;
 /// Share of the pairs that is spread evenly over all tiles.
 const EVEN_SHARE: f64 = 0.25;
+/// Largest share of a tile, of the mean.
+const MAX_RELATIVE: f64 = 8.0;
 /// Variance of a tile that showed no difference, as a share of the mean: none seen is not none.
 const VARIANCE_FLOOR: f64 = 0.02;
 
@@ -54,7 +56,7 @@ impl Allocation {
         let wanted = pairs_per_pixel * TILE_PIXELS as f64;
         let mut round = Vec::with_capacity(self.cursors.len());
         for (cursor, &variance) in self.cursors.iter_mut().zip(&self.variance) {
-            let relative = if spread > 0.0 { deviation(variance) / spread } else { 1.0 };
+            let relative = if spread > 0.0 { (deviation(variance) / spread).min(MAX_RELATIVE) } else { 1.0 };
             let share = wanted * (EVEN_SHARE + (1.0 - EVEN_SHARE) * relative);
             // The cursor, which visits every number evenly, decides which of two whole numbers is taken.
             let pairs = share.floor() as usize + usize::from(share.fract() * TILE_PIXELS as f64 > f64::from(*cursor));

@@ -22,9 +22,9 @@ const TASK: usize = 512;
 /// Result of one coupled path: the traced field less the surrogate.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct CoupledPath {
-    /// CoupledPath of the radiances.
+    /// Difference of the radiances.
     pub radiance: [f32; 3],
-    /// CoupledPath of the weights of the scattering events.
+    /// Difference of the weights of the scattering events.
     pub alpha: f32,
     /// Queries of the traced field.
     pub queries: u32,

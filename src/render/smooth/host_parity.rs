@@ -1,4 +1,4 @@
-//! Compares the kernels that march and combine, compiled as host C++, with this room. Needs no GPU but a C++ compiler (`c++`, or the one in CXX).
+//! Compares the kernels that march and combine, compiled as host C++, with this module. Needs no GPU but a C++ compiler (`c++`, or the one in CXX).
 
 #![allow(clippy::unwrap_used)] // Tests: a panic is the report.
 

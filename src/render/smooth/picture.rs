@@ -242,7 +242,7 @@ impl Picture {
         let march = self.march.error();
         let error = PictureError::of(&tiles, march, samples_per_pixel, self.march.rays);
         let mean: Vec<f32> = combined.squared.iter().map(|e| e[0].iter().sum::<f32>() / 3.0).collect();
-        let floor = (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32;
+        let floor = if error.is_known() { (ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0)) as f32 } else { 0.0 };
         film.error = smoothed(&mean, width, ERROR_RADIUS).into_iter().map(|e| (e.max(floor) + march as f32).sqrt()).collect();
         (film, error, tiles)
     }

@@ -86,6 +86,13 @@ fn estimate<'a>(tiles: impl Iterator<Item = &'a TileErrors>, weighting: usize) -
             variance += (0.5 * all * (squared(1) / first - squared(2) / second)).powi(2);
         }
     }
+    if count == 0.0 {
+        return ErrorEstimate { value: f64::INFINITY, low: 0.0, high: f64::INFINITY };
+    }
+    if variance == 0.0 {
+        // One quarter alone says nothing about the scatter.
+        variance = sum * sum;
+    }
     let (mean, deviation) = (sum / f64::max(count, 1.0), f64::sqrt(variance) / f64::max(count, 1.0));
     // A mean below what the samples resolve says no more than that.
     let value = mean.max(0.5 * deviation);
@@ -93,13 +100,19 @@ fn estimate<'a>(tiles: impl Iterator<Item = &'a TileErrors>, weighting: usize) -
 }
 
 impl PictureError {
+    /// True if samples measured the error of lit pixels. Otherwise nothing is stated.
+    pub(crate) fn is_known(&self) -> bool {
+        [self.rms, self.relmse, self.psnr, self.psnr_all].iter().all(|e| e.value.is_finite() && e.low.is_finite() && e.high.is_finite())
+    }
+
     /// Error of a picture from its tiles and the mean square error of its march.
     pub(crate) fn of(tiles: &[TileSums], march: f64, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
         let lit = |weighting: usize| estimate(tiles.iter().map(|tile| &tile.lit), weighting);
         let linear = lit(0);
         // The error of marching is measured without weights and counts in proportion.
         let with_march = |e: ErrorEstimate| {
-            let share = if linear.value > 0.0 { march * e.value / linear.value } else { march };
+            let known = linear.value > 0.0 && linear.value.is_finite();
+            let share = if known { march * e.value / linear.value } else { march };
             e.map(|v| v + share)
         };
         let decibels = |e: ErrorEstimate| {

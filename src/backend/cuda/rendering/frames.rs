@@ -8,6 +8,7 @@ use crate::backend::cuda::driver::Gpu;
 use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
 use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
+use crate::render::smooth::PictureError;
 use crate::render::{RenderStats, Renderer};
 use crate::surrogate::{FrozenHybrid, Samples};
 use crate::trust::Gate;
@@ -207,7 +208,7 @@ impl GpuFrames {
             report(1.0);
         }
         let tally = Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
-        Ok(Rendered { film, stats, tally, samples: labels, error: Some(error) })
+        Ok(Rendered { film, stats, tally, samples: labels, error: Some(error).filter(PictureError::is_known) })
     }
 
     /// Audits a frame.

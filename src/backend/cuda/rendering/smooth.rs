@@ -148,13 +148,18 @@ impl GpuSmooth {
             self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             match self.control.decide(error.rms.value.powi(2) - self.control.error(), marching < allowed) {
                 Marching::Enough => break error,
-                Marching::Anew => self.prepare(round, renderer)?,
+                Marching::Anew => {
+                    // If the preparation fails, the picture starts anew.
+                    let shows = self.shows.take();
+                    self.prepare(round, renderer)?;
+                    self.shows = shows;
+                }
                 Marching::More => {}
             }
             marching += self.march(round, renderer, &parameters)?;
         };
         let march = self.control.error();
-        let floor = ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0);
+        let floor = if error.is_known() { ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0) } else { 0.0 };
         let film = film(&self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?, width, height);
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
         Ok((film, stats, error))
