@@ -26,7 +26,14 @@ fn replay(files: &Path, tau: f64) -> Film {
     let out = folder.path().join("run");
     let tau = format!("time.tau={tau:?}");
     let picture = set(&["render.width=128", "render.height=64", "render.samples=4"]);
-    let length = set(&["training.steps_per_frame=100", "time.slides=1", "time.frames_per_slide=8", &tau]);
+    let length = set(&[
+        "render.method=gated",
+        "surrogate.kind=residual",
+        "training.steps_per_frame=100",
+        "time.slides=1",
+        "time.frames_per_slide=8",
+        &tau,
+    ]);
     let mut command = program::ridgewatch(["replay", "--json", "--out", text(&out), text(files)]);
     program::run(command.args(picture).args(length)).success();
     let records = records(&out);
