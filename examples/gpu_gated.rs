@@ -168,7 +168,7 @@ fn main() {
     let device = CudaDevice { gpu: gpu.clone(), storage: Storage::F32, when_lost: WhenLost::Stop, may_fall_back: false };
     let device = Device::Cuda(device);
     let text = include_str!("../configs/turbulence_easy.toml");
-    let mut keys = vec!["flow.steps=22".to_owned()];
+    let mut keys = ["flow.steps=22", "surrogate.kind=residual"].map(str::to_owned).to_vec();
     keys.extend(NETWORK.map(str::to_owned));
     keys.extend(told);
     let mut scene = SceneFile::parse(Path::new("turbulence_easy.toml"), text, &keys).unwrap().settings();
