@@ -101,7 +101,7 @@ fn main() {
     let noise = |i: usize| ((i as u32).wrapping_mul(2_654_435_769) >> 8) as f32 / 16_777_216.0 - 0.5;
     let mut pairs: Vec<f32> = (0..12 * pixels).map(|i| 0.2 * noise(i) + 0.01).collect();
     pairs.extend(std::iter::repeat_n(2.0, 2 * pixels));
-    pairs.extend(std::iter::repeat_n(0.0, pixels));
+    pairs.extend(std::iter::repeat_n(0.0, 2 * pixels));
     let pairs = gpu.upload("pairs", &pairs).unwrap();
     println!("\n| correction | combination | error and film |");
     println!("|---|---|---|");

@@ -212,7 +212,7 @@ impl Renderer {
     }
 
     /// Refines a picture by one round of rays and coupled samples, whose traced queries `answers` takes. The film is that of the whole picture.
-    /// `None` if the round was stopped; the picture then keeps its samples.
+    /// `None` if the round was stopped.
     pub fn refine(
         &mut self,
         picture: &mut Picture,

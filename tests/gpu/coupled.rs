@@ -4,10 +4,9 @@ use crate::render::{OnHost, ThroughHost, domain, scene, waves};
 use crate::scenes::{gpu, opened};
 use ridgewatch::backend::cuda::{
     Buffer, CoupledStats, CoupledTracker, DeviceError, DeviceLogStretch, Gpu, GpuSettings, PairTiles, SUM_PLANES, SurrogateNodes,
-    bayer_rank,
 };
 use ridgewatch::render::Renderer;
-use ridgewatch::render::smooth::Nodes;
+use ridgewatch::render::smooth::{Nodes, bayer_rank};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -41,7 +40,7 @@ fn listed(round: usize) -> Vec<u32> {
     let is_listed = |pixel: &u32| {
         let (x, y) = (pixel % WIDTH as u32, pixel / WIDTH as u32);
         let tile = (y / 16 * 13 + x / 16) as usize;
-        (bayer_rank(x % 16, y % 16) + 256 - u32::from(cursors[tile])) % 256 < u32::from(pairs[tile])
+        u16::from(bayer_rank(x as usize % 16, y as usize % 16).wrapping_sub(cursors[tile] as u8)) < pairs[tile]
     };
     all.filter(is_listed).collect()
 }

@@ -26,7 +26,7 @@ pub(crate) use rendering::LightArgument;
 pub use rendering::{
     Audits, CombineInput, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DeviceNodes, DevicePredict,
     DeviceQueryRouter, FilmPlanes, FrameQueries, GpuCombine, GpuFrames, GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, PairTiles,
-    RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll, bayer_rank,
+    RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll,
 };
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};

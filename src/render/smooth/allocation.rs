@@ -25,8 +25,9 @@ pub(crate) struct Allocation {
     variance: Vec<f64>,
 }
 
-/// Rank of a pixel within its tile, in the order in which pixels get samples: bits of x ^ y and y interleaved (ordered dithering, Bayer 1973).
-pub(crate) fn rank(x: usize, y: usize) -> u8 {
+/// Rank of a pixel within its tile of 16x16, in the order in which pixels get samples: bits of x ^ y and y interleaved (ordered dithering, Bayer
+/// 1973; `bayer_rank` of `kernels/rendering/coupled.cuh`).
+pub fn bayer_rank(x: usize, y: usize) -> u8 {
     let (a, b) = (x ^ y, y);
     (0..4).fold(0, |rank, bit| (rank << 2) | ((((a >> bit) & 1) << 1) | ((b >> bit) & 1)) as u8)
 }
@@ -84,7 +85,7 @@ pub(super) fn pixels(round: &[TilePairs], width: usize, height: usize) -> Vec<u3
             let now = (pairs - first).min(TILE_PIXELS);
             for (y, x) in (0..TILE).flat_map(|y| (0..TILE).map(move |x| (y, x))) {
                 let is_inside = corner[0] + x < width && corner[1] + y < height;
-                if is_inside && usize::from(rank(x, y).wrapping_sub(cursor)) < now {
+                if is_inside && usize::from(bayer_rank(x, y).wrapping_sub(cursor)) < now {
                     chosen.push(((corner[1] + y) * width + corner[0] + x) as u32);
                 }
             }
@@ -113,7 +114,7 @@ mod tests {
         for range in [0..4, 0..16, 16..32, 0..64, 0..128, 128..256_usize] {
             let mut quarters = [0; 2];
             for (y, x) in (0..TILE).flat_map(|y| (0..TILE).map(move |x| (y, x))) {
-                if range.contains(&usize::from(rank(x, y))) {
+                if range.contains(&usize::from(bayer_rank(x, y))) {
                     quarters[quarter(x, y, 0)] += 1;
                 }
             }

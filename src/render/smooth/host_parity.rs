@@ -6,7 +6,7 @@ use super::combine::{Correction, PairSums, combine, smoothed};
 use super::light_volume::{LightGrid, LightVolume};
 use super::march::{Medium, RaySum, ToLight};
 use super::nodes::Nodes;
-use crate::backend::cuda::LightArgument;
+use crate::backend::cuda::{LightArgument, SUM_PLANES};
 use crate::field::Domain;
 use crate::render::rng::philox;
 use crate::render::{CameraSettings, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
@@ -315,7 +315,7 @@ fn a_device_agrees() {
                 .collect();
             let checked = march.check(&medium, &checks, case.shifted).unwrap();
             // Without pairs the film is the marched picture.
-            let pairs = gpu.upload("pairs", &vec![0.0_f32; 15 * pixels]).unwrap();
+            let pairs = gpu.upload("pairs", &vec![0.0_f32; SUM_PLANES * pixels]).unwrap();
             let input = CombineInput { size: [37, 23], pairs: &pairs, march: &march, how: None, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
             let tiles = combine.combine(&input).unwrap();
             assert!(tiles.len() == 6 && tiles.iter().all(|tile| tile.all.pixels == [0.0; 3]));

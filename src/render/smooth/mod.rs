@@ -15,6 +15,7 @@ mod nodes;
 mod picture;
 mod statement;
 
+pub use allocation::bayer_rank;
 pub use coupled::CoupledPath;
 pub(in crate::render) use coupled::coupled_paths;
 #[cfg(feature = "cuda")]

@@ -41,7 +41,7 @@ pub struct Refinement<'a> {
     pub samples: f64,
     /// Number that selects the random stream when the picture starts anew.
     pub number: u64,
-    /// Setting it ends the round early; the picture is unchanged then.
+    /// Setting it ends the round early, without a film.
     pub stop: &'a AtomicBool,
 }
 
@@ -82,7 +82,7 @@ impl Picture {
         };
     }
 
-    /// One round: more rays, more pairs, and the picture with its error. `None` if `stop` ended it early; the samples are then as before.
+    /// One round: more rays, more pairs, and the picture with its error. `None` if `stop` ended it early.
     pub(in crate::render) fn refine(
         &mut self,
         frame: &FrameScene<'_>,

@@ -3,6 +3,7 @@
 //! All pictures are planes of f32. The halves of the samples are shrunk one after the other in the same memory, so that the planes of one half stay
 //! in L2 as far as possible. The film leaves the device as whole planes.
 
+use super::coupled::SUM_PLANES;
 use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
 use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::device_repr;
@@ -19,8 +20,7 @@ const MAX_RADIUS: i32 = 32;
 /// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
 const BOX_ROW: usize = 512;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
-/// Planes of the sums over pairs: differences by half, quarter and channel; pairs by quarter; differences of alpha.
-pub(in crate::backend::cuda) const PAIR_PLANES: usize = 15;
+/// First plane of the pairs by quarter in the sums (see [`SUM_PLANES`]).
 const PAIR_COUNTS: usize = 12;
 /// Floats of a pixel of the film.
 const FILM_PLANES: usize = 8;
@@ -72,7 +72,7 @@ device_repr!(QuartersArgument, LevelArgument, CombineArgument);
 pub struct CombineInput<'a> {
     /// Pixels across and down.
     pub size: [usize; 2],
-    /// Sums over pairs, 15 planes: differences by half, quarter and channel; numbers of pairs by quarter; differences of alpha.
+    /// Sums over pairs, [`SUM_PLANES`] planes.
     pub pairs: &'a Buffer<f32>,
     /// The marched picture, of the same size.
     pub march: &'a GpuMarch,
@@ -175,7 +175,7 @@ impl GpuCombine {
         let pixels = width * height;
         let refused = |what: &str| Err(DeviceError::Unsupported { what: what.into() });
         let Some(base) = input.march.sums().filter(|_| input.march.pixels() == pixels) else { return refused("a picture without rays") };
-        if input.pairs.len() < PAIR_PLANES * pixels {
+        if input.pairs.len() < SUM_PLANES * pixels {
             return refused("sums over pairs of a smaller picture");
         }
         const { assert!(RAY_FIELDS == 6) };
@@ -303,11 +303,6 @@ impl GpuCombine {
         let (rgba, rest) = read.values().split_at(4 * pixels);
         let plane = |number: usize| &rest[number * pixels..(number + 1) * pixels];
         Ok(FilmPlanes { rgba: bytemuck::cast_slice(rgba), ftle_mean: plane(0), error: plane(1), missing: plane(2), samples: plane(3) })
-    }
-
-    /// Frees the memory.
-    pub fn release(&mut self) {
-        (self.planes, self.tile_sums, self.tiles_read, self.film_read, self.begun) = (None, None, None, None, None);
     }
 }
 

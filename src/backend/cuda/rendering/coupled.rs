@@ -10,6 +10,7 @@ use crate::backend::cuda::driver::pinned::Pinned;
 use crate::backend::cuda::layout::{MissingCellsArgument, TableArgument};
 use crate::backend::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument};
 use crate::backend::cuda::{Buffer, DeviceError, DeviceLogStretch, DeviceMissingCells, Gpu, launch, threads};
+use crate::render::smooth::{TILE, bayer_rank};
 use crate::render::{CellObservations, FrameParameters, Renderer};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
@@ -20,13 +21,12 @@ use std::sync::atomic::{AtomicBool, Ordering};
 /// Default limit on the collisions of a path that one wave evaluates. In the test scene it saves seven in eight waves for 8 % more points.
 const LOOK_AHEAD: u32 = 16;
 /// Limit on the paths that advance together.
-const MOST_SLOTS: u64 = 1 << 22;
+const MAX_SLOTS: u64 = 1 << 22;
 /// Collisions in the queue per slot, on average, if memory allows, and at least.
 const QUEUE_PER_SLOT: u64 = 8;
-const LEAST_QUEUE_PER_SLOT: u64 = 2;
-/// Pixels along the edge of a tile, and in a tile.
-const TILE_EDGE: usize = 16;
-const TILE_PIXELS: usize = TILE_EDGE * TILE_EDGE;
+const MIN_QUEUE_PER_SLOT: u64 = 2;
+/// Pixels in a tile.
+const TILE_PIXELS: usize = TILE * TILE;
 /// Planes of the sums, one value per pixel each: summed differences by half, quarter and channel (the channel fastest), pairs in quarters 0 and
 /// 1, summed differences of alpha, traced queries.
 pub const SUM_PLANES: usize = 16;
@@ -79,11 +79,6 @@ pub struct CoupledStats {
     pub answer_seconds: f64,
     /// True if `stop` ended the frame early. The sums are unchanged then.
     pub stopped: bool,
-}
-
-/// Rank of a pixel of a tile in the 16 x 16 Bayer order (`bayer_rank` of `kernels/rendering/coupled.cuh`).
-pub fn bayer_rank(x: u32, y: u32) -> u32 {
-    (0..4).fold(0, |rank, bit| (rank << 2) | ((((x ^ y) >> bit) & 1) << 1) | ((y >> bit) & 1))
 }
 
 #[repr(C)]
@@ -384,7 +379,7 @@ impl CoupledTracker {
 
 /// The tiles with the places of their pixels in the list, and the length of the list.
 fn placed(width: usize, height: usize, tiles: PairTiles<'_>) -> Result<(Vec<PairTile>, usize), DeviceError> {
-    let [across, down] = [width, height].map(|n| n.div_ceil(TILE_EDGE));
+    let [across, down] = [width, height].map(|n| n.div_ceil(TILE));
     let fits = |values: &[u16], most: usize| values.len() == across * down && values.iter().all(|&n| usize::from(n) <= most);
     if !fits(tiles.pairs, TILE_PIXELS) || !fits(tiles.cursors, TILE_PIXELS - 1) {
         return Err(DeviceError::Unsupported {
@@ -395,11 +390,11 @@ fn placed(width: usize, height: usize, tiles: PairTiles<'_>) -> Result<(Vec<Pair
     let place = |number: usize| {
         let (count, cursor) = (tiles.pairs[number], tiles.cursors[number]);
         let tile = PairTile { offset: end as u32, count, cursor };
-        let inside = [width - number % across * TILE_EDGE, height - number / across * TILE_EDGE].map(|n| n.min(TILE_EDGE) as u32);
-        end += if inside == [TILE_EDGE as u32; 2] {
+        let inside = [width - number % across * TILE, height - number / across * TILE].map(|n| n.min(TILE));
+        end += if inside == [TILE; 2] {
             usize::from(count)
         } else {
-            let listed = |x, y| bayer_rank(x, y).wrapping_sub(u32::from(cursor)) % (TILE_PIXELS as u32) < u32::from(count);
+            let listed = |x, y| u16::from(bayer_rank(x, y).wrapping_sub(cursor as u8)) < count;
             (0..inside[1]).map(|y| (0..inside[0]).filter(|&x| listed(x, y)).count()).sum()
         };
         tile
@@ -425,14 +420,14 @@ impl Plan {
     /// Plans lists of `entries` pixels, within `memory` bytes if a band of one pair suffices for that.
     fn new(entries: usize, tiles: usize, cells: usize, memory: u64) -> Self {
         let (entries, tiles, cells) = (entries.max(1) as u64, tiles as u64, cells as u64);
-        let slots = MOST_SLOTS.min(2 * entries);
+        let slots = MAX_SLOTS.min(2 * entries);
         let mut plan = Self { slots, queue: slots * QUEUE_PER_SLOT, entries, tiles, cells };
         while Layout::new(&plan).end > memory && plan.slots > 2 {
-            if plan.queue > LEAST_QUEUE_PER_SLOT * plan.slots {
-                plan.queue = (plan.queue / 2).max(LEAST_QUEUE_PER_SLOT * plan.slots);
+            if plan.queue > MIN_QUEUE_PER_SLOT * plan.slots {
+                plan.queue = (plan.queue / 2).max(MIN_QUEUE_PER_SLOT * plan.slots);
             } else {
                 plan.slots = (plan.slots / 4 * 2).max(2);
-                plan.queue = LEAST_QUEUE_PER_SLOT * plan.slots;
+                plan.queue = MIN_QUEUE_PER_SLOT * plan.slots;
             }
         }
         plan
@@ -596,7 +591,7 @@ mod tests {
 
     #[test]
     fn every_rank_is_one_pixel_and_any_share_is_spread_evenly() {
-        let mut at = [[0_u32; 2]; TILE_PIXELS];
+        let mut at = [[0_usize; 2]; TILE_PIXELS];
         let mut seen = [0; TILE_PIXELS];
         for (x, y) in (0..16).flat_map(|y| (0..16).map(move |x| (x, y))) {
             at[bayer_rank(x, y) as usize] = [x, y];
@@ -622,7 +617,7 @@ mod tests {
         let cursors = [0, 9, 200, 255, 1, 3];
         let (tiles, entries) = placed(33, 18, PairTiles { pairs: &pairs, cursors: &cursors }).unwrap();
         let offsets: Vec<u32> = tiles.iter().map(|tile| tile.offset).collect();
-        let few = (0..32).filter(|i| (bayer_rank(i % 16, i / 16) + 1) % 256 < 7).count() as u32;
+        let few = (0..32).filter(|i| bayer_rank(i % 16, i / 16).wrapping_add(1) < 7).count() as u32;
         assert_eq!(offsets, [0, 256, 256, 272, 272 + few, 272 + few + 32]);
         assert_eq!(entries as u32, 272 + few + 32 + 2);
         let refused = |pairs: &[u16], cursors: &[u16]| placed(33, 18, PairTiles { pairs, cursors }).is_err();

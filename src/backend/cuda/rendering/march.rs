@@ -243,11 +243,6 @@ impl DeviceNodes {
         let argument = table.map(DeviceTable::argument).or(self.laid);
         argument.map(|argument| NodeGrid { argument, _memory: PhantomData })
     }
-
-    /// Frees the memory.
-    pub fn release(&mut self) {
-        (self.unit, self.values, self.laid) = (None, None, None);
-    }
 }
 
 /// Macros of `march.cu`.
@@ -455,11 +450,5 @@ impl GpuMarch {
         let mut radiance = vec![0.0; 3 * checks.len()];
         out.read(&mut radiance)?;
         Ok(radiance.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect())
-    }
-
-    /// Frees the memory.
-    pub fn release(&mut self) {
-        (self.highest, self.depth, self.sums, self.checks, self.checked) = (None, None, None, None, None);
-        (self.ready, self.rays) = (None, 0);
     }
 }

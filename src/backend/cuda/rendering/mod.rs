@@ -13,7 +13,7 @@ mod smooth;
 
 pub use audit::Audits;
 pub use combine::{CombineInput, FilmPlanes, GpuCombine};
-pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes, bayer_rank};
+pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
 #[cfg(test)]
