@@ -10,16 +10,16 @@
 //! A cycle takes the newest snapshots, slides the window, renders with the weights of the previous cycle, compares every traced sample with
 //! the surrogate, which updates the trust map, and then trains on it.
 
-pub mod backend;
 pub mod config;
-pub mod field;
-pub mod files;
-pub mod flow;
 pub mod publish;
-pub mod render;
 pub mod run;
-pub mod setting;
-pub mod simd;
-pub mod source;
-pub mod surrogate;
-pub mod trust;
+
+pub use ridgewatch_backend as backend;
+pub use ridgewatch_base::{files, setting};
+pub use ridgewatch_field as field;
+pub use ridgewatch_flow as flow;
+pub use ridgewatch_render as render;
+pub use ridgewatch_simd as simd;
+pub use ridgewatch_source as source;
+pub use ridgewatch_surrogate as surrogate;
+pub use ridgewatch_trust as trust;

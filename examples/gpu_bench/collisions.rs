@@ -1,6 +1,7 @@
 //! Collision points that a frame's waves query.
 
 use cudarc::driver::result;
+use ridgewatch::backend::cuda::driver_error;
 use ridgewatch::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, TraceAll};
 use ridgewatch::flow::Extras;
 use ridgewatch::render::{RenderSettings, Renderer, Scene, TransferSettings};
@@ -71,8 +72,7 @@ impl DeviceLogStretch for Listening<'_> {
             let gpu = self.inner.0.gpu();
             let to = self.points.address() + 12 * filled as u64;
             // SAFETY: the queue holds `count` points, and the buffer has room for `part` more.
-            unsafe { result::memcpy_dtod_async(to, points, 12 * part, gpu.work().cu_stream()) }
-                .map_err(DeviceError::driver("copying points"))?;
+            unsafe { result::memcpy_dtod_async(to, points, 12 * part, gpu.work().cu_stream()) }.map_err(driver_error("copying points"))?;
             self.waves.push(part);
         }
         self.inner.evaluate(points, count, log_stretch, by)

@@ -6,12 +6,12 @@
 
 use super::DeviceError;
 use super::router::push_sample;
-use crate::flow::{Extras, Traced};
-use crate::render::Transfer;
-use crate::render::rng::{philox, unit};
-use crate::surrogate::{Predict, Samples, Trace};
-use crate::trust::{Audited, Gate, Residual, Strata, TrustedError};
 use rayon::prelude::*;
+use ridgewatch_flow::{Extras, Traced};
+use ridgewatch_render::Transfer;
+use ridgewatch_render::rng::{philox, unit};
+use ridgewatch_surrogate::{Predict, Samples, Trace};
+use ridgewatch_trust::{Audited, Gate, Residual, Strata, TrustedError};
 
 /// Points per parallel task.
 const CHUNK: usize = 1 << 12;

@@ -6,15 +6,15 @@ use super::audit::{AuditFindings, AuditRequest, audit};
 use super::interruptible::Interruptible;
 use super::router::QueryRouter;
 use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
-use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-use crate::render::smooth::{Nodes, Picture, PictureError, Refinement};
-use crate::render::{Film, RenderStats, Renderer};
-use crate::source::Listener;
-use crate::surrogate::{
+use rayon::prelude::*;
+use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement};
+use ridgewatch_render::{Film, RenderStats, Renderer};
+use ridgewatch_source::Listener;
+use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, Trace, build,
 };
-use crate::trust::Gate;
-use rayon::prelude::*;
+use ridgewatch_trust::Gate;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;

@@ -6,9 +6,9 @@ use super::settings::{DeviceChoice, DeviceSettings};
 #[cfg(feature = "cuda")]
 use super::settings::{Storage, WhenLost};
 use super::{BackendError, DeviceError};
-use crate::flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch_flow::{Extras, FlowMap, Traced, Tracer, VelocitySource, cpu_tracer};
 #[cfg(feature = "cuda")]
-use crate::surrogate::Trace;
+use ridgewatch_surrogate::Trace;
 #[cfg(feature = "cuda")]
 use std::sync::Arc;
 use std::time::Instant;

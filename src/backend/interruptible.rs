@@ -1,8 +1,8 @@
 //! A tracer that can be stopped. It traces large batches in parts and checks the stop flag between them, because preparing a slide may take minutes.
 
 use super::DeviceError;
-use crate::flow::{Extras, Traced, Tracer};
-use crate::surrogate::Trace;
+use ridgewatch_flow::{Extras, Traced, Tracer};
+use ridgewatch_surrogate::Trace;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -78,7 +78,7 @@ impl Trace for Interruptible<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Domain;
+    use ridgewatch_field::Domain;
 
     /// Log-stretch = x; asks for a stop once it has traced `limit` seeds.
     struct Counting<'a> {

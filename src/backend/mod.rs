@@ -8,7 +8,6 @@ mod cpu;
 #[cfg(feature = "cuda")]
 pub mod cuda;
 mod device;
-mod error;
 mod interruptible;
 mod placement;
 mod router;
@@ -19,19 +18,19 @@ pub use cpu::{Cpu, HostFrame, HostPicture, render_on_cpu};
 #[cfg(feature = "cuda")]
 pub use device::CudaDevice;
 pub use device::{Device, TracedOnce};
-pub use error::DeviceError;
 pub use interruptible::Interruptible;
 pub use placement::{Needs, Place, Placement};
+pub use ridgewatch_base::DeviceError;
 pub use router::{QueryRouter, Routing, Tally, keeps_label};
 pub use settings::{DeviceChoice, DeviceSettings, Storage, UnknownDevice, WhenLost};
 
-use crate::field::Domain;
-use crate::flow::{FlowError, FlowMap, VelocitySource};
-use crate::render::smooth::PictureError;
-use crate::render::{Film, Method, RenderStats, Renderer};
-use crate::source::Listener;
-use crate::surrogate::network::NetworkSettings;
-use crate::surrogate::{
+use ridgewatch_field::Domain;
+use ridgewatch_flow::{FlowError, FlowMap, VelocitySource};
+use ridgewatch_render::smooth::PictureError;
+use ridgewatch_render::{Film, Method, RenderStats, Renderer};
+use ridgewatch_source::Listener;
+use ridgewatch_surrogate::network::NetworkSettings;
+use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, HostSurrogate, Learned, NetworkFrom, Predict, ReplayBuffer, Samples, SurrogateError,
     SurrogateSettings, Trace,
 };

@@ -12,12 +12,12 @@
 //! queries, whatever their order, and a uniform sample of it.
 
 use super::DeviceError;
-use crate::field::Domain;
-use crate::flow::{Extras, Traced};
-use crate::render::LogStretch;
-use crate::render::rng::philox;
-use crate::surrogate::{Predict, Samples, Trace};
-use crate::trust::Gate;
+use ridgewatch_field::Domain;
+use ridgewatch_flow::{Extras, Traced};
+use ridgewatch_render::LogStretch;
+use ridgewatch_render::rng::philox;
+use ridgewatch_surrogate::{Predict, Samples, Trace};
+use ridgewatch_trust::Gate;
 use std::time::Instant;
 
 /// Inputs of the routing rule, and which labels are kept.
@@ -278,9 +278,9 @@ impl LogStretch for QueryRouter<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::analytic::Analytic;
-    use crate::flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
-    use crate::render::{RenderSettings, Renderer, Scene, TransferSettings};
+    use ridgewatch_field::analytic::Analytic;
+    use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
+    use ridgewatch_render::{RenderSettings, Renderer, Scene, TransferSettings};
     use std::sync::atomic::AtomicBool;
 
     fn saddle() -> Box<dyn Tracer> {
@@ -320,7 +320,7 @@ mod tests {
         let (tracer, gate) = (saddle(), Gate::uniform(false));
         let mut points: Vec<[f32; 3]> = (0..TRACED as u32)
             .map(|i| philox([i, 0, 0, 0], [7, 0]))
-            .map(|w| [0, 1, 2].map(|k| 2.0 * crate::render::rng::unit(w[k]) - 1.0))
+            .map(|w| [0, 1, 2].map(|k| 2.0 * ridgewatch_render::rng::unit(w[k]) - 1.0))
             .collect();
         for keep in [0, 1, 2, 10, 1000, 4096, TRACED, 2 * TRACED] {
             let mut labels = |batch: usize| {

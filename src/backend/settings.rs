@@ -1,6 +1,6 @@
 //! The option `--device` and the settings table `[device]`.
 
-use crate::setting::{Refused, require};
+use ridgewatch_base::setting::{Refused, require};
 use serde::{Deserialize, Serialize};
 use std::fmt;
 use std::str::FromStr;

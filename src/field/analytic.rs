@@ -1,8 +1,8 @@
 //! Flows in closed form: velocity and exact gradient, for any lanes.
 
 use super::{Geometry, Grid, Snapshot};
-use crate::simd::{Lanes, Real, array};
 use rayon::prelude::*;
+use ridgewatch_simd::{Lanes, Real, array};
 use std::f64::consts::PI;
 use std::sync::Arc;
 
@@ -81,15 +81,13 @@ pub struct DoubleGyre {
 
 impl DoubleGyre {
     /// Phase in radians per unit of time. The flow depends on time through its phase alone.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn rate(&self) -> f64 {
+    pub fn rate(&self) -> f64 {
         self.omega
     }
 
     /// The first two constants, and epsilon times sine and cosine of the phase `time` after a start. With sine and cosine of the phase at the
     /// start they give the constants at that time (sin(a + b) = sin a cos b + cos a sin b).
-    #[cfg(feature = "cuda")]
-    pub(crate) fn constants_since(&self, time: f64) -> Constants<f64> {
+    pub fn constants_since(&self, time: f64) -> Constants<f64> {
         let [scale, scale_pi, ..] = self.constants(time);
         let (sine, cosine) = (self.omega * time).sin_cos();
         [scale, scale_pi, self.epsilon * sine, self.epsilon * cosine]

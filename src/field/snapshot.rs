@@ -154,7 +154,7 @@ fn average_known(row: &mut [[f32; 4]]) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, EARTH_RADIUS};
+    use crate::{Axis, EARTH_RADIUS};
 
     #[test]
     fn a_pole_is_one_vector() {

@@ -142,7 +142,7 @@ impl Turbulence {
                     let start = mode.wave[0] * along_x[0] + mode.wave[1] * y + mode.wave[2] * z + mode.phase + mode.speed * time;
                     let turn = mode.wave[0] * step;
                     let angle = f64x4::new(std::array::from_fn(|i| start + turn * i as f64));
-                    let (mut sine, mut cosine) = crate::simd::Lanes::sin_cos(angle);
+                    let (mut sine, mut cosine) = ridgewatch_simd::Lanes::sin_cos(angle);
                     let (s, c) = (4.0 * turn).sin_cos();
                     let (s, c) = (f64x4::splat(s), f64x4::splat(c));
                     let amplitude = mode.amplitude.map(f64x4::splat);

@@ -190,7 +190,7 @@ impl Window {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, Geometry};
+    use crate::{Axis, Geometry};
 
     fn grid(nodes: usize) -> Arc<Grid> {
         let axis = |name| Axis::uniform(name, "m", 0.0, 1.0, nodes).unwrap();

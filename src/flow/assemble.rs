@@ -8,9 +8,9 @@ use super::sphere_levels::LayeredSphereFlow;
 use super::tracer::{AdaptiveKernel, CpuTracer, DifferencesKernel, Kernel, Order, Stages, TangentKernel};
 use super::velocity::{ClosedFormFlow, Coordinates, Velocity};
 use super::{Boundary, FlowError, FlowMap, Integrator, Precision, StepChoice, Steps, Tracer, VelocitySource, dormand_prince, steps};
-use crate::field::analytic::{ClosedForm, Form};
-use crate::field::{Domain, Geometry, Window};
-use crate::simd::{Gather, LanePair, Lanes};
+use ridgewatch_field::analytic::{ClosedForm, Form};
+use ridgewatch_field::{Domain, Geometry, Window};
+use ridgewatch_simd::{Gather, LanePair, Lanes};
 use std::marker::PhantomData;
 use wide::{f32x8, f64x4};
 

@@ -4,8 +4,8 @@
 //! integer and fractional part. On other axes they come from a lookup table.
 
 use super::Boundary;
-use crate::field::Axis;
-use crate::simd::{Gather, Mask, Real};
+use ridgewatch_field::Axis;
+use ridgewatch_simd::{Gather, Mask, Real};
 
 /// One axis, prepared for lookups.
 #[derive(Debug, Clone)]

@@ -1,7 +1,7 @@
 //! Displacements of particles between snapshots, in cells.
 
-use crate::field::{Geometry, Snapshot, Window};
 use rayon::prelude::*;
+use ridgewatch_field::{Geometry, Snapshot, Window};
 use std::sync::Arc;
 
 /// Degrees from a pole within which displacements are not measured in cells, whose width tends to 0.

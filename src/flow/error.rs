@@ -1,7 +1,7 @@
 //! Errors of making a tracer.
 
 use super::{Boundary, Precision};
-use crate::setting::{Refused, shown, word};
+use ridgewatch_base::setting::{Refused, shown, word};
 use thiserror::Error;
 
 /// Error of making a tracer.

@@ -3,8 +3,8 @@
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Coordinates, Velocity, bounds, identity, within};
 use super::{Boundary, FlowError, Interpolation};
-use crate::field::{Grid, Window};
-use crate::simd::{Gather, Real, array};
+use ridgewatch_field::{Grid, Window};
+use ridgewatch_simd::{Gather, Real, array};
 
 /// A window on a Cartesian grid of D axes.
 #[derive(Debug, Clone)]

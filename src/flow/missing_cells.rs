@@ -1,8 +1,8 @@
 //! Cells in which a velocity is missing, so that no particle can start there.
 
 use super::Interpolation;
-use crate::field::{Axis, Grid, Snapshot, Window};
 use rayon::prelude::*;
+use ridgewatch_field::{Axis, Grid, Snapshot, Window};
 use std::sync::Arc;
 
 /// The missing cells of a window at one time.
@@ -43,7 +43,6 @@ impl MissingCells {
 
     /// The grid and, for each of its cells (x fastest), whether the cell is missing; `None` if no cell is. A periodic axis has a cell
     /// between its last node and the image of the first.
-    #[cfg_attr(not(feature = "cuda"), allow(dead_code))]
     pub fn cells(&self) -> Option<(Arc<Grid>, Vec<bool>)> {
         let grid = self.grid()?;
         let count: [usize; 3] = std::array::from_fn(|k| grid.axes.get(k).map_or(1, Axis::cells));
@@ -100,7 +99,7 @@ fn cell_at(axis: &Axis, x: f64) -> usize {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Geometry;
+    use ridgewatch_field::Geometry;
 
     #[test]
     fn a_missing_corner_makes_its_four_cells_missing() {

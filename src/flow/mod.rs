@@ -6,7 +6,7 @@
 //! FTLE(x, t, tau) = 1/|tau| ln sqrt(lambda_max(J^T J)) with J = d phi / d x, the gradient of the flow map phi (Haller 2001; Shadden, Lekien
 //! and Marsden 2005). J is the solution of the variational equation dJ/dt = (grad v) J, integrated together with the path (`rk4`).
 
-use crate::field::{Domain, Window, analytic::Analytic};
+use ridgewatch_field::{Domain, Window, analytic::Analytic};
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -30,19 +30,15 @@ mod tracer;
 mod velocity;
 
 pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
-#[cfg(feature = "cuda")]
-pub(crate) use axis_map::AxisMap;
+pub use axis_map::AxisMap;
 pub use error::FlowError;
-#[cfg(feature = "cuda")]
-pub(crate) use missing_cells::MissingCells;
+pub use missing_cells::MissingCells;
 pub use resolution::{TimeResolution, time_resolution};
 pub use settings::{FlowSettings, StepsSetting};
-#[cfg(feature = "cuda")]
-pub(crate) use sphere::poles;
-pub(crate) use stretch::log_stretch;
+pub use sphere::poles;
+pub use stretch::log_stretch;
 pub use tracer::Order;
-#[cfg(feature = "cuda")]
-pub(crate) use velocity::{angle_slack, bounds};
+pub use velocity::{angle_slack, bounds};
 
 /// Direction of time in which particles travel from the seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -219,7 +215,7 @@ pub struct Traced {
 
 impl Traced {
     /// Resizes all arrays to `count` seeds; new entries are NaN, with a lifetime of 0. `double`: also those in double precision.
-    pub(crate) fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
+    pub fn set_len(&mut self, count: usize, extras: Extras, double: bool) {
         let wanted = |yes: bool| if yes { count } else { 0 };
         self.log_stretch.resize(count, f32::NAN);
         self.log_stretch_f64.resize(wanted(double), f64::NAN);
@@ -271,4 +267,38 @@ pub trait Tracer: Send + Sync {
     }
     /// Traces all seeds in parallel on the current rayon pool, sorted by cell if that is faster. Replaces the contents of `out`.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced);
+}
+
+impl Tracer for Box<dyn Tracer> {
+    fn domain(&self) -> &Domain {
+        (**self).domain()
+    }
+
+    fn start(&self) -> f64 {
+        (**self).start()
+    }
+
+    fn tau(&self) -> f64 {
+        (**self).tau()
+    }
+
+    fn steps(&self) -> usize {
+        (**self).steps()
+    }
+
+    fn step_choice(&self) -> Option<StepChoice> {
+        (**self).step_choice()
+    }
+
+    fn has_missing(&self) -> bool {
+        (**self).has_missing()
+    }
+
+    fn is_missing(&self, seed: [f32; 3]) -> bool {
+        (**self).is_missing(seed)
+    }
+
+    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) {
+        (**self).trace(seeds, extras, out);
+    }
 }

@@ -2,7 +2,7 @@
 
 use super::displacement::displacements;
 use super::{Extras, FlowError, FlowMap, Traced, VelocitySource, assemble::cpu_tracer, steps};
-use crate::field::{Snapshot, Window};
+use ridgewatch_field::{Snapshot, Window};
 use std::sync::Arc;
 
 /// Displacement between snapshots, and change of the FTLE without every second snapshot.

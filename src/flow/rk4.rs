@@ -6,7 +6,7 @@
 
 use super::stretch::{log_stretch, rescale};
 use super::velocity::Velocity;
-use crate::simd::{Lanes, Mask, Real, array};
+use ridgewatch_simd::{Lanes, Mask, Real, array};
 
 /// Result of a batch of particles, one per lane.
 pub struct TracedBatch<L: Lanes, const D: usize, const C: usize> {

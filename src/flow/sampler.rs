@@ -17,8 +17,8 @@
 use super::axis_map::{AxisMap, GridLocation};
 use super::stencil::Stencil;
 use super::{Boundary, FlowError, Interpolation};
-use crate::field::{Grid, Snapshot, Window};
-use crate::simd::{Gather, Lanes, NodePair, NodePairReader, Real, array};
+use ridgewatch_field::{Grid, Snapshot, Window};
+use ridgewatch_simd::{Gather, Lanes, NodePair, NodePairReader, Real, array};
 use std::sync::Arc;
 
 /// Interpolates the velocity of a window of snapshots. `N` is the number of grid axes.
@@ -26,7 +26,7 @@ use std::sync::Arc;
 pub struct Sampler<R, const N: usize> {
     snapshots: Vec<Arc<Snapshot>>,
     times: Vec<f64>,
-    pub(crate) axes: [AxisMap<R>; N],
+    pub axes: [AxisMap<R>; N],
     /// Factors from the four components of a node to state units per time; 1 for a mark.
     unit_factors: [f64; 4],
     row: usize,

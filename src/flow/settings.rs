@@ -1,7 +1,7 @@
 //! `[flow]` of a scene file.
 
 use super::{Boundary, Integrator, Interpolation, Normalisation, Precision};
-use crate::setting::{Refused, count, positive};
+use ridgewatch_base::setting::{Refused, count, positive};
 use serde::{Deserialize, Deserializer, Serialize};
 
 /// `steps = 40` or `steps = "auto"`.

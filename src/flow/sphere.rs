@@ -8,8 +8,8 @@ use super::axis_map::AxisMap;
 use super::sampler::{GridStage, Sampler};
 use super::velocity::{Coordinates, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
-use crate::field::{Grid, Window, is_pole};
-use crate::simd::{Gather, Lanes, Real, array};
+use ridgewatch_field::{Grid, Window, is_pole};
+use ridgewatch_simd::{Gather, Lanes, Real, array};
 
 /// Converts directions to locations on a longitude-latitude grid in degrees.
 #[derive(Debug, Clone)]
@@ -57,12 +57,12 @@ const NEAR_POLE_SPACINGS: f64 = 0.125;
 
 /// Smallest distance of a location from a pole, in spacings, so that slope and radius do not vanish: 16 units in the last place of a grid of
 /// 1024 rows.
-pub(crate) fn min_colatitude<R: Real>() -> R {
+pub fn min_colatitude<R: Real>() -> R {
     R::from_f64(if size_of::<R>() == size_of::<f32>() { 1.0 / 1024.0 } else { 1.0 / f64::from(1 << 30) })
 }
 
 /// State coordinates of the south and north pole; minus and plus infinity unless the pole is a row of the grid.
-pub(crate) fn poles<R: Real>(latitude: &AxisMap<R>) -> [f64; 2] {
+pub fn poles<R: Real>(latitude: &AxisMap<R>) -> [f64; 2] {
     let ends = latitude.ends();
     array(|k| {
         let beyond = [f64::NEG_INFINITY, f64::INFINITY][k];

@@ -1,7 +1,7 @@
 //! Gridded flow on the sphere with levels: a unit vector p as in [`super::sphere`], and a height.
 //!
 //! The shallow-atmosphere approximation holds: a horizontal metre is a metre on the radius of the sphere at every height. A node stores its
-//! horizontal velocity as a geocentric vector and its vertical velocity in place of the mark (see [`crate::field::Snapshot::nodes`]). The
+//! horizontal velocity as a geocentric vector and its vertical velocity in place of the mark (see [`ridgewatch_field::Snapshot::nodes`]). The
 //! interpolation therefore never mixes them: vertical winds are a thousand times weaker than horizontal ones. Lengths of the tangent are in
 //! radii, along (east, north, up).
 
@@ -9,8 +9,8 @@ use super::sampler::{GridStage, Sampler};
 use super::sphere::{Globe, MIN_COSINE, dot, normalised, project, project_derivative, trigonometry};
 use super::velocity::{Coordinates, Velocity, angle_slack, bounds, within};
 use super::{Boundary, FlowError, Interpolation};
-use crate::field::{Grid, Window};
-use crate::simd::{Gather, Real, array};
+use ridgewatch_field::{Grid, Window};
+use ridgewatch_simd::{Gather, Real, array};
 
 /// A window on a grid of longitude, latitude (degrees) and height (the unit of the radius).
 #[derive(Debug, Clone)]

@@ -1,7 +1,7 @@
 //! Nodes and weights of the cubic interpolation along one axis: a Hermite cubic with Catmull-Rom slopes.
 
 use super::axis_map::AxisMap;
-use crate::simd::Real;
+use ridgewatch_simd::Real;
 
 /// The four nodes that a Hermite cubic reads along one axis.
 pub struct Stencil<R> {

@@ -1,7 +1,7 @@
 //! Chooses the number of Runge-Kutta steps by its error: step doubling on quasi-random points (Roberts 2018).
 
 use super::{FlowError, StepChoice, Traced};
-use crate::field::Domain;
+use ridgewatch_field::Domain;
 
 /// Smallest number of steps tried on closed forms.
 const MIN_STEPS: usize = 4;

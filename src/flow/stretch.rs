@@ -1,6 +1,6 @@
 //! The log-stretch of a flow map's gradient J: ln of its largest singular value, which is |tau| FTLE (Shadden, Lekien and Marsden 2005).
 
-use crate::simd::{Lanes, Mask, array};
+use ridgewatch_simd::{Lanes, Mask, array};
 
 /// Returns ln sigma_max of a 2x2 or 3x3 matrix; minus infinity for the zero matrix.
 #[inline(always)]
@@ -90,7 +90,7 @@ pub fn rescale<L: Lanes, const C: usize, const D: usize>(m: &mut [[L; C]; D], ex
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::simd::Real;
+    use ridgewatch_simd::Real;
     use wide::{f32x8, f64x4};
 
     /// Deterministic numbers in (-1, 1).

@@ -4,9 +4,9 @@ use super::missing_cells::MissingCells;
 use super::rk4::{self, MAX_LANES, TracedBatch};
 use super::velocity::{Coordinates, Velocity};
 use super::{Boundary, Extras, Normalisation, StepChoice, Traced, Tracer, dormand_prince};
-use crate::field::Domain;
-use crate::simd::{Lanes, Mask, Real};
 use rayon::prelude::*;
+use ridgewatch_field::Domain;
+use ridgewatch_simd::{Lanes, Mask, Real};
 use std::marker::PhantomData;
 
 /// Integrator of a batch of at most `L::LANES` particles.

@@ -1,8 +1,8 @@
 //! The traits that an integrator needs of a flow, and their implementation for closed forms.
 
 use super::Boundary;
-use crate::field::{Domain, analytic::ClosedForm};
-use crate::simd::{Lanes, Mask, Real, array};
+use ridgewatch_field::{Domain, analytic::ClosedForm};
+use ridgewatch_simd::{Lanes, Mask, Real, array};
 
 /// Coordinates of the integration: seeds become states, states become arrival points. A state has `D` components, its tangent `C` columns.
 pub trait Coordinates<const D: usize, const C: usize>: Send + Sync {
@@ -76,7 +76,7 @@ impl<F, R: Real, const D: usize> ClosedFormFlow<F, R, D> {
 
 /// Rounding error, in state units, of a longitude or latitude computed in `R` from a unit vector: a few units in the last place. A seed on
 /// the edge of its grid must count as inside despite this error. `radian` is the length of a radian in state units.
-pub(crate) fn angle_slack<R: Real>(radian: R) -> R {
+pub fn angle_slack<R: Real>(radian: R) -> R {
     let unit = R::one().above() - R::one();
     R::from_f64(8.0 * std::f64::consts::PI) * unit * radian
 }

@@ -3,7 +3,7 @@
 use super::CameraSettings;
 use super::error::{RenderError, require, require_finite};
 use super::space::{cross, dot, length, scaled, subtract};
-use crate::field::Domain;
+use ridgewatch_field::Domain;
 
 /// A checked camera, in scene units, in the layout that kernels read.
 #[repr(C)]

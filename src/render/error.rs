@@ -1,6 +1,6 @@
 //! Errors of rendering.
 
-use crate::setting::{Refused, shown};
+use ridgewatch_base::setting::{Refused, shown};
 use serde::Serialize;
 use std::fmt::Debug;
 use thiserror::Error;

@@ -37,8 +37,7 @@ impl Film {
 
     /// A film without samples whose memory pages all threads of the current rayon pool touch. A large new film is mapped page by page at the
     /// first write, which takes longer than copying the picture and longer than the work of a GPU on a frame.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn resident(width: usize, height: usize) -> Self {
+    pub fn resident(width: usize, height: usize) -> Self {
         use rayon::prelude::*;
         /// Enough pages to be worth a task.
         const PIXELS_PER_TASK: usize = 1 << 16;

@@ -6,8 +6,8 @@
 //! the extinction exceeds its majorant (see `tracking`).
 
 use super::Transfer;
-use crate::field::Domain;
 use rayon::prelude::*;
+use ridgewatch_field::Domain;
 use std::sync::atomic::Ordering::Relaxed;
 use std::sync::atomic::{AtomicBool, AtomicU32};
 
@@ -236,7 +236,7 @@ impl MajorantGrid {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::TransferSettings;
+    use crate::TransferSettings;
 
     fn transfer(extinction: f64) -> Transfer {
         Transfer::new(&TransferSettings { low: Some(0.0), high: Some(1.0), extinction: Some(extinction), ..Default::default() }, 1.0)

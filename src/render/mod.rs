@@ -34,9 +34,10 @@ pub use parameters::FrameParameters;
 pub use renderer::{FrameSetup, RenderStats, Renderer};
 pub use scene::Scene;
 pub use settings::MAX_FRAMES_UNTIL;
-pub(crate) use settings::MAX_SAMPLES;
+pub use settings::MAX_SAMPLES;
 pub use settings::{CameraSettings, Combine, LightSettings, Method, RenderSettings, Target, TransferSettings};
-pub use space::overview_scale;
+pub use space::{SceneBox, overview_scale};
+pub use tracking::FrameScene;
 pub use transfer::Transfer;
 
 /// Answers log-stretch queries. The renderer passes the collision points of one wavefront step per call.

@@ -6,14 +6,13 @@ use super::majorant::{CellObservations, MajorantGrid};
 use super::parameters::FrameParameters;
 use super::rng::FrameRandom;
 use super::smooth::{CoupledPath, IsMissing, Nodes, Picture, PictureError, Refinement, coupled_paths};
-#[cfg(feature = "cuda")]
 use super::smooth::{LightGrid, node_spacing};
 use super::space::{SceneBox, length};
 use super::tracking::FrameScene;
 use super::wavefront::{FlightGroup, PathCounts, Schedule, collect};
 use super::{Camera, Light, LogStretch, Scene, Transfer};
-use crate::field::Domain;
 use rayon::prelude::*;
+use ridgewatch_field::Domain;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -194,7 +193,7 @@ impl Renderer {
     }
 
     /// The scene of a frame, with the current majorants.
-    pub(super) fn frame_scene(&self, frame: u64) -> FrameScene<'_> {
+    pub fn frame_scene(&self, frame: u64) -> FrameScene<'_> {
         let settings = &self.scene.settings;
         FrameScene {
             camera: &self.camera,
@@ -262,13 +261,11 @@ impl Renderer {
     }
 
     /// Where the light volume of a surrogate with `shape` nodes lies, with at most about `max_values` values.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn light_grid(&self, shape: [usize; 3], max_values: usize, refine: usize) -> LightGrid {
+    pub fn light_grid(&self, shape: [usize; 3], max_values: usize, refine: usize) -> LightGrid {
         LightGrid::new(self.space.edges(), shape, &self.light, max_values, refine)
     }
 
     /// Smallest distance between nodes of a surrogate, in scene units.
-    #[cfg(feature = "cuda")]
     pub fn node_spacing(&self, shape: [usize; 3]) -> f64 {
         node_spacing(self.space.edges(), shape)
     }

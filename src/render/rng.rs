@@ -44,7 +44,7 @@ impl FrameRandom {
     }
 
     /// Key and frame number of the counter.
-    pub(super) fn parts(&self) -> ([u32; 2], u32) {
+    pub fn parts(&self) -> ([u32; 2], u32) {
         (self.key, self.frame)
     }
 

@@ -2,7 +2,7 @@
 
 use super::error::{RenderError, require};
 use super::{CameraSettings, LightSettings, RenderSettings, TransferSettings, overview_scale};
-use crate::field::Domain;
+use ridgewatch_field::Domain;
 
 /// A scene to render. Camera, light and extinction are in scene units: domain coordinates times `scale`.
 #[derive(Debug, Clone, PartialEq)]

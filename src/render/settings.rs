@@ -12,7 +12,7 @@ const MAX_EDGE: usize = 16_384;
 /// Largest number of pixels; their film takes 3 GB.
 const MAX_PIXELS: usize = 1 << 26;
 /// Largest number of samples per pixel in one call.
-pub(crate) const MAX_SAMPLES: usize = 1 << 24;
+pub const MAX_SAMPLES: usize = 1 << 24;
 /// Largest number of majorant cells along one axis.
 const MAX_CELLS: usize = 1024;
 

@@ -1,6 +1,6 @@
 //! The three frames of reference: domain (data coordinates), scene (lengths, for camera, light and extinction) and grid (majorant cells).
 
-use crate::field::{Domain, VERTICAL_EDGE};
+use ridgewatch_field::{Domain, VERTICAL_EDGE};
 
 /// Factors per axis from domain to scene coordinates for default views: the longer of the edges along x and y becomes 1, and their ratio is
 /// kept. The third axis keeps its ratio too ([`Domain::lengths`]), unless the flow is two-dimensional (the thickness of the slab has no
@@ -19,7 +19,7 @@ pub fn overview_scale(domain: &Domain) -> [f64; 3] {
 /// The rendered box, in the layout that kernels read.
 #[repr(C)]
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct SceneBox {
+pub struct SceneBox {
     /// Corners in scene units.
     min: [f64; 3],
     max: [f64; 3],
@@ -37,7 +37,8 @@ pub(super) struct SceneBox {
 }
 
 impl SceneBox {
-    pub(super) fn new(domain: &Domain, scale: [f64; 3], cells: [usize; 3]) -> Self {
+    /// A box around `domain` (edges times `scale` in scene units) with this number of majorant cells per axis.
+    pub fn new(domain: &Domain, scale: [f64; 3], cells: [usize; 3]) -> Self {
         let extent = domain.extent();
         let inward = |value: f64, up: bool| {
             let nearest = value as f32;
@@ -60,29 +61,30 @@ impl SceneBox {
         }
     }
 
-    pub(super) fn cells(&self) -> [usize; 3] {
+    /// Majorant cells per axis.
+    pub fn cells(&self) -> [usize; 3] {
         self.cells.map(|n| n as usize)
     }
 
     /// Edges in scene units.
-    pub(super) fn edges(&self) -> [f64; 3] {
+    pub fn edges(&self) -> [f64; 3] {
         std::array::from_fn(|k| self.max[k] - self.min[k])
     }
 
     /// Unit coordinates of grid coordinates.
     #[inline]
-    pub(super) fn unit_of_grid(&self, grid: [f32; 3]) -> [f32; 3] {
+    pub fn unit_of_grid(&self, grid: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| grid[k] / self.cells[k] as f32)
     }
 
     /// Grid coordinates of unit coordinates.
     #[inline]
-    pub(super) fn grid_of_unit(&self, unit: [f32; 3]) -> [f32; 3] {
+    pub fn grid_of_unit(&self, unit: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| unit[k] * self.cells[k] as f32)
     }
 
     /// Distances at which a ray enters and leaves the box; `None` if it misses the box or the box lies behind.
-    pub(super) fn intersect(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<(f64, f64)> {
+    pub fn intersect(&self, origin: [f64; 3], direction: [f64; 3]) -> Option<(f64, f64)> {
         let (mut enter, mut leave) = (0.0_f64, f64::INFINITY);
         for k in 0..3 {
             if direction[k] == 0.0 {
@@ -99,12 +101,12 @@ impl SceneBox {
     }
 
     /// Grid coordinates of a scene point, clamped to the grid.
-    pub(super) fn grid_point(&self, point: [f64; 3]) -> [f32; 3] {
+    pub fn grid_point(&self, point: [f64; 3]) -> [f32; 3] {
         std::array::from_fn(|k| (((point[k] - self.min[k]) / self.cell_edge[k]) as f32).clamp(0.0, self.cells[k] as f32))
     }
 
     /// Grid coordinates of a domain point, clamped to the grid.
-    pub(super) fn grid_of_domain(&self, point: [f32; 3]) -> [f32; 3] {
+    pub fn grid_of_domain(&self, point: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| {
             (((f64::from(point[k]) - self.domain_min[k]) / self.cell_extent[k]) as f32).clamp(0.0, self.cells[k] as f32)
         })
@@ -112,19 +114,19 @@ impl SceneBox {
 
     /// Converts a scene direction to cells per scene length.
     #[inline]
-    pub(super) fn grid_direction(&self, direction: [f64; 3]) -> [f32; 3] {
+    pub fn grid_direction(&self, direction: [f64; 3]) -> [f32; 3] {
         std::array::from_fn(|k| (direction[k] / self.cell_edge[k]) as f32)
     }
 
     /// Scene point of grid coordinates.
     #[inline]
-    pub(super) fn scene_point(&self, grid: [f32; 3]) -> [f64; 3] {
+    pub fn scene_point(&self, grid: [f32; 3]) -> [f64; 3] {
         std::array::from_fn(|k| self.min[k] + f64::from(grid[k]) * self.cell_edge[k])
     }
 
     /// Domain point of grid coordinates, clamped to the box.
     #[inline]
-    pub(super) fn domain_point(&self, grid: [f32; 3]) -> [f32; 3] {
+    pub fn domain_point(&self, grid: [f32; 3]) -> [f32; 3] {
         std::array::from_fn(|k| {
             ((self.domain_min[k] + f64::from(grid[k]) * self.cell_extent[k]) as f32).max(self.inward_min[k]).min(self.inward_max[k])
         })
@@ -132,7 +134,7 @@ impl SceneBox {
 
     /// Scene length along `direction` from `from` (both in grid coordinates) to the end of the grid.
     #[inline]
-    pub(super) fn exit(&self, from: [f32; 3], direction: [f32; 3]) -> f32 {
+    pub fn exit(&self, from: [f32; 3], direction: [f32; 3]) -> f32 {
         let mut leave = f32::INFINITY;
         for k in 0..3 {
             if direction[k] != 0.0 {
@@ -144,23 +146,23 @@ impl SceneBox {
     }
 }
 
-pub(super) fn subtract(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub fn subtract(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     std::array::from_fn(|k| a[k] - b[k])
 }
 
-pub(super) fn scaled(a: [f64; 3], factor: f64) -> [f64; 3] {
+pub fn scaled(a: [f64; 3], factor: f64) -> [f64; 3] {
     a.map(|v| v * factor)
 }
 
-pub(super) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+pub fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-pub(super) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+pub fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
     [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 }
 
-pub(super) fn length(a: [f64; 3]) -> f64 {
+pub fn length(a: [f64; 3]) -> f64 {
     dot(a, a).sqrt()
 }
 

@@ -13,28 +13,39 @@ use super::space::SceneBox;
 use super::{Camera, Light, Transfer};
 
 /// Isotropic phase function.
-pub(super) const PHASE: f32 = 1.0 / (4.0 * std::f32::consts::PI);
+pub const PHASE: f32 = 1.0 / (4.0 * std::f32::consts::PI);
 /// Transmittance below which Russian roulette ends shadow flights. It is unbiased and saves expensive queries.
-pub(super) const ROULETTE: f32 = 1.0 / 16.0;
+pub const ROULETTE: f32 = 1.0 / 16.0;
 
 /// Everything that is constant during a frame.
-pub(super) struct FrameScene<'a> {
-    pub(super) camera: &'a Camera,
-    pub(super) light: &'a Light,
-    pub(super) transfer: &'a Transfer,
-    pub(super) space: &'a SceneBox,
-    pub(super) majorants: &'a MajorantGrid,
-    pub(super) random: FrameRandom,
-    pub(super) width: usize,
-    pub(super) height: usize,
-    pub(super) background: [f32; 3],
-    pub(super) missing: [f32; 3],
-    pub(super) inverse_tau: f32,
+pub struct FrameScene<'a> {
+    /// Camera.
+    pub camera: &'a Camera,
+    /// Light.
+    pub light: &'a Light,
+    /// Transfer function.
+    pub transfer: &'a Transfer,
+    /// The box, in domain and scene units.
+    pub space: &'a SceneBox,
+    /// Upper bounds of the extinction per cell.
+    pub majorants: &'a MajorantGrid,
+    /// Random numbers of the frame.
+    pub random: FrameRandom,
+    /// Pixels across.
+    pub width: usize,
+    /// Pixels down.
+    pub height: usize,
+    /// Linear radiance behind the box.
+    pub background: [f32; 3],
+    /// Linear radiance of missing cells.
+    pub missing: [f32; 3],
+    /// 1 / |tau|, which turns a log-stretch into an FTLE.
+    pub inverse_tau: f32,
 }
 
 impl FrameScene<'_> {
     /// The parameters that a device needs to track the paths itself.
-    pub(super) fn parameters(&self) -> FrameParameters {
+    pub fn parameters(&self) -> FrameParameters {
         let (key, frame) = self.random.parts();
         FrameParameters {
             camera: *self.camera,
@@ -67,7 +78,7 @@ enum Stage {
 
 /// Result of advancing a flight.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Outcome {
+pub enum Outcome {
     /// The flight waits for the extinction at its tentative collision.
     Pending,
     /// The path has ended.
@@ -76,7 +87,7 @@ pub(super) enum Outcome {
 
 /// A path in flight. Positions are in grid coordinates, `t` in scene lengths from `origin`.
 #[derive(Debug, Clone)]
-pub(super) struct Flight {
+pub struct Flight {
     origin: [f32; 3],
     direction: [f32; 3],
     t: f32,
@@ -96,12 +107,12 @@ pub(super) struct Flight {
     /// Contribution of the path at full transmittance.
     path: PathSample,
     /// Index of the result in its group.
-    pub(super) slot: u32,
+    pub slot: u32,
 }
 
 impl Flight {
     /// Starts the path of a sample and advances it to its first tentative collision.
-    pub(super) fn start(scene: &FrameScene, pixel: u32, sample: u32, slot: u32) -> (Self, Outcome) {
+    pub fn start(scene: &FrameScene, pixel: u32, sample: u32, slot: u32) -> (Self, Outcome) {
         let [jitter_x, jitter_y, ..] = scene.random.words(pixel, sample, 0).map(|w| f64::from(unit(w)));
         let (column, row) = (pixel as usize % scene.width, pixel as usize / scene.width);
         let x = (column as f64 + jitter_x) / scene.width as f64 * 2.0 - 1.0;
@@ -136,7 +147,7 @@ impl Flight {
 
     /// Grid coordinates of the tentative collision.
     #[inline]
-    pub(super) fn point(&self) -> [f32; 3] {
+    pub fn point(&self) -> [f32; 3] {
         std::array::from_fn(|k| self.origin[k] + self.t * self.direction[k])
     }
 
@@ -184,7 +195,7 @@ impl Flight {
 
     /// Processes the answer at the tentative collision and advances to the next. `exceeded` counts extinctions above their majorant.
     #[inline]
-    pub(super) fn resolve(&mut self, scene: &FrameScene, log_stretch: f32, traced: bool, exceeded: &mut u64) -> Outcome {
+    pub fn resolve(&mut self, scene: &FrameScene, log_stretch: f32, traced: bool, exceeded: &mut u64) -> Outcome {
         self.path.queries += 1;
         self.path.traced += u32::from(traced);
         if !log_stretch.is_finite() {
@@ -250,16 +261,16 @@ impl Flight {
 
 /// The point at which the optical depth of a flight is used up.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct Hit {
-    pub(super) t: f32,
-    pub(super) cell: u32,
-    pub(super) majorant: f32,
+pub struct Hit {
+    pub t: f32,
+    pub cell: u32,
+    pub majorant: f32,
 }
 
 /// Traverses the grid from `t` along `origin + t direction` (grid coordinates) until the majorants integrate to `depth`; `None` if that is
 /// beyond `end`. Visits at most as many cells as the grid has along its three axes together.
 #[inline]
-pub(super) fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
+pub fn walk(grid: &MajorantGrid, origin: [f32; 3], direction: [f32; 3], mut t: f32, end: f32, mut depth: f32) -> Option<Hit> {
     let cells = grid.cells();
     let majorants = grid.majorants();
     let strides = [1, cells[0] as isize, (cells[0] * cells[1]) as isize];

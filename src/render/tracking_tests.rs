@@ -1,6 +1,6 @@
 use super::*;
-use crate::field::Domain;
-use crate::render::{CameraSettings, LightSettings, TransferSettings};
+use crate::{CameraSettings, LightSettings, TransferSettings};
+use ridgewatch_field::Domain;
 
 /// A grid with a different majorant in each cell: 1 + index, over a box of unit cells.
 fn graded(cells: [usize; 3]) -> MajorantGrid {

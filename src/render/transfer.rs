@@ -80,8 +80,7 @@ impl Transfer {
     }
 
     /// Parameters of the ramp of a log-stretch over `tau`: low, 1 / (high - low), and tau.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn ramp_parts(&self, tau: f64) -> (f32, f32, f32) {
+    pub fn ramp_parts(&self, tau: f64) -> (f32, f32, f32) {
         (self.low, self.per_range, tau as f32)
     }
 
@@ -117,7 +116,7 @@ fn polynomial(coefficients: &[f64], t: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::ALBEDO_PRESETS;
+    use crate::ALBEDO_PRESETS;
 
     fn published() -> TransferSettings {
         TransferSettings { low: Some(0.05), high: Some(0.235), extinction: Some(100.0), ..TransferSettings::default() }

@@ -104,7 +104,7 @@ impl SyntheticSettings {
 
     /// Description of the velocities.
     pub(super) fn described(&self) -> String {
-        crate::field::turbulence::Turbulence::described(self.modes, self.k_max, self.amplitude, self.seed)
+        ridgewatch_field::turbulence::Turbulence::described(self.modes, self.k_max, self.amplitude, self.seed)
     }
 
     /// The defaults of a shape.

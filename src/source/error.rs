@@ -1,7 +1,7 @@
 //! Errors of the sources. Each names the file, the variable, what was found and what is accepted.
 
 use super::formats::FormatError;
-use crate::setting::Refused;
+use ridgewatch_base::setting::Refused;
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 use thiserror::Error;

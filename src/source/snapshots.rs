@@ -2,7 +2,7 @@
 
 use super::archive_settings::Metric;
 use super::error::SourceError;
-use crate::field::{Grid, Snapshot};
+use ridgewatch_field::{Grid, Snapshot};
 use serde::Serialize;
 use std::sync::Arc;
 

@@ -1,7 +1,7 @@
 //! `[source]` and `[domain]` of a scene file: kind of velocity, and the box of a closed form.
 
 use super::archive_settings::ArchiveSettings;
-use crate::setting::{Refused, count, require, shown};
+use ridgewatch_base::setting::{Refused, count, require, shown};
 use serde::{Deserialize, Serialize};
 
 /// Origin of the velocity.

@@ -103,7 +103,7 @@ impl<'a> Checkpoint<'a> {
         let io = |source| CheckpointError::Io { path: path.into(), source };
         let foreign =
             |found: &str| CheckpointError::Mismatch { path: path.into(), found: found.into(), expected: format!("a {kind} checkpoint") };
-        let mut file = crate::files::open(path).map_err(io)?;
+        let mut file = ridgewatch_base::files::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
         let mut length = [0; 8];
         if size < 8 {

@@ -3,7 +3,7 @@
 use super::checkpoint::Checkpoint;
 use super::trainer::NetworkState;
 use super::{CheckpointError, Table};
-use crate::backend::DeviceError;
+use ridgewatch_base::DeviceError;
 use std::path::Path;
 
 /// Downloads a table's values from the device that holds them.

@@ -6,7 +6,7 @@
 use super::network::{Architecture, Average, Model, Objective, PlannedStep};
 use super::trace::Trace;
 use super::{Kind, Predict, ReplayBuffer, Table};
-use crate::backend::DeviceError;
+use ridgewatch_base::DeviceError;
 use std::sync::Arc;
 
 /// One device, with its types for the parts of a surrogate.

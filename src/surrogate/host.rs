@@ -7,8 +7,8 @@ use super::hybrid::Hybrid;
 use super::network::{Architecture, Average, Field, Fused, Model, Objective, PlannedStep, Predictor, Step};
 use super::trace::Trace;
 use super::{Kind, NetworkSettings, SurrogateError, SurrogateSettings, Table};
-use crate::backend::DeviceError;
-use crate::field::Domain;
+use ridgewatch_base::DeviceError;
+use ridgewatch_field::Domain;
 use std::sync::Arc;
 
 /// The CPU as a surrogate's device. Its calls never fail.

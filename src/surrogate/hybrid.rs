@@ -11,7 +11,7 @@ use super::network::{HELD_OUT, Loss, Model, NetworkSettings, Target};
 use super::trace::Trace;
 use super::trainer::Trainer;
 use super::{CheckpointError, Kind, Learned, Predict, ReplayBuffer, Samples, SurrogateError, fresh_stamp};
-use crate::backend::DeviceError;
+use ridgewatch_base::DeviceError;
 use std::path::Path;
 use std::time::Instant;
 
@@ -110,14 +110,12 @@ impl<D: SurrogateDevice> Hybrid<D> {
     }
 
     /// The table, to be changed in place.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn table_mut(&mut self) -> Option<&mut D::Table> {
+    pub fn table_mut(&mut self) -> Option<&mut D::Table> {
         self.table.as_mut()
     }
 
     /// The network's training, to be moved elsewhere.
-    #[cfg(feature = "cuda")]
-    pub(crate) fn training_mut(&mut self) -> Option<&mut D::Training> {
+    pub fn training_mut(&mut self) -> Option<&mut D::Training> {
         self.trainer.as_mut().map(|trainer| &mut trainer.training)
     }
 

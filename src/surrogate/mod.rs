@@ -2,10 +2,10 @@
 //!
 //! In: traced samples. Out: predictions with a known cost and size. Calls `flow` and `field`.
 
-use crate::backend::DeviceError;
-use crate::field::Domain;
-use crate::setting::Refused;
 use network::NetworkSettings;
+use ridgewatch_base::DeviceError;
+use ridgewatch_base::setting::Refused;
+use ridgewatch_field::Domain;
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicU64, Ordering};
 
@@ -33,12 +33,12 @@ pub use table::Table;
 pub use trace::Trace;
 
 /// Returns a number that is unique in this process.
-pub(crate) fn fresh_stamp() -> u64 {
+pub fn fresh_stamp() -> u64 {
     static NEXT: AtomicU64 = AtomicU64::new(0);
     NEXT.fetch_add(1, Ordering::Relaxed)
 }
 
-/// Traced samples to learn from. Positions are unit coordinates ([`crate::field::Domain::to_unit`]).
+/// Traced samples to learn from. Positions are unit coordinates ([`ridgewatch_field::Domain::to_unit`]).
 #[derive(Debug, Clone, Default)]
 pub struct Samples {
     /// Unit coordinates in [0, 1]^3.
@@ -65,12 +65,12 @@ impl Samples {
     }
 
     /// Network input of sample `index`.
-    pub(crate) fn row(&self, index: usize) -> network::Row {
+    pub fn row(&self, index: usize) -> network::Row {
         network::row(self.points[index], self.times_of(index))
     }
 
     /// Unit times of sample `index`.
-    pub(crate) fn times_of(&self, index: usize) -> [f32; 2] {
+    pub fn times_of(&self, index: usize) -> [f32; 2] {
         self.times.get(index).copied().unwrap_or(network::UNTIMED)
     }
 }
@@ -253,9 +253,9 @@ impl Default for SurrogateSettings {
 /// Default nodes along the longest edge of a table for closed forms: of a table alone, and of a table below a network.
 const DEFAULT_NODES: [usize; 2] = [256, 128];
 /// Maximum nodes of a table with the nodes of the data. Every slide traces them again, which takes two cores about ten seconds.
-pub(crate) const MAX_OWN_NODES: usize = 1 << 21;
+pub const MAX_OWN_NODES: usize = 1 << 21;
 /// The same if a GPU traces them: 128 MiB.
-pub(crate) const MAX_DEVICE_NODES: usize = 1 << 25;
+pub const MAX_DEVICE_NODES: usize = 1 << 25;
 /// Maximum nodes of a table: 4 GiB of f32.
 const MAX_NODES: usize = 1 << 30;
 
@@ -272,7 +272,7 @@ impl SurrogateSettings {
         if !network.inputs.is_empty() && self.kind != Kind::Network {
             return Err(SurrogateError::Setting {
                 key: "network.inputs".into(),
-                found: crate::setting::shown(&network.inputs),
+                found: ridgewatch_base::setting::shown(&network.inputs),
                 accepted: "none, or surrogate.kind = \"network\": a table knows one window and one duration".into(),
             });
         }
@@ -324,7 +324,7 @@ impl SurrogateSettings {
 
     /// Nodes of the table: those set, or 256 along the longest edge (128 below a network) and in proportion along the others; one along z in two
     /// dimensions.
-    pub(crate) fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
+    pub fn nodes(&self, domain: &Domain) -> Result<[usize; 3], SurrogateError> {
         let dimensions = domain.dimensions.clamp(1, 3);
         self.check_nodes(dimensions)?;
         let longest = DEFAULT_NODES[usize::from(self.kind == Kind::Residual)];

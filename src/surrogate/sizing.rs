@@ -6,7 +6,7 @@
 
 use super::network::{Encoding, NetworkSettings};
 use super::{Kind, MAX_OWN_NODES, SurrogateError, SurrogateSettings};
-use crate::field::Domain;
+use ridgewatch_field::Domain;
 
 /// Frames before a size is judged, since new weights need some training first.
 const FRAMES_TO_JUDGE: u32 = 4;

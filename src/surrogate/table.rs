@@ -4,9 +4,9 @@ use super::CheckpointError;
 use super::checkpoint::{Checkpoint, Entry};
 use super::network::Field;
 use super::trace::Trace;
-use crate::backend::DeviceError;
-use crate::flow::{Extras, Traced};
 use rayon::prelude::*;
+use ridgewatch_base::DeviceError;
+use ridgewatch_flow::{Extras, Traced};
 use std::sync::Arc;
 use wide::{f32x8, i32x8};
 
@@ -154,8 +154,8 @@ impl Field for Table {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::Domain;
-    use crate::flow::Tracer;
+    use ridgewatch_field::Domain;
+    use ridgewatch_flow::Tracer;
 
     /// Log-stretch 1 + 2x + 3y + 4z in unit coordinates, NaN left of `hole`.
     struct Plane(Domain, f32);

@@ -1,7 +1,7 @@
 //! Flow maps that some device traces.
 
-use crate::backend::DeviceError;
-use crate::flow::{Extras, Traced, Tracer};
+use ridgewatch_base::DeviceError;
+use ridgewatch_flow::{Extras, Traced, Tracer};
 
 /// A flow map on any device. Tracing fails if the device fails.
 pub trait Trace: Send + Sync {
@@ -22,17 +22,6 @@ impl<T: Tracer> Trace for T {
 
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
         Tracer::trace(self, seeds, extras, out);
-        Ok(())
-    }
-}
-
-impl Trace for Box<dyn Tracer> {
-    fn flow(&self) -> &dyn Tracer {
-        &**self
-    }
-
-    fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError> {
-        Tracer::trace(&**self, seeds, extras, out);
         Ok(())
     }
 }

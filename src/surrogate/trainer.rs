@@ -7,10 +7,10 @@
 use super::device::{HostNetwork, Labels, NetworkCopy, SurrogateTable, SyncedSamples, Training};
 use super::network::{Architecture, Encoding, Field, Model, NetworkSettings, Objective, PlannedStep, Times};
 use super::{Learned, NetworkFrom, ReplayBuffer, SurrogateError};
-use crate::backend::DeviceError;
-use crate::flow::Tracer;
 use copy::{Copies, PendingCopy};
 use progress::Progress;
+use ridgewatch_base::DeviceError;
+use ridgewatch_flow::Tracer;
 use std::sync::Arc;
 use std::time::Instant;
 

@@ -5,7 +5,7 @@
 
 use super::strata::{PreviousAudit, Residual, Strata, cell_of};
 use super::{Audited, CellErrors, TrustSettings};
-use crate::field::Domain;
+use ridgewatch_field::Domain;
 
 /// Decayed sums over the residuals of one cell.
 #[derive(Debug, Clone, Copy, Default)]

@@ -13,7 +13,7 @@ pub use error::TrustedError;
 pub use map::{Gate, TrustMap};
 pub use strata::{Residual, Strata};
 
-use crate::setting::{Refused, count, positive, require};
+use ridgewatch_base::setting::{Refused, count, positive, require};
 use serde::{Deserialize, Serialize};
 
 /// `[trust]` of a scene file.

@@ -272,7 +272,7 @@ fn labels_are_what_was_traced_an_even_share_of_it_and_the_same_in_every_run() {
         assert!(first.points.iter().all(|&p| !stage.gate.trusts(p)));
         let points: Vec<[f32; 3]> = first.points.iter().map(|&p| stage.domain().from_unit(p)).collect();
         let mut exact = ridgewatch::flow::Traced::default();
-        stage.host.trace(&points, Extras::default(), &mut exact).unwrap();
+        Trace::trace(&stage.host, &points, Extras::default(), &mut exact).unwrap();
         let mut errors: Vec<f32> = exact.log_stretch.iter().zip(&first.log_stretch).map(|(a, b)| (a - b).abs()).collect();
         errors.sort_by(f32::total_cmp);
         // Unit coordinates round the seed, by 1e-7 of a domain of 96 cells: 1e-5 of a cell, stretched by up to e^4.

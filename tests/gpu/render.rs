@@ -1,6 +1,7 @@
 //! Rendering on the GPU against rendering on the CPU: the same picture from the same answers, whatever the schedule.
 
 use crate::scenes::{gpu, opened, store, turbulence};
+use ridgewatch::backend::cuda::driver_error;
 use ridgewatch::backend::cuda::{CudaTracer, DeviceError, DeviceLogStretch, Gpu, GpuRenderer, GpuSettings, LookAhead, TraceAll, Tuning};
 use ridgewatch::field::Domain;
 use ridgewatch::field::analytic::Analytic;
@@ -36,7 +37,7 @@ pub struct ThroughHost<'a>(pub &'a Gpu);
 impl DeviceLogStretch for ThroughHost<'_> {
     fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         use cudarc::driver::result;
-        let doing = DeviceError::driver("answering on the host");
+        let doing = driver_error("answering on the host");
         let stream = self.0.work().cu_stream();
         let mut host = vec![[0.0_f32; 3]; count];
         // SAFETY: the renderer says that as many values lie there.

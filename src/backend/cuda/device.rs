@@ -5,16 +5,16 @@ use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu};
 use super::rendering::{CudaSamples, GpuFrames};
 use super::tracing::{CudaTracer, Tuning};
 use super::window::SnapshotStore;
-use crate::backend::cpu::{HostFrame, HostPicture, render_on_cpu};
-use crate::backend::{
+use crate::cpu::{HostFrame, HostPicture, render_on_cpu};
+use crate::{
     AuditFindings, AuditRequest, Backend, BackendError, CudaDevice, DeviceError, FrameJob, Interruptible, Needs, Place, Placement,
     Rendered, Surrogate, SurrogateRequest, WhenLost, audit,
 };
-use crate::flow::{FlowMap, VelocitySource};
-use crate::render::Renderer;
-use crate::source::Listener;
-use crate::surrogate::network::{Architecture, NetworkSettings, Objective};
-use crate::surrogate::{
+use ridgewatch_flow::{FlowMap, VelocitySource};
+use ridgewatch_render::Renderer;
+use ridgewatch_source::Listener;
+use ridgewatch_surrogate::network::{Architecture, NetworkSettings, Objective};
+use ridgewatch_surrogate::{
     CheckpointError, CheckpointState, FrozenHybrid, Host, HostNetwork, HostSurrogate, Hybrid, Kind, Learned, NetworkFrom, Predict,
     ReplayBuffer, build, fresh_stamp,
 };

@@ -1,14 +1,14 @@
 //! Compares the tracing kernels' numerics, compiled as host C++ with the macros and arguments of a launch, with the Rust reference in f64. Needs
 //! no GPU.
 
-use crate::backend::cuda::layout::{DeviceReal, Outputs, ResultPolicy};
-use crate::backend::cuda::tracing::trace::{ClosedArguments, result_policy};
-use crate::backend::cuda::window::grid::{GridArguments, Nodes, WindowFlowMap};
-use crate::backend::cuda::{DeviceError, Storage};
-use crate::field::analytic::Analytic;
-use crate::field::turbulence::Turbulence;
-use crate::field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
-use crate::flow::{
+use crate::cuda::layout::{DeviceReal, Outputs, ResultPolicy};
+use crate::cuda::tracing::trace::{ClosedArguments, result_policy};
+use crate::cuda::window::grid::{GridArguments, Nodes, WindowFlowMap};
+use crate::cuda::{DeviceError, Storage};
+use ridgewatch_field::analytic::Analytic;
+use ridgewatch_field::turbulence::Turbulence;
+use ridgewatch_field::{Axis, Domain, Geometry, Grid, Snapshot, Window};
+use ridgewatch_flow::{
     Boundary, Direction, Extras, FlowMap, Integrator, Interpolation, Normalisation, Precision, Steps, Traced, VelocitySource, cpu_tracer,
 };
 use std::collections::hash_map::RandomState;
@@ -23,7 +23,7 @@ type HostTrace =
 
 /// Compiles `source` of `kernels/` with these macros.
 pub(super) fn library(folder: &Path, source: &str, defines: &[String]) -> libloading::Library {
-    let kernels = concat!(env!("CARGO_MANIFEST_DIR"), "/kernels");
+    let kernels = concat!(env!("CARGO_MANIFEST_DIR"), "/../../kernels");
     let out = folder.join("kernel.so");
     let mut command = Command::new("g++");
     command.args(["-std=c++17", "-O1", "-shared", "-fPIC", "-Wall", "-Wextra", "-Werror", "-Wno-unknown-pragmas", "-I", kernels, "-o"]);

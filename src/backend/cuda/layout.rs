@@ -1,9 +1,9 @@
 //! Structures that kernels read, laid out as in the headers of `kernels/`. All padding is explicit, so that every byte is initialised.
 
-use crate::simd::Real;
-use crate::trust::CellErrors;
 use bytemuck::{NoUninit, Pod, Zeroable};
 use cudarc::driver::DeviceRepr;
+use ridgewatch_simd::Real;
+use ridgewatch_trust::CellErrors;
 use std::fmt::Debug;
 
 /// A floating-point type of the kernels.

@@ -13,20 +13,18 @@ mod rendering;
 mod tracing;
 mod window;
 
-pub use super::error::DeviceError;
 pub use super::settings::Storage;
 pub use device::{Cuda, CudaFrozen, CudaSurrogate};
-pub use driver::{Budget, Buffer, FoundDevice, Gpu, GpuSettings, compile, launch, nvrtc_version, probe, threads};
+pub use driver::{Budget, Buffer, FoundDevice, Gpu, GpuSettings, compile, driver_error, launch, nvrtc_version, probe, threads};
 pub use layout::Outputs;
 pub use network::{
     CudaTable, CudaTraining, DeviceNetwork, DeviceSamples, DeviceTraining, NetworkAbove, OnGpu, Tiling, is_fused, network_defines,
 };
-#[cfg(test)]
-pub(crate) use rendering::LightArgument;
 pub use rendering::{
     Audits, CombineInput, CoupledStats, CoupledTracker, CudaSamples, DeviceLearns, DeviceLogStretch, DeviceNodes, DevicePredict,
     DeviceQueryRouter, FilmPlanes, FrameQueries, GpuCombine, GpuFrames, GpuMarch, GpuRenderer, LookAhead, Medium, NodeGrid, PairTiles,
     RayCheck, RoutedQueries, SUM_PLANES, SurrogateNodes, Timeline, TraceAll,
 };
+pub use ridgewatch_base::DeviceError;
 pub use tracing::{CudaTracer, DeviceTable, DeviceTracer, SortCells, Sorter, Tuning};
 pub use window::{DeviceMissingCells, DeviceSnapshot, DeviceWindow, SnapshotStore};

@@ -1,7 +1,7 @@
 //! Distribution of coupled samples over tiles: in proportion to the standard deviation of a sample (Neyman allocation, Cochran 1977, section 5.5).
 
 /// Edge of a tile, in pixels.
-pub(crate) const TILE: usize = 16;
+pub const TILE: usize = 16;
 const TILE_PIXELS: usize = TILE * TILE;
 /// Share of the pairs that is spread evenly over all tiles.
 const EVEN_SHARE: f64 = 0.25;
@@ -12,14 +12,14 @@ const VARIANCE_FLOOR: f64 = 0.02;
 
 /// Pairs of one tile in one round: the pixels whose ranks follow `cursor`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) struct TilePairs {
-    pub(crate) cursor: u8,
-    pub(crate) pairs: usize,
+pub struct TilePairs {
+    pub cursor: u8,
+    pub pairs: usize,
 }
 
 /// Samples per tile, and where each tile goes on.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub(crate) struct Allocation {
+pub struct Allocation {
     cursors: Vec<u8>,
     /// Variance of a single sample.
     variance: Vec<f64>,
@@ -34,23 +34,24 @@ pub fn bayer_rank(x: usize, y: usize) -> u8 {
 
 /// Quarter of a pixel's pair with this number: the parity of the bits of both coordinates, which halves the pixels of every range of ranks that
 /// starts at a multiple of its length, and alternates from pair to pair.
-pub(crate) fn quarter(x: usize, y: usize, pair: usize) -> usize {
+pub fn quarter(x: usize, y: usize, pair: usize) -> usize {
     (x.count_ones() as usize + y.count_ones() as usize + pair) & 1
 }
 
 /// Tiles across and down.
-pub(crate) fn tiles(width: usize, height: usize) -> [usize; 2] {
+pub fn tiles(width: usize, height: usize) -> [usize; 2] {
     [width.div_ceil(TILE), height.div_ceil(TILE)]
 }
 
 impl Allocation {
-    pub(crate) fn new(width: usize, height: usize) -> Self {
+    /// No samples yet, for a film of this size.
+    pub fn new(width: usize, height: usize) -> Self {
         let count = tiles(width, height).iter().product();
         Self { cursors: vec![0; count], variance: vec![0.0; count] }
     }
 
     /// Pairs of each tile in the next round, rows of tiles from the top.
-    pub(crate) fn next(&mut self, pairs_per_pixel: f64) -> Vec<TilePairs> {
+    pub fn next(&mut self, pairs_per_pixel: f64) -> Vec<TilePairs> {
         let mean = self.variance.iter().sum::<f64>() / self.variance.len() as f64;
         let deviation = |variance: f64| variance.max(VARIANCE_FLOOR * mean).sqrt();
         let spread = self.variance.iter().map(|&v| deviation(v)).sum::<f64>() / self.variance.len() as f64;
@@ -68,7 +69,7 @@ impl Allocation {
     }
 
     /// Takes in the variance of a single sample in each tile; `None` where it is unknown.
-    pub(crate) fn learn(&mut self, variances: impl Iterator<Item = Option<f64>>) {
+    pub fn learn(&mut self, variances: impl Iterator<Item = Option<f64>>) {
         for (known, found) in self.variance.iter_mut().zip(variances) {
             *known = found.unwrap_or(*known);
         }

@@ -19,18 +19,22 @@ const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 
 /// Sums over the coupled samples of a pixel. Samples come in pairs, one of either half.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct PairSums {
+pub struct PairSums {
     /// By half and quarter.
-    pub(super) radiance: [[[f32; 3]; 2]; 2],
-    pub(super) alpha: f32,
+    pub radiance: [[[f32; 3]; 2]; 2],
+    /// Sum of the opacity.
+    pub alpha: f32,
     /// Pairs by quarter.
-    pub(super) pairs: [u32; 2],
-    pub(super) queries: u32,
-    pub(super) traced: u32,
+    pub pairs: [u32; 2],
+    /// Queries of both trackers.
+    pub queries: u32,
+    /// Queries that Runge-Kutta answered.
+    pub traced: u32,
 }
 
 impl PairSums {
-    pub(super) fn pairs(&self) -> u32 {
+    /// Pairs of both quarters.
+    pub fn pairs(&self) -> u32 {
         self.pairs[0] + self.pairs[1]
     }
 
@@ -41,7 +45,7 @@ impl PairSums {
     }
 
     /// Variance of one sample, mean over the channels, from the difference between the halves; 0 without pairs.
-    pub(super) fn sample_variance(&self) -> f32 {
+    pub fn sample_variance(&self) -> f32 {
         let difference = |k: usize| (0..2).map(|q| self.radiance[0][q][k] - self.radiance[1][q][k]).sum::<f32>();
         // The sums of the halves differ by twice the pairs times the variance of one sample.
         (0..3).map(|k| difference(k).powi(2)).sum::<f32>() / (6.0 * self.pairs().max(1) as f32)
@@ -168,7 +172,7 @@ fn shrunk(mut quarters: [Vec<Weighted>; 2], width: usize) -> Vec<[f32; 3]> {
 
 /// How the correction is added.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Correction {
+pub enum Correction {
     /// Not at all; the samples only measure the error.
     Left,
     /// Shrunk.
@@ -178,13 +182,15 @@ pub(super) enum Correction {
 }
 
 /// The correction that is shown, and its error.
-pub(super) struct Combined {
-    pub(super) correction: Vec<[f32; 3]>,
+pub struct Combined {
+    /// Radiance to add to the marched picture, per pixel.
+    pub correction: Vec<[f32; 3]>,
     /// Per pixel and channel, estimates of the squared error: from all pairs, and from those of one quarter. NaN where there are none.
-    pub(super) squared: Vec<[[f32; 3]; 3]>,
+    pub squared: Vec<[[f32; 3]; 3]>,
 }
 
-pub(super) fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
+/// The correction of `sums` (row by row, `width` pixels each) and its squared error, from the products of differences between halves.
+pub fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
     let halves: [Vec<[f32; 3]>; 2] = std::array::from_fn(|half| match how {
         Correction::Left => vec![[0.0; 3]; sums.len()],
         Correction::Summed => sums.par_iter().map(|sums| sums.half(half)).collect(),
@@ -220,7 +226,7 @@ pub(super) fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combi
 }
 
 /// Mean of the known values over a square around each pixel; NaN where none is known.
-pub(super) fn smoothed(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
+pub fn smoothed(values: &[f32], width: usize, radius: usize) -> Vec<f32> {
     let known: Vec<[f32; 2]> = values.iter().map(|v| if v.is_finite() { [*v, 1.0] } else { [0.0; 2] }).collect();
     box_sum(&known, width, radius).into_iter().map(|[sum, count]| if count > 0.5 { sum / count } else { f32::NAN }).collect()
 }
@@ -228,7 +234,7 @@ pub(super) fn smoothed(values: &[f32], width: usize, radius: usize) -> Vec<f32> 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::render::rng::{philox, unit};
+    use crate::rng::{philox, unit};
 
     /// Pairs of a picture whose correction is `truth`, with uniform noise of standard deviation `noise`.
     fn sampled(truth: &[f32], noise: f32, pairs: u32, seed: u32) -> Vec<PairSums> {

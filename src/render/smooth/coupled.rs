@@ -7,9 +7,9 @@
 
 use super::march::{IsMissing, Medium};
 use super::nodes::Nodes;
-use crate::render::LogStretch;
-use crate::render::rng::unit;
-use crate::render::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};
+use crate::LogStretch;
+use crate::rng::unit;
+use crate::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};
 use rayon::prelude::*;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -327,8 +327,8 @@ pub(super) fn track(
     (found, counts)
 }
 
-/// [`track`] in a medium of these parts, to the end.
-pub(in crate::render) fn coupled_paths(
+/// Coupled tracking in a medium of these parts, to the end.
+pub fn coupled_paths(
     scene: &FrameScene<'_>,
     nodes: &Nodes,
     missing: Option<IsMissing<'_>>,

@@ -5,13 +5,13 @@
 //! plain grid is marched by itself.
 
 use super::march::{Medium, node_spacing};
-use crate::render::Light;
+use crate::Light;
 use rayon::prelude::*;
 use std::ops::RangeInclusive;
 
 /// Optical depth to the light at any point of the box.
 #[derive(Debug, Clone)]
-pub(crate) struct LightVolume {
+pub struct LightVolume {
     grid: LightGrid,
     /// Grid positions along x, y, z are unit coordinates times `cells`.
     cells: [f32; 3],
@@ -20,35 +20,35 @@ pub(crate) struct LightVolume {
 
 /// Where the values of a light volume lie.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) struct LightGrid {
+pub struct LightGrid {
     /// Nodes along x, y, z.
-    pub(crate) nodes: [usize; 3],
+    pub nodes: [usize; 3],
     /// `Some` for a directional light.
-    pub(crate) shear: Option<Shear>,
+    pub shear: Option<Shear>,
     /// Stored values along the first lateral axis, the second, and the planes; x, y, z for a point light.
-    pub(crate) size: [usize; 3],
+    pub size: [usize; 3],
     /// Quadrature points from plane to plane.
-    pub(crate) samples: usize,
+    pub samples: usize,
     /// Step of the quadrature to a point light, scene units.
-    pub(crate) step: f32,
+    pub step: f32,
 }
 
 /// Axes and slopes of the columns.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Shear {
+pub struct Shear {
     /// Axis across the planes, and the two others.
-    pub(crate) major: usize,
-    pub(crate) lateral: [usize; 2],
+    pub major: usize,
+    pub lateral: [usize; 2],
     /// True if the light is on the high side of the major axis.
-    pub(crate) from_above: bool,
+    pub from_above: bool,
     /// Lateral shift per plane, walking away from the light.
-    pub(crate) slope: [f32; 2],
+    pub slope: [f32; 2],
     /// Scene length along the light per plane.
-    pub(crate) length: f32,
+    pub length: f32,
 }
 
 /// Stored columns beyond the box on either side.
-pub(crate) const MARGIN: i32 = 2;
+pub const MARGIN: i32 = 2;
 
 impl Shear {
     fn offset(&self, lateral: usize, plane: usize) -> i32 {
@@ -59,7 +59,7 @@ impl Shear {
 impl LightGrid {
     /// The finest grid over a box with these edges (scene units) and a surrogate of `shape` nodes that has at most about `max_values` values.
     /// The distance between its values is that of the nodes divided by `refine`, if the limit allows.
-    pub(crate) fn new(edges: [f64; 3], shape: [usize; 3], light: &Light, max_values: usize, refine: usize) -> Self {
+    pub fn new(edges: [f64; 3], shape: [usize; 3], light: &Light, max_values: usize, refine: usize) -> Self {
         let spacing = node_spacing(edges, shape);
         // Quarters of the distance between nodes, from the finest that is asked for.
         let grid_of = |quarter: usize| -> [usize; 3] {
@@ -95,12 +95,12 @@ impl LightGrid {
     }
 
     /// Number of stored values.
-    pub(crate) fn values(&self) -> usize {
+    pub fn values(&self) -> usize {
         self.size.iter().product()
     }
 
     /// Numbers of the columns along a lateral axis that any plane stores.
-    pub(crate) fn columns(&self, shear: &Shear, side: usize) -> RangeInclusive<i32> {
+    pub fn columns(&self, shear: &Shear, side: usize) -> RangeInclusive<i32> {
         let ends = [shear.offset(side, 0), shear.offset(side, self.size[2] - 1)];
         -MARGIN - ends[0].max(ends[1])..=self.size[side] as i32 - 1 - MARGIN - ends[0].min(ends[1])
     }
@@ -108,7 +108,7 @@ impl LightGrid {
 
 impl LightVolume {
     /// Tabulates the depth on the grid of [`LightGrid::new`].
-    pub(super) fn new(medium: &Medium<'_>, max_values: usize, refine: usize) -> Self {
+    pub fn new(medium: &Medium<'_>, max_values: usize, refine: usize) -> Self {
         let space = medium.scene.space;
         let grid = LightGrid::new(space.edges(), medium.nodes.shape(), medium.scene.light, max_values, refine);
         let cells = grid.nodes.map(|n| (n - 1) as f32);
@@ -179,7 +179,7 @@ impl LightVolume {
 
     /// Optical depth from a point in unit coordinates to the light.
     #[inline]
-    pub(super) fn at(&self, unit: [f32; 3]) -> f32 {
+    pub fn at(&self, unit: [f32; 3]) -> f32 {
         let place: [f32; 3] = std::array::from_fn(|k| unit[k].clamp(0.0, 1.0) * self.cells[k]);
         let lower = |x: f32, n: usize| (x.floor() as usize).min(n - 2);
         let between = |a: f32, b: f32, f: f32| (b - a).mul_add(f, a);

@@ -5,9 +5,9 @@
 
 use super::light_volume::LightVolume;
 use super::nodes::Nodes;
-use crate::render::Light;
-use crate::render::rng::unit;
-use crate::render::tracking::{FrameScene, PHASE};
+use crate::Light;
+use crate::rng::unit;
+use crate::tracking::{FrameScene, PHASE};
 
 /// Transmittance below which the rest of a ray is not marched.
 const OPAQUE: f32 = 1e-4;
@@ -21,16 +21,19 @@ pub type IsMissing<'a> = &'a (dyn Fn([f32; 3]) -> bool + Sync);
 
 /// What is marched through.
 #[derive(Clone, Copy)]
-pub(crate) struct Medium<'a> {
-    pub(crate) scene: &'a FrameScene<'a>,
-    pub(crate) nodes: &'a Nodes,
+pub struct Medium<'a> {
+    /// Camera, light, transfer function and box.
+    pub scene: &'a FrameScene<'a>,
+    /// Log-stretch on nodes.
+    pub nodes: &'a Nodes,
     /// `None`: every cell has data.
-    pub(crate) missing: Option<IsMissing<'a>>,
+    pub missing: Option<IsMissing<'a>>,
 }
 
 /// How the transmittance to the light is found.
 #[derive(Clone, Copy)]
-pub(super) enum ToLight<'a> {
+pub enum ToLight<'a> {
+    /// From the swept light volume.
     Volume(&'a LightVolume),
     /// By marching from the point with this step, in scene units.
     March(f32),
@@ -38,16 +41,20 @@ pub(super) enum ToLight<'a> {
 
 /// One ray, or a sum of rays.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub(super) struct RaySum {
-    pub(super) radiance: [f32; 3],
-    pub(super) alpha: f32,
+pub struct RaySum {
+    /// Linear radiance.
+    pub radiance: [f32; 3],
+    /// Opacity.
+    pub alpha: f32,
     /// Sum of weight times FTLE.
-    pub(super) ftle: f32,
-    pub(super) missing: f32,
+    pub ftle: f32,
+    /// Share of the ray that lies in missing cells.
+    pub missing: f32,
 }
 
 impl RaySum {
-    pub(super) fn add(&mut self, ray: &Self) {
+    /// Adds a ray.
+    pub fn add(&mut self, ray: &Self) {
         (0..3).for_each(|k| self.radiance[k] += ray.radiance[k]);
         self.alpha += ray.alpha;
         self.ftle += ray.ftle;
@@ -64,19 +71,19 @@ fn offsets(j: u64) -> [f32; 3] {
 }
 
 /// Smallest distance between nodes, in scene units.
-pub(crate) fn node_spacing(edges: [f64; 3], shape: [usize; 3]) -> f64 {
+pub fn node_spacing(edges: [f64; 3], shape: [usize; 3]) -> f64 {
     (0..3).filter(|&k| shape[k] > 1).map(|k| edges[k] / (shape[k] - 1) as f64).fold(f64::INFINITY, f64::min)
 }
 
 impl Medium<'_> {
     /// Smallest distance between nodes, in scene units.
-    pub(super) fn spacing(&self) -> f64 {
+    pub fn spacing(&self) -> f64 {
         node_spacing(self.scene.space.edges(), self.nodes.shape())
     }
 
     /// FTLE of the surrogate at a point in unit coordinates; `None` in missing cells.
     #[inline]
-    pub(super) fn ftle(&self, unit: [f32; 3]) -> Option<f32> {
+    pub fn ftle(&self, unit: [f32; 3]) -> Option<f32> {
         if self.missing.is_some_and(|missing| missing(self.scene.space.domain_point(self.scene.space.grid_of_unit(unit)))) {
             return None;
         }
@@ -85,12 +92,12 @@ impl Medium<'_> {
 
     /// Extinction at a point in unit coordinates, per scene length.
     #[inline]
-    pub(super) fn extinction(&self, unit: [f32; 3]) -> f32 {
+    pub fn extinction(&self, unit: [f32; 3]) -> f32 {
         self.ftle(unit).map_or(0.0, |ftle| self.scene.transfer.extinction(ftle))
     }
 
     /// Optical depth from a point (grid coordinates) to the light, by the midpoint rule.
-    pub(super) fn depth_to_light(&self, point: [f32; 3], step: f32) -> f32 {
+    pub fn depth_to_light(&self, point: [f32; 3], step: f32) -> f32 {
         let space = self.scene.space;
         let (direction, distance, _) = self.scene.light.seen_from(space.scene_point(point));
         let direction = space.grid_direction(direction);
@@ -102,7 +109,7 @@ impl Medium<'_> {
     }
 
     /// Ray `j` of a pixel with steps of at most `step` scene units. `shift` draws a random shift of the ray for each pixel.
-    pub(super) fn ray(&self, pixel: u32, j: u64, step: f32, light: ToLight<'_>, shift: bool) -> RaySum {
+    pub fn ray(&self, pixel: u32, j: u64, step: f32, light: ToLight<'_>, shift: bool) -> RaySum {
         let (scene, space) = (self.scene, self.scene.space);
         let mut offset = offsets(j);
         if shift {

@@ -1,30 +1,31 @@
 //! How finely a picture is marched: its error is measured on random pixels and kept well below that of the picture.
 
-use crate::render::rng::FrameRandom;
+use crate::rng::FrameRandom;
 
 /// Rays per pixel of the first round. Later rounds add one each.
-pub(crate) const FIRST_RAYS: u64 = 2;
+pub const FIRST_RAYS: u64 = 2;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
-/// Pixels per call whose rays are compared with others of the same pixel, and the first of them that are compared with a finer march as well.
+/// Pixels per call whose rays are compared with others of the same pixel.
 const AUDITED_PIXELS: u64 = 256;
-pub(crate) const FINELY_AUDITED: usize = 24;
+/// Number of audited pixels whose rays are compared with a finer march as well.
+pub const FINELY_AUDITED: usize = 24;
 /// Counter word of the draw of these pixels, which no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX - 2;
 
 /// State of the march of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct MarchControl {
+pub struct MarchControl {
     /// Rays per pixel so far.
-    pub(crate) rays: u64,
+    pub rays: u64,
     /// Rays per pixel to march next.
-    pub(crate) next_rays: u64,
+    pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
-    pub(crate) step: f32,
+    pub step: f32,
     /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `FIRST_RAYS` rays.
     audited: [f64; 2],
     quadrature: f64,
@@ -33,7 +34,7 @@ pub(crate) struct MarchControl {
 
 /// What to do after a round.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Marching {
+pub enum Marching {
     /// The march is fine enough.
     Enough,
     /// Forget the rays and the light volume, and march with the smaller step.
@@ -50,17 +51,17 @@ impl Default for MarchControl {
 
 impl MarchControl {
     /// The control of another picture. The steps of the last one are likely to suit it.
-    pub(crate) fn restarted(self) -> Self {
+    pub fn restarted(self) -> Self {
         Self { step: self.step, ..Self::default() }
     }
 
     /// Divisor of the distances in the light volume.
-    pub(crate) fn refine(&self) -> usize {
+    pub fn refine(&self) -> usize {
         (FIRST_STEP / self.step).round().max(1.0) as usize
     }
 
     /// Pixels to audit after the rays from `rays` on.
-    pub(crate) fn audit_pixels(&self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
+    pub fn audit_pixels(&self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
         let pixel = |i: u64| {
             let word = random.words((self.rays * AUDITED_PIXELS + i) as u32, u32::MAX, AUDIT_DIMENSION)[0];
             ((u64::from(word) * pixels as u64) >> 32) as u32
@@ -69,7 +70,7 @@ impl MarchControl {
     }
 
     /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
-    pub(crate) fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
+    pub fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
         let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
         // Pixels that show the background alone agree exactly. They do not count, since errors are stated over lit pixels.
         let filter = square(coarse, following);
@@ -95,12 +96,12 @@ impl MarchControl {
     }
 
     /// Mean square error of marching, mean over channels.
-    pub(crate) fn error(&self) -> f64 {
+    pub fn error(&self) -> f64 {
         self.quadrature() + self.filter()
     }
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
-    pub(crate) fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
+    pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         if !may_go_on {
             self.next_rays = u64::from(self.rays < MAX_RAYS);
             return Marching::Enough;

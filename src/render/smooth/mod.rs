@@ -6,8 +6,6 @@
 mod allocation;
 mod combine;
 mod coupled;
-#[cfg(all(test, feature = "cuda"))]
-mod host_parity;
 mod light_volume;
 mod march;
 mod march_control;
@@ -16,18 +14,14 @@ mod picture;
 mod statement;
 
 pub use allocation::bayer_rank;
-pub use coupled::CoupledPath;
-pub(in crate::render) use coupled::coupled_paths;
-#[cfg(feature = "cuda")]
-pub(crate) use light_volume::{LightGrid, MARGIN};
-pub use march::IsMissing;
-#[cfg(feature = "cuda")]
-pub(crate) use march::node_spacing;
+pub use combine::{Combined, Correction, PairSums, combine, smoothed};
+pub use coupled::{CoupledPath, coupled_paths};
+pub use light_volume::{LightGrid, LightVolume, MARGIN};
+pub use march::{IsMissing, Medium, RaySum, ToLight, node_spacing};
 pub use nodes::{BRICK, Nodes};
 pub use picture::{Picture, Refinement};
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
-#[cfg(feature = "cuda")]
-pub(crate) use {
+pub use {
     allocation::{Allocation, TILE},
     march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},

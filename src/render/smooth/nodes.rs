@@ -1,6 +1,6 @@
 //! The surrogate as a picture sees it: log-stretch at the nodes of a regular grid, interpolated multilinearly.
 
-use crate::render::Transfer;
+use crate::Transfer;
 use rayon::prelude::*;
 use std::sync::Arc;
 
@@ -52,8 +52,7 @@ impl Nodes {
     }
 
     /// Largest value at the nodes of each brick, x fastest.
-    #[cfg(all(test, feature = "cuda"))]
-    pub(super) fn brick_max(&self) -> &[f32] {
+    pub fn brick_max(&self) -> &[f32] {
         &self.brick_max
     }
 

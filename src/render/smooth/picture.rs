@@ -8,10 +8,10 @@ use super::march::{IsMissing, Medium, RaySum, ToLight};
 use super::march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
-use crate::render::renderer::RenderStats;
-use crate::render::rng::FrameRandom;
-use crate::render::tracking::FrameScene;
-use crate::render::{Film, LogStretch, Method, Scene};
+use crate::renderer::RenderStats;
+use crate::rng::FrameRandom;
+use crate::tracking::FrameScene;
+use crate::{Film, LogStretch, Method, Scene};
 use rayon::prelude::*;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -20,12 +20,13 @@ use std::time::Instant;
 /// Largest number of values of the light volume on the CPU.
 const LIGHT_VALUES: usize = 1 << 24;
 /// Pairs per pixel that measure the error of a marched picture.
-pub(crate) const AUDIT_PAIRS: f64 = 1.0 / 16.0;
+pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
 /// Seconds of marching that a round may take at least. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
-/// Radius over which the squared error of a pixel is averaged, and its floor as a share of the frame's mean.
-pub(crate) const ERROR_RADIUS: usize = 8;
-pub(crate) const ERROR_FLOOR: f64 = 0.05;
+/// Radius over which the squared error of a pixel is averaged, in pixels.
+pub const ERROR_RADIUS: usize = 8;
+/// Floor of a pixel's squared error, as a share of the frame's mean.
+pub const ERROR_FLOOR: f64 = 0.05;
 
 /// One round of refinement.
 pub struct Refinement<'a> {
@@ -83,7 +84,7 @@ impl Picture {
     }
 
     /// One round: more rays, more pairs, and the picture with its error. `None` if `stop` ended it early.
-    pub(in crate::render) fn refine(
+    pub fn refine(
         &mut self,
         frame: &FrameScene<'_>,
         scene: &Scene,

@@ -4,7 +4,7 @@ use bytemuck::{Pod, Zeroable};
 use serde::{Deserialize, Serialize};
 
 /// Opacity above which a pixel counts as lit.
-pub(crate) const LIT: f32 = 0.01;
+pub const LIT: f32 = 0.01;
 /// Two-sided 95 % of the normal distribution.
 const NORMAL: f64 = 1.96;
 
@@ -68,7 +68,7 @@ pub struct TileSums {
 
 impl TileSums {
     /// Variance of one sample; `None` without pairs.
-    pub(crate) fn sample_variance(&self) -> Option<f64> {
+    pub fn sample_variance(&self) -> Option<f64> {
         (self.all.pixels[0] > 0.0).then(|| f64::from(self.variance / self.all.pixels[0]))
     }
 }
@@ -101,12 +101,12 @@ fn estimate<'a>(tiles: impl Iterator<Item = &'a TileErrors>, weighting: usize) -
 
 impl PictureError {
     /// True if samples measured the error of lit pixels. Otherwise nothing is stated.
-    pub(crate) fn is_known(&self) -> bool {
+    pub fn is_known(&self) -> bool {
         [self.rms, self.relmse, self.psnr, self.psnr_all].iter().all(|e| e.value.is_finite() && e.low.is_finite() && e.high.is_finite())
     }
 
     /// Error of a picture from its tiles and the mean square error of its march.
-    pub(crate) fn of(tiles: &[TileSums], march: f64, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
+    pub fn of(tiles: &[TileSums], march: f64, samples_per_pixel: f64, rays_per_pixel: u64) -> Self {
         let lit = |weighting: usize| estimate(tiles.iter().map(|tile| &tile.lit), weighting);
         let linear = lit(0);
         // The error of marching is measured without weights and counts in proportion.

@@ -3,16 +3,14 @@
 use super::check::{check, check_fit};
 use super::files::expand;
 use super::synthetic::{declared, synthesized};
-use crate::field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
-use crate::source::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
-use crate::source::cf::calendar::Calendar;
-use crate::source::cf::coordinate::Kind;
-use crate::source::error::SourceError;
-use crate::source::formats::{DataFile, Format, Listing};
-use crate::source::grids::{
-    AxisPlan, ComponentPlan, Layout, Orders, Poles, Resampling, VelocityScale, difference, plan, read_component, slab_of,
-};
-use crate::source::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
+use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
+use crate::cf::calendar::Calendar;
+use crate::cf::coordinate::Kind;
+use crate::error::SourceError;
+use crate::formats::{DataFile, Format, Listing};
+use crate::grids::{AxisPlan, ComponentPlan, Layout, Orders, Poles, Resampling, VelocityScale, difference, plan, read_component, slab_of};
+use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
+use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 

@@ -1,9 +1,9 @@
 //! Checks of the archive settings: by themselves, and against the files.
 
-use crate::source::archive_settings::{ArchiveSettings, Metric, Staggering};
-use crate::source::error::SourceError;
-use crate::source::formats::Format;
-use crate::source::grids::{Layout, Resampling};
+use crate::archive_settings::{ArchiveSettings, Metric, Staggering};
+use crate::error::SourceError;
+use crate::formats::Format;
+use crate::grids::{Layout, Resampling};
 
 /// Refuses settings that are wrong for all files.
 ///

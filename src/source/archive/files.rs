@@ -1,7 +1,7 @@
 //! Files, folders and patterns as a list of files.
 
-use crate::source::error::SourceError;
-use crate::source::formats::FormatFault;
+use crate::error::SourceError;
+use crate::formats::FormatFault;
 use std::path::{Path, PathBuf};
 
 /// Extensions of the files that are taken from a folder.

@@ -1,13 +1,13 @@
 //! Inspection of an archive: what would be read from it, and why.
 
 use super::archive::{Archive, Displacement, files_of};
-use crate::setting::{Refused, word};
-use crate::source::archive_settings::ArchiveSettings;
-use crate::source::cf::velocity;
-use crate::source::error::SourceError;
-use crate::source::formats::{DataFile, Listing};
-use crate::source::grids::{AxisPlan, InFile, Quantity, readable_axes};
-use crate::source::snapshots::{SnapshotSource, SourceDescription, TimeGap, median_interval, span, window_snapshots};
+use crate::archive_settings::ArchiveSettings;
+use crate::cf::velocity;
+use crate::error::SourceError;
+use crate::formats::{DataFile, Listing};
+use crate::grids::{AxisPlan, InFile, Quantity, readable_axes};
+use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, median_interval, span, window_snapshots};
+use ridgewatch_base::setting::{Refused, word};
 use serde::Serialize;
 use std::fmt;
 use std::path::PathBuf;

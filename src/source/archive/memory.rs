@@ -1,9 +1,9 @@
 //! Snapshots that are computed or held in memory.
 
-use crate::field::{Geometry, Grid, Snapshot};
-use crate::source::archive_settings::Metric;
-use crate::source::error::SourceError;
-use crate::source::snapshots::{SnapshotSource, SourceDescription};
+use crate::archive_settings::Metric;
+use crate::error::SourceError;
+use crate::snapshots::{SnapshotSource, SourceDescription};
+use ridgewatch_field::{Geometry, Grid, Snapshot};
 use std::sync::Arc;
 
 /// A source whose snapshots come from a function of their index and time: closed forms sampled on a grid, tests, arrays.

@@ -1,8 +1,8 @@
 //! The I/O thread, which reads ahead into a bounded channel.
 
-use crate::field::Snapshot;
-use crate::source::error::SourceError;
-use crate::source::snapshots::{Listener, SnapshotSource, StillReading};
+use crate::error::SourceError;
+use crate::snapshots::{Listener, SnapshotSource, StillReading};
+use ridgewatch_field::Snapshot;
 use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
@@ -126,8 +126,8 @@ impl Iterator for ReadAhead {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, Geometry, Grid};
-    use crate::source::archive::memory::MemorySource;
+    use crate::archive::memory::MemorySource;
+    use ridgewatch_field::{Axis, Geometry, Grid};
     use std::sync::atomic::AtomicUsize;
 
     fn source(count: usize, made: Arc<AtomicUsize>, panic_at: usize) -> Box<dyn SnapshotSource> {

@@ -1,8 +1,8 @@
 //! One snapshot as a steady flow.
 
-use crate::field::{Grid, Snapshot};
-use crate::source::error::SourceError;
-use crate::source::snapshots::{SnapshotSource, SourceDescription};
+use crate::error::SourceError;
+use crate::snapshots::{SnapshotSource, SourceDescription};
+use ridgewatch_field::{Grid, Snapshot};
 use std::sync::Arc;
 
 /// A source of one snapshot that appears at two times: the flow does not change between them.

@@ -1,13 +1,13 @@
 //! Archives of the standard turbulence in the layouts of common models, so that a replay runs anywhere and has a known result.
 
-use crate::field::turbulence::Turbulence;
-use crate::field::{Axis, AxisFault, EARTH_RADIUS};
-use crate::setting::word;
-use crate::source::archive_settings::{SyntheticSettings, SyntheticShape};
-use crate::source::cf::coordinate::Kind;
-use crate::source::error::SourceError;
-use crate::source::formats::{Attribute, Listing, NewVariable, NumberType, Values, write_hdf5, write_netcdf};
-use crate::source::grids::{AxisPlan, Quantity, VelocityScale, to_heights};
+use crate::archive_settings::{SyntheticSettings, SyntheticShape};
+use crate::cf::coordinate::Kind;
+use crate::error::SourceError;
+use crate::formats::{Attribute, Listing, NewVariable, NumberType, Values, write_hdf5, write_netcdf};
+use crate::grids::{AxisPlan, Quantity, VelocityScale, to_heights};
+use ridgewatch_base::setting::word;
+use ridgewatch_field::turbulence::Turbulence;
+use ridgewatch_field::{Axis, AxisFault, EARTH_RADIUS};
 use std::path::{Path, PathBuf};
 
 /// Seconds between snapshots of the longitude-latitude shapes.

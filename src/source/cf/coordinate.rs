@@ -2,7 +2,7 @@
 
 use super::time::TimeUnit;
 use super::units::Unit;
-use crate::source::formats::Variable;
+use crate::formats::Variable;
 
 /// Quantity along an axis.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -85,7 +85,7 @@ pub fn classify_name(name: &str) -> Kind {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::formats::{Attribute, NumberType};
+    use crate::formats::{Attribute, NumberType};
 
     #[test]
     fn attributes_come_before_names() {

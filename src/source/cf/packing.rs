@@ -1,7 +1,7 @@
 //! Packed and missing values: `scale_factor`, `add_offset`, `_FillValue`, `missing_value`, `valid_range`, `_Unsigned`
 //! (CF conventions, section 8.1; NetCDF User's Guide, appendix A).
 
-use crate::source::formats::{Attribute, NumberType, Variable};
+use crate::formats::{Attribute, NumberType, Variable};
 
 /// Conversion of raw numbers to values; missing ones become NaN.
 #[derive(Debug, Clone, PartialEq)]

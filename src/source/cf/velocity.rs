@@ -1,7 +1,7 @@
 //! Finding the velocity: by `standard_name`, then by usual names, then by `long_name`; always with a fitting unit.
 
 use super::units::Unit;
-use crate::source::formats::{Listing, Variable};
+use crate::formats::{Listing, Variable};
 
 /// The rule that chooses among several candidates.
 pub const RULE: &str = "standard names go before usual names before long names, then pairs of one naming family, then more \

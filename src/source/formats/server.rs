@@ -56,7 +56,7 @@ impl OpenFile {
     /// takes milliseconds and many small reads; a file that resembles `expected` is opened through libhdf5 instead.
     fn open(path: &Path, expected: Option<&Listing>) -> Result<Self, FormatError> {
         let failed = |cause: std::io::Error| FormatFault::Open(cause.to_string()).of(path);
-        let mut file = crate::files::open(path).map_err(failed)?;
+        let mut file = ridgewatch_base::files::open(path).map_err(failed)?;
         let bytes = file.metadata().map_err(failed)?.len();
         let format = recognise(&mut file, bytes).map_err(failed)?.map_err(|found| FormatFault::Unknown(found).of(path))?;
         let empty = |format| Listing { path: path.into(), format, bytes, dimensions: vec![], variables: vec![], attributes: vec![] };
@@ -132,8 +132,8 @@ fn recognise(file: &mut File, length: u64) -> std::io::Result<Result<Format, Str
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::formats::messages::{Attribute, Dimension};
-    use crate::source::formats::write::{NewVariable, Values, write_netcdf};
+    use crate::formats::messages::{Attribute, Dimension};
+    use crate::formats::write::{NewVariable, Values, write_netcdf};
 
     #[test]
     fn requests_and_answers_survive_a_process_boundary() {

@@ -1,10 +1,10 @@
 //! Ascending axes from the coordinates in a file, and the order in which to read the file for them.
 
-use crate::field::{Axis, AxisFault};
-use crate::source::cf::coordinate::Kind;
-use crate::source::cf::units::{AXIS_UNITS, Unit};
-use crate::source::error::SourceError;
-use crate::source::formats::Variable;
+use crate::cf::coordinate::Kind;
+use crate::cf::units::{AXIS_UNITS, Unit};
+use crate::error::SourceError;
+use crate::formats::Variable;
+use ridgewatch_field::{Axis, AxisFault};
 use serde::Serialize;
 use std::ops::Range;
 use std::path::Path;

@@ -1,9 +1,9 @@
 //! One component of the velocity in a file, and its values at one time.
 
 use super::axes::runs;
-use crate::source::cf::packing::Packing;
-use crate::source::error::SourceError;
-use crate::source::formats::DataFile;
+use crate::cf::packing::Packing;
+use crate::error::SourceError;
+use crate::formats::DataFile;
 
 /// Meaning of a dimension of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

@@ -8,8 +8,8 @@
 
 use super::component::{ComponentPlan, SquaredErrors, read_component};
 use super::locator::{Locator, Mesh, Target};
-use crate::source::error::SourceError;
-use crate::source::formats::DataFile;
+use crate::error::SourceError;
+use crate::formats::DataFile;
 use std::sync::Arc;
 
 /// How to read a file of curvilinear coordinates.

@@ -6,13 +6,13 @@ use super::curvilinear::Curvilinear;
 use super::layout::{Layout, Resampling};
 use super::locator::{Locator, Mesh, target};
 use super::planner::Planner;
-use crate::field::Axis;
-use crate::source::archive_settings::{Metric, VelocityUnit};
-use crate::source::cf::coordinate::{Kind, classify};
-use crate::source::cf::units::Unit;
-use crate::source::cf::velocity::Velocity;
-use crate::source::error::SourceError;
-use crate::source::formats::Variable;
+use crate::archive_settings::{Metric, VelocityUnit};
+use crate::cf::coordinate::{Kind, classify};
+use crate::cf::units::Unit;
+use crate::cf::velocity::Velocity;
+use crate::error::SourceError;
+use crate::formats::Variable;
+use ridgewatch_field::Axis;
 use std::sync::Arc;
 
 /// Longitude and latitude variables of a component.

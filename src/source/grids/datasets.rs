@@ -9,12 +9,12 @@ use super::component::{ComponentPlan, Role};
 use super::layout::Layout;
 use super::planner::Planner;
 use super::times::TimePlan;
-use crate::source::archive_settings::{Metric, VelocityUnit};
-use crate::source::cf::coordinate::Kind;
-use crate::source::cf::units::Unit;
-use crate::source::cf::velocity;
-use crate::source::error::SourceError;
-use crate::source::formats::{Attribute, Variable};
+use crate::archive_settings::{Metric, VelocityUnit};
+use crate::cf::coordinate::Kind;
+use crate::cf::units::Unit;
+use crate::cf::velocity;
+use crate::error::SourceError;
+use crate::formats::{Attribute, Variable};
 
 /// Names of a scalar, attribute or dataset that holds the time.
 const TIME_NAMES: [&str; 5] = ["time", "Time", "t", "simulation_time", "physical_time"];
@@ -401,7 +401,7 @@ impl Planner<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::formats::NumberType;
+    use crate::formats::NumberType;
 
     #[test]
     fn numbers_are_found_in_names() {

@@ -1,9 +1,9 @@
 //! Meaning of the dimensions of the velocity: by coordinate variables, then by the settings, then by position.
 
 use super::planner::Planner;
-use crate::source::cf::coordinate::{Kind, classify, classify_name};
-use crate::source::error::SourceError;
-use crate::source::formats::NumberType;
+use crate::cf::coordinate::{Kind, classify, classify_name};
+use crate::error::SourceError;
+use crate::formats::NumberType;
 
 /// Longest coordinate variable that is read: a damaged header must not exhaust the memory.
 const MAX_COORDINATES: usize = 1 << 26;

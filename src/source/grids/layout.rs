@@ -6,11 +6,11 @@ use super::curvilinear::Curvilinear;
 use super::poles::Poles;
 use super::staggered::Staggered;
 use super::times::TimePlan;
-use crate::field::{Axis, AxisFault};
-use crate::source::archive_settings::Metric;
-use crate::source::cf::calendar::Calendar;
-use crate::source::error::SourceError;
-use crate::source::formats::{DataFile, Listing};
+use crate::archive_settings::Metric;
+use crate::cf::calendar::Calendar;
+use crate::error::SourceError;
+use crate::formats::{DataFile, Listing};
+use ridgewatch_field::{Axis, AxisFault};
 use std::sync::Arc;
 
 /// How to read one file.

@@ -2,7 +2,7 @@
 //! atmosphere: z = -H ln(p / p0).
 
 use super::axes::{AxisPlan, Quantity};
-use crate::field::{Axis, AxisFault};
+use ridgewatch_field::{Axis, AxisFault};
 
 /// Scale height of the atmosphere, metres.
 const SCALE_HEIGHT: f64 = 7000.0;

@@ -4,9 +4,9 @@
 //! time.
 
 use super::locator::apart;
-use crate::field::EARTH_RADIUS;
-use crate::source::error::SourceError;
-use crate::source::formats::DataFile;
+use crate::error::SourceError;
+use crate::formats::DataFile;
+use ridgewatch_field::EARTH_RADIUS;
 use std::sync::Arc;
 
 /// Largest distance of a corner from a centre, in cells: more than rounding, less than any move.

@@ -3,10 +3,10 @@
 use super::axes::{AxisPlan, Coordinates};
 use super::layout::Layout;
 use super::planner::Planner;
-use crate::source::archive_settings::ArchiveSettings;
-use crate::source::cf::coordinate::{Kind, classify};
-use crate::source::error::SourceError;
-use crate::source::formats::DataFile;
+use crate::archive_settings::ArchiveSettings;
+use crate::cf::coordinate::{Kind, classify};
+use crate::error::SourceError;
+use crate::formats::DataFile;
 
 /// Plans how to read a file. Costly parts are taken from `first`, the layout of the archive's first file.
 ///

@@ -1,7 +1,7 @@
 //! Grids whose last row lies beside a pole: the pole becomes a row too, so that no hole remains around it.
 
 use super::axes::AxisPlan;
-use crate::field::{Axis, AxisFault};
+use ridgewatch_field::{Axis, AxisFault};
 
 /// Poles that were added as rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

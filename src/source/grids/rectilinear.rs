@@ -5,14 +5,14 @@ use super::component::Role;
 use super::dimensions::Extent;
 use super::layout::Layout;
 use super::planner::Planner;
-use crate::field::{Axis, AxisFault};
-use crate::setting::word;
-use crate::source::archive_settings::{Metric, VelocityUnit};
-use crate::source::cf::coordinate::{Kind, classify};
-use crate::source::cf::units::Unit;
-use crate::source::cf::velocity::{self, Velocity};
-use crate::source::error::SourceError;
-use crate::source::formats::Variable;
+use crate::archive_settings::{Metric, VelocityUnit};
+use crate::cf::coordinate::{Kind, classify};
+use crate::cf::units::Unit;
+use crate::cf::velocity::{self, Velocity};
+use crate::error::SourceError;
+use crate::formats::Variable;
+use ridgewatch_base::setting::word;
+use ridgewatch_field::{Axis, AxisFault};
 
 impl Planner<'_> {
     /// Finds the components of the velocity.

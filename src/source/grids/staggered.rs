@@ -10,10 +10,10 @@
 use super::axes::{AxisPlan, Quantity};
 use super::component::{ComponentPlan, SquaredErrors, read_component};
 use super::nest::{Nest, Shift};
-use crate::field::{Axis, AxisFault};
-use crate::source::cf::coordinate::Kind;
-use crate::source::error::SourceError;
-use crate::source::formats::DataFile;
+use crate::cf::coordinate::Kind;
+use crate::error::SourceError;
+use crate::formats::DataFile;
+use ridgewatch_field::{Axis, AxisFault};
 
 /// Acceleration of gravity in WRF, m/s^2.
 const GRAVITY: f64 = 9.81;

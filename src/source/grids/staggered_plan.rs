@@ -7,12 +7,12 @@ use super::nest::Nest;
 use super::planner::Planner;
 use super::staggered::{Cells, Reach, Staggered};
 use super::times::TimePlan;
-use crate::field::Axis;
-use crate::source::archive_settings::{Metric, Staggering, VelocityUnit};
-use crate::source::cf::coordinate::{Kind, classify_name};
-use crate::source::cf::velocity::Velocity;
-use crate::source::error::SourceError;
-use crate::source::formats::NumberType;
+use crate::archive_settings::{Metric, Staggering, VelocityUnit};
+use crate::cf::coordinate::{Kind, classify_name};
+use crate::cf::velocity::Velocity;
+use crate::error::SourceError;
+use crate::formats::NumberType;
+use ridgewatch_field::Axis;
 use std::sync::Arc;
 
 /// Names of the map scale factors at the points of u and v.

@@ -2,11 +2,11 @@
 
 use super::dimensions::Extent;
 use super::planner::Planner;
-use crate::source::cf::calendar::{CALENDARS, Calendar};
-use crate::source::cf::coordinate::{Kind, classify};
-use crate::source::cf::time::{TIME_UNITS, TimeUnit};
-use crate::source::error::SourceError;
-use crate::source::formats::NumberType;
+use crate::cf::calendar::{CALENDARS, Calendar};
+use crate::cf::coordinate::{Kind, classify};
+use crate::cf::time::{TIME_UNITS, TimeUnit};
+use crate::error::SourceError;
+use crate::formats::NumberType;
 
 /// Times of one file.
 #[derive(Debug, Clone, PartialEq)]

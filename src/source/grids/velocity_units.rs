@@ -2,7 +2,7 @@
 //! second.
 
 use super::axes::{AxisPlan, Quantity};
-use crate::field::EARTH_RADIUS;
+use ridgewatch_field::EARTH_RADIUS;
 
 /// Factors along the axes: u is multiplied by `u_x[i] u_y[j]`, v by `v_y[j]`, w by `w_z[k]`.
 pub struct VelocityScale {

@@ -1,7 +1,7 @@
 //! Conversion of a step's components to a snapshot, by a few threads and in reused memory.
 
-use crate::field::{Grid, Snapshot};
-use crate::source::error::SourceError;
+use crate::error::SourceError;
+use ridgewatch_field::{Grid, Snapshot};
 use std::sync::Arc;
 use std::sync::mpsc::{RecvTimeoutError, sync_channel};
 use std::time::Duration;
@@ -83,7 +83,7 @@ impl Conversion {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, Geometry};
+    use ridgewatch_field::{Axis, Geometry};
 
     fn grid() -> Arc<Grid> {
         let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();

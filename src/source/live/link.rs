@@ -1,7 +1,7 @@
 //! Origin of the blocks: the ring of this node, or relays of other nodes.
 
 use super::settings::LiveSettings;
-use crate::source::error::SourceError;
+use crate::error::SourceError;
 use ridgewatch_wire::message::ConnectionFile;
 use ridgewatch_wire::relay::{BUFFERS, RelayFollower};
 use ridgewatch_wire::{Event, Limits, RING_VARIABLE, RingFollower};

@@ -1,6 +1,6 @@
 //! `[live]` of a scene file.
 
-use crate::setting::{Refused, require};
+use ridgewatch_base::setting::{Refused, require};
 use serde::{Deserialize, Serialize};
 use std::path::PathBuf;
 

@@ -2,9 +2,9 @@
 
 use super::link::Link;
 use super::settings::LiveSettings;
-use crate::field::{Axis, AxisFault, Geometry, Grid};
-use crate::source::error::SourceError;
-use crate::source::grids::slab_of;
+use crate::error::SourceError;
+use crate::grids::slab_of;
+use ridgewatch_field::{Axis, AxisFault, Geometry, Grid};
 use ridgewatch_wire::{Description, Event, Limits};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,6 +1,6 @@
 //! Choice of the steps that the window keeps if memory does not hold all, and the interpolation error of this choice.
 
-use crate::field::{Snapshot, Window};
+use ridgewatch_field::{Snapshot, Window};
 use std::sync::Arc;
 
 /// Nodes at which the interpolation is measured.
@@ -92,7 +92,7 @@ fn interpolation_error(before: &Snapshot, between: &Snapshot, after: &Snapshot) 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, Geometry, Grid};
+    use ridgewatch_field::{Axis, Geometry, Grid};
 
     fn at(time: f64) -> Snapshot {
         let axis = |n| Axis::uniform(n, "m", 0.0, 1.0, 3).unwrap();

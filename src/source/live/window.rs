@@ -4,9 +4,9 @@ use super::conversion::Conversion;
 use super::settings::{AtEnd, Follow};
 use super::simulation::Live;
 use super::thinning::Thinning;
-use crate::field::{Window, WindowFault};
-use crate::source::error::SourceError;
-use crate::source::snapshots::{Listener, StillReading};
+use crate::error::SourceError;
+use crate::snapshots::{Listener, StillReading};
+use ridgewatch_field::{Window, WindowFault};
 use ridgewatch_wire::{Assembler, Event, LEAD, Step};
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -445,7 +445,7 @@ fn since(moment: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::source::live::settings::LiveSettings;
+    use crate::live::settings::LiveSettings;
     use ridgewatch_wire::{AxisDescription, Description, Geometry, Policy, Producer};
 
     #[test]

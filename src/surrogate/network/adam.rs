@@ -16,15 +16,18 @@ const PREFETCHED_LINES: usize = 32;
 
 /// Factors of one step, with both bias corrections folded in.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Adam {
-    pub(crate) rate: f32,
-    pub(crate) epsilon: f32,
-    pub(crate) correction: f32,
+pub struct Adam {
+    /// Learning rate.
+    pub rate: f32,
+    /// Added to the root of the second moment, times the root of its bias correction.
+    pub epsilon: f32,
+    /// Both bias corrections: of the root of the second moment over that of the first.
+    pub correction: f32,
 }
 
 impl Adam {
     /// Factors of step number `time`, counted from 1.
-    pub(crate) fn at(time: usize, rate: f64, epsilon: f32) -> Self {
+    pub fn at(time: usize, rate: f64, epsilon: f32) -> Self {
         // 1 - 0.999^t is 1 in f32 long before i32 runs out.
         let time = time.min(1 << 30) as i32;
         let second = (1.0 - BETA_2.powi(time)).sqrt();

@@ -2,14 +2,14 @@
 
 use super::settings::{Encoding, NetworkSettings, Target, refused};
 use super::times::{COLUMN_NAMES, FIRST_TIME};
-use crate::surrogate::SurrogateError;
+use crate::SurrogateError;
 use serde::{Deserialize, Serialize};
 
 /// Inputs of a hash grid at most: every input doubles the corners of a cell.
-pub(crate) const GRID_INPUTS: usize = 4;
+pub const GRID_INPUTS: usize = 4;
 /// Multipliers of the spatial hash for each input (the first three: Teschner et al. 2003, as in Müller et al. 2022; the fourth:
 /// tiny-cuda-nn).
-pub(crate) const HASH: [u32; GRID_INPUTS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
+pub const HASH: [u32; GRID_INPUTS] = [1, 2_654_435_761, 805_459_861, 3_674_653_429];
 
 /// One level of the hash grid.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -58,7 +58,7 @@ pub struct Architecture {
 
 impl Architecture {
     /// Resolves `settings` for inputs along `axes` of the domain and the times in the settings. `lengths` are the lengths of the domain's
-    /// edges along x, y and z, in one unit ([`crate::field::Domain::lengths`]).
+    /// edges along x, y and z, in one unit ([`ridgewatch_field::Domain::lengths`]).
     ///
     /// # Errors
     /// [`SurrogateError::Setting`] if a setting is out of range, the axes are not ascending, or a hash grid would get too many inputs.
@@ -156,7 +156,7 @@ impl Architecture {
     }
 
     /// Parameters of the output layer, in the flat vector of layers.
-    pub(crate) fn output_parameters(&self) -> std::ops::Range<usize> {
+    pub fn output_parameters(&self) -> std::ops::Range<usize> {
         let head = self.output_layer();
         head.weights..head.biases + head.outputs
     }

@@ -5,7 +5,7 @@ use super::architecture::Architecture;
 use super::model::Model;
 use super::module::Network;
 use super::objective::Objective;
-use crate::surrogate::Samples;
+use crate::Samples;
 use burn::backend::{Autodiff, Flex};
 use burn::module::{Param, ParamId};
 use burn::optim::{AdamConfig, GradientsParams, SimpleOptimizer};

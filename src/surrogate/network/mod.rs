@@ -26,18 +26,16 @@ mod tile;
 mod times;
 mod train;
 
-#[cfg(feature = "cuda")]
-pub(crate) use adam::Adam;
+pub use adam::Adam;
 pub use architecture::{Architecture, Layer, Level};
-#[cfg(feature = "cuda")]
-pub(crate) use architecture::{GRID_INPUTS, HASH};
+pub use architecture::{GRID_INPUTS, HASH};
 pub use autodiff::{autodiff_gradient, operation_step, stock_step};
 pub use model::Model;
 pub use module::Network;
 pub use objective::{Field, Objective, Scale, signed_exp, signed_log};
 pub use operation::{FusedNetwork, NetworkInputs};
-pub(crate) use predictor::Predictor;
-pub(crate) use random::{draw, uniform};
+pub use predictor::Predictor;
+pub use random::{draw, uniform};
 pub use settings::{Encoding, Input, Loss, NetworkSettings, Size, Target};
 pub use times::{Row, Times, UNTIMED, row};
 pub use train::{Average, Fused, HELD_OUT, PlannedStep, Step};

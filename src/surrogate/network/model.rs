@@ -47,7 +47,7 @@ impl Model {
     }
 
     /// Parameters, first and second moments of tables and layers; moments are 0 before the first step.
-    pub(crate) fn state(&self) -> [[Vec<f32>; 3]; 2] {
+    pub fn state(&self) -> [[Vec<f32>; 3]; 2] {
         let lengths = [self.shape.table_entries() * self.shape.features, self.shape.layer_parameters()];
         let mut state = lengths.map(|len| [(); 3].map(|()| vec![0.0; len]));
         self.copy_state(&mut state);
@@ -55,7 +55,7 @@ impl Model {
     }
 
     /// Copies the state into the result of an earlier [`Model::state`].
-    pub(crate) fn copy_state(&self, [tables, layers]: &mut [[Vec<f32>; 3]; 2]) {
+    pub fn copy_state(&self, [tables, layers]: &mut [[Vec<f32>; 3]; 2]) {
         if let Some(parameter) = &self.module.tables {
             copy(parameter.val(), self.table_moments.as_ref(), tables);
         }
@@ -63,7 +63,7 @@ impl Model {
     }
 
     /// Sets the result of [`Model::state`] after `steps` steps. Lengths must be those of the shape.
-    pub(crate) fn set_state(&mut self, [tables, layers]: [[Vec<f32>; 3]; 2], steps: usize) {
+    pub fn set_state(&mut self, [tables, layers]: [[Vec<f32>; 3]; 2], steps: usize) {
         if let Some(parameter) = self.module.tables.take() {
             let (values, moments) = from_values(tables, [self.shape.table_entries(), self.shape.features], steps);
             self.module.tables = Some(Param::initialized(parameter.id, values));

@@ -6,9 +6,9 @@
 use super::architecture::Architecture;
 use super::memory::Outputs;
 use super::settings::{Loss, NetworkSettings, Target};
-use crate::flow::log_stretch;
-use crate::surrogate::Samples;
+use crate::Samples;
 use rayon::prelude::*;
+use ridgewatch_flow::log_stretch;
 use serde::{Deserialize, Serialize};
 
 /// Outputs are trained as (value - mean) / deviation, so that learning rates mean the same on every scene. Per output.

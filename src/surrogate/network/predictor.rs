@@ -8,18 +8,18 @@ use super::tile::{Parameters, Weights};
 use super::times::row;
 
 /// Layers packed for prediction.
-pub(crate) struct Predictor {
+pub struct Predictor {
     weights: Weights,
 }
 
 impl Predictor {
     /// Packs the flat vector of layers.
-    pub(crate) fn new(shape: &Architecture, layers: &[f32]) -> Self {
+    pub fn new(shape: &Architecture, layers: &[f32]) -> Self {
         Self { weights: Weights::new(shape, layers, false) }
     }
 
     /// Writes the log-stretch at each unit point, at these unit times. A flow map is differentiated forwards.
-    pub(crate) fn log_stretch(
+    pub fn log_stretch(
         &self,
         shape: &Architecture,
         objective: &Objective,

@@ -8,12 +8,12 @@ fn bits(seed: u64, counter: u64) -> u64 {
 }
 
 /// A number in [0, 1).
-pub(crate) fn uniform(seed: u64, counter: u64) -> f32 {
+pub fn uniform(seed: u64, counter: u64) -> f32 {
     (bits(seed, counter) >> 40) as f32 / (1_u64 << 24) as f32
 }
 
 /// A number in `0..count`.
-pub(crate) fn draw(seed: u64, counter: u64, count: usize) -> usize {
+pub fn draw(seed: u64, counter: u64, count: usize) -> usize {
     // Multiply-shift: its bias of 2^-64 * count is far below anything that training could notice.
     ((u128::from(bits(seed, counter)) * count as u128) >> 64) as usize
 }

@@ -1,6 +1,6 @@
 //! `[network]` of a scene file.
 
-use crate::surrogate::SurrogateError;
+use crate::SurrogateError;
 use serde::{Deserialize, Serialize};
 
 /// Encoding of the inputs of the MLP.
@@ -51,7 +51,7 @@ pub enum Loss {
 pub enum Size {
     /// The size in the scene.
     Fixed,
-    /// A size found from the measured error, at most the size in the scene ([`crate::surrogate::Sizing`]).
+    /// A size found from the measured error, at most the size in the scene ([`crate::Sizing`]).
     Auto,
 }
 
@@ -136,7 +136,11 @@ impl NetworkSettings {
     /// [`SurrogateError::Setting`] with the first key whose value is not accepted.
     pub fn validate(&self) -> Result<(), SurrogateError> {
         if (1..self.inputs.len()).any(|i| self.inputs[i..].contains(&self.inputs[i - 1])) {
-            return Err(refused("inputs", crate::setting::shown(&self.inputs), "each of \"start\" and \"duration\" once at most"));
+            return Err(refused(
+                "inputs",
+                ridgewatch_base::setting::shown(&self.inputs),
+                "each of \"start\" and \"duration\" once at most",
+            ));
         }
         if let Some([first, last]) = self.start_range {
             let range = format!("[{first}, {last}]");

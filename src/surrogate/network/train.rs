@@ -9,7 +9,7 @@ use super::model::{Model, ModelBuffers};
 use super::objective::{Field, Objective, signed_exp};
 use super::random::draw;
 use super::tile::{Parameters, Tile, Weights};
-use crate::surrogate::Samples;
+use crate::Samples;
 use rayon::prelude::*;
 
 /// Held-out samples are one in this many, if a step holds samples out.

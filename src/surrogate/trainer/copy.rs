@@ -5,7 +5,7 @@
 
 use super::super::device::{Download, HostNetwork};
 use super::Progress;
-use crate::backend::DeviceError;
+use ridgewatch_base::DeviceError;
 use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};

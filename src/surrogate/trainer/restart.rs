@@ -6,19 +6,19 @@ use super::super::device::{HostNetwork, Training};
 use super::super::network::Average;
 use super::copy::Copies;
 use super::{NetworkSource, Progress, Trainer};
-use crate::backend::DeviceError;
+use ridgewatch_base::DeviceError;
 use std::sync::Arc;
 use std::time::Instant;
 
 /// A network in training at one moment, to be written.
-pub(in crate::surrogate) struct NetworkState {
+pub(crate) struct NetworkState {
     notes: Vec<(String, String)>,
     source: NetworkSource,
 }
 
 impl NetworkState {
     /// Reason why frames had to wait for the copy; `None` if they did not.
-    pub(in crate::surrogate) fn wait_reason(&self) -> Option<&str> {
+    pub(crate) fn wait_reason(&self) -> Option<&str> {
         match &self.source {
             NetworkSource::Here(_, why) => why.as_deref(),
             NetworkSource::Pending(_) => None,
@@ -26,7 +26,7 @@ impl NetworkState {
     }
 
     /// Adds notes and tensors to a checkpoint. Waits for downloads in progress.
-    pub(in crate::surrogate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceError> {
+    pub(crate) fn entries<'a>(&'a self, checkpoint: &mut Checkpoint<'a>) -> Result<(), DeviceError> {
         for (key, text) in &self.notes {
             checkpoint.note(&format!("network.{key}"), text.clone());
         }
@@ -60,7 +60,7 @@ impl<T: Training> Trainer<T> {
     ///
     /// # Errors
     /// The device fails.
-    pub(in crate::surrogate) fn checkpoint(&self) -> Result<NetworkState, DeviceError> {
+    pub(crate) fn checkpoint(&self) -> Result<NetworkState, DeviceError> {
         Ok(NetworkState { notes: self.notes(), source: NetworkSource::Here(self.training.download()?, None) })
     }
 
@@ -68,7 +68,7 @@ impl<T: Training> Trainer<T> {
     ///
     /// # Errors
     /// The device fails.
-    pub(in crate::surrogate) fn checkpoint_async(&mut self) -> Result<Option<NetworkState>, DeviceError> {
+    pub(crate) fn checkpoint_async(&mut self) -> Result<Option<NetworkState>, DeviceError> {
         let begin = Instant::now();
         let Some(source) = self.copy()? else { return Ok(None) };
         (self.copies.made, self.copies.wait_seconds) = (Instant::now(), begin.elapsed().as_secs_f64());
@@ -112,7 +112,7 @@ impl<T: Training> Trainer<T> {
     }
 
     /// Restores the trainer. The whole checkpoint is checked before any state changes.
-    pub(in crate::surrogate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
+    pub(crate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
         for (key, text) in self.fixed() {
             checkpoint.expect_note(&format!("network.{key}"), &text)?;
         }

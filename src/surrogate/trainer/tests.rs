@@ -1,10 +1,10 @@
 //! Tests of the warning for a device without memory for a copy, and of the state to roll back to.
 
 use super::*;
-use crate::field::Domain;
-use crate::field::analytic::Analytic;
-use crate::flow::{FlowMap, VelocitySource, cpu_tracer};
-use crate::surrogate::{HostTraining, Samples, Table};
+use crate::{HostTraining, Samples, Table};
+use ridgewatch_field::Domain;
+use ridgewatch_field::analytic::Analytic;
+use ridgewatch_flow::{FlowMap, VelocitySource, cpu_tracer};
 use std::sync::Mutex;
 use std::time::Duration;
 

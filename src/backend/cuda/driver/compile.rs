@@ -3,7 +3,7 @@
 //! Each source in `kernels/` is compiled with macros for everything that is constant during a run (dimensions, precision, interpolation, ...). A
 //! kernel then contains one variant only and uses no more registers than this variant needs.
 
-use crate::backend::cuda::DeviceError;
+use crate::cuda::DeviceError;
 use cudarc::nvrtc::{result as nvrtc, sys};
 use std::ffi::{CStr, CString};
 use std::fs;

@@ -3,10 +3,11 @@
 //! [`probe`] checks that the driver and NVRTC libraries are present before anything else, because cudarc panics if they are not. Each [`Gpu`] has
 //! three streams: one for kernels, one for uploads and one for asynchronous readback.
 
-use crate::backend::cuda::DeviceError;
-use crate::backend::cuda::driver::compile::{self, KernelCache};
-use crate::backend::cuda::driver::memory::{Budget, Buffer};
-use crate::backend::cuda::driver::readback::AsyncReadback;
+use crate::cuda::DeviceError;
+use crate::cuda::driver::compile::{self, KernelCache};
+use crate::cuda::driver::memory::{Budget, Buffer};
+use crate::cuda::driver::readback::AsyncReadback;
+use crate::cuda::driver_error;
 use cudarc::driver::{CudaContext, CudaEvent, CudaFunction, CudaModule, CudaStream, DeviceRepr, result, sys};
 use cudarc::nvrtc::Ptx;
 use std::collections::HashMap;
@@ -98,7 +99,7 @@ pub fn probe() -> Result<Vec<FoundDevice>, DeviceError> {
 fn driver_version() -> Result<i32, DeviceError> {
     let mut version = 0;
     // SAFETY: `version` outlives the call, and `probe` found the library.
-    unsafe { sys::cuDriverGetVersion(&mut version) }.result().map_err(DeviceError::driver("querying the driver version"))?;
+    unsafe { sys::cuDriverGetVersion(&mut version) }.result().map_err(driver_error("querying the driver version"))?;
     Ok(version)
 }
 
@@ -112,7 +113,7 @@ impl Gpu {
         let Some(found) = devices.iter().find(|d| d.ordinal == ordinal) else {
             return Err(DeviceError::NoSuchDevice { asked: ordinal, present: devices.len() as u32 });
         };
-        let opening = DeviceError::driver("opening the device");
+        let opening = driver_error("opening the device");
         let context = CudaContext::new(ordinal as usize).map_err(&opening)?;
         let capability = context.compute_capability().map_err(&opening)?;
         if capability < (7, 0) {
@@ -159,7 +160,7 @@ impl Gpu {
         if !self.context.has_async_alloc() {
             return Ok(());
         }
-        let doing = DeviceError::driver("setting the release threshold of the memory pool");
+        let doing = driver_error("setting the release threshold of the memory pool");
         let mut threshold: u64 = self.budget.cap();
         // SAFETY: the pool is the device's own, the attribute's type is u64, and `threshold` outlives the call.
         unsafe {
@@ -205,10 +206,10 @@ impl Gpu {
     pub fn transfer(&self) -> &Arc<CudaStream> {
         &self.transfer
     }
-    pub(in crate::backend::cuda) fn readback(&self) -> &AsyncReadback {
+    pub(in crate::cuda) fn readback(&self) -> &AsyncReadback {
         &self.readback
     }
-    pub(in crate::backend::cuda) fn budget(&self) -> &Arc<Budget> {
+    pub(in crate::cuda) fn budget(&self) -> &Arc<Budget> {
         &self.budget
     }
     /// Bytes in use and the limit, bytes.
@@ -222,7 +223,7 @@ impl Gpu {
 
     /// Returns the batch size for items of `bytes` bytes: as many as fit in a quarter of the free memory, at most `most`, and at least 4096 (or
     /// `most`, if that is smaller).
-    pub(in crate::backend::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
+    pub(in crate::cuda) fn batch(&self, most: usize, bytes: u64) -> usize {
         const SHARE: u64 = 4;
         const MIN: usize = 1 << 12;
         usize::try_from(self.memory_left() / SHARE / bytes).unwrap_or(most).max(MIN).min(most)
@@ -257,7 +258,7 @@ impl Gpu {
         if let Some(module) = modules.get(&key) {
             return module.clone();
         }
-        let load = |cubin: Vec<u8>| self.context.load_module(Ptx::from_binary(cubin)).map_err(DeviceError::driver("loading kernels"));
+        let load = |cubin: Vec<u8>| self.context.load_module(Ptx::from_binary(cubin)).map_err(driver_error("loading kernels"));
         let request = compile::Request::new(source, self.capability, defines)?;
         let module = match self.cache.find(&request).map(load) {
             Some(Ok(module)) => module,
@@ -284,7 +285,7 @@ impl Gpu {
     /// # Errors
     /// As for [`Self::module`]; or the module has no kernel of this name.
     pub fn kernel(&self, source: &str, defines: &[String], name: &str) -> Result<CudaFunction, DeviceError> {
-        self.module(source, defines)?.load_function(name).map_err(DeviceError::driver("finding a kernel"))
+        self.module(source, defines)?.load_function(name).map_err(driver_error("finding a kernel"))
     }
 
     /// Waits for all work enqueued on the work stream.
@@ -292,7 +293,7 @@ impl Gpu {
     /// # Errors
     /// That work, or the driver call, fails.
     pub fn synchronize(&self) -> Result<(), DeviceError> {
-        self.work.synchronize().map_err(DeviceError::driver("waiting for the device"))
+        self.work.synchronize().map_err(driver_error("waiting for the device"))
     }
 
     /// Records an event on the work stream, to measure time or to make another stream wait.
@@ -300,7 +301,7 @@ impl Gpu {
     /// # Errors
     /// A driver call fails.
     pub fn mark(&self) -> Result<CudaEvent, DeviceError> {
-        self.work.record_event(Some(sys::CUevent_flags::CU_EVENT_DEFAULT)).map_err(DeviceError::driver("recording an event"))
+        self.work.record_event(Some(sys::CUevent_flags::CU_EVENT_DEFAULT)).map_err(driver_error("recording an event"))
     }
 
     /// Returns the device time between two events in milliseconds. Waits for the second event.
@@ -308,7 +309,7 @@ impl Gpu {
     /// # Errors
     /// A driver call fails.
     pub fn milliseconds(&self, from: &CudaEvent, to: &CudaEvent) -> Result<f32, DeviceError> {
-        from.elapsed_ms(to).map_err(DeviceError::driver("measuring time"))
+        from.elapsed_ms(to).map_err(driver_error("measuring time"))
     }
 
     /// Returns the peak clock rate of the multiprocessors, in Hz.
@@ -317,7 +318,7 @@ impl Gpu {
     /// A driver call fails.
     pub fn top_clock_hz(&self) -> Result<f64, DeviceError> {
         let kilohertz = self.context.attribute(sys::CUdevice_attribute::CU_DEVICE_ATTRIBUTE_CLOCK_RATE);
-        Ok(f64::from(kilohertz.map_err(DeviceError::driver("querying the clock rate"))?) * 1e3)
+        Ok(f64::from(kilohertz.map_err(driver_error("querying the clock rate"))?) * 1e3)
     }
 
     /// Measures the memory bandwidth of the device with a copy of `bytes` bytes: bytes read plus bytes written, per second. It bounds the speed of
@@ -326,7 +327,7 @@ impl Gpu {
     /// # Errors
     /// The device fails or lacks memory for two buffers of this size.
     pub fn copy_rate(&self, bytes: usize) -> Result<f64, DeviceError> {
-        let doing = DeviceError::driver("copying on the device");
+        let doing = driver_error("copying on the device");
         let (mut from, to) = (self.alloc::<u8>("a copy", bytes)?, self.alloc::<u8>("a copy", bytes)?);
         from.fill_bytes(0x5a)?;
         let mut best = f32::INFINITY;

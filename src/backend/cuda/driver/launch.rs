@@ -1,6 +1,7 @@
 //! Launches kernels.
 
-use crate::backend::cuda::{DeviceError, Gpu};
+use crate::cuda::driver_error;
+use crate::cuda::{DeviceError, Gpu};
 use cudarc::driver::sys::CUfunction_attribute as Function;
 use cudarc::driver::{CudaFunction, LaunchArgs, LaunchConfig};
 
@@ -19,17 +20,17 @@ pub fn threads(count: usize, block: u32) -> LaunchConfig {
 /// until the work stream has passed the launch.
 pub unsafe fn launch(arguments: &mut LaunchArgs<'_>, config: LaunchConfig) -> Result<(), DeviceError> {
     // SAFETY: as required of the caller.
-    unsafe { arguments.launch(config) }.map(|_| ()).map_err(DeviceError::driver("launching a kernel"))
+    unsafe { arguments.launch(config) }.map(|_| ()).map_err(driver_error("launching a kernel"))
 }
 
 /// A persistent kernel: its blocks stay on the device and take one tile after another. It uses more shared memory than the default limit.
 #[derive(Debug)]
-pub(in crate::backend::cuda) struct Resident {
-    pub(in crate::backend::cuda) function: CudaFunction,
+pub(in crate::cuda) struct Resident {
+    pub(in crate::cuda) function: CudaFunction,
     threads: u32,
     shared: u32,
     /// Number of blocks that are resident at once.
-    pub(in crate::backend::cuda) blocks: u32,
+    pub(in crate::cuda) blocks: u32,
 }
 
 impl Resident {
@@ -37,8 +38,8 @@ impl Resident {
     ///
     /// # Errors
     /// Error of the driver.
-    pub(in crate::backend::cuda) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
-        let doing = DeviceError::driver("requesting shared memory");
+    pub(in crate::cuda) fn new(gpu: &Gpu, function: CudaFunction, threads: u32, shared: usize) -> Result<Self, DeviceError> {
+        let doing = driver_error("requesting shared memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
         function.set_attribute(Function::CU_FUNC_ATTRIBUTE_MAX_DYNAMIC_SHARED_SIZE_BYTES, shared as i32).map_err(&doing)?;
         let together = function.occupancy_max_active_blocks_per_multiprocessor(threads, shared, None).map_err(&doing)?;
@@ -46,7 +47,7 @@ impl Resident {
     }
 
     /// As many blocks as are resident at once, at most one per tile.
-    pub(in crate::backend::cuda) fn config(&self, tiles: usize) -> LaunchConfig {
+    pub(in crate::cuda) fn config(&self, tiles: usize) -> LaunchConfig {
         let blocks = tiles.clamp(1, self.blocks as usize) as u32;
         LaunchConfig { grid_dim: (blocks, 1, 1), block_dim: (self.threads, 1, 1), shared_mem_bytes: self.shared }
     }

@@ -1,6 +1,7 @@
 //! Device memory: buffers in stream order, counted against a limit.
 
-use crate::backend::cuda::DeviceError;
+use crate::cuda::DeviceError;
+use crate::cuda::driver_error;
 use cudarc::driver::{CudaSlice, CudaStream, DevicePtr, DevicePtrMut, DeviceRepr, result, sys};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -73,12 +74,7 @@ impl<T: DeviceRepr> Buffer<T> {
     ///
     /// # Errors
     /// [`DeviceError::OutOfMemory`], or a driver call fails.
-    pub(in crate::backend::cuda) fn new(
-        stream: &Arc<CudaStream>,
-        budget: &Arc<Budget>,
-        what: &str,
-        len: usize,
-    ) -> Result<Self, DeviceError> {
+    pub(in crate::cuda) fn new(stream: &Arc<CudaStream>, budget: &Arc<Budget>, what: &str, len: usize) -> Result<Self, DeviceError> {
         // At least one value, so that an empty buffer has an address too.
         let len = len.max(1);
         let bytes = (len as u64).saturating_mul(size_of::<T>() as u64);
@@ -90,7 +86,7 @@ impl<T: DeviceRepr> Buffer<T> {
                 sys::CUresult::CUDA_ERROR_OUT_OF_MEMORY => {
                     budget.refusal(what, bytes, budget.used(), "but other programs use the rest of the device")
                 }
-                _ => DeviceError::driver("allocating device memory")(error),
+                _ => driver_error("allocating device memory")(error),
             }
         })?;
         let mut buffer = Self { slice, budget: budget.clone(), stream: stream.clone(), reader: None, bytes };
@@ -101,7 +97,7 @@ impl<T: DeviceRepr> Buffer<T> {
     }
 
     /// Declares another stream that reads the buffer. That stream must wait for an event after the last write.
-    pub(in crate::backend::cuda) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
+    pub(in crate::cuda) fn read_by(mut self, reader: &Arc<CudaStream>) -> Self {
         self.reader = Some(reader.clone());
         self
     }
@@ -116,9 +112,9 @@ impl<T: DeviceRepr> Buffer<T> {
     ///
     /// # Safety
     /// `values` does not change until the stream has executed the copy.
-    pub(in crate::backend::cuda) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
+    pub(in crate::cuda) unsafe fn write_behind(&mut self, at: usize, values: &[T]) -> Result<(), DeviceError> {
         assert!(at + values.len() <= self.len(), "values fit the buffer");
-        let doing = DeviceError::driver("copying to the device");
+        let doing = driver_error("copying to the device");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let address = self.address() + (at * size_of::<T>()) as u64;
         // SAFETY: the destination is within the buffer; the caller guarantees the source.
@@ -157,7 +153,7 @@ impl<T: DeviceRepr> Buffer<T> {
             return Ok(());
         }
         assert!(values.len() <= self.len(), "values fit the buffer");
-        self.stream.memcpy_htod(values, &mut self.slice).map_err(DeviceError::driver("copying to the device"))
+        self.stream.memcpy_htod(values, &mut self.slice).map_err(driver_error("copying to the device"))
     }
 
     /// Copies `values` to position `first`, in stream order.
@@ -172,7 +168,7 @@ impl<T: DeviceRepr> Buffer<T> {
             return Ok(());
         }
         let mut view = self.slice.slice_mut(first..first + values.len());
-        self.stream.memcpy_htod(values, &mut view).map_err(DeviceError::driver("copying to the device"))
+        self.stream.memcpy_htod(values, &mut view).map_err(driver_error("copying to the device"))
     }
 
     /// Sets the bytes of `count` values from position `first` on to 0, in stream order.
@@ -184,7 +180,7 @@ impl<T: DeviceRepr> Buffer<T> {
     /// If the range exceeds the buffer.
     pub fn zero_at(&self, first: usize, count: usize) -> Result<(), DeviceError> {
         assert!(first + count <= self.len(), "the buffer holds as many");
-        let doing = DeviceError::driver("filling device memory");
+        let doing = driver_error("filling device memory");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let at = self.address() + (first * size_of::<T>()) as u64;
         // SAFETY: the range is within the buffer, which is freed later on the same stream.
@@ -203,7 +199,7 @@ impl<T: DeviceRepr> Buffer<T> {
             return Ok(());
         }
         assert!(out.len() <= self.len(), "the buffer holds as many");
-        let doing = DeviceError::driver("copying from the device");
+        let doing = driver_error("copying from the device");
         let view = self.slice.slice(0..out.len());
         self.stream.memcpy_dtoh(&view, out).map_err(&doing)?;
         self.stream.synchronize().map_err(&doing)
@@ -230,7 +226,7 @@ impl<T: DeviceRepr> Buffer<T> {
     }
 
     fn set_bytes(&mut self, byte: u8, bytes: usize) -> Result<(), DeviceError> {
-        let doing = DeviceError::driver("filling device memory");
+        let doing = driver_error("filling device memory");
         self.stream.context().bind_to_thread().map_err(&doing)?;
         let (address, _guard) = self.slice.device_ptr_mut(&self.stream);
         // SAFETY: `address` holds at least `bytes` bytes until `self` is dropped, which comes later on the same stream.

@@ -9,6 +9,7 @@ pub(super) mod pinned;
 mod readback;
 
 pub use compile::nvrtc_version;
+pub use error::driver_error;
 pub use gpu::{FoundDevice, Gpu, GpuSettings, probe};
 pub(super) use launch::Resident;
 pub use launch::{launch, threads};

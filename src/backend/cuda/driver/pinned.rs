@@ -1,12 +1,13 @@
 //! Pinned (page-locked) host memory, the target of asynchronous copies from the device.
 
-use crate::backend::cuda::DeviceError;
+use crate::cuda::DeviceError;
+use crate::cuda::driver_error;
 use cudarc::driver::{CudaContext, CudaStream, result};
 use std::sync::Arc;
 
 /// Pinned values. The device may write them at any time between [`Self::copy_from`] and the next synchronisation of its stream, so a caller
 /// synchronises before it reads them.
-pub(in crate::backend::cuda) struct Pinned<T: Copy> {
+pub(in crate::cuda) struct Pinned<T: Copy> {
     values: *mut T,
     len: usize,
     context: Arc<CudaContext>,
@@ -22,8 +23,8 @@ impl<T: Copy + Default> Pinned<T> {
     ///
     /// # Errors
     /// The driver cannot allocate pinned memory.
-    pub(in crate::backend::cuda) fn new(context: &Arc<CudaContext>, len: usize) -> Result<Self, DeviceError> {
-        let doing = DeviceError::driver("allocating pinned host memory");
+    pub(in crate::cuda) fn new(context: &Arc<CudaContext>, len: usize) -> Result<Self, DeviceError> {
+        let doing = driver_error("allocating pinned host memory");
         context.bind_to_thread().map_err(&doing)?;
         // SAFETY: the context is current. Flags 0 select memory that the CPU caches, since the CPU reads it.
         let values = unsafe { result::malloc_host(len.max(1) * size_of::<T>(), 0) }.map_err(&doing)?.cast::<T>();
@@ -35,7 +36,7 @@ impl<T: Copy + Default> Pinned<T> {
     }
 
     /// Number of values.
-    pub(in crate::backend::cuda) fn len(&self) -> usize {
+    pub(in crate::cuda) fn len(&self) -> usize {
         self.len
     }
 
@@ -46,16 +47,16 @@ impl<T: Copy + Default> Pinned<T> {
     ///
     /// # Safety
     /// The address `from` holds `count` values when the stream executes the copy, and `count` is at most `len`.
-    pub(in crate::backend::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
+    pub(in crate::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
         debug_assert!(count <= self.len);
         // SAFETY: `count` values of `T` lie within the allocation.
         let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };
         // SAFETY: guaranteed by the caller; the host memory lives until `drop`, where the driver waits for copies in progress.
-        unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(DeviceError::driver("copying from the device"))
+        unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(driver_error("copying from the device"))
     }
 
     /// Returns the values. The caller has synchronised the stream of the last copy.
-    pub(in crate::backend::cuda) fn values(&self) -> &[T] {
+    pub(in crate::cuda) fn values(&self) -> &[T] {
         // SAFETY: initialised in `new`; the caller waits for copies in progress, as the type requires.
         unsafe { std::slice::from_raw_parts(self.values, self.len) }
     }

@@ -2,9 +2,10 @@
 //!
 //! Two pinned buffers alternate (double buffering): one receives a piece from the device while the CPU copies the other to its destination.
 
-use crate::backend::cuda::DeviceError;
-use crate::backend::cuda::driver::memory::Buffer;
-use crate::backend::cuda::driver::pinned::Pinned;
+use crate::cuda::DeviceError;
+use crate::cuda::driver::memory::Buffer;
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::driver_error;
 use cudarc::driver::CudaStream;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -12,7 +13,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 const PIECE: usize = 1 << 20;
 
 /// Stream and pinned buffers of the readback. The lock admits one reader at a time.
-pub(in crate::backend::cuda) struct AsyncReadback {
+pub(in crate::cuda) struct AsyncReadback {
     stream: Arc<CudaStream>,
     /// The stream whose results are read.
     work: Arc<CudaStream>,
@@ -21,7 +22,7 @@ pub(in crate::backend::cuda) struct AsyncReadback {
 }
 
 impl AsyncReadback {
-    pub(in crate::backend::cuda) fn new(stream: Arc<CudaStream>, work: Arc<CudaStream>) -> Self {
+    pub(in crate::cuda) fn new(stream: Arc<CudaStream>, work: Arc<CudaStream>) -> Self {
         Self { stream, work, pieces: Mutex::new(None) }
     }
 
@@ -33,7 +34,7 @@ impl AsyncReadback {
     ///
     /// # Panics
     /// If `len` exceeds the length of the buffer.
-    pub(in crate::backend::cuda) fn read(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
+    pub(in crate::cuda) fn read(&self, from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
         assert!(len <= from.len(), "the buffer holds as many");
         let mut pieces = self.pieces.lock().unwrap_or_else(PoisonError::into_inner);
         let pieces = match &mut *pieces {
@@ -52,7 +53,7 @@ impl AsyncReadback {
     }
 
     fn read_in(&self, pieces: &mut [Pinned<f32>; 2], from: &Buffer<f32>, len: usize) -> Result<Vec<f32>, DeviceError> {
-        let doing = DeviceError::driver("reading values back");
+        let doing = driver_error("reading values back");
         let stream = &self.stream;
         stream.join(&self.work).map_err(&doing)?;
         let mut values = vec![0.0; len];

@@ -1,11 +1,11 @@
 //! Networks too wide or too deep for a warp's registers: a block takes a tile of samples through all layers, and weight gradients are products
 //! over all samples. See `kernels/network/network_batched.cu`.
 
-use crate::backend::cuda::driver::Resident;
-use crate::backend::cuda::network::layout::{DrawArgument, GridArgument, ReadingArgument};
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
-use crate::surrogate::network::{Architecture, Target};
+use crate::cuda::driver::Resident;
+use crate::cuda::network::layout::{DrawArgument, GridArgument, ReadingArgument};
+use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
+use ridgewatch_surrogate::network::{Architecture, Target};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// `DEPTH`, `THREADS`, `PANEL` and `SKEW` of `network_batched.cu`.

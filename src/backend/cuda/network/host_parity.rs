@@ -1,9 +1,9 @@
 //! Compares the network's kernels, compiled as host C++ with the macros and arguments of a launch, with the CPU's prediction. Needs no GPU.
 
-use crate::backend::cuda::host_parity::{half, library};
-use crate::backend::cuda::network::layout::{GridArgument, ReadingArgument};
-use crate::backend::cuda::network::network::{further_places, grid, network_defines, placed_times, reading};
-use crate::surrogate::network::{Architecture, Encoding, Input, Loss, NetworkSettings, Objective, Predictor, Scale, Target, uniform};
+use crate::cuda::host_parity::{half, library};
+use crate::cuda::network::layout::{GridArgument, ReadingArgument};
+use crate::cuda::network::network::{further_places, grid, network_defines, placed_times, reading};
+use ridgewatch_surrogate::network::{Architecture, Encoding, Input, Loss, NetworkSettings, Objective, Predictor, Scale, Target, uniform};
 
 type HostPredict = unsafe extern "C" fn(*const GridArgument, *const u16, *const f32, *const ReadingArgument, *const f32, u32, *mut f32);
 

@@ -1,7 +1,7 @@
 //! Structures that the network's kernels read, laid out as in the files of `kernels/network/`.
 
-use crate::backend::cuda::layout::{TableArgument, device_repr};
-use crate::surrogate::network::GRID_INPUTS;
+use crate::cuda::layout::{TableArgument, device_repr};
+use ridgewatch_surrogate::network::GRID_INPUTS;
 
 /// Maximum number of levels of a hash grid.
 const MAX_LEVELS: usize = 32;

@@ -4,14 +4,15 @@
 //! Tables are in half precision, each level padded to a multiple of 64 entries. Layers are in burn's layout; a block rounds them when it reads
 //! them (fused), or a kernel does once per call (batched).
 
-use crate::backend::cuda::driver::Resident;
-use crate::backend::cuda::layout::TableArgument;
-use crate::backend::cuda::network::batched::{Batched, GradientTo, Tiling};
-use crate::backend::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
-use crate::backend::cuda::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
-use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
+use crate::cuda::driver::Resident;
+use crate::cuda::driver_error;
+use crate::cuda::layout::TableArgument;
+use crate::cuda::network::batched::{Batched, GradientTo, Tiling};
+use crate::cuda::network::layout::{DrawArgument, GridArgument, LevelArgument, PlacedTimes, ReadingArgument, UnitBoxArgument};
+use crate::cuda::{Buffer, DeviceError, DevicePredict, DeviceTable, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg, result};
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::network::{Architecture, Encoding, HASH, Loss, Objective, Row, Target, UNTIMED, row};
 use std::sync::Arc;
 
 /// Threads of a block, and samples of a block's tile, in `network_predict` and `network_gradient`.
@@ -427,7 +428,7 @@ impl DevicePredict for NetworkAbove<'_> {
 /// Copies `from` to the front of `to` in the order of the work stream.
 pub(super) fn copy(gpu: &Gpu, from: &Buffer<f32>, to: &Buffer<f32>) -> Result<(), DeviceError> {
     assert!(from.len() <= to.len(), "room for a copy");
-    let doing = DeviceError::driver("copying on the device");
+    let doing = driver_error("copying on the device");
     gpu.context().bind_to_thread().map_err(&doing)?;
     // SAFETY: both buffers hold as many values, and neither is freed before the work stream has passed this call.
     unsafe { result::memcpy_dtod_async(to.address(), from.address(), 4 * from.len(), gpu.work().cu_stream()) }.map_err(doing)
@@ -456,7 +457,7 @@ mod tests {
         }
         tables
     }
-    use crate::surrogate::network::{Encoding, NetworkSettings};
+    use ridgewatch_surrogate::network::{Encoding, NetworkSettings};
 
     /// Each level is at the position that [`grid`] passes to the kernels.
     #[test]

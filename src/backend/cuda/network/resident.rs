@@ -5,14 +5,14 @@
 use super::samples::{Filled, SampleWriter, TracedBatch};
 use super::training::NetworkCopy as DeviceCopy;
 use super::{DeviceNetwork, DeviceSamples, DeviceTraining};
-use crate::backend::DeviceError;
-use crate::backend::cuda::driver::Gpu;
-use crate::backend::cuda::layout::Outputs;
-use crate::backend::cuda::rendering::{DeviceLearns, DevicePredict, HELD_BACK};
-use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
-use crate::field::Domain;
-use crate::surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
-use crate::surrogate::{
+use crate::DeviceError;
+use crate::cuda::driver::Gpu;
+use crate::cuda::layout::Outputs;
+use crate::cuda::rendering::{DeviceLearns, DevicePredict, HELD_BACK};
+use crate::cuda::tracing::{CudaTracer, DeviceTable};
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::network::{Architecture, Average, Objective, PlannedStep, Target};
+use ridgewatch_surrogate::{
     BufferMark, Download, FrozenHybrid, HostNetwork, HostTraining, Labels, NetworkCopy, SurrogateDevice, SurrogateTable, SyncedSamples,
     Table, Training, fresh_stamp,
 };
@@ -65,9 +65,7 @@ impl SurrogateDevice for OnGpu {
 ///
 /// # Errors
 /// The memory of the table on the device is already freed.
-pub(in crate::backend::cuda) fn frozen_parts(
-    frozen: &FrozenHybrid<OnGpu>,
-) -> Result<(Option<&DeviceTable>, Option<&CudaNetwork>), DeviceError> {
+pub(in crate::cuda) fn frozen_parts(frozen: &FrozenHybrid<OnGpu>) -> Result<(Option<&DeviceTable>, Option<&CudaNetwork>), DeviceError> {
     Ok((frozen.table.as_ref().map(CudaTable::device).transpose()?, frozen.network.as_deref()))
 }
 
@@ -75,7 +73,7 @@ pub(in crate::backend::cuda) fn frozen_parts(
 ///
 /// # Errors
 /// The device fails or lacks memory.
-pub(in crate::backend::cuda) fn predict_from_host(
+pub(in crate::cuda) fn predict_from_host(
     gpu: &Gpu,
     by: &dyn DevicePredict,
     points: &[[f32; 3]],
@@ -119,7 +117,7 @@ impl CudaTable {
     ///
     /// # Errors
     /// The device fails.
-    pub(in crate::backend::cuda) fn leave_device(&mut self) -> Result<(), DeviceError> {
+    pub(in crate::cuda) fn leave_device(&mut self) -> Result<(), DeviceError> {
         self.to_host()?;
         self.device = None;
         Ok(())
@@ -144,19 +142,19 @@ impl SurrogateTable for CudaTable {
 /// Labels that frames trace on the device and that stay on it. A slide that invalidates them clears the pool. The lock serialises writes by frames
 /// and reads by training.
 #[derive(Debug)]
-pub(in crate::backend::cuda) struct LabelPool {
+pub(in crate::cuda) struct LabelPool {
     writer: SampleWriter,
     samples: Mutex<DeviceSamples>,
 }
 
 impl LabelPool {
     /// Returns a mark of the present content, for [`Self::go_back`].
-    pub(in crate::backend::cuda) fn mark(&self) -> Filled {
+    pub(in crate::cuda) fn mark(&self) -> Filled {
         self.samples().filled()
     }
 
     /// Removes the labels that were added after a mark.
-    pub(in crate::backend::cuda) fn go_back(&self, to: Filled) {
+    pub(in crate::cuda) fn go_back(&self, to: Filled) {
         self.samples().go_back(to);
     }
 
@@ -166,7 +164,7 @@ impl LabelPool {
 }
 
 /// Sink that adds the labels of one frame to the pool.
-pub(in crate::backend::cuda) struct LabelSink<'a> {
+pub(in crate::cuda) struct LabelSink<'a> {
     pool: &'a LabelPool,
     domain: &'a Domain,
     base: Option<&'a DeviceTable>,
@@ -204,12 +202,12 @@ impl CudaNetwork {
         &self.network
     }
 
-    pub(in crate::backend::cuda) fn pool(&self) -> Option<&Arc<LabelPool>> {
+    pub(in crate::cuda) fn pool(&self) -> Option<&Arc<LabelPool>> {
         self.pool.as_ref()
     }
 
     /// Returns the sink for the labels of a frame at these unit times. Targets are differences from `base`. `None` if the CPU trains the network.
-    pub(in crate::backend::cuda) fn label_sink<'a>(
+    pub(in crate::cuda) fn label_sink<'a>(
         &'a self,
         domain: &'a Domain,
         base: Option<&'a DeviceTable>,
@@ -325,7 +323,7 @@ impl Resident {
         })
     }
 
-    fn download(&self, shaped: &crate::surrogate::network::Model) -> Result<HostNetwork, DeviceError> {
+    fn download(&self, shaped: &ridgewatch_surrogate::network::Model) -> Result<HostNetwork, DeviceError> {
         let mut model = shaped.clone();
         let average = Arc::new(self.training.average()?);
         self.training.store(&mut model)?;

@@ -1,12 +1,12 @@
 //! Samples of one network on the device: traced points, their times and targets, in a replay buffer.
 
-use crate::backend::cuda::network::layout::ReadingArgument;
-use crate::backend::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s, unit_box};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
-use crate::field::Domain;
-use crate::surrogate::Samples;
-use crate::surrogate::network::{Objective, Target};
+use crate::cuda::network::layout::ReadingArgument;
+use crate::cuda::network::network::{NetworkKernels, POINT, further_places, placed_times, reading, sample_float4s, unit_box};
+use crate::cuda::{Buffer, DeviceError, DeviceTable, launch, threads};
 use cudarc::driver::PushKernelArg;
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Samples;
+use ridgewatch_surrogate::network::{Objective, Target};
 use std::borrow::Cow;
 use std::ops::Range;
 use std::sync::Arc;
@@ -33,7 +33,7 @@ pub(super) struct TracedBatch<'a> {
     pub(super) base: Option<&'a DeviceTable>,
     /// Unit times of all points; `None` if points carry theirs.
     pub(super) times: Option<[f32; 2]>,
-    /// One point in 2^held_back gets no target ([`crate::backend::keeps_label`]), since the host may keep it for validation; with 0 all get one.
+    /// One point in 2^held_back gets no target ([`crate::keeps_label`]), since the host may keep it for validation; with 0 all get one.
     pub(super) held_back: u32,
 }
 
@@ -130,7 +130,7 @@ pub struct DeviceSamples {
 
 /// Fill state of a replay buffer.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(in crate::backend::cuda) struct Filled {
+pub(in crate::cuda) struct Filled {
     pub(super) len: usize,
     /// Index of the next sample.
     next: usize,

@@ -4,17 +4,17 @@
 //! Parameters, Adam's moments and the parameters' mean stay on the device, in single precision and in burn's layout. Gradients use
 //! half-precision values and single-precision sums. Threads add gradients in any order, so runs agree up to rounding.
 
-use crate::backend::cuda::network::batched::GradientTo;
-use crate::backend::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
-use crate::backend::cuda::network::network::{
+use crate::cuda::network::batched::GradientTo;
+use crate::cuda::network::layout::{AdamArgument, DrawArgument, ReadingArgument};
+use crate::cuda::network::network::{
     DeviceNetwork, NetworkKernels, copied, copy, further_places, has_penalty, reading, sample_float4s, unit_box,
 };
-use crate::backend::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedBatch};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
-use crate::field::Domain;
-use crate::surrogate::Samples;
-use crate::surrogate::network::{Adam, Architecture, Average, HELD_OUT, Model, Objective, PlannedStep};
+use crate::cuda::network::samples::{DeviceSamples, Filled, SampleWriter, TracedBatch};
+use crate::cuda::{Buffer, DeviceError, DeviceTable, Gpu, launch, threads};
 use cudarc::driver::PushKernelArg;
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Samples;
+use ridgewatch_surrogate::network::{Adam, Architecture, Average, HELD_OUT, Model, Objective, PlannedStep};
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -207,7 +207,7 @@ impl DeviceTraining {
 
     /// Device memory of a network in training with `capacity` samples, bytes: parameters, moments, mean and gradient, the state to roll back to,
     /// rounded tables, and two frozen copies.
-    pub(in crate::backend::cuda) fn bytes(shape: &Architecture, capacity: usize) -> u64 {
+    pub(in crate::cuda) fn bytes(shape: &Architecture, capacity: usize) -> u64 {
         const STATE: u64 = 9 * size_of::<f32>() as u64;
         const ROUNDED: u64 = 3 * size_of::<u16>() as u64;
         let samples = size_of::<[f32; 4]>() * sample_float4s(shape) * capacity;

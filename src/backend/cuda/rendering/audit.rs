@@ -1,17 +1,17 @@
-//! Audit of a frame on the device, by the method of [`crate::backend::audit`]: stratified random points, drawn with Philox4x32-10.
+//! Audit of a frame on the device, by the method of [`crate::audit`]: stratified random points, drawn with Philox4x32-10.
 //!
 //! The device draws, traces and predicts the points, and sums the residuals of each cell. The host reads back the sums, the optical residual of each
 //! point (for quantiles), and the samples if they are requested for training.
 
-use crate::backend::audit::{AuditFindings, AuditRequest, draws};
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
-use crate::backend::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
-use crate::backend::router::unit_arrival;
-use crate::field::Domain;
-use crate::surrogate::Samples;
-use crate::trust::Audited;
+use crate::audit::{AuditFindings, AuditRequest, draws};
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::layout::{AuditBatchArgument, AuditDrawArgument, AuditPointsArgument, CellFindings, Outputs};
+use crate::cuda::{Buffer, CudaTracer, DeviceError, DeviceMissingCells, DevicePredict, Gpu, launch, threads};
+use crate::router::unit_arrival;
 use cudarc::driver::{CudaFunction, DeviceRepr, PushKernelArg};
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Samples;
+use ridgewatch_trust::Audited;
 use std::ops::Range;
 use std::sync::Arc;
 
@@ -94,7 +94,7 @@ impl Audits {
         Ok(Self { draw: kernel("audit_draw")?, measure: kernel("audit_measure")?, gpu: gpu.clone(), memory: None })
     }
 
-    /// Audits a frame. The result is bitwise that of [`crate::backend::audit::audit`] if traced and predicted values are equal. The samples have no
+    /// Audits a frame. The result is bitwise that of [`crate::audit::audit`] if traced and predicted values are equal. The samples have no
     /// Jacobians.
     ///
     /// # Errors

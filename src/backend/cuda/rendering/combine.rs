@@ -5,12 +5,12 @@
 
 use super::coupled::SUM_PLANES;
 use super::march::{GpuMarch, RAY_FIELDS, pinned_room, room};
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::device_repr;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
-use crate::render::Combine as Combination;
-use crate::render::smooth::{TILE, TileSums};
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::layout::device_repr;
+use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, LaunchConfig, PushKernelArg};
+use ridgewatch_render::Combine as Combination;
+use ridgewatch_render::smooth::{TILE, TileSums};
 use std::sync::Arc;
 
 /// Scales of the transform, and the radius over which energies are summed: `RADIUS` times the spacing of the scale, at most `MAX_RADIUS`.

@@ -6,14 +6,15 @@
 //!
 //! Results of the paths stay apart until the frame is complete; `coupled_add` then adds them to the sums.
 
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{MissingCellsArgument, TableArgument};
-use crate::backend::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceLogStretch, DeviceMissingCells, Gpu, launch, threads};
-use crate::render::smooth::{TILE, bayer_rank};
-use crate::render::{CellObservations, FrameParameters, Renderer};
+use super::renderer::ParametersArgument;
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::layout::{MissingCellsArgument, TableArgument};
+use crate::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument};
+use crate::cuda::{Buffer, DeviceError, DeviceLogStretch, DeviceMissingCells, Gpu, launch, threads};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
+use ridgewatch_render::smooth::{TILE, bayer_rank};
+use ridgewatch_render::{CellObservations, FrameParameters, Renderer};
 use std::mem::offset_of;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -177,7 +178,7 @@ pub struct CoupledTracker {
 
 /// Kernel arguments that all waves of a frame share.
 struct Frame {
-    parameters: FrameParameters,
+    parameters: ParametersArgument,
     grid: GridArgument,
     watch: WatchArgument,
     surrogate: SurrogateArgument,
@@ -546,7 +547,7 @@ impl Memory {
         let [place, way, kept_place, kept_way, factors, colour, colour_rest, found, progress] = l.slots.map(|offset| self.at(offset));
         let (watch, cells) = (self.at(l.watch), 4 * self.plan.cells);
         Frame {
-            parameters,
+            parameters: ParametersArgument(parameters),
             grid: GridArgument { majorants: self.at(l.majorants), may_miss: self.at(l.may_miss) },
             watch: WatchArgument { count: watch, highest: watch + cells, missing: watch + 2 * cells },
             surrogate,

@@ -4,14 +4,14 @@ use super::audit::Audits;
 use super::renderer::GpuRenderer;
 use super::router::{DeviceLearns, DevicePredict, DeviceQueryRouter, FrameQueries, TraceAll};
 use super::smooth::{GpuSmooth, SmoothRound};
-use crate::backend::cuda::driver::Gpu;
-use crate::backend::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
-use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
-use crate::backend::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
-use crate::render::smooth::PictureError;
-use crate::render::{RenderStats, Renderer};
-use crate::surrogate::{FrozenHybrid, Samples};
-use crate::trust::Gate;
+use crate::cuda::driver::Gpu;
+use crate::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, frozen_parts};
+use crate::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
+use ridgewatch_render::smooth::PictureError;
+use ridgewatch_render::{RenderStats, Renderer};
+use ridgewatch_surrogate::{FrozenHybrid, Samples};
+use ridgewatch_trust::Gate;
 use std::sync::Arc;
 
 /// Renders and audits frames. It reuses kernels and memory between frames.
@@ -25,7 +25,7 @@ pub struct GpuFrames {
 }
 
 /// Device-side predictor of one frame.
-pub(in crate::backend::cuda) enum Predictor<'a> {
+pub(in crate::cuda) enum Predictor<'a> {
     Table(&'a DeviceTable),
     /// The network, above a table if the surrogate has one, and the sink for labels if the device trains the network.
     Network(NetworkAbove<'a>, Option<LabelSink<'a>>),
@@ -71,7 +71,7 @@ pub struct CudaSamples {
 
 impl CudaSamples {
     /// Creates labels that are on the host only.
-    pub(in crate::backend::cuda) fn on_host(host: Samples) -> Self {
+    pub(in crate::cuda) fn on_host(host: Samples) -> Self {
         Self { host, uncommitted: None }
     }
 }

@@ -1,20 +1,20 @@
-//! Training labels of a frame on the host, by the label rule of [`crate::backend::QueryRouter`].
+//! Training labels of a frame on the host, by the label rule of [`crate::QueryRouter`].
 //!
 //! The set of the labels does not depend on the order in which GPU threads run. The host sorts it, so its order does not either.
 
-use crate::backend::cuda::layout::LabelsArgument;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu};
-use crate::backend::router::{LabelShare, unit_arrival};
-use crate::field::Domain;
-use crate::surrogate::Samples;
+use crate::cuda::layout::LabelsArgument;
+use crate::cuda::{Buffer, DeviceError, Gpu};
+use crate::router::{LabelShare, unit_arrival};
 use rayon::prelude::*;
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Samples;
 
 /// Limit on the labels of one frame (64 MiB).
 const MAX_LABELS: usize = 1 << 22;
 
 /// With training on the device, one label in 2^3 may go to the host instead of the label pool of the device. The host holds out some of its labels
 /// for validation, so the pool must not contain them.
-pub(in crate::backend::cuda) const HELD_BACK: u32 = 3;
+pub(in crate::cuda) const HELD_BACK: u32 = 3;
 
 /// A traced query.
 #[derive(Debug, Clone, Copy)]

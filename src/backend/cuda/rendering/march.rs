@@ -1,23 +1,24 @@
 //! Marched pictures on the GPU: surrogates laid out on nodes, light volumes, and rays. The algorithm and its reference are in
-//! [`crate::render::smooth`].
+//! [`ridgewatch_render::smooth`].
 //!
 //! A picture of 1920x1080 pixels through 600x192x192 nodes reads at most the 88 MB of nodes and about as much light volume from memory, 40 us on an
 //! H200. Its hundreds of millions of quadrature points with 16 loads each take longer: neighbouring rays run in one warp, so that their loads share
 //! cache lines, and bricks that the transfer function does not show are skipped.
 
+use super::renderer::ParametersArgument;
 use super::router::DevicePredict;
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{MissingCellsArgument, TableArgument, device_repr};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTable, Gpu, launch, threads};
-use crate::render::smooth::{BRICK, LightGrid, MARGIN};
-use crate::render::{FrameParameters, Renderer};
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::layout::{MissingCellsArgument, TableArgument, device_repr};
+use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTable, Gpu, launch, threads};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaFunction, DeviceRepr, LaunchConfig, PushKernelArg};
+use ridgewatch_render::smooth::{BRICK, LightGrid, MARGIN};
+use ridgewatch_render::{FrameParameters, Renderer};
 use std::marker::PhantomData;
 use std::sync::Arc;
 
 /// Sums over the rays of a pixel (`RAY_FIELDS` of the kernels): red, green, blue, alpha, FTLE, missing.
-pub(in crate::backend::cuda) const RAY_FIELDS: usize = 6;
+pub(in crate::cuda) const RAY_FIELDS: usize = 6;
 /// Nodes of a network that are predicted at once; their points take 12 MB.
 const NODES_AT_ONCE: usize = 1 << 20;
 /// Columns of a block of `march_columns`.
@@ -166,7 +167,7 @@ impl NodeGrid<'_> {
     }
 
     /// Kernel argument, the struct `Table` of `table.cuh`.
-    pub(in crate::backend::cuda) fn argument(&self) -> TableArgument {
+    pub(in crate::cuda) fn argument(&self) -> TableArgument {
         self.argument
     }
 
@@ -340,11 +341,11 @@ impl GpuMarch {
         call.arg(&nodes).arg(&bricks_argument).arg(&n).arg(&highest);
         // SAFETY: the arguments of `march_bricks`, whose blocks do eight bricks; `highest` holds `bricks` values.
         unsafe { launch(&mut call, threads(bricks * 32, 256)) }?;
-        let argument = Self::argument(medium, bricks_argument, light);
+        let (parameters, argument) = (ParametersArgument(*medium.parameters), Self::argument(medium, bricks_argument, light));
         let values = grid.values() as u32;
         if grid.shear.is_none() {
             let mut call = stream.launch_builder(&self.kernels.points);
-            call.arg(medium.parameters).arg(&argument).arg(&values);
+            call.arg(&parameters).arg(&argument).arg(&values);
             // SAFETY: the arguments of `march_points`; `depth` holds `values` values, and `medium` borrows the nodes and missing cells, which their
             // owners free in the order of the stream.
             unsafe { launch(&mut call, threads(grid.values(), 128)) }?;
@@ -352,7 +353,7 @@ impl GpuMarch {
             let blocks = |side: usize| (light.columns[side] as usize).div_ceil(COLUMN_BLOCK[side]) as u32;
             let config = LaunchConfig { grid_dim: (blocks(0), blocks(1), 1), block_dim: (128, 1, 1), shared_mem_bytes: 0 };
             let mut call = stream.launch_builder(&self.kernels.columns);
-            call.arg(medium.parameters).arg(&argument);
+            call.arg(&parameters).arg(&argument);
             // SAFETY: the arguments of `march_columns`, as above.
             unsafe { launch(&mut call, config) }?;
         }
@@ -402,6 +403,7 @@ impl GpuMarch {
         if rays == 0 {
             return Ok(());
         }
+        let parameters = ParametersArgument(*medium.parameters);
         let argument = MarchArgument { step, first_ray: self.rays, rays, shifted: i32::from(shifted), ..self.ready(medium)? };
         let sums = room(&gpu, &mut self.sums, "sums over rays", RAY_FIELDS * pixels)?.address();
         let fresh = i32::from(self.rays == 0);
@@ -409,7 +411,7 @@ impl GpuMarch {
         let blocks = |n: usize| n.div_ceil(PIXEL_BLOCK) as u32;
         let config = LaunchConfig { grid_dim: (blocks(width), blocks(height), 1), block_dim: (256, 1, 1), shared_mem_bytes: 0 };
         let mut call = gpu.work().launch_builder(&self.kernels.pixels);
-        call.arg(medium.parameters).arg(&argument).arg(&sums).arg(&fresh);
+        call.arg(&parameters).arg(&argument).arg(&sums).arg(&fresh);
         // SAFETY: the arguments of `march_pixels`; `sums` holds `RAY_FIELDS` planes of the pixels, which an earlier call has written unless this one
         // is fresh; `medium` borrows nodes and missing cells.
         unsafe { launch(&mut call, config) }?;
@@ -418,12 +420,12 @@ impl GpuMarch {
     }
 
     /// Device address of the sums over rays, `RAY_FIELDS` planes of f64. `None` before the first ray.
-    pub(in crate::backend::cuda) fn sums(&self) -> Option<u64> {
+    pub(in crate::cuda) fn sums(&self) -> Option<u64> {
         self.sums.as_ref().filter(|_| self.rays > 0).map(Buffer::address)
     }
 
     /// Number of pixels of the sums.
-    pub(in crate::backend::cuda) fn pixels(&self) -> usize {
+    pub(in crate::cuda) fn pixels(&self) -> usize {
         self.pixels
     }
 
@@ -436,6 +438,7 @@ impl GpuMarch {
             return Ok(Vec::new());
         }
         let gpu = self.gpu.clone();
+        let parameters = ParametersArgument(*medium.parameters);
         let argument = MarchArgument { shifted: i32::from(shifted), ..self.ready(medium)? };
         let what = "checks of the march";
         let from = room(&gpu, &mut self.checks, what, checks.len())?;
@@ -444,7 +447,7 @@ impl GpuMarch {
         let (given, found) = (from.address(), out.address());
         let config = LaunchConfig { grid_dim: (checks.len() as u32, 1, 1), block_dim: (CHECK_BLOCK, 1, 1), shared_mem_bytes: 0 };
         let mut call = gpu.work().launch_builder(&self.kernels.checks);
-        call.arg(medium.parameters).arg(&argument).arg(&given).arg(&found);
+        call.arg(&parameters).arg(&argument).arg(&given).arg(&found);
         // SAFETY: the arguments of `march_checks`; both arrays have an entry for each block.
         unsafe { launch(&mut call, config) }?;
         let mut radiance = vec![0.0; 3 * checks.len()];

@@ -2,10 +2,10 @@
 //!
 //! A slot holds the state of one flight of a light path (delta tracking from collision to collision). Each band runs `band * parts` slots at once.
 
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu};
-use crate::render::PixelValue;
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::{Buffer, DeviceError, Gpu};
 use cudarc::driver::DeviceRepr;
+use ridgewatch_render::PixelValue;
 
 /// Target number of slots: enough to fill the device and to make sorting worthwhile.
 const WANTED_SLOTS: u64 = 1 << 21;
@@ -18,22 +18,22 @@ const SUM_FIELDS: u64 = 11;
 
 /// Sizes of a frame's arrays on the device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(in crate::backend::cuda) struct Plan {
+pub(in crate::cuda) struct Plan {
     /// Pixels that are tracked together.
-    pub(in crate::backend::cuda) band: u32,
+    pub(in crate::cuda) band: u32,
     /// Parts of a pixel's samples that run concurrently.
-    pub(in crate::backend::cuda) parts: u32,
+    pub(in crate::cuda) parts: u32,
     /// Capacity of the collision queue.
-    pub(in crate::backend::cuda) queue: u32,
+    pub(in crate::cuda) queue: u32,
     /// Number of majorant cells.
-    pub(in crate::backend::cuda) cells: u32,
+    pub(in crate::cuda) cells: u32,
 }
 
 impl Plan {
     /// Plans a frame that uses at most `memory` bytes, if one pixel per band suffices for that. The number of parts sets the order of the sums, and
     /// therefore the last bits of the picture. So it depends only on the number of pixels and samples. The size of a band depends on `memory` and
     /// affects only the speed.
-    pub(in crate::backend::cuda) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
+    pub(in crate::cuda) fn new(pixels: usize, samples: u32, cells: usize, memory: u64) -> Self {
         let pixels = pixels.max(1) as u64;
         let parts = (WANTED_SLOTS / pixels).clamp(1, u64::from(samples));
         let mut band = pixels.min(MAX_SLOTS / parts).max(1);
@@ -50,7 +50,7 @@ impl Plan {
         plan(band, queue)
     }
 
-    pub(in crate::backend::cuda) fn slots(&self) -> u64 {
+    pub(in crate::cuda) fn slots(&self) -> u64 {
         u64::from(self.band) * u64::from(self.parts)
     }
 
@@ -59,32 +59,32 @@ impl Plan {
     }
 
     /// Returns true if the memory of `self` is large enough for `other`.
-    pub(in crate::backend::cuda) fn covers(&self, other: &Self) -> bool {
+    pub(in crate::cuda) fn covers(&self, other: &Self) -> bool {
         self.slots() >= other.slots() && self.band >= other.band && self.queue >= other.queue && self.cells == other.cells
     }
 }
 
 /// Offset of each array in the allocation, bytes.
 #[derive(Debug, Clone, Copy, Default)]
-pub(in crate::backend::cuda) struct Layout {
-    pub(in crate::backend::cuda) place: u64,
-    pub(in crate::backend::cuda) way: u64,
-    pub(in crate::backend::cuda) colour: u64,
-    pub(in crate::backend::cuda) progress: u64,
-    pub(in crate::backend::cuda) seen: u64,
-    pub(in crate::backend::cuda) first: u64,
-    pub(in crate::backend::cuda) sums: u64,
-    pub(in crate::backend::cuda) live: [u64; 2],
-    pub(in crate::backend::cuda) points: u64,
-    pub(in crate::backend::cuda) hits: [u64; 2],
-    pub(in crate::backend::cuda) log_stretch: u64,
-    pub(in crate::backend::cuda) by: u64,
-    pub(in crate::backend::cuda) film: u64,
-    pub(in crate::backend::cuda) majorants: u64,
-    pub(in crate::backend::cuda) may_miss: u64,
+pub(in crate::cuda) struct Layout {
+    pub(in crate::cuda) place: u64,
+    pub(in crate::cuda) way: u64,
+    pub(in crate::cuda) colour: u64,
+    pub(in crate::cuda) progress: u64,
+    pub(in crate::cuda) seen: u64,
+    pub(in crate::cuda) first: u64,
+    pub(in crate::cuda) sums: u64,
+    pub(in crate::cuda) live: [u64; 2],
+    pub(in crate::cuda) points: u64,
+    pub(in crate::cuda) hits: [u64; 2],
+    pub(in crate::cuda) log_stretch: u64,
+    pub(in crate::cuda) by: u64,
+    pub(in crate::cuda) film: u64,
+    pub(in crate::cuda) majorants: u64,
+    pub(in crate::cuda) may_miss: u64,
     /// Observations of each majorant cell: counts, highest values, missing values. Set to 0 at the start of a frame, together with `control`.
-    pub(in crate::backend::cuda) watch: u64,
-    pub(in crate::backend::cuda) control: u64,
+    pub(in crate::cuda) watch: u64,
+    pub(in crate::cuda) control: u64,
     end: u64,
 }
 
@@ -125,24 +125,24 @@ impl Layout {
 /// Counters of the kernels (`Control` of `kernels/rendering/render.cu`).
 #[repr(C)]
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(in crate::backend::cuda) struct Control {
-    pub(in crate::backend::cuda) live: u32,
-    pub(in crate::backend::cuda) length: u32,
+pub(in crate::cuda) struct Control {
+    pub(in crate::cuda) live: u32,
+    pub(in crate::cuda) length: u32,
     /// Queries, traced queries, queries in missing cells, exceeded majorants, finished paths, queries over the tracing budget.
-    pub(in crate::backend::cuda) totals: [u64; 6],
+    pub(in crate::cuda) totals: [u64; 6],
 }
 
 // SAFETY: `repr(C)`, plain numbers, laid out as in `kernels/rendering/render.cu`.
 unsafe impl DeviceRepr for Control {}
 
 /// Device memory of a plan, and pinned memory for its readback.
-pub(in crate::backend::cuda) struct Memory {
-    pub(in crate::backend::cuda) plan: Plan,
-    pub(in crate::backend::cuda) layout: Layout,
-    pub(in crate::backend::cuda) block: Buffer<u8>,
-    pub(in crate::backend::cuda) control: Pinned<Control>,
-    pub(in crate::backend::cuda) watch: Pinned<u32>,
-    pub(in crate::backend::cuda) film: Pinned<PixelValue>,
+pub(in crate::cuda) struct Memory {
+    pub(in crate::cuda) plan: Plan,
+    pub(in crate::cuda) layout: Layout,
+    pub(in crate::cuda) block: Buffer<u8>,
+    pub(in crate::cuda) control: Pinned<Control>,
+    pub(in crate::cuda) watch: Pinned<u32>,
+    pub(in crate::cuda) film: Pinned<PixelValue>,
 }
 
 impl Memory {
@@ -150,7 +150,7 @@ impl Memory {
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    pub(in crate::backend::cuda) fn new(gpu: &Gpu, plan: Plan) -> Result<Self, DeviceError> {
+    pub(in crate::cuda) fn new(gpu: &Gpu, plan: Plan) -> Result<Self, DeviceError> {
         let layout = Layout::new(&plan);
         Ok(Self {
             plan,
@@ -166,7 +166,7 @@ impl Memory {
     ///
     /// # Errors
     /// A driver call fails.
-    pub(in crate::backend::cuda) fn write<T: Copy>(&mut self, offset: u64, values: &[T]) -> Result<(), DeviceError> {
+    pub(in crate::cuda) fn write<T: Copy>(&mut self, offset: u64, values: &[T]) -> Result<(), DeviceError> {
         let bytes = size_of_val(values);
         // SAFETY: numbers and bools, whose bytes are all initialised.
         let bytes = unsafe { std::slice::from_raw_parts(values.as_ptr().cast::<u8>(), bytes) };
@@ -177,12 +177,12 @@ impl Memory {
     ///
     /// # Errors
     /// A driver call fails.
-    pub(in crate::backend::cuda) fn zero(&self, offset: u64, bytes: u64) -> Result<(), DeviceError> {
+    pub(in crate::cuda) fn zero(&self, offset: u64, bytes: u64) -> Result<(), DeviceError> {
         self.block.zero_at(offset as usize, bytes as usize)
     }
 
     /// Device address of an offset of the layout.
-    pub(in crate::backend::cuda) fn at(&self, offset: u64) -> u64 {
+    pub(in crate::cuda) fn at(&self, offset: u64) -> u64 {
         self.block.address() + offset
     }
 }

@@ -4,6 +4,8 @@ mod audit;
 mod combine;
 mod coupled;
 mod frames;
+#[cfg(test)]
+mod host_parity;
 mod labels;
 mod march;
 mod memory;
@@ -16,8 +18,6 @@ pub use combine::{CombineInput, FilmPlanes, GpuCombine};
 pub use coupled::{CoupledStats, CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 pub use frames::{CudaSamples, GpuFrames};
 pub(super) use labels::HELD_BACK;
-#[cfg(test)]
-pub(crate) use march::LightArgument;
 pub use march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 pub use renderer::{GpuRenderer, LookAhead, Timeline};
 pub use router::{DeviceLearns, DeviceLogStretch, DevicePredict, DeviceQueryRouter, FrameQueries, RoutedQueries, TraceAll};

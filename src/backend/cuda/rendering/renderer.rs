@@ -9,10 +9,10 @@
 //! [`Renderer::render`] up to rounding if the evaluated values are equal: random numbers and states are the same, and the order of the sums depends
 //! only on the numbers of pixels and samples. Between frames, the host updates the majorants from the observations of the device.
 
-use crate::backend::cuda::rendering::memory::{Control, Memory, Plan};
-use crate::backend::cuda::{DeviceError, DeviceLogStretch, Gpu, launch, threads};
-use crate::render::{CellObservations, Film, FrameParameters, RenderError, RenderStats, Renderer};
+use crate::cuda::rendering::memory::{Control, Memory, Plan};
+use crate::cuda::{DeviceError, DeviceLogStretch, Gpu, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
+use ridgewatch_render::{CellObservations, Film, FrameParameters, RenderError, RenderStats, Renderer};
 use std::ops::Range;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -107,8 +107,13 @@ unsafe impl DeviceRepr for BandArgument {}
 unsafe impl DeviceRepr for SlotsArgument {}
 // SAFETY: as above.
 unsafe impl DeviceRepr for QueueArgument {}
+/// [`FrameParameters`] as an argument of a kernel.
+#[repr(transparent)]
+#[derive(Clone, Copy)]
+pub(super) struct ParametersArgument(pub(super) FrameParameters);
+
 // SAFETY: `repr(C)`, plain numbers, laid out as `FrameScene` of `kernels/rendering/tracking.cuh`, whose size both sides assert.
-unsafe impl DeviceRepr for FrameParameters {}
+unsafe impl DeviceRepr for ParametersArgument {}
 
 /// Renders frames on a GPU. It reuses its memory between frames.
 pub struct GpuRenderer {
@@ -126,7 +131,7 @@ pub struct GpuRenderer {
 
 /// Kernel arguments that all waves of a band share.
 struct Wave {
-    parameters: FrameParameters,
+    parameters: ParametersArgument,
     grid: GridArgument,
     watch: WatchArgument,
     band: BandArgument,
@@ -407,7 +412,7 @@ impl Memory {
         let cells = 4 * u64::from(self.plan.cells);
         let watch = self.at(l.watch);
         Wave {
-            parameters,
+            parameters: ParametersArgument(parameters),
             grid: GridArgument { majorants: self.at(l.majorants), may_miss: self.at(l.may_miss) },
             watch: WatchArgument { count: watch, highest: watch + cells, missing: watch + 2 * cells },
             band,

@@ -1,17 +1,18 @@
-//! Routes the log-stretch queries of a frame on the device by the rule of [`crate::backend::QueryRouter`], and keeps a sample of the traced ones as
+//! Routes the log-stretch queries of a frame on the device by the rule of [`crate::QueryRouter`], and keeps a sample of the traced ones as
 //! training labels.
 //!
 //! Each batch runs four steps: `answer_split` lists the points to predict and the points to trace, the predictor evaluates the first list, the
 //! tracer the second, and `answer_join` writes the values back in the order of the queries.
 
-use crate::backend::cuda::driver::pinned::Pinned;
-use crate::backend::cuda::layout::{ChoiceArgument, ListsArgument, Outputs};
-use crate::backend::cuda::rendering::labels::{HELD_BACK, Labels};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
-use crate::field::Domain;
-use crate::surrogate::Samples;
-use crate::trust::Gate;
+use crate::cuda::driver::pinned::Pinned;
+use crate::cuda::driver_error;
+use crate::cuda::layout::{ChoiceArgument, ListsArgument, Outputs};
+use crate::cuda::rendering::labels::{HELD_BACK, Labels};
+use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, DeviceTracer, Gpu, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, PushKernelArg, result};
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Samples;
+use ridgewatch_trust::Gate;
 use std::sync::Arc;
 
 /// Evaluates log-stretch queries in device memory.
@@ -67,7 +68,7 @@ pub struct TraceAll<'a>(pub &'a DeviceTracer);
 impl DeviceLogStretch for TraceAll<'_> {
     fn evaluate(&mut self, points: u64, count: usize, log_stretch: u64, by: u64) -> Result<(), DeviceError> {
         let gpu = self.0.gpu();
-        let doing = DeviceError::driver("filling device memory");
+        let doing = driver_error("filling device memory");
         gpu.context().bind_to_thread().map_err(&doing)?;
         // SAFETY: the renderer's queue holds `count` entries at each address until the next wave, which comes later on the stream.
         unsafe {

@@ -1,20 +1,20 @@
 //! Smooth frames on the GPU: marches the surrogate, tracks pairs of coupled paths where the variance is, combines both, and states the error of the
-//! result. The algorithm and its reference are in [`crate::render::smooth`]; how finely to march and where to sample is decided there as well.
+//! result. The algorithm and its reference are in [`ridgewatch_render::smooth`]; how finely to march and where to sample is decided there as well.
 
 use super::combine::{CombineInput, FilmPlanes, GpuCombine};
 use super::coupled::{CoupledTracker, PairTiles, SUM_PLANES, SurrogateNodes};
 use super::frames::Predictor;
 use super::march::{DeviceNodes, GpuMarch, Medium, NodeGrid, RayCheck};
 use super::router::DeviceLogStretch;
-use crate::backend::Smooth;
-use crate::backend::cuda::driver::Gpu;
-use crate::backend::cuda::tracing::{CudaTracer, DeviceTable};
-use crate::backend::cuda::{Buffer, DeviceError};
-use crate::render::rng::FrameRandom;
-use crate::render::smooth::{
+use crate::Smooth;
+use crate::cuda::driver::Gpu;
+use crate::cuda::tracing::{CudaTracer, DeviceTable};
+use crate::cuda::{Buffer, DeviceError};
+use ridgewatch_render::rng::FrameRandom;
+use ridgewatch_render::smooth::{
     AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FINELY_AUDITED, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
 };
-use crate::render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
+use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -28,7 +28,7 @@ const MIN_MARCH_SECONDS: f64 = 0.005;
 const MAX_PAIRS: usize = 256;
 
 /// One picture that accumulates on the GPU. It reuses kernels and memory from picture to picture.
-pub(in crate::backend::cuda) struct GpuSmooth {
+pub(in crate::cuda) struct GpuSmooth {
     gpu: Arc<Gpu>,
     march: GpuMarch,
     nodes: DeviceNodes,

@@ -1,9 +1,9 @@
 //! Sorts points by cell along a Morton curve (Morton 1966) with a counting sort, so that neighbouring threads read neighbouring memory.
 
-use crate::backend::cuda::layout::SortFrame;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, launch, threads};
-use crate::field::{Domain, Grid};
+use crate::cuda::layout::SortFrame;
+use crate::cuda::{Buffer, DeviceError, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg};
+use ridgewatch_field::{Domain, Grid};
 use std::sync::Arc;
 
 /// Maximum number of points that are sorted together. It bounds the scratch memory.

@@ -2,13 +2,13 @@
 //!
 //! The seeds are generated brick by brick (8^3 or 8^2 nodes), so that neighbouring threads trace neighbouring seeds.
 
-use crate::backend::cuda::layout::{Outputs, TableArgument, TableFrame};
-use crate::backend::cuda::tracing::sort::Sorter;
-use crate::backend::cuda::tracing::trace::DeviceTracer;
-use crate::backend::cuda::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
-use crate::field::Domain;
-use crate::surrogate::Table;
+use crate::cuda::layout::{Outputs, TableArgument, TableFrame};
+use crate::cuda::tracing::sort::Sorter;
+use crate::cuda::tracing::trace::DeviceTracer;
+use crate::cuda::{Buffer, DeviceError, DevicePredict, Gpu, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg};
+use ridgewatch_field::Domain;
+use ridgewatch_surrogate::Table;
 use std::sync::Arc;
 
 /// Log-stretch at nodes i / (n - 1) of the unit domain, x fastest.
@@ -54,9 +54,9 @@ impl DeviceTable {
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    pub(in crate::backend::cuda) fn with_values(&self, table: &Table) -> Result<Self, DeviceError> {
+    pub(in crate::cuda) fn with_values(&self, table: &Table) -> Result<Self, DeviceError> {
         let domain =
-            crate::field::Domain { dimensions: self.frame.dimensions as usize, ..crate::field::Domain::cuboid([0.0; 3], [1.0; 3]) };
+            ridgewatch_field::Domain { dimensions: self.frame.dimensions as usize, ..ridgewatch_field::Domain::cuboid([0.0; 3], [1.0; 3]) };
         let mut copy = Self::empty(&self.gpu, &domain, self.nodes())?;
         copy.frame = self.frame;
         copy.values.write(table.values())?;
@@ -140,7 +140,7 @@ impl DeviceTable {
         self.values.address()
     }
     /// Kernel argument, the struct `Table` of `table.cuh`.
-    pub(in crate::backend::cuda) fn argument(&self) -> TableArgument {
+    pub(in crate::cuda) fn argument(&self) -> TableArgument {
         let TableFrame { nodes, dimensions, .. } = self.frame;
         TableArgument { nodes, dimensions, values: self.values.address() }
     }

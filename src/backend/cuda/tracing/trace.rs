@@ -2,15 +2,16 @@
 //!
 //! Seeds and results are at device addresses. In a window of snapshots, seeds are sorted by cell first ([`Sorter`]).
 
-use crate::backend::cuda::layout::{ClosedData, DeviceReal, Outputs, ResultPolicy, Words, words};
-use crate::backend::cuda::tracing::sort::{MAX_POINTS, SortCells, Sorter};
-use crate::backend::cuda::window::DeviceWindow;
-use crate::backend::cuda::window::grid::{GridArguments, WindowFlowMap};
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
-use crate::field::analytic::{Analytic, ClosedForm, Constants, Form};
-use crate::field::{Domain, Geometry};
-use crate::flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
+use crate::cuda::driver_error;
+use crate::cuda::layout::{ClosedData, DeviceReal, Outputs, ResultPolicy, Words, words};
+use crate::cuda::tracing::sort::{MAX_POINTS, SortCells, Sorter};
+use crate::cuda::window::DeviceWindow;
+use crate::cuda::window::grid::{GridArguments, WindowFlowMap};
+use crate::cuda::{Buffer, DeviceError, Gpu, SnapshotStore, Storage, launch, threads};
 use cudarc::driver::{CudaFunction, PushKernelArg};
+use ridgewatch_field::analytic::{Analytic, ClosedForm, Constants, Form};
+use ridgewatch_field::{Domain, Geometry};
+use ridgewatch_flow::{Boundary, FlowMap, Integrator, Normalisation, Precision, VelocitySource};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Order in which seeds are traced, and format in which velocities are read. Other values than the default are for measurements.
@@ -58,7 +59,7 @@ pub struct DeviceTracer {
 }
 
 impl DeviceTracer {
-    /// Tracer of seeds at time `t0`, with this many steps. Settings that [`crate::flow::cpu_tracer`] refuses are not checked again.
+    /// Tracer of seeds at time `t0`, with this many steps. Settings that [`ridgewatch_flow::cpu_tracer`] refuses are not checked again.
     ///
     /// # Errors
     /// The adaptive integrator is not supported, the window does not fit into memory, or a kernel does not compile.
@@ -186,7 +187,7 @@ impl DeviceTracer {
     /// # Errors
     /// Error of the driver.
     pub fn resources(&self) -> Result<(i32, i32), DeviceError> {
-        let doing = DeviceError::driver("querying the resources of a kernel");
+        let doing = driver_error("querying the resources of a kernel");
         let kernel = if self.cells.is_some() { &self.sorted } else { &self.plain };
         Ok((kernel.num_regs().map_err(&doing)?, kernel.local_size_bytes().map_err(&doing)?))
     }
@@ -226,7 +227,7 @@ impl DeviceTracer {
     ///
     /// # Safety
     /// As for [`Self::trace`], with room for every index.
-    pub(in crate::backend::cuda) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
+    pub(in crate::cuda) unsafe fn in_sequence(&self, sorted: u64, count: usize, out: &Outputs) -> Result<(), DeviceError> {
         // SAFETY: as required of the caller.
         unsafe { self.launch(&self.sorted, self.seeds_a_warp, sorted, count, out) }
     }
@@ -287,22 +288,16 @@ fn step_word<R: DeviceReal>(map: &FlowMap, steps: usize) -> [u64; 1] {
 }
 
 /// Launch arguments and macros of `trace_closed.cu`.
-pub(in crate::backend::cuda) struct ClosedArguments {
-    pub(in crate::backend::cuda) data: Words,
+pub(in crate::cuda) struct ClosedArguments {
+    pub(in crate::cuda) data: Words,
     /// Constants of every stage, as bytes.
-    pub(in crate::backend::cuda) stages: Vec<u8>,
-    pub(in crate::backend::cuda) defines: Vec<String>,
+    pub(in crate::cuda) stages: Vec<u8>,
+    pub(in crate::cuda) defines: Vec<String>,
 }
 
 impl ClosedArguments {
     /// `t0`: `None` if every seed of a double gyre has its own start time.
-    pub(in crate::backend::cuda) fn new<R: DeviceReal>(
-        flow: &Analytic,
-        domain: &Domain,
-        map: &FlowMap,
-        t0: Option<f64>,
-        steps: usize,
-    ) -> Self {
+    pub(in crate::cuda) fn new<R: DeviceReal>(flow: &Analytic, domain: &Domain, map: &FlowMap, t0: Option<f64>, steps: usize) -> Self {
         let from = t0.unwrap_or(0.0);
         let to = from + map.direction.sign() * map.tau;
         let (stages, form, rate) = match (flow.form(), t0) {
@@ -328,7 +323,7 @@ fn closed_defines<R: DeviceReal>(map: &FlowMap, form: u8, starts: bool) -> Vec<S
 }
 
 /// Edge policy and normalisation of results.
-pub(in crate::backend::cuda) fn result_policy(map: &FlowMap, steps: usize) -> ResultPolicy {
+pub(in crate::cuda) fn result_policy(map: &FlowMap, steps: usize) -> ResultPolicy {
     ResultPolicy {
         zero_if_left: i32::from(map.boundary == Boundary::Zero),
         by_lifetime: i32::from(map.normalisation == Normalisation::Lifetime),

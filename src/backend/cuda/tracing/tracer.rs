@@ -1,11 +1,11 @@
 //! Flow map of a slide on the GPU, for seeds on the host (in batches) and for seeds on the device.
 
-use crate::backend::BackendError;
-use crate::backend::cuda::layout::Outputs;
-use crate::backend::cuda::tracing::trace::{DeviceTracer, Tuning};
-use crate::backend::cuda::{Buffer, DeviceError, DeviceMissingCells, Gpu, SnapshotStore};
-use crate::flow::{Extras, FlowMap, MissingCells, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
-use crate::surrogate::Trace;
+use crate::BackendError;
+use crate::cuda::layout::Outputs;
+use crate::cuda::tracing::trace::{DeviceTracer, Tuning};
+use crate::cuda::{Buffer, DeviceError, DeviceMissingCells, Gpu, SnapshotStore};
+use ridgewatch_flow::{Extras, FlowMap, MissingCells, Precision, Traced, Tracer, VelocitySource, cpu_tracer};
+use ridgewatch_surrogate::Trace;
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Limit on the seeds of a batch, to bound the memory of a call.

@@ -1,10 +1,10 @@
 //! Launch arguments and macros of the kernels that trace in a window of snapshots.
 
-use crate::backend::cuda::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
-use crate::backend::cuda::{DeviceError, Storage};
-use crate::field::{Geometry, Grid};
-use crate::flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
+use crate::cuda::layout::{AxisData, DeviceReal, GridData, GridStep, Words, words};
+use crate::cuda::{DeviceError, Storage};
 use bytemuck::{Zeroable, cast_slice};
+use ridgewatch_field::{Geometry, Grid};
+use ridgewatch_flow::{AxisMap, FlowMap, Integrator, Interpolation, angle_slack, bounds, poles};
 
 /// Launch arguments and macros of `trace_grid.cu`.
 #[derive(Debug)]
@@ -161,7 +161,7 @@ impl GridArguments {
 }
 
 /// `RW_STORAGE`, as `Storage` in `grid.cuh`.
-pub(in crate::backend::cuda) fn storage_define(storage: Storage) -> String {
+pub(in crate::cuda) fn storage_define(storage: Storage) -> String {
     format!("RW_STORAGE={}", storage as u8)
 }
 

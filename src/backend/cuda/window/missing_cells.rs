@@ -1,9 +1,9 @@
 //! Missing cells on the device: grid cells without velocity data, in which no particle can start.
 
-use crate::backend::cuda::layout::{MissingCellsArgument, MissingCellsAxis};
-use crate::backend::cuda::{Buffer, DeviceError, Gpu};
-use crate::flow::MissingCells;
+use crate::cuda::layout::{MissingCellsArgument, MissingCellsAxis};
+use crate::cuda::{Buffer, DeviceError, Gpu};
 use bytemuck::Zeroable;
+use ridgewatch_flow::MissingCells;
 
 /// Missing cells at the start time of one window.
 #[derive(Debug)]
@@ -19,7 +19,7 @@ impl DeviceMissingCells {
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    pub(in crate::backend::cuda) fn new(gpu: &Gpu, voids: &MissingCells) -> Result<Option<Self>, DeviceError> {
+    pub(in crate::cuda) fn new(gpu: &Gpu, voids: &MissingCells) -> Result<Option<Self>, DeviceError> {
         let Some((grid, empty)) = voids.cells() else { return Ok(None) };
         let mut argument = MissingCellsArgument { dimensions: grid.axes.len() as i32, ..Zeroable::zeroed() };
         let mut nodes = Vec::new();
@@ -37,7 +37,7 @@ impl DeviceMissingCells {
     }
 
     /// Kernel argument, the struct `MissingCells` of `missing_cells.cuh`.
-    pub(in crate::backend::cuda) fn argument(&self) -> MissingCellsArgument {
+    pub(in crate::cuda) fn argument(&self) -> MissingCellsArgument {
         self.argument
     }
 }

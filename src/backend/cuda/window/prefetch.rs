@@ -1,6 +1,6 @@
 //! Upload queue of snapshots. Snapshots that a window needs now come first. Those of later windows follow, in the order in which they are read.
 
-use crate::field::Snapshot;
+use ridgewatch_field::Snapshot;
 use std::collections::VecDeque;
 use std::sync::{Arc, Weak};
 
@@ -107,7 +107,7 @@ impl<T> PrefetchQueue<T> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::field::{Axis, Geometry, Grid};
+    use ridgewatch_field::{Axis, Geometry, Grid};
 
     fn snapshots(count: usize) -> Vec<Arc<Snapshot>> {
         let axis = |name| Axis::uniform(name, "", 0.0, 1.0, 2).unwrap();

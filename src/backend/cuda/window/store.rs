@@ -4,14 +4,15 @@
 //!
 //! Half-precision velocities are stored as v / scale, with one power of two as the scale of the whole window.
 
-use crate::backend::cuda::window::grid::{Nodes, storage_define};
-use crate::backend::cuda::window::prefetch::PrefetchQueue;
-use crate::backend::cuda::window::snapshot::DeviceSnapshot;
-use crate::backend::cuda::window::uploader::SnapshotUploader;
-use crate::backend::cuda::{DeviceError, Gpu, Storage, launch, threads};
-use crate::field::{Snapshot, Window};
+use crate::cuda::driver_error;
+use crate::cuda::window::grid::{Nodes, storage_define};
+use crate::cuda::window::prefetch::PrefetchQueue;
+use crate::cuda::window::snapshot::DeviceSnapshot;
+use crate::cuda::window::uploader::SnapshotUploader;
+use crate::cuda::{DeviceError, Gpu, Storage, launch, threads};
 use cudarc::driver::PushKernelArg;
 use rayon::prelude::*;
+use ridgewatch_field::{Snapshot, Window};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
@@ -39,7 +40,7 @@ pub struct DeviceWindow {
 
 impl DeviceWindow {
     /// Description of the nodes for kernels.
-    pub(in crate::backend::cuda) fn nodes(&self) -> Nodes {
+    pub(in crate::cuda) fn nodes(&self) -> Nodes {
         let first = self.snapshots.first();
         Nodes {
             addresses: self.snapshots.iter().map(|s| s.nodes.address()).collect(),
@@ -236,7 +237,7 @@ impl Shared {
             state.uploaded += 1;
             state.held.push(uploaded?);
         }
-        let doing = DeviceError::driver("ordering the transfer of snapshots");
+        let doing = driver_error("ordering the transfer of snapshots");
         let mut snapshots = Vec::with_capacity(wanted.len());
         for snapshot in wanted {
             let Some(there) = state.held.iter().find(|s| Arc::ptr_eq(snapshot, &s.host)) else { continue };

@@ -3,12 +3,13 @@
 //! Two pinned buffers alternate (double buffering): the CPU fills one while the device copies the other. For half-precision storage, a kernel on the
 //! same stream encodes each piece.
 
-use crate::backend::cuda::window::grid::storage_define;
-use crate::backend::cuda::window::snapshot::DeviceSnapshot;
-use crate::backend::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
-use crate::field::Snapshot;
+use crate::cuda::driver_error;
+use crate::cuda::window::grid::storage_define;
+use crate::cuda::window::snapshot::DeviceSnapshot;
+use crate::cuda::{Buffer, DeviceError, Gpu, Storage, launch, threads};
 use cudarc::driver::{CudaEvent, CudaFunction, PinnedHostSlice, PushKernelArg};
 use rayon::prelude::*;
+use ridgewatch_field::Snapshot;
 use std::sync::{Arc, OnceLock};
 
 /// Nodes of a pinned buffer: 8 MiB.
@@ -16,7 +17,7 @@ const PIECE: usize = 1 << 19;
 
 /// Uploads snapshots one after the other.
 #[derive(Debug)]
-pub(in crate::backend::cuda) struct SnapshotUploader {
+pub(in crate::cuda) struct SnapshotUploader {
     gpu: Arc<Gpu>,
     pieces: Option<Pieces>,
     encode: Option<(Storage, CudaFunction)>,
@@ -33,7 +34,7 @@ struct Pieces {
 
 impl SnapshotUploader {
     /// Creates an uploader. It allocates its memory at the first upload.
-    pub(in crate::backend::cuda) fn new(gpu: &Arc<Gpu>) -> Self {
+    pub(in crate::cuda) fn new(gpu: &Arc<Gpu>) -> Self {
         Self { gpu: gpu.clone(), pieces: None, encode: None }
     }
 
@@ -41,14 +42,14 @@ impl SnapshotUploader {
     ///
     /// # Errors
     /// The device fails or lacks memory.
-    pub(in crate::backend::cuda) fn upload(
+    pub(in crate::cuda) fn upload(
         &mut self,
         snapshot: &Arc<Snapshot>,
         storage: Storage,
         scale: f32,
     ) -> Result<DeviceSnapshot, DeviceError> {
         let gpu = self.gpu.clone();
-        let doing = DeviceError::driver("uploading a snapshot");
+        let doing = driver_error("uploading a snapshot");
         let words = (storage.bytes() / 4) as usize;
         let mut nodes = Buffer::<u32>::new(gpu.transfer(), gpu.budget(), "a snapshot", snapshot.nodes.len() * words)?.read_by(gpu.work());
         if self.pieces.is_none() {

@@ -1,4 +1,4 @@
-//! Checks of settings. Every room checks its own; [`crate::config`] finds the line of a fault.
+//! Checks of settings. Every room checks its own; `config` finds the line of a fault.
 
 use serde::Serialize;
 use std::fmt::{Debug, Display};
@@ -47,16 +47,16 @@ pub fn word(value: impl Serialize + Debug) -> String {
 }
 
 /// Refuses unless `holds`.
-pub(crate) fn require(holds: bool, key: &str, value: impl Serialize + Debug, accepted: &str) -> Result<(), Refused> {
+pub fn require(holds: bool, key: &str, value: impl Serialize + Debug, accepted: &str) -> Result<(), Refused> {
     if holds { Ok(()) } else { Err(Refused::new(key, format_args!("is {}", shown(value)), accepted)) }
 }
 
 /// Refuses a value that is not a finite number above 0.
-pub(crate) fn positive(key: &str, value: f64) -> Result<(), Refused> {
+pub fn positive(key: &str, value: f64) -> Result<(), Refused> {
     require(value.is_finite() && value > 0.0, key, value, "a number above 0")
 }
 
 /// Refuses a value outside `low..=high`.
-pub(crate) fn count(key: &str, value: usize, low: usize, high: usize) -> Result<(), Refused> {
+pub fn count(key: &str, value: usize, low: usize, high: usize) -> Result<(), Refused> {
     require((low..=high).contains(&value), key, value, &format!("a whole number from {low} to {high}"))
 }

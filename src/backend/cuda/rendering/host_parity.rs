@@ -2,14 +2,12 @@
 
 #![allow(clippy::unwrap_used)] // Tests: a panic is the report.
 
-use super::combine::{Correction, PairSums, combine, smoothed};
-use super::light_volume::{LightGrid, LightVolume};
-use super::march::{Medium, RaySum, ToLight};
-use super::nodes::Nodes;
-use crate::backend::cuda::{LightArgument, SUM_PLANES};
-use crate::field::Domain;
-use crate::render::rng::philox;
-use crate::render::{CameraSettings, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
+use super::march::LightArgument;
+use crate::cuda::SUM_PLANES;
+use ridgewatch_field::Domain;
+use ridgewatch_render::rng::philox;
+use ridgewatch_render::smooth::{Correction, LightGrid, LightVolume, Medium, Nodes, PairSums, RaySum, ToLight, combine, smoothed};
+use ridgewatch_render::{CameraSettings, Combine, LightSettings, RenderSettings, Renderer, Scene, TransferSettings};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
@@ -20,7 +18,7 @@ fn harness() -> &'static Path {
     static BUILT: OnceLock<(tempfile::TempDir, PathBuf)> = OnceLock::new();
     &BUILT
         .get_or_init(|| {
-            let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+            let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../..");
             let folder = tempfile::tempdir().unwrap();
             let out = folder.path().join("harness");
             let compiler = std::env::var("CXX").unwrap_or_else(|_| "c++".into());
@@ -293,15 +291,13 @@ fn checked_rays_agree() {
 #[test]
 #[ignore = "needs a GPU"]
 fn a_device_agrees() {
-    use crate::backend::cuda::{
-        CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, RayCheck,
-    };
+    use crate::cuda::{CombineInput, DeviceNodes, DeviceTable, Gpu, GpuCombine, GpuMarch, GpuSettings, Medium as DeviceMedium, RayCheck};
     let gpu = Gpu::open(0, &GpuSettings { poison: true, ..GpuSettings::default() }).unwrap();
     let (laid, mut march, mut combine) = (DeviceNodes::new(&gpu).unwrap(), GpuMarch::new(&gpu).unwrap(), GpuCombine::new(&gpu).unwrap());
     for case in cases().iter().filter(|case| !case.holes) {
         case.with(|renderer, nodes, with_medium| {
             let (step, pixels) = (0.03, 37 * 23);
-            let table = crate::surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
+            let table = ridgewatch_surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
             let table = DeviceTable::upload(&gpu, &case.domain, &table).unwrap();
             let parameters = renderer.frame_setup(3, 0..1).unwrap().parameters;
             let grid = laid.grid(Some(&table)).unwrap();
@@ -353,7 +349,7 @@ fn a_device_agrees() {
     let mut scene = renderer.scene().clone();
     (scene.settings.width, scene.settings.height) = (width, height);
     renderer.set_scene(scene).unwrap();
-    let table = crate::surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
+    let table = ridgewatch_surrogate::Table::from_values(case.shape, nodes.values().to_vec(), 0);
     let table = DeviceTable::upload(&gpu, &case.domain, &table).unwrap();
     let parameters = renderer.frame_setup(3, 0..1).unwrap().parameters;
     let medium = DeviceMedium { parameters: &parameters, nodes: laid.grid(Some(&table)).unwrap(), missing_cells: None };
@@ -361,11 +357,9 @@ fn a_device_agrees() {
     march.march(&medium, 0.05, 2, false).unwrap();
     let pairs = gpu.upload("pairs", &planes).unwrap();
     let mut base = Vec::new();
-    for (how, correction) in [
-        (None, Correction::Left),
-        (Some(crate::render::Combine::Shrink), Correction::Shrunk),
-        (Some(crate::render::Combine::Sum), Correction::Summed),
-    ] {
+    for (how, correction) in
+        [(None, Correction::Left), (Some(Combine::Shrink), Correction::Shrunk), (Some(Combine::Sum), Correction::Summed)]
+    {
         combine.poison().unwrap();
         let input = CombineInput { size: [width, height], pairs: &pairs, march: &march, how, tone_map: [1.85, 0.75, 1.4], lit: 0.01 };
         let tiles = combine.combine(&input).unwrap();
@@ -374,7 +368,7 @@ fn a_device_agrees() {
         if how.is_none() {
             base = film.rgba.to_vec();
         }
-        let combined = super::combine::combine(&sums, width, correction);
+        let combined = ridgewatch_render::smooth::combine(&sums, width, correction);
         let mean: Vec<f32> = combined.squared.iter().map(|e| (e[0][0] + e[0][1] + e[0][2]) / 3.0).collect();
         let expected: f64 = mean.iter().filter(|e| e.is_finite()).map(|e| f64::from(*e)).sum();
         assert!((measured - expected).abs() <= 1e-3 * expected.abs() + 1e-2, "{correction:?}: {measured} and {expected}");

@@ -1,0 +1,7 @@
+//! What every room may use: checks of settings, files written whole, and the errors of devices. Uses no other room.
+
+mod device_error;
+pub mod files;
+pub mod setting;
+
+pub use device_error::DeviceError;
