@@ -11,9 +11,9 @@ use rayon::prelude::*;
 
 /// Scales of the transform.
 const LEVELS: usize = 5;
-/// Radius over which energies are averaged: `RADIUS` times the spacing of the scale, at most `MAX_RADIUS`.
-const RADIUS: usize = 4;
-const MAX_RADIUS: usize = 32;
+/// Radius over which energies are averaged, in pixels. A smaller one leaves gains that follow the noise: with radii of 4 to 32 pixels, growing with the
+/// scale, pictures of one sample a pixel got worse with the second.
+const RADIUS: usize = 32;
 /// Rec. 709 luminance.
 const LUMINANCE: [f32; 3] = [0.2126, 0.7152, 0.0722];
 
@@ -160,12 +160,12 @@ fn shrunk(mut quarters: [Vec<Weighted>; 2], width: usize) -> Vec<[f32; 3]> {
             };
             quarters[q].par_iter().zip(&coarse[q]).with_min_len(1 << 12).map(detail).collect()
         });
-        let gains = gains(&details, width, (RADIUS * spacing).min(MAX_RADIUS));
+        let gains = gains(&details, width, RADIUS);
         add(&mut result, &details, &quarters, &gains);
         quarters = coarse;
     }
     let coarsest = quarters.each_ref().map(|quarter| quarter.par_iter().map(value).collect::<Vec<_>>());
-    let gains = gains(&coarsest, width, MAX_RADIUS);
+    let gains = gains(&coarsest, width, RADIUS);
     add(&mut result, &coarsest, &quarters, &gains);
     result
 }
@@ -305,7 +305,9 @@ mod tests {
     #[test]
     fn the_stated_error_is_that_of_the_picture_shown() {
         let (width, height) = (256, 192);
-        let truth = bump(width, height);
+        // Fine detail, which shrinkage cannot tell from noise, so that its error stands above the scatter of the statements.
+        let detail = |i: usize| 0.15 * (unit(philox([i as u32, 0, 0, 0], [7, 2])[0]) - 0.5);
+        let truth: Vec<f32> = bump(width, height).iter().enumerate().map(|(i, bump)| bump + detail(i)).collect();
         for how in [Correction::Left, Correction::Shrunk, Correction::Summed] {
             let (mut stated, mut found) = (0.0, 0.0);
             for seed in 0..24 {
@@ -313,8 +315,8 @@ mod tests {
                 stated += combined.squared.iter().map(|e| f64::from(e[0][0])).sum::<f64>() / truth.len() as f64;
                 found += error_of(&combined, &truth);
             }
-            // The mean of 24 statements scatters by some 5 %.
-            assert!((stated / found - 1.0).abs() < 0.2, "{how:?}: stated {stated}, found {found}");
+            // The mean of 24 statements scatters by some 1 %.
+            assert!((stated / found - 1.0).abs() < 0.05, "{how:?}: stated {stated}, found {found}");
         }
     }
 }

@@ -13,10 +13,10 @@ use ridgewatch_render::Combine as Combination;
 use ridgewatch_render::smooth::{TILE, TileSums};
 use std::sync::Arc;
 
-/// Scales of the transform, and the radius over which energies are summed: `RADIUS` times the spacing of the scale, at most `MAX_RADIUS`.
+/// Scales of the transform.
 const LEVELS: u32 = 5;
-const RADIUS: i32 = 4;
-const MAX_RADIUS: i32 = 32;
+/// Radius over which energies are summed, and the largest one that the kernels can sum, in pixels.
+const RADIUS: i32 = 32;
 /// Pixels that a block of `combine_box` sums along a row, and columns and rows of a block of `combine_gains` and `combine_errors`.
 const BOX_ROW: usize = 512;
 const BOX_COLUMNS: [usize; 2] = [16, 128];
@@ -238,7 +238,6 @@ impl GpuCombine {
         let filtered = QuartersArgument { planes: [0, 1].map(|q| std::array::from_fn(|k| plane(PLANES.coarse + 4 * q + k))) };
         for number in 0..=LEVELS {
             let (spacing, fresh) = (1_i32 << number, i32::from(number == 0));
-            let radius = (RADIUS * spacing).min(MAX_RADIUS);
             // SAFETY: the arguments of the kernels of combine.cu; each address is that of as many planes as the kernel expects, in memory that is freed
             // in the order of the stream.
             unsafe {
@@ -251,9 +250,9 @@ impl GpuCombine {
                     let mut call = stream.launch_builder(&self.columns);
                     launch(call.arg(&fine).arg(&rows).arg(&coarse).arg(&level).arg(&spacing), config)?;
                 }
-                self.box_rows(level.energy, boxed, input.size, radius)?;
+                self.box_rows(level.energy, boxed, input.size, RADIUS)?;
                 let mut call = stream.launch_builder(&self.gains);
-                launch(call.arg(&level).arg(&boxed).arg(&radius).arg(&shrunk).arg(&fresh), box_columns(input.size))?;
+                launch(call.arg(&level).arg(&boxed).arg(&RADIUS).arg(&shrunk).arg(&fresh), box_columns(input.size))?;
             }
             fine = filtered;
         }
@@ -281,7 +280,7 @@ impl GpuCombine {
     /// # Panics
     /// If the radius is not one of those.
     pub fn finish(&mut self, radius: u32, floor: f32, added: f32) -> Result<FilmPlanes<'_>, DeviceError> {
-        assert!(radius.is_power_of_two() && radius <= MAX_RADIUS as u32, "a radius that the kernels can sum");
+        assert!(radius.is_power_of_two() && radius <= RADIUS as u32, "a radius that the kernels can sum");
         let (Some(argument), Some(planes)) = (self.begun.take(), &self.planes) else {
             return Err(DeviceError::Unsupported { what: "a film before its pictures are combined".into() });
         };
