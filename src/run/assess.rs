@@ -9,8 +9,9 @@ use crate::backend::{
     AuditFindings, Backend, FrameSamples, Interruptible, Rendered, Tally, audit, residuals, stratified_points, trusted_error,
 };
 use crate::flow::Extras;
+use crate::render::Method;
 use crate::surrogate::{Predict, Samples, Trace};
-use crate::trust::{Audited, Gate, Residual, Strata};
+use crate::trust::{Audited, Gate, REJECTED, Residual, Strata};
 use std::sync::atomic::Ordering;
 
 /// A rendered and audited frame whose results have not taken effect.
@@ -83,6 +84,17 @@ impl Run<'_> {
             record
                 .warnings
                 .push(format!("the tracing budget was spent: {over_budget} queries of untrusted cells were answered by the surrogate"));
+        }
+        if self.plan.scene.render.method == Method::Gated
+            && let Some(error) = trusted
+        {
+            let evidence = learning.trust.weigh(&error);
+            record.gate_evidence = Some(evidence);
+            if evidence >= REJECTED {
+                record.warnings.push(format!(
+                    "the error where the surrogate is trusted was above `trust.tolerance` over the last frames (evidence {evidence:.0}, limit {REJECTED}): every cell must earn trust again"
+                ));
+            }
         }
         learning.trust.decay();
         learning.trust.observe(Some(audited), &rendered);

@@ -57,6 +57,9 @@ pub struct FrameRecord {
     pub tolerance_excess: Option<f64>,
     /// Error of the surrogate on audit points of the trusted region. `None` if nothing is trusted.
     pub trusted_error: Option<TrustedError>,
+    /// Evidence, an e-value, against the hypothesis that the mean square optical residual of the trusted region was within the tolerance squared in
+    /// every frame since the run began or the gate was last reset. At 20 or above the gate is reset. `None` if the method has no gate.
+    pub gate_evidence: Option<f64>,
     /// PSNR in decibels of the surrogate over the whole domain, on the audit points; peak: their largest traced log-stretch. `None` for
     /// `reference`.
     #[serde(default)]

@@ -4,7 +4,7 @@
 //! distributed over the trusted cells by optimal allocation (Neyman 1934).
 
 use super::strata::{PreviousAudit, Residual, Strata, cell_of};
-use super::{Audited, CellErrors, TrustSettings};
+use super::{Audited, CellErrors, GateEvidence, REJECTED, TrustSettings, TrustedError};
 use ridgewatch_field::Domain;
 
 /// Decayed sums over the residuals of one cell.
@@ -27,6 +27,7 @@ pub struct TrustMap {
     latest_mean_square: Option<f64>,
     just_slid: bool,
     measured_growth: f64,
+    evidence: GateEvidence,
 }
 
 /// The cells that the surrogate answers during one frame.
@@ -89,6 +90,7 @@ impl TrustMap {
             latest_mean_square: None,
             just_slid: false,
             measured_growth: 1.0,
+            evidence: GateEvidence::new(settings.tolerance),
         }
     }
 
@@ -151,6 +153,17 @@ impl TrustMap {
         self.audited.fill(Cell::default());
         self.latest_mean_square = None;
         self.just_slid = false;
+        self.evidence.restart();
+    }
+
+    /// Adds a frame's measured error to the evidence against the gate, and returns the evidence. At [`REJECTED`] or above the gate
+    /// has promised too much over the run: all residuals are forgotten, so that every cell earns its trust again.
+    pub fn weigh(&mut self, trusted: &TrustedError) -> f64 {
+        let evidence = self.evidence.observe(trusted.optical_rms.powi(2));
+        if evidence >= REJECTED {
+            self.reset();
+        }
+        evidence
     }
 
     /// Upper 95 % bound of the mean square optical residual of a cell; `None` with too few samples.

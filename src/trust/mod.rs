@@ -5,11 +5,13 @@
 
 mod audited;
 mod error;
+mod evidence;
 mod map;
 mod strata;
 
 pub use audited::{Audited, CellErrors};
 pub use error::TrustedError;
+pub use evidence::{GateEvidence, REJECTED};
 pub use map::{Gate, TrustMap};
 pub use strata::{Residual, Strata};
 
