@@ -3,12 +3,11 @@
 use crate::byte_lock::{self, Kind};
 use crate::description::BLOCKS;
 use crate::header::MARKS;
-use crate::private::{check_private, create_private, make_folder, metadata, open_private, refused};
+use crate::private::{check_private, create_private, make_folder, metadata, names, open_private, refused, remove_own};
 use crate::{WireError, block_path, followers_path, lock_path, part_path};
 use rustix::io::Errno;
 use std::fs::File;
 use std::io::{Error, ErrorKind};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -47,27 +46,24 @@ impl FileLock {
                 Some(Errno::NOSPC) => WireError::NoSpace { path: path.clone(), needed: 4096 },
                 _ => refused(&path, "cannot be created", e),
             })?;
-            let about = metadata(&path, file.metadata())?;
-            check_private(&path, &about)?;
+            check_private(&path, &metadata(&path, file.metadata())?)?;
             if !byte_lock::try_lock(&file, kind, 0).map_err(|e| WireError::io(&path, "cannot be locked", e))? {
                 return Ok(None);
             }
             // Its last holder may have removed the file that was just locked.
-            match std::fs::metadata(&path) {
-                Ok(now) if (now.dev(), now.ino()) == (about.dev(), about.ino()) => {
-                    return Ok(Some(Self { path, file, process: std::process::id() }));
-                }
-                Err(error) if error.kind() != ErrorKind::NotFound => return Err(WireError::io(&path, "cannot be examined", error)),
-                _ => std::thread::yield_now(),
+            if names(&path, &file).map_err(|e| WireError::io(&path, "cannot be examined", e))? {
+                return Ok(Some(Self { path, file, process: std::process::id() }));
             }
+            std::thread::yield_now();
         }
         let error = Error::other(format!("another file was at its path after each of {ATTEMPTS} attempts"));
         Err(WireError::io(&path, "cannot be locked", error))
     }
 
-    /// Removes the file while it is locked: a process that opened it finds that it is no longer at the path.
+    /// Removes the file while it is locked: a process that opened it finds that it is no longer at the path. Another's file at the path stays: somebody
+    /// removed this one by hand.
     fn remove(self) {
-        let _ = std::fs::remove_file(&self.path);
+        remove_own(&self.path, &self.file);
     }
 }
 
@@ -112,9 +108,26 @@ impl NameLock {
 /// Returns true if a block's producer lives: its process runs and has not closed the ring.
 ///
 /// # Errors
-/// The lock cannot be examined, for instance because no descriptor is left.
+/// The locks cannot be examined, for instance because no descriptor is left.
 pub fn producer_lives(ring: &Path, block: u32) -> Result<bool, WireError> {
-    Ok(conflict(&lock_path(ring, block), Kind::Shared)?.is_some())
+    Ok(conflict(&lock_path(ring, block), Kind::Shared)?.is_some() || is_held(ring, block)?)
+}
+
+/// Returns true if a living producer has locked the block's ring itself, or the file that becomes its ring. The name's lock does not show a producer whose
+/// lock file was removed by hand.
+///
+/// # Errors
+/// Those of [`producer_lives`].
+pub(crate) fn is_held(ring: &Path, block: u32) -> Result<bool, WireError> {
+    for path in [block_path(ring, block), part_path(ring, block)] {
+        match conflict(&path, Kind::Shared) {
+            Ok(None) => {}
+            // A link or another user's file: no producer of this user made it.
+            Err(WireError::Foreign { .. }) => {}
+            found => return found.map(|found| found.is_some()),
+        }
+    }
+    Ok(false)
 }
 
 /// Returns true if the ring has followers, or if that cannot be found out: unread steps must not be lost.
@@ -145,7 +158,15 @@ impl Dead {
 
 /// Files of producers that have ended, one producer after another: one at a time takes memory and a descriptor.
 pub(crate) fn dead(ring: &Path) -> impl Iterator<Item = Dead> {
-    let of = |block| Some(Dead { ring: block_path(ring, block), part: part_path(ring, block), name: NameLock::take(ring, block).ok()?? });
+    let of = |block| {
+        let name = NameLock::take(ring, block).ok()??;
+        if is_held(ring, block).unwrap_or(true) {
+            // Its own lock file was removed by hand, and `take` made this one.
+            name.remove();
+            return None;
+        }
+        Some(Dead { ring: block_path(ring, block), part: part_path(ring, block), name })
+    };
     blocks(ring).filter_map(of)
 }
 

@@ -41,6 +41,23 @@ pub(crate) fn refused(path: &Path, action: &'static str, error: io::Error) -> Wi
     }
 }
 
+/// Returns true if a path still names this file: nobody removed or replaced it.
+pub(crate) fn names(path: &Path, file: &File) -> io::Result<bool> {
+    let about = file.metadata()?;
+    match std::fs::symlink_metadata(path) {
+        Ok(now) => Ok((now.dev(), now.ino()) == (about.dev(), about.ino())),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// Removes a file if the path still names it.
+pub(crate) fn remove_own(path: &Path, file: &File) {
+    if names(path, file).unwrap_or(false) {
+        let _ = std::fs::remove_file(path);
+    }
+}
+
 /// Adds the path to an error of `stat`.
 pub(crate) fn metadata(path: &Path, found: io::Result<Metadata>) -> Result<Metadata, WireError> {
     found.map_err(|e| WireError::io(path, "cannot be examined", e))
