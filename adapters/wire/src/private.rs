@@ -90,6 +90,14 @@ fn foreign(path: &Path, found: String) -> WireError {
 pub(crate) fn make_folder(ring: &Path) -> Result<(), WireError> {
     let made = DirBuilder::new().mode(0o700).recursive(true).create(ring);
     made.map_err(|e| WireError::io(ring, "cannot be created", e))?;
+    check_folder(ring)
+}
+
+/// Checks that a ring's folder is one, and that nobody else may write into it or replace it.
+///
+/// # Errors
+/// `Foreign`: others may. The folder cannot be examined, for instance because it does not exist.
+pub(crate) fn check_folder(ring: &Path) -> Result<(), WireError> {
     let parent = ring.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
     if let Some(parent) = parent {
         let about = metadata(parent, std::fs::metadata(parent))?;

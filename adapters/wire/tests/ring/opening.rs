@@ -449,6 +449,7 @@ fn no_more_of_a_killed_run_goes_than_the_next_needs() {
     let _alone = Folder::alone("least");
     let disk = SmallDisk::new("least", "3m");
     let ring = disk.0.join("ring");
+    let _following = Following::begin(&ring).unwrap();
     // Three rings of 0.79 MB leave 0.7 MB.
     killed(&ring, 3);
     let there = || [0, 1, 2].map(|block| block_path(&ring, block).exists());
@@ -460,7 +461,6 @@ fn no_more_of_a_killed_run_goes_than_the_next_needs() {
     assert!(matches!(open(20), Err(WireError::NoSpace { .. })));
     assert_eq!(there(), [true; 3]);
     // 1.2 MB fit without the ring of this name, 2 MB without one more.
-    let _following = Following::begin(&ring).unwrap();
     open(6).unwrap();
     assert_eq!(there(), [true; 3], "the new ring replaces the old one of its name");
     open(10).unwrap();
