@@ -63,6 +63,10 @@ pub fn leftovers(ring: &Path) -> Result<Cleaned, WireError> {
 /// Those of [`leftovers`].
 pub fn clean(ring: &Path) -> Result<Cleaned, WireError> {
     let mut found = leftovers(ring)?;
+    // Otherwise any empty folder would be removed.
+    if found.leftovers.is_empty() {
+        return Ok(found);
+    }
     match Unfollowed::take(ring)? {
         Some(alone) => alone.clean(ring),
         // A follower came meanwhile.
