@@ -10,8 +10,14 @@ use std::process::Command;
 fn library_folder() -> PathBuf {
     let folder = std::env::current_exe().unwrap().parent().unwrap().to_owned();
     assert!(folder.join("libridgewatch_adapter.so").exists(), "no library in {}", folder.display());
+    // The name that programs ask for; `make install-adapters` makes the same link. Tests of other processes may have made it.
+    let _ = std::os::unix::fs::symlink("libridgewatch_adapter.so", folder.join(SONAME));
     folder
 }
+
+/// With the version of the header.
+const SONAME: &str = "libridgewatch_adapter.so.2";
+
 
 struct Folder(PathBuf);
 
@@ -49,6 +55,17 @@ fn compile(source: &Path, to: &Path, link: Link, extra: &[&str]) {
     };
     let out = cc.arg("-lm").args(extra).output().expect("a C compiler");
     assert!(out.status.success(), "{}", String::from_utf8_lossy(&out.stderr));
+}
+
+/// Programs ask for the version that they were linked with, wherever the library is.
+#[test]
+fn the_library_is_known_by_its_version() {
+    let build = tempfile("soname");
+    let program = build.0.join("solver");
+    compile(&Path::new(env!("CARGO_MANIFEST_DIR")).join("examples/solver.c"), &program, Link::Shared, &[]);
+    let out = Command::new("ldd").arg(&program).output().unwrap();
+    let asked = String::from_utf8_lossy(&out.stdout).into_owned();
+    assert!(asked.contains(&format!("{SONAME} =>")), "{asked}");
 }
 
 /// Writes the header if `RIDGEWATCH_WRITE_HEADER` is set (`make header`).
