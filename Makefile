@@ -111,6 +111,8 @@ $(CARGO_FUZZ)/bin/cargo-fuzz:
 
 # Without a sanitizer, so that a stable toolchain suffices: what is looked for are panics, hangs and memory. Inputs that were found stay in target/fuzz.
 fuzz: packages $(CARGO_FUZZ)/bin/cargo-fuzz
+	@# The versions of the dependencies are those of the program.
+	@cp Cargo.lock tests/fuzz/Cargo.lock
 	@for target in $(FUZZ_TARGETS); do \
 	  mkdir -p target/fuzz/corpus/$$target; \
 	  seeds=""; [ $$target != scene ] || seeds=configs; \

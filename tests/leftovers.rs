@@ -53,7 +53,8 @@ fn without_descriptors_no_temporary_folder_is_left() {
     let files = tempfile::tempdir().unwrap();
     let temporary = files.path().join("temporary");
     std::fs::create_dir(&temporary).unwrap();
-    let scene = scene::write(files.path(), &double_gyre([8, 4, 1], "time.tau = 1\ntransfer.low = 0.05\ntransfer.high = 0.45\nflow.steps = 4"));
+    let scene =
+        scene::write(files.path(), &double_gyre([8, 4, 1], "time.tau = 1\ntransfer.low = 0.05\ntransfer.high = 0.45\nflow.steps = 4"));
     for descriptors in 10..20 {
         let mut shell = Command::new("sh");
         shell.args(["-c", "ulimit -n \"$1\"; shift; exec \"$@\"", "sh", &descriptors.to_string(), env!("CARGO_BIN_EXE_ridgewatch")]);

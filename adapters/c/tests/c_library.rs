@@ -18,7 +18,6 @@ fn library_folder() -> PathBuf {
 /// With the version of the header.
 const SONAME: &str = "libridgewatch_adapter.so.2";
 
-
 struct Folder(PathBuf);
 
 impl Folder {

@@ -1,8 +1,8 @@
 //! Producer side: copies a step into the next slot of the ring.
 
+use crate::byte_lock::{self, Kind};
 use crate::copy::Field;
 use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, MAX_SLOTS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, STATE};
-use crate::byte_lock::{self, Kind};
 use crate::lock::{Dead, NameLock, clean_up, dead, is_followed, is_held};
 use crate::map::{Map, allocated, room_with};
 use crate::private::{create_private, open_private, remove_own};

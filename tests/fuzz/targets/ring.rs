@@ -4,7 +4,9 @@
 mod support;
 
 use libfuzzer_sys::fuzz_target;
-use ridgewatch_wire::{AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, Read, ReadAt, RingReader, block_path};
+use ridgewatch_wire::{
+    AxisDescription, Description, Element, Field, Geometry, Limits, Policy, Producer, Read, ReadAt, RingReader, block_path,
+};
 use std::io::{ErrorKind, Result};
 use std::sync::OnceLock;
 

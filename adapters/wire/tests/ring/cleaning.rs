@@ -2,7 +2,8 @@
 
 use super::{Folder, cube, publish, step};
 use ridgewatch_wire::{
-    BlockExtent, Description, Following, Limits, Policy, Producer, RingFollower, RingReader, WireError, block_path, clean, find_rings, leftovers,
+    BlockExtent, Description, Following, Limits, Policy, Producer, RingFollower, RingReader, WireError, block_path, clean, find_rings,
+    leftovers,
 };
 use std::os::unix::fs::symlink;
 use std::path::{Path, PathBuf};
@@ -58,7 +59,7 @@ fn a_ring_that_its_solver_and_its_follower_left_is_found_and_removed() {
     forsaken(&ring);
     // Looking changes nothing, and a link leads nowhere.
     symlink(&ring, folder.0.join("link")).unwrap();
-    assert_eq!(find_rings(&folder.0), [ring.clone()]);
+    assert_eq!(find_rings(&folder.0), std::slice::from_ref(&ring));
     let found = leftovers(&ring).unwrap();
     assert_eq!((found.living.len(), found.followed), (0, false));
     let files: Vec<PathBuf> = found.leftovers.iter().map(|file| file.path.clone()).collect();

@@ -435,7 +435,12 @@ fn a_second_start_without_room_does_not_kill_a_solver_whose_lock_was_removed() {
         // SAFETY: waits for this child.
         unsafe { libc::waitpid(child, &mut status, 0) };
         let signal = libc::WIFSIGNALED(status).then(|| libc::WTERMSIG(status));
-        assert_eq!((signal, libc::WEXITSTATUS(status)), (None, 0), "{count} blocks: SIGBUS is {}; the second start: {second:?}", libc::SIGBUS);
+        assert_eq!(
+            (signal, libc::WEXITSTATUS(status)),
+            (None, 0),
+            "{count} blocks: SIGBUS is {}; the second start: {second:?}",
+            libc::SIGBUS
+        );
         match count {
             1 => assert!(matches!(second, Err(WireError::InUse { .. })), "{second:?}"),
             _ => assert!(matches!(second, Err(WireError::NoSpace { .. })), "{second:?}"),
