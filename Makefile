@@ -2,10 +2,12 @@
 # make test            runs the whole suite and compiles the GPU kernels (NVRTC is fetched into target/); tests of real archives run if the archives are present
 # make test-data       runs only the tests of real archives; RIDGEWATCH_DATA=folder names the folder of the archives
 # make test-reader     tests the NumPy reader of networks
-# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python
+# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
 # make adapters        builds the C library, the Fortran module and, if pip and the network are available, the Python wheel, into out/adapters
-# make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver
+# make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver. The flags of the pkg-config file let
+#                      a solver find the shared library in PREFIX/lib when it runs
+# make fuzz            runs each fuzz target in tests/fuzz for FUZZ_SECONDS (60); cargo-fuzz goes into target/cargo-fuzz only
 # make test-adapters   tests the adapters with gfortran, mpicc and Python. Missing compilers are installed if apt is available (gfortran, openmpi-bin,
 #                      libopenmpi-dev, python3-venv), else named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv only
 # make live-figures    measures the figures of docs/live.md that need no GPU and prints their tables, in some 20 minutes; with SHORT=1 in a few
@@ -24,6 +26,11 @@ NVRTC := target/nvrtc
 NVRTC_VERSION := 13.0.88
 # mypy's stubtest compares the type stubs of the Python package with the module.
 MYPY_VERSION := 2.4.1
+# The fuzzer of tests/fuzz.
+CARGO_FUZZ := target/cargo-fuzz
+CARGO_FUZZ_VERSION := 0.13.2
+FUZZ_TARGETS := ring message netcdf checkpoint scene
+FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
 
 # Folder of the real archives that tests/archive/real.rs reads.
@@ -32,9 +39,11 @@ RIDGEWATCH_DATA ?= $(abspath ../shared/data)
 # Output folder of `make adapters`, and where `make install-adapters` installs it.
 ADAPTERS := out/adapters
 PREFIX ?= /usr/local
+# The shared library's name for programs that were linked with it, after the version of its interface.
+SONAME := libridgewatch_adapter.so.$(shell sed -n 's/^.define RW_VERSION //p' adapters/c/include/ridgewatch.h)
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-long packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-long fuzz packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -95,6 +104,21 @@ test-reader: packages .venv/installed
 
 test-long: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
+	$(MAKE) --no-print-directory fuzz
+
+$(CARGO_FUZZ)/bin/cargo-fuzz:
+	$(CARGO) install --quiet --locked --root $(CARGO_FUZZ) cargo-fuzz --version $(CARGO_FUZZ_VERSION)
+
+# Without a sanitizer, so that a stable toolchain suffices: what is looked for are panics, hangs and memory. Inputs that were found stay in target/fuzz.
+fuzz: packages $(CARGO_FUZZ)/bin/cargo-fuzz
+	@# The versions of the dependencies are those of the program.
+	@cp Cargo.lock tests/fuzz/Cargo.lock
+	@for target in $(FUZZ_TARGETS); do \
+	  mkdir -p target/fuzz/corpus/$$target; \
+	  seeds=""; [ $$target != scene ] || seeds=configs; \
+	  PATH="$(CURDIR)/$(CARGO_FUZZ)/bin:$$PATH" $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir target/fuzz --sanitizer none $$target \
+	    target/fuzz/corpus/$$target $$seeds -- -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=1024 -max_len=8192 -print_final_stats=1 || exit 1; \
+	done
 
 .venv/installed: | python-packages
 	$(PYTHON) -m venv .venv
@@ -120,7 +144,10 @@ header:
 adapters:
 	$(CARGO) build --release -p ridgewatch-adapter
 	mkdir -p $(ADAPTERS)/lib $(ADAPTERS)/include
-	cp target/release/libridgewatch_adapter.so target/release/libridgewatch_adapter.a $(ADAPTERS)/lib/
+	cp target/release/libridgewatch_adapter.a $(ADAPTERS)/lib/
+	rm -f $(ADAPTERS)/lib/libridgewatch_adapter.so*
+	cp target/release/libridgewatch_adapter.so $(ADAPTERS)/lib/$(SONAME)
+	ln -s $(SONAME) $(ADAPTERS)/lib/libridgewatch_adapter.so
 	cp adapters/c/include/ridgewatch.h $(ADAPTERS)/include/
 	@if command -v gfortran >/dev/null; then \
 	  gfortran -O2 -std=f2018 -fPIC -J $(ADAPTERS)/include -c adapters/fortran/ridgewatch.f90 -o $(ADAPTERS)/ridgewatch.o && \
@@ -140,7 +167,9 @@ $(ADAPTERS)/venv/installed: Makefile
 
 install-adapters: adapters
 	install -d $(DESTDIR)$(PREFIX)/lib/pkgconfig $(DESTDIR)$(PREFIX)/include
-	install -m 644 $(ADAPTERS)/lib/libridgewatch_* $(DESTDIR)$(PREFIX)/lib/
+	install -m 644 $(ADAPTERS)/lib/libridgewatch_*.a $(DESTDIR)$(PREFIX)/lib/
+	install -m 755 $(ADAPTERS)/lib/$(SONAME) $(DESTDIR)$(PREFIX)/lib/
+	ln -sf $(SONAME) $(DESTDIR)$(PREFIX)/lib/libridgewatch_adapter.so
 	install -m 644 $$(ls $(ADAPTERS)/include/*.h $(ADAPTERS)/include/*.mod 2>/dev/null) $(DESTDIR)$(PREFIX)/include/
 	sed -e 's|@PREFIX@|$(PREFIX)|' -e 's|@VERSION@|$(VERSION)|' adapters/c/ridgewatch.pc.in > $(DESTDIR)$(PREFIX)/lib/pkgconfig/ridgewatch.pc
 

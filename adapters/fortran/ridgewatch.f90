@@ -16,10 +16,10 @@ module ridgewatch
   implicit none
   private
   public :: rw_publisher, rw_message, rw_ok, rw_off, rw_argument, rw_in_use, rw_no_space, rw_foreign, rw_system, &
-            rw_forked, rw_internal
+            rw_forked, rw_internal, rw_removed
 
   integer, parameter :: rw_ok = 0, rw_off = 1, rw_argument = 2, rw_in_use = 3, rw_no_space = 4, rw_foreign = 5, rw_system = 6, &
-                        rw_forked = 7, rw_internal = 8
+                        rw_forked = 7, rw_internal = 8, rw_removed = 9
 
   character(3), parameter :: names = "uvw"
 

@@ -9,7 +9,7 @@ program test
   real(real32) :: east(4, 3), west(4, 3)
   character(:), allocatable :: message
   character(200) :: ring
-  integer :: i, j, k, status
+  integer :: i, j, k, status, unit
   integer(int64) :: published, overwrote, before, after, rate
 
   call publisher%begin(3)
@@ -138,6 +138,21 @@ program test
   call want(status == rw_ok, 22)
   call second%close(status)
   call want(status == rw_ok, 23)
+  ! A ring that was removed by hand.
+  call publisher%begin(2)
+  call publisher%uniform(1, 0d0, 3d0, 4)
+  call publisher%uniform(2, 0d0, 2d0, 3)
+  call publisher%open(status, trim(ring) // "/removed")
+  call want(status == rw_ok, 24)
+  call publisher%publish(1, 1d0, east, east, status)
+  call want(status == rw_ok, 25)
+  open(newunit=unit, file=trim(ring) // "/removed/block-00000.ring", status="old")
+  close(unit, status="delete")
+  call publisher%publish(2, 2d0, east, east, status)
+  message = rw_message()
+  call want(status == rw_removed .and. index(message, "was removed") > 0, 26)
+  call publisher%close(status)
+  call want(status == rw_ok, 27)
 
 contains
 

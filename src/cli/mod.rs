@@ -1,6 +1,7 @@
 //! The command line, one file a command.
 
 mod attach;
+mod clean;
 mod common;
 mod compare;
 mod doctor;
@@ -43,6 +44,8 @@ enum Command {
     Publish(publish::Options),
     /// Send the rings of this node to ridgewatch on another node.
     Relay(relay::Options),
+    /// Remove rings from shared memory that no living process holds.
+    Clean(clean::Options),
     /// Render one picture.
     Render(render::Options),
     /// Compute the FTLE field on a grid as NetCDF; `--check` compares it with the truth.
@@ -83,6 +86,7 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Attach(options) => attach::run(&common, options),
         Command::Publish(options) => publish::run(&common, options),
         Command::Relay(options) => relay::run(&common, options),
+        Command::Clean(options) => clean::run(&common, &options),
         Command::Render(options) => render::run(&common, options),
         Command::Ftle(options) => ftle::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),

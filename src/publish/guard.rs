@@ -42,10 +42,20 @@ const COMMAND: u8 = 4;
 /// First byte of a subscription in ZMTP 3.0, the version that the socket speaks.
 const SUBSCRIBE: u8 = 1;
 
+/// A folder with a socket. Unlike `tempfile`'s it is removed by path: that opens the folder, and leaves it if no descriptor is free.
+struct SocketFolder(PathBuf);
+
+impl Drop for SocketFolder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(self.0.join("socket"));
+        let _ = std::fs::remove_dir(&self.0);
+    }
+}
+
 /// Opens a listener that no other process can reach, with a handle of its place. Its folder is removed at once, so that no file remains.
 pub(super) fn private_listener() -> Result<(UnixListener, File)> {
-    let folder = tempfile::Builder::new().prefix("ridgewatch-").tempdir()?;
-    let path = folder.path().join("socket");
+    let folder = SocketFolder(tempfile::Builder::new().prefix("ridgewatch-").tempdir()?.keep());
+    let path = folder.0.join("socket");
     let listener = UnixListener::bind(&path)?;
     let place = OpenOptions::new().read(true).custom_flags(libc::O_PATH).open(&path)?;
     Ok((listener, place))

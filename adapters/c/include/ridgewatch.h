@@ -46,6 +46,8 @@ typedef enum {
   RW_FORKED = 7,
   // Internal error of this library.
   RW_INTERNAL = 8,
+  // The ring's file was removed or replaced, so no follower finds it: nothing was published. Close the ring, and open it again.
+  RW_REMOVED = 9,
 } rw_status;
 
 // Description of a grid.

@@ -46,6 +46,8 @@ pub enum Status {
     RwForked = 7,
     /// Internal error of this library.
     RwInternal = 8,
+    /// The ring's file was removed or replaced, so no follower finds it: nothing was published. Close the ring, and open it again.
+    RwRemoved = 9,
 }
 
 /// Version of this header.
@@ -106,6 +108,7 @@ impl Failure {
                 WireError::NoSpace { .. } | WireError::FileSize { .. } => Status::RwNoSpace,
                 WireError::Foreign { .. } => Status::RwForeign,
                 WireError::Forked { .. } => Status::RwForked,
+                WireError::Removed => Status::RwRemoved,
                 WireError::Io { .. } | WireError::NoMemory { .. } | WireError::NotInMemory { .. } => Status::RwSystem,
                 _ => Status::RwArgument,
             },

@@ -13,6 +13,8 @@ fn fortran_arrays_arrive_as_they_are() {
     std::fs::create_dir_all(&build).unwrap();
     let ring = PathBuf::from("/dev/shm").join(format!("rw-fortran-{}", std::process::id()));
     let library = std::env::current_exe().unwrap().parent().unwrap().to_owned();
+    // The library's SONAME.
+    let _ = std::os::unix::fs::symlink("libridgewatch_adapter.so", library.join("libridgewatch_adapter.so.2"));
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../fortran");
     let program = build.join("test");
     let out = Command::new("gfortran")

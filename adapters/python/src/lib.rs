@@ -6,6 +6,7 @@
 use pyo3::buffer::{Element as BufferElement, PyBuffer};
 use pyo3::exceptions::{PyException, PyRuntimeWarning, PyTypeError, PyValueError};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 use ridgewatch_wire::{AxisDescription, BlockExtent, Description, Element, Field, Geometry, Policy, Producer, ring_from_environment};
 use std::ffi::CString;
 use std::path::PathBuf;
@@ -57,6 +58,47 @@ struct Array {
     _buffer: Held,
 }
 
+/// True if a buffer's values have the byte order of another machine. `PyBuffer` does not tell (pyo3 0.26 takes the order `>` for that of every machine).
+fn is_foreign<T: BufferElement>(buffer: &PyBuffer<T>) -> bool {
+    let foreign: &[u8] = if cfg!(target_endian = "little") { b">!" } else { b"<" };
+    buffer.format().to_bytes().first().is_some_and(|order| foreign.contains(order))
+}
+
+/// A floating-point array in this machine's byte order, with NaN at masked values: a masked array's buffer has what lies under the mask, and arrays from
+/// NetCDF and FITS files are big-endian. Any other object is returned as it is.
+fn plain<'py>(given: &Bound<'py, PyAny>) -> PyResult<Bound<'py, PyAny>> {
+    let Ok(dtype) = given.getattr("dtype") else { return Ok(given.clone()) };
+    // Not so the types of other libraries.
+    if !dtype.getattr("kind").and_then(|kind| kind.extract::<String>()).is_ok_and(|kind| kind == "f") {
+        return Ok(given.clone());
+    }
+    // Only masked arrays have it. Without masked values it copies nothing.
+    let filled = match given.getattr_opt("filled")? {
+        Some(filled) => filled.call1((f64::NAN,))?,
+        None => given.clone(),
+    };
+    if dtype.getattr("isnative")?.is_truthy()? {
+        return Ok(filled);
+    }
+    filled.call_method1("astype", (dtype.call_method1("newbyteorder", ("=",))?,))
+}
+
+/// [`plain`] components. Once one of them is a copy, all are packed, so that they still have one layout.
+fn plain_components<'py>(py: Python<'py>, given: &[&Bound<'py, PyAny>]) -> PyResult<Vec<Bound<'py, PyAny>>> {
+    let plain = given.iter().map(|array| plain(array)).collect::<PyResult<Vec<_>>>()?;
+    if plain.iter().zip(given).all(|(plain, given)| plain.is(*given)) {
+        return Ok(plain);
+    }
+    let packed = |array: &Bound<'py, PyAny>| {
+        let Ok(dtype) = array.getattr("dtype") else { return Ok(array.clone()) };
+        let how = PyDict::new(py);
+        how.set_item("order", "C")?;
+        how.set_item("copy", false)?;
+        array.call_method("astype", (dtype,), Some(&how))
+    };
+    plain.iter().map(packed).collect()
+}
+
 enum Held {
     #[allow(dead_code)]
     F32(PyBuffer<f32>),
@@ -91,24 +133,29 @@ impl Array {
     }
 
     fn new(given: &Bound<'_, PyAny>, reversed: bool) -> PyResult<Self> {
-        if let Ok(buffer) = PyBuffer::<f32>::get(given) {
+        if let Ok(buffer) = PyBuffer::<f32>::get(given)
+            && !is_foreign(&buffer)
+        {
             return Self::of(buffer, Element::F32, reversed, Held::F32);
         }
-        match PyBuffer::<f64>::get(given) {
-            Ok(buffer) => Self::of(buffer, Element::F64, reversed, Held::F64),
-            Err(_) => {
-                let found = match given.getattr("dtype") {
-                    Ok(dtype) => format!("an array of {dtype}"),
-                    Err(_) => format!("an object of type {}", given.get_type().name()?),
-                };
-                Err(PyTypeError::new_err(format!("{found}; accepted: NumPy arrays of float32 or float64")))
-            }
+        if let Ok(buffer) = PyBuffer::<f64>::get(given)
+            && !is_foreign(&buffer)
+        {
+            return Self::of(buffer, Element::F64, reversed, Held::F64);
         }
+        let found = match given.getattr("dtype") {
+            Ok(dtype) => format!("an array of {dtype}"),
+            Err(_) => format!("an object of type {}", given.get_type().name()?),
+        };
+        Err(PyTypeError::new_err(format!("{found}; accepted: NumPy arrays of float32 or float64")))
     }
 }
 
 fn coordinates(given: &Bound<'_, PyAny>) -> PyResult<Vec<f64>> {
-    if let Ok(buffer) = PyBuffer::<f64>::get(given) {
+    let given = &plain(given)?;
+    if let Ok(buffer) = PyBuffer::<f64>::get(given)
+        && !is_foreign(&buffer)
+    {
         return buffer.to_vec(given.py());
     }
     given.try_iter()?.map(|item| item?.extract::<f64>()).collect()
@@ -191,7 +238,8 @@ impl Publisher {
         if given.len() != self.dimensions {
             return Err(PyValueError::new_err(format!("{} components; accepted: {}, one per axis", given.len(), self.dimensions)));
         }
-        let arrays = given.into_iter().map(|array| Array::new(array, self.reversed)).collect::<PyResult<Vec<_>>>()?;
+        let given = plain_components(py, &given)?;
+        let arrays = given.iter().map(|array| Array::new(array, self.reversed)).collect::<PyResult<Vec<_>>>()?;
         let (extent, first) = (producer.description().block.extent, &arrays[0]);
         for (name, array) in ["u", "v", "w"].into_iter().zip(&arrays) {
             if array.shape != extent {

@@ -53,6 +53,58 @@ def test_arrays_arrive(ring):
     assert not publisher.is_open and not os.path.exists(ring)
 
 
+@pytest.mark.parametrize("kind", [">f4", ">f8"])
+def test_big_endian_arrays_arrive(ring, kind):
+    """Arrays of scipy.io.netcdf_file and of FITS files are big-endian."""
+    x, y = np.array([0.0, 1.5, 2.0], kind), np.array([-2.0, 1.0], kind)
+    field = np.array([[[1.5, -2.25, 3.0], [0.0, 1e-3, 7e9]], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]], kind)
+    with Publisher(x, y) as publisher:
+        assert publisher.publish(1, 0.5, *field)
+        assert np.array_equal(newest(ring, (2, 3))[2], field.astype(np.float32))
+        # Interleaved and reversed; and beside a component in the order of this machine.
+        for u, v in [np.moveaxis(field, 0, -1)[:, ::-1].transpose(2, 0, 1), (field[0], field[1].astype(kind[1:])[::-1])]:
+            assert publisher.publish(2, 1.0, u, v)
+            assert np.array_equal(newest(ring, (2, 3))[2], np.array([u, v], np.float32))
+        data = open(os.path.join(ring, "block-00000.ring"), "rb").read()
+        assert struct.pack("<3d", *x) in data[8192:] and struct.pack("<2d", *y) in data[8192:]
+    # An object without a dtype cannot be converted.
+    memory = memoryview(field[0])
+    with Publisher(x, y) as publisher, pytest.raises(TypeError, match="accepted"):
+        publisher.publish(0, 0.0, memory, memory)
+
+
+def test_masked_values_are_missing(ring):
+    x = np.arange(3.0)
+    under = np.full((3, 3), 1e20, np.float32)
+    mask = np.eye(3, dtype=bool)
+    u, v = np.ma.array(under, mask=mask), np.ma.array(2 * under, mask=False)
+    with Publisher(x, x) as publisher:
+        # One component with a copy, one without.
+        for u, v in [(u, v), (u.T, v), (u.astype(">f8"), v.astype(np.float64).T)]:
+            assert publisher.publish(0, 0.0, u, v)
+            values = newest(ring, (3, 3))[2]
+            assert np.isnan(values[0][mask]).all() and (values[0][~mask] == under[0, 0]).all() and (values[1] == 2 * under).all()
+        with pytest.raises(TypeError, match="an array of int32; accepted"):
+            publisher.publish(1, 1.0, np.ma.array(np.zeros((3, 3), np.int32), mask=mask), v)
+    # A masked coordinate is no coordinate.
+    with pytest.raises(RidgewatchError, match="axis.coordinates"):
+        Publisher(np.ma.array([0.0, 1.0, 2.0], mask=[False, True, False]), x, strict=True)
+
+
+def test_a_ring_that_was_removed_is_told(ring):
+    x = np.arange(4.0)
+    good = np.zeros((4, 4), np.float32)
+    with Publisher(x, x) as publisher:
+        assert publisher.publish(0, 0.0, good, good)
+        shutil.rmtree(ring)
+        with pytest.warns(RuntimeWarning, match="a step was not published: the ring was removed"):
+            assert publisher.publish(1, 1.0, good, good) is False
+        with Publisher(x, x) as second:
+            assert second.is_open and second.publish(0, 0.0, good, good)
+            publisher.close()
+            assert os.path.exists(os.path.join(ring, "block-00000.lock")) and second.publish(1, 1.0, good, good)
+
+
 def test_a_block_of_a_start(ring):
     x, y = np.arange(6.0), np.arange(4.0)
     part = np.ones((4, 2), np.float32)

@@ -149,6 +149,9 @@ pub enum WireError {
         /// This process.
         here: u32,
     },
+    /// The ring's file was removed or replaced while this process published into it. Without its path, because publishing allocates nothing.
+    #[error("the ring was removed or replaced while it was open, and no follower finds it: close it and open it again")]
+    Removed,
     /// The relay closed the connection after this follower's signature.
     #[error("the relay rejected this follower: another key, or too many followers")]
     Rejected,

@@ -10,6 +10,7 @@ mod assemble;
 mod byte_lock;
 mod bytes;
 mod choice;
+mod clean;
 mod copy;
 #[cfg(test)]
 #[path = "../tests/support/counting.rs"]
@@ -35,6 +36,7 @@ mod system;
 
 pub use assemble::{Assembler, Incomplete, Step};
 pub use choice::LEAD;
+pub use clean::{Cleaned, Leftover, clean, find_rings, leftovers};
 pub use copy::{Element, Field};
 pub use description::{AXIS_NODES, AxisDescription, BlockExtent, Description, Geometry, Limits, TEXT, even};
 pub use error::WireError;

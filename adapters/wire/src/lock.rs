@@ -3,12 +3,11 @@
 use crate::byte_lock::{self, Kind};
 use crate::description::BLOCKS;
 use crate::header::MARKS;
-use crate::private::{check_private, create_private, make_folder, metadata, open_private, refused};
-use crate::{WireError, block_path, followers_path, lock_path, part_path};
+use crate::private::{check_private, create_private, make_folder, metadata, names, open_private, refused, remove_own};
+use crate::{Limits, RingReader, WireError, block_path, followers_path, lock_path, part_path};
 use rustix::io::Errno;
 use std::fs::File;
 use std::io::{Error, ErrorKind};
-use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -47,27 +46,31 @@ impl FileLock {
                 Some(Errno::NOSPC) => WireError::NoSpace { path: path.clone(), needed: 4096 },
                 _ => refused(&path, "cannot be created", e),
             })?;
-            let about = metadata(&path, file.metadata())?;
-            check_private(&path, &about)?;
+            check_private(&path, &metadata(&path, file.metadata())?)?;
             if !byte_lock::try_lock(&file, kind, 0).map_err(|e| WireError::io(&path, "cannot be locked", e))? {
                 return Ok(None);
             }
             // Its last holder may have removed the file that was just locked.
-            match std::fs::metadata(&path) {
-                Ok(now) if (now.dev(), now.ino()) == (about.dev(), about.ino()) => {
-                    return Ok(Some(Self { path, file, process: std::process::id() }));
-                }
-                Err(error) if error.kind() != ErrorKind::NotFound => return Err(WireError::io(&path, "cannot be examined", error)),
-                _ => std::thread::yield_now(),
+            if names(&path, &file).map_err(|e| WireError::io(&path, "cannot be examined", e))? {
+                return Ok(Some(Self { path, file, process: std::process::id() }));
             }
+            std::thread::yield_now();
         }
         let error = Error::other(format!("another file was at its path after each of {ATTEMPTS} attempts"));
         Err(WireError::io(&path, "cannot be locked", error))
     }
 
-    /// Removes the file while it is locked: a process that opened it finds that it is no longer at the path.
+    /// Changes the lock of the present owner, without a moment in between in which the file is not locked.
+    fn share(&self) -> Result<(), WireError> {
+        let shared = byte_lock::try_lock(&self.file, Kind::Shared, 0).map_err(|e| WireError::io(&self.path, "cannot be locked", e))?;
+        debug_assert!(shared, "nobody else has a lock");
+        Ok(())
+    }
+
+    /// Removes the file while it is locked: a process that opened it finds that it is no longer at the path. Another's file at the path stays: somebody
+    /// removed this one by hand.
     fn remove(self) {
-        let _ = std::fs::remove_file(&self.path);
+        remove_own(&self.path, &self.file);
     }
 }
 
@@ -112,9 +115,26 @@ impl NameLock {
 /// Returns true if a block's producer lives: its process runs and has not closed the ring.
 ///
 /// # Errors
-/// The lock cannot be examined, for instance because no descriptor is left.
+/// The locks cannot be examined, for instance because no descriptor is left.
 pub fn producer_lives(ring: &Path, block: u32) -> Result<bool, WireError> {
-    Ok(conflict(&lock_path(ring, block), Kind::Shared)?.is_some())
+    Ok(conflict(&lock_path(ring, block), Kind::Shared)?.is_some() || is_held(ring, block)?)
+}
+
+/// Returns true if a living producer has locked the block's ring itself, or the file that becomes its ring. The name's lock does not show a producer whose
+/// lock file was removed by hand.
+///
+/// # Errors
+/// Those of [`producer_lives`].
+pub(crate) fn is_held(ring: &Path, block: u32) -> Result<bool, WireError> {
+    for path in [block_path(ring, block), part_path(ring, block)] {
+        match conflict(&path, Kind::Shared) {
+            Ok(None) => {}
+            // A link or another user's file: no producer of this user made it.
+            Err(WireError::Foreign { .. }) => {}
+            found => return found.map(|found| found.is_some()),
+        }
+    }
+    Ok(false)
 }
 
 /// Returns true if the ring has followers, or if that cannot be found out: unread steps must not be lost.
@@ -124,6 +144,7 @@ pub(crate) fn is_followed(ring: &Path) -> bool {
 
 /// Files of a producer that has ended, or was killed while it opened. No other producer can take the name meanwhile.
 pub(crate) struct Dead {
+    block: u32,
     ring: PathBuf,
     part: PathBuf,
     name: NameLock,
@@ -133,6 +154,12 @@ impl Dead {
     /// The files that occupy memory.
     pub fn files(&self) -> [&Path; 2] {
         [&self.ring, &self.part]
+    }
+
+    /// Returns true if the producer closed the ring: a follower that comes reads its last steps.
+    fn is_closed_in_order(&self, ring: &Path) -> bool {
+        // Of any size: another follower may have more memory.
+        RingReader::open(ring, self.block, &Limits { step_bytes: u64::MAX }).and_then(|reader| reader.is_closed()).unwrap_or(false)
     }
 
     /// Removes all files; the ring by `remove`.
@@ -145,8 +172,37 @@ impl Dead {
 
 /// Files of producers that have ended, one producer after another: one at a time takes memory and a descriptor.
 pub(crate) fn dead(ring: &Path) -> impl Iterator<Item = Dead> {
-    let of = |block| Some(Dead { ring: block_path(ring, block), part: part_path(ring, block), name: NameLock::take(ring, block).ok()?? });
+    let of = |block| {
+        let name = NameLock::take(ring, block).ok()??;
+        if is_held(ring, block).unwrap_or(true) {
+            // Its own lock file was removed by hand, and `take` made this one.
+            name.remove();
+            return None;
+        }
+        Some(Dead { block, ring: block_path(ring, block), part: part_path(ring, block), name })
+    };
     blocks(ring).filter_map(of)
+}
+
+/// A ring's folder without followers, until it is dropped: no follower comes meanwhile.
+pub(crate) struct Unfollowed(FileLock);
+
+impl Unfollowed {
+    /// Returns `None` if the ring has followers, or if another process cleans it.
+    ///
+    /// # Errors
+    /// The folder does not exist, or a file does not belong to this user alone.
+    pub fn take(ring: &Path) -> Result<Option<Self>, WireError> {
+        Ok(FileLock::take(followers_path(ring), Kind::Exclusive)?.map(Self))
+    }
+
+    /// Removes the rings of producers that have ended, and the folder if it is empty.
+    pub fn clean(self, ring: &Path) {
+        // A producer that holds its name cleans up by itself when it ends.
+        dead(ring).for_each(|dead| dead.remove(|path| drop(std::fs::remove_file(path))));
+        self.0.remove();
+        let _ = std::fs::remove_dir(ring);
+    }
 }
 
 /// Removes the rings of producers that have ended, and the folder if it is empty, unless the ring has followers. Waits up to `limit` for another process
@@ -154,7 +210,7 @@ pub(crate) fn dead(ring: &Path) -> impl Iterator<Item = Dead> {
 pub(crate) fn clean_up(ring: &Path, limit: Duration) {
     let (path, begin) = (followers_path(ring), Instant::now());
     let last = loop {
-        match FileLock::take(path.clone(), Kind::Exclusive) {
+        match Unfollowed::take(ring) {
             Ok(Some(last)) => break last,
             Ok(None) => {
                 // The last follower will do it.
@@ -167,10 +223,7 @@ pub(crate) fn clean_up(ring: &Path, limit: Duration) {
             Err(_) => return,
         }
     };
-    // A producer that holds its name cleans up by itself when it ends.
-    dead(ring).for_each(|dead| dead.remove(|path| drop(std::fs::remove_file(path))));
-    last.remove();
-    let _ = std::fs::remove_dir(ring);
+    last.clean(ring);
 }
 
 /// Marks the ring as followed: a producer that ends leaves its last steps there. Dropping it removes the rings of producers that have ended, unless
@@ -182,13 +235,19 @@ pub struct Following {
 }
 
 impl Following {
-    /// Creates the ring's folder if it does not exist.
+    /// Creates the ring's folder if it does not exist. The first follower removes what killed producers left, which no follower reads.
     ///
     /// # Errors
     /// The folder or a file does not belong to this user alone; another process (a stopped one) cleans the folder for too long.
     pub fn begin(ring: &Path) -> Result<Self, WireError> {
         let (path, begin) = (followers_path(ring), Instant::now());
         let lock = loop {
+            if let Some(alone) = FileLock::take_in(ring, path.clone(), Kind::Exclusive)? {
+                let killed = dead(ring).filter(|dead| !dead.is_closed_in_order(ring));
+                killed.for_each(|dead| dead.remove(|path| drop(std::fs::remove_file(path))));
+                alone.share()?;
+                break alone;
+            }
             match FileLock::take_in(ring, path.clone(), Kind::Shared)? {
                 Some(lock) => break lock,
                 None if begin.elapsed() > CLEANUP_TIMEOUT => {

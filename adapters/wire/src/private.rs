@@ -41,6 +41,23 @@ pub(crate) fn refused(path: &Path, action: &'static str, error: io::Error) -> Wi
     }
 }
 
+/// Returns true if a path still names this file: nobody removed or replaced it.
+pub(crate) fn names(path: &Path, file: &File) -> io::Result<bool> {
+    let about = file.metadata()?;
+    match std::fs::symlink_metadata(path) {
+        Ok(now) => Ok((now.dev(), now.ino()) == (about.dev(), about.ino())),
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(false),
+        Err(error) => Err(error),
+    }
+}
+
+/// Removes a file if the path still names it.
+pub(crate) fn remove_own(path: &Path, file: &File) {
+    if names(path, file).unwrap_or(false) {
+        let _ = std::fs::remove_file(path);
+    }
+}
+
 /// Adds the path to an error of `stat`.
 pub(crate) fn metadata(path: &Path, found: io::Result<Metadata>) -> Result<Metadata, WireError> {
     found.map_err(|e| WireError::io(path, "cannot be examined", e))
@@ -73,6 +90,14 @@ fn foreign(path: &Path, found: String) -> WireError {
 pub(crate) fn make_folder(ring: &Path) -> Result<(), WireError> {
     let made = DirBuilder::new().mode(0o700).recursive(true).create(ring);
     made.map_err(|e| WireError::io(ring, "cannot be created", e))?;
+    check_folder(ring)
+}
+
+/// Checks that a ring's folder is one, and that nobody else may write into it or replace it.
+///
+/// # Errors
+/// `Foreign`: others may. The folder cannot be examined, for instance because it does not exist.
+pub(crate) fn check_folder(ring: &Path) -> Result<(), WireError> {
     let parent = ring.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
     if let Some(parent) = parent {
         let about = metadata(parent, std::fs::metadata(parent))?;

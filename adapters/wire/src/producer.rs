@@ -1,11 +1,13 @@
 //! Producer side: copies a step into the next slot of the ring.
 
+use crate::byte_lock::{self, Kind};
 use crate::copy::Field;
 use crate::header::{DESCRIPTION, ENDED, Header, MARK, MARK_BYTES, MARKS, MAX_SLOTS, OPEN, OVERWRITTEN, PUBLISHED, SLOT_HEADER, STATE};
-use crate::lock::{Dead, NameLock, clean_up, dead, is_followed};
+use crate::lock::{Dead, NameLock, clean_up, dead, is_followed, is_held};
 use crate::map::{Map, allocated, room_with};
-use crate::private::{create_private, open_private};
+use crate::private::{create_private, open_private, remove_own};
 use crate::{Description, Limits, WireError, block_path, part_path, system};
+use rustix::fs::fstat;
 use std::fs::File;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
@@ -44,6 +46,9 @@ pub struct Producer {
     header: Header,
     first_slot: usize,
     map: Map,
+    /// The mapped file. Its byte 0 is locked until the ring ends, so that no other process truncates or replaces it, even if the name's lock file is
+    /// removed by hand.
+    file: File,
     policy: Policy,
     /// Process that opened the ring; a fork may not publish.
     process: u32,
@@ -86,11 +91,17 @@ impl Producer {
         let path = block_path(ring, block);
         let begin = Instant::now();
         let lock = loop {
-            match NameLock::take(ring, block)? {
-                Some(lock) => break lock,
-                None if begin.elapsed() > NAME_TIMEOUT => return Err(WireError::InUse { pid: holder(&path), path }),
-                None => std::thread::sleep(Duration::from_millis(1)),
+            if let Some(lock) = NameLock::take(ring, block)? {
+                match is_held(ring, block) {
+                    Ok(false) => break lock,
+                    // A producer lives whose lock file was removed by hand: this one is not left in its place.
+                    held => (lock.remove(), held?),
+                };
             }
+            if begin.elapsed() > NAME_TIMEOUT {
+                return Err(WireError::InUse { pid: holder(&path), path });
+            }
+            std::thread::sleep(Duration::from_millis(1));
         };
         // The first reading of the clock looks it up in the vDSO, for which memory may be needed.
         system::monotonic();
@@ -104,12 +115,13 @@ impl Producer {
         };
         let part = part_path(ring, block);
         let made = header.encode().and_then(|(fixed, description, total, first_slot)| {
-            let map = Self::room(ring, block, total)?;
+            let (file, map) = Self::room(ring, block, total)?;
             let producer = Self {
                 ring: ring.to_owned(),
                 header,
                 first_slot: first_slot as usize,
                 map,
+                file,
                 policy,
                 process: std::process::id(),
                 writer: Mutex::new(Writer { count: 0, published: 0, given_up_at: None }),
@@ -136,15 +148,19 @@ impl Producer {
         }
     }
 
-    /// Allocates a ring under a temporary name. If there is no room, rings whose producers have ended are removed one after another, even with unread
+    /// Allocates a ring under a temporary name, and locks its file. If there is no room, rings whose producers have ended are removed one after another, even with unread
     /// steps, but only if that can free enough.
-    fn room(ring: &Path, block: u32, bytes: u64) -> Result<Map, WireError> {
+    fn room(ring: &Path, block: u32, bytes: u64) -> Result<(File, Map), WireError> {
         let (part, path) = (part_path(ring, block), block_path(ring, block));
         // A killed run may have left one.
         let _ = std::fs::remove_file(&part);
         let file = create_private(&part, true).map_err(|e| WireError::io(&part, "cannot be created", e))?;
+        // Nobody else locks a new file.
+        byte_lock::try_lock(&file, Kind::Exclusive, 0).map_err(|e| WireError::io(&part, "cannot be locked", e))?;
         let mut found = None;
-        Map::create(&file, &path, bytes, || found.get_or_insert_with(|| removable(ring, &path, &file, bytes)).remove_one())
+        let map = Map::create(&file, &path, bytes, || found.get_or_insert_with(|| removable(ring, &path, &file, bytes)).remove_one())?;
+        drop(found);
+        Ok((file, map))
     }
 
     /// The published field.
@@ -155,8 +171,8 @@ impl Producer {
     /// Publishes a step. Allocates nothing, even on an error. With [`Policy::NewestWins`] it waits only for other threads that publish.
     ///
     /// # Errors
-    /// A time that is not finite, a wrong number of components, a null or misaligned pointer, or a fork of the process that opened the ring. Nothing was
-    /// published then.
+    /// A time that is not finite, a wrong number of components, a null or misaligned pointer, a fork of the process that opened the ring, or a ring whose
+    /// file was removed ([`WireError::Removed`]). Nothing was published then.
     ///
     /// # Safety
     /// Every value that `field` and the block's extent describe is readable and does not change during the call.
@@ -169,6 +185,9 @@ impl Producer {
             return Err(WireError::Time { time });
         }
         field.check(self.header.description.components())?;
+        if self.is_removed() {
+            return Err(WireError::Removed);
+        }
         let mut writer = self.writer.lock().unwrap_or_else(|broken| broken.into_inner());
         let count = writer.count;
         let overwrote = !self.has_room(&mut writer);
@@ -191,6 +210,11 @@ impl Producer {
         }
         self.word(PUBLISHED).store(count + 1, Ordering::Release);
         Ok(Published { count: count + 1, overwrote })
+    }
+
+    /// Returns true if no name is left of the ring's file. Asks the file and not its path, which may lead over a server for which the solver would wait.
+    fn is_removed(&self) -> bool {
+        fstat(&self.file).is_ok_and(|about| about.st_nlink == 0)
     }
 
     /// Returns true if the next slot is free, after waiting as the policy demands.
@@ -262,12 +286,14 @@ impl Drop for Producer {
         let Some(lock) = self.lock.take() else { return };
         let block = self.header.description.block.index;
         self.word(STATE).store(ENDED, Ordering::Release);
+        // Nothing is written after this. Before the name: who takes that finds the file free. Closing it would not do, see `FileLock`.
+        byte_lock::unlock_all(&self.file);
         if is_followed(&self.ring) {
             drop(lock);
             // A follower that left at this moment may have found the name taken.
             return clean_up(&self.ring, NAME_TIMEOUT);
         }
-        let _ = std::fs::remove_file(block_path(&self.ring, block));
+        remove_own(&block_path(&self.ring, block), &self.file);
         lock.remove();
         // Succeeds only if the folder is empty: other blocks may be there.
         let _ = std::fs::remove_dir(&self.ring);
@@ -303,9 +329,15 @@ impl<Others: Iterator<Item = Dead>> Removable<Others> {
     }
 }
 
-/// Removes a ring and frees its memory even if followers have it open. They read it through the file, and find that it was truncated.
+/// Removes a ring and frees its memory even if followers have it open. They read it through the file, and find that it was truncated. A producer that has it
+/// mapped would be killed by a signal, so a locked ring stays.
 fn free(path: &Path) {
-    let _ = open_private(path, true).map(|file| file.set_len(0));
+    if let Ok(file) = open_private(path, true) {
+        if !matches!(byte_lock::conflict(&file, Kind::Exclusive), Ok(None)) {
+            return;
+        }
+        let _ = file.set_len(0);
+    }
     let _ = std::fs::remove_file(path);
 }
 

@@ -51,6 +51,8 @@ class Publisher:
     def publish(self, step: int, time: float, u: _Field, v: _Field, w: _Field | None = None) -> bool:
         """Copies a step into the ring; False if publishing is off or the step was refused. The arrays share shape, dtype and strides.
 
+        Arrays of the other byte order (from NetCDF or FITS files) and masked arrays are converted first, which allocates memory; masked values
+        arrive as NaN, which is missing velocity. If the ring's file was removed, each step is refused: close the publisher and open another.
         Several threads may publish at once, and other Python threads run meanwhile; none of them may write to the arrays.
         """
 

@@ -3,6 +3,7 @@
 #![allow(clippy::unwrap_used, clippy::print_stdout)]
 
 mod assembling;
+mod cleaning;
 #[path = "../support/folder.rs"]
 mod folder;
 mod following;

@@ -70,6 +70,57 @@ fn two_producers_of_one_name_and_what_a_killed_one_leaves() {
     drop(second);
 }
 
+/// Path of the file whose lock the producer of block 0 holds.
+fn lock_of(ring: &Path) -> PathBuf {
+    ring.join("block-00000.lock")
+}
+
+#[test]
+fn a_living_ring_whose_lock_was_removed_by_hand_is_neither_replaced_nor_taken_for_dead() {
+    let folder = Folder::new("unlocked");
+    let first = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    std::fs::remove_file(lock_of(&folder.0)).unwrap();
+    assert!(producer_lives(&folder.0, 0).unwrap());
+    let error = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err();
+    assert!(matches!(error, WireError::InUse { pid, .. } if pid == u64::from(std::process::id())), "{error}");
+    // A follower that comes and one that leaves take it for living too.
+    let mut follower = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+    let mut values = Vec::new();
+    assert!(matches!(follower.poll(&mut values), Some(Event::Opened { .. })));
+    publish(&first, 3, 0.0).unwrap();
+    assert!(matches!(follower.poll(&mut values), Some(Event::Step { step: 3, .. })));
+    std::thread::sleep(Duration::from_millis(150));
+    assert!(follower.poll(&mut values).is_none());
+    drop(follower);
+    publish(&first, 4, 1.0).unwrap();
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    assert_eq!(step(&mut reader, &mut values).unwrap().step, 3);
+    drop(first);
+    assert!(!folder.0.exists(), "{:?}", std::fs::read_dir(&folder.0).unwrap().flatten().collect::<Vec<_>>());
+}
+
+#[test]
+fn a_producer_whose_ring_was_removed_by_hand_is_told_and_takes_nothing_from_the_next() {
+    let folder = Folder::new("removed");
+    let first = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    publish(&first, 0, 0.0).unwrap();
+    std::fs::remove_file(block_path(&folder.0, 0)).unwrap();
+    assert!(matches!(publish(&first, 1, 1.0), Err(WireError::Removed)));
+    // The name is still the first one's.
+    assert!(matches!(Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins), Err(WireError::InUse { .. })));
+    std::fs::remove_dir_all(&folder.0).unwrap();
+    let second = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap();
+    let error = publish(&first, 2, 2.0).unwrap_err().to_string();
+    assert!(error.contains("was removed") && error.contains("open it again"), "{error}");
+    drop(first);
+    publish(&second, 5, 0.0).unwrap();
+    let mut reader = RingReader::open(&folder.0, 0, &Limits::default()).unwrap();
+    assert_eq!(step(&mut reader, &mut Vec::new()).unwrap().step, 5);
+    assert!(producer_lives(&folder.0, 0).unwrap() && lock_of(&folder.0).exists());
+    drop(second);
+    assert!(!folder.0.exists());
+}
+
 #[test]
 fn open_rings_links_and_odd_files_are_refused() {
     let folder = Folder::new("foreign");
@@ -337,12 +388,73 @@ fn what_a_killed_run_left_takes_no_room_from_the_next() {
     assert_eq!(seen[1..], ["ended false", "opened", "step 3"]);
 }
 
+/// A solver in a process of its own, which publishes into a ring of 2.3 MB until a file `stop` exists beside the ring. Returns its process id.
+fn solver_beside(ring: &Path) -> i32 {
+    // SAFETY: the child opens a producer and ends, and needs no other thread.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        let producer = Producer::open(ring, cube([24, 24, 84]), 4, Policy::NewestWins).unwrap();
+        let begin = Instant::now();
+        let mut step = 0;
+        while !ring.with_file_name("stop").exists() && begin.elapsed() < Duration::from_secs(60) {
+            publish(&producer, step, step as f64).unwrap();
+            step += 1;
+        }
+        // SAFETY: ends the child without the tests' own cleaning.
+        unsafe { libc::_exit(0) };
+    }
+    let begin = Instant::now();
+    let published = || RingReader::open(ring, 0, &Limits::default()).is_ok_and(|mut reader| step(&mut reader, &mut Vec::new()).is_some());
+    while !published() {
+        assert!(begin.elapsed() < Duration::from_secs(30));
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    child
+}
+
+#[test]
+#[ignore = "mounts a small file system, which needs root"]
+fn a_second_start_without_room_does_not_kill_a_solver_whose_lock_was_removed() {
+    let _alone = Folder::alone("second");
+    // The second start has the same block, or another block of the same run.
+    for count in [1, 2] {
+        let disk = SmallDisk::new(&format!("second{count}"), "3m");
+        let ring = disk.0.join("ring");
+        let child = solver_beside(&ring);
+        std::fs::remove_file(lock_of(&ring)).unwrap();
+        let extent = [24, 24, 84];
+        let block = BlockExtent { index: count - 1, count, offset: [0, 0, 84 * u64::from(count - 1)], extent };
+        let description = match count {
+            1 => cube(extent),
+            _ => Description { block, ..cube([24, 24, 168]) },
+        };
+        let second = Producer::open(&ring, description, 4, Policy::NewestWins).map(drop);
+        std::thread::sleep(Duration::from_millis(200));
+        std::fs::write(disk.0.join("stop"), "").unwrap();
+        let mut status = 0;
+        // SAFETY: waits for this child.
+        unsafe { libc::waitpid(child, &mut status, 0) };
+        let signal = libc::WIFSIGNALED(status).then(|| libc::WTERMSIG(status));
+        assert_eq!(
+            (signal, libc::WEXITSTATUS(status)),
+            (None, 0),
+            "{count} blocks: SIGBUS is {}; the second start: {second:?}",
+            libc::SIGBUS
+        );
+        match count {
+            1 => assert!(matches!(second, Err(WireError::InUse { .. })), "{second:?}"),
+            _ => assert!(matches!(second, Err(WireError::NoSpace { .. })), "{second:?}"),
+        }
+    }
+}
+
 #[test]
 #[ignore = "mounts a small file system, which needs root"]
 fn no_more_of_a_killed_run_goes_than_the_next_needs() {
     let _alone = Folder::alone("least");
     let disk = SmallDisk::new("least", "3m");
     let ring = disk.0.join("ring");
+    let _following = Following::begin(&ring).unwrap();
     // Three rings of 0.79 MB leave 0.7 MB.
     killed(&ring, 3);
     let there = || [0, 1, 2].map(|block| block_path(&ring, block).exists());
@@ -354,7 +466,6 @@ fn no_more_of_a_killed_run_goes_than_the_next_needs() {
     assert!(matches!(open(20), Err(WireError::NoSpace { .. })));
     assert_eq!(there(), [true; 3]);
     // 1.2 MB fit without the ring of this name, 2 MB without one more.
-    let _following = Following::begin(&ring).unwrap();
     open(6).unwrap();
     assert_eq!(there(), [true; 3], "the new ring replaces the old one of its name");
     open(10).unwrap();

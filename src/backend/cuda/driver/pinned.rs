@@ -45,12 +45,14 @@ impl<T: Copy + Default> Pinned<T> {
     /// # Errors
     /// A driver call fails.
     ///
+    /// # Panics
+    /// `count` is above [`Self::len`].
+    ///
     /// # Safety
-    /// The address `from` holds `count` values when the stream executes the copy, and `count` is at most `len`.
+    /// The address `from` holds `count` values when the stream executes the copy.
     pub(in crate::cuda) unsafe fn copy_from(&mut self, stream: &CudaStream, from: u64, count: usize) -> Result<(), DeviceError> {
-        debug_assert!(count <= self.len);
-        // SAFETY: `count` values of `T` lie within the allocation.
-        let to = unsafe { std::slice::from_raw_parts_mut(self.values, count) };
+        // SAFETY: the allocation has `len` values, and `&mut self` is the only access to them.
+        let to = unsafe { front(self.values, self.len, count) };
         // SAFETY: guaranteed by the caller; the host memory lives until `drop`, where the driver waits for copies in progress.
         unsafe { result::memcpy_dtoh_async(to, from, stream.cu_stream()) }.map_err(driver_error("copying from the device"))
     }
@@ -62,10 +64,35 @@ impl<T: Copy + Default> Pinned<T> {
     }
 }
 
+/// The first `count` of `len` values. The check is not left to debug builds: the device would write behind the allocation.
+///
+/// # Safety
+/// The `len` values are initialised, and nothing else accesses them during the lifetime.
+unsafe fn front<'a, T>(values: *mut T, len: usize, count: usize) -> &'a mut [T] {
+    assert!(count <= len, "a copy of {count} values to pinned memory; accepted: at most {len}");
+    // SAFETY: `count` of the caller's values.
+    unsafe { std::slice::from_raw_parts_mut(values, count) }
+}
+
 impl<T: Copy> Drop for Pinned<T> {
     fn drop(&mut self) {
         // SAFETY: `values` was returned by `malloc_host` and is not used again. The driver waits for a copy in progress before it frees the
         // memory.
         let _ = self.context.bind_to_thread().and_then(|()| unsafe { result::free_host(self.values.cast()) });
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    #[should_panic(expected = "a copy of 4 values to pinned memory; accepted: at most 3")]
+    fn no_copy_is_longer_than_its_memory() {
+        let mut values = [1, 2, 3];
+        // SAFETY: the array has three values.
+        assert_eq!(unsafe { front(values.as_mut_ptr(), 3, 2) }, [1, 2]);
+        // SAFETY: as above.
+        unsafe { front(values.as_mut_ptr(), 3, 4) };
     }
 }
