@@ -165,7 +165,7 @@ impl Client {
         full
     }
 
-    /// Serves the connection until either side ends it. `subscribed` is called after each subscription.
+    /// Serves the connection until either side ends it. `subscribed` is called when it has a first subscription.
     pub async fn serve(
         &self,
         mut from: impl AsyncRead + Unpin,
@@ -203,9 +203,12 @@ impl Client {
             let mut outbox = lock(&self.outbox);
             match incoming {
                 Incoming::Subscribe(topic) => {
+                    let first = outbox.topics.is_empty();
                     outbox.subscribe(topic, reader.limits)?;
                     drop(outbox);
-                    subscribed();
+                    if first {
+                        subscribed();
+                    }
                 }
                 Incoming::Cancel(topic) => {
                     outbox.topic_bytes -= if outbox.topics.remove(&topic) { topic.len() } else { 0 };

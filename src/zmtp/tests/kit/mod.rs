@@ -257,3 +257,9 @@ fn fill(stream: &mut TcpStream, mut buffer: &mut [u8], stop: &AtomicBool) -> io:
     }
     Ok(())
 }
+
+/// User of this process.
+pub fn user() -> u32 {
+    // SAFETY: has no arguments and cannot fail.
+    unsafe { libc::geteuid() }
+}
