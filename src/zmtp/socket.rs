@@ -48,7 +48,8 @@ pub struct PubSocket {
     shared: Arc<Shared>,
     endpoint: String,
     close_by: watch::Sender<Option<Instant>>,
-    thread: Option<JoinHandle<()>>,
+    /// `None` once it has ended.
+    thread: Mutex<Option<JoinHandle<()>>>,
 }
 
 /// What the thread and the handle share.
@@ -91,7 +92,7 @@ impl PubSocket {
             // Drops all tasks, and with them their connections.
             runtime.shutdown_timeout(SHUTDOWN_LIMIT);
         })?;
-        Ok(Self { shared, endpoint, close_by, thread: Some(thread) })
+        Ok(Self { shared, endpoint, close_by, thread: Mutex::new(Some(thread)) })
     }
 
     /// The endpoint, with the port that was bound.
@@ -140,21 +141,16 @@ impl PubSocket {
     }
 
     /// Waits at most until `by` until subscribers have taken what was sent, and closes all connections.
-    pub fn close(mut self, by: Instant) -> Counts {
-        self.end(by);
-        self.counts()
-    }
-
-    fn end(&mut self, by: Instant) {
+    pub fn close(&self, by: Instant) {
         self.close_by.send_replace(Some(by));
         // A panic has been printed.
-        let _ = self.thread.take().map(JoinHandle::join);
+        let _ = lock(&self.thread).take().map(JoinHandle::join);
     }
 }
 
 impl Drop for PubSocket {
     fn drop(&mut self) {
-        self.end(Instant::now());
+        self.close(Instant::now());
     }
 }
 

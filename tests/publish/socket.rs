@@ -162,7 +162,7 @@ fn a_port_in_use_is_said_at_start() {
     let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
     let taken = PublishSettings { endpoint: Some(publisher.endpoint().to_owned()), ..Default::default() };
     let error = Output::start(&taken, None).unwrap_err();
-    assert!(matches!(error, PublishError::PortInUse { .. }));
+    assert!(matches!(error, PublishError::EndpointInUse { .. }));
     assert!(error.to_string().contains(publisher.endpoint()) && error.to_string().contains("in use"), "{error}");
 }
 
