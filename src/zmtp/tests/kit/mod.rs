@@ -139,7 +139,7 @@ pub fn attack_if_asked() {
             moved |= connection.push(address, &bytes);
         }
         // Stalls as often as it can: a stalled connection is only seen to be closed by reading.
-        if since.elapsed() > Duration::from_secs(3) {
+        if since.elapsed() > Duration::from_secs(5) {
             (reader, since) = (Connection::default(), Instant::now());
         }
         reader.push(address, &everything);
@@ -262,4 +262,13 @@ fn fill(stream: &mut TcpStream, mut buffer: &mut [u8], stop: &AtomicBool) -> io:
 pub fn user() -> u32 {
     // SAFETY: has no arguments and cannot fail.
     unsafe { libc::geteuid() }
+}
+
+/// Checks that a flood cost the healthy subscriber and the process little.
+pub fn check(outcome: &Outcome) {
+    println!("largest gap {:?}, {} frames, {outcome:?}", outcome.gap, outcome.frames);
+    let ([descriptors, _, descriptors_after], [resident, most, _]) = (outcome.descriptors, outcome.resident);
+    assert!(outcome.gap < Duration::from_secs(3), "the healthy subscriber waited");
+    assert!(descriptors_after <= descriptors, "connections stay open");
+    assert!(most <= resident + 32, "memory grows");
 }
