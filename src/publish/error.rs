@@ -6,7 +6,8 @@ use std::{io, path::PathBuf};
 use thiserror::Error;
 
 /// Accepted endpoints.
-const ENDPOINTS: &str = "tcp://HOST:PORT (port 0 takes a free one), ipc://PATH, \"private\" (a socket that only this user reaches) or \"none\"";
+const ENDPOINTS: &str =
+    "tcp://HOST:PORT (port 0 takes a free one), ipc://PATH, \"private\" (a socket that only this user reaches) or \"none\"";
 
 /// Why frames cannot be published. Every variant arises before work starts or while a file is read back.
 #[derive(Debug, Error)]
@@ -84,11 +85,9 @@ impl PublishError {
     pub fn refused(&self) -> Option<Refused> {
         match self {
             PublishError::Setting(refused) => Some(refused.clone()),
-            PublishError::Endpoint { endpoint, problem } => Some(Refused::new(
-                "publish.endpoint",
-                format_args!("is \"{endpoint}\": {problem}"),
-                ENDPOINTS,
-            )),
+            PublishError::Endpoint { endpoint, problem } => {
+                Some(Refused::new("publish.endpoint", format_args!("is \"{endpoint}\": {problem}"), ENDPOINTS))
+            }
             _ => None,
         }
     }

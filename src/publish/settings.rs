@@ -162,7 +162,8 @@ mod tests {
 
     #[test]
     fn settings_round_trip_and_none_is_a_word() {
-        let settings = PublishSettings { endpoint: None, peers: Some(Peers::Any), payload: Payload::Raw, keep: Some(3), ..Default::default() };
+        let settings =
+            PublishSettings { endpoint: None, peers: Some(Peers::Any), payload: Payload::Raw, keep: Some(3), ..Default::default() };
         let text = toml::to_string(&settings).unwrap();
         assert!(text.contains("endpoint = \"none\""), "{text}");
         assert_eq!(toml::from_str::<PublishSettings>(&text).unwrap(), settings);

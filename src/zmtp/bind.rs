@@ -115,7 +115,9 @@ fn in_use(error: io::Error) -> BindError {
 fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
     let bytes = path.as_os_str().len();
     if !path.is_absolute() || bytes > MAX_PATH {
-        return Err(BindError::Endpoint(format!("the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes")));
+        return Err(BindError::Endpoint(format!(
+            "the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"
+        )));
     }
     let folder = File::open(path.parent().unwrap_or(path))?;
     // Two programs must not take each other's new socket for a left one.
@@ -157,7 +159,8 @@ fn user() -> u32 {
 /// # Errors
 /// The folder cannot be created, or others have rights to it.
 pub fn private_endpoint(name: &str) -> Result<String, BindError> {
-    let runtime = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute() && check_private(folder).is_ok());
+    let runtime =
+        std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute() && check_private(folder).is_ok());
     let folder = match runtime {
         Some(folder) => folder.join("ridgewatch"),
         None => {

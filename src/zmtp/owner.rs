@@ -10,7 +10,7 @@ use std::time::Instant;
 const ESTABLISHED: &str = "01";
 
 /// Owner of a connection, for the shares of connections.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum Owner {
     /// A user of this machine, whatever the address: a user may take any address of 127.0.0.0/8.
     User(u32),
@@ -74,17 +74,12 @@ fn address(text: &str) -> Option<SocketAddr> {
 /// Index of the connection to close, from the owner of each, whether it has subscribed, and since when it took no message: of the owner with the
 /// most connections, preferably one that has not subscribed, preferably the one that took nothing for longest.
 pub(crate) fn displaced(connections: &[(Owner, bool, Instant)]) -> Option<usize> {
-    let count = |owner: Owner| connections.iter().filter(|(one, ..)| *one == owner).count();
-    // The owner whose turn it is first: counting for each connection would cost the square of their number.
-    let mut owners: Vec<(Owner, usize)> = Vec::new();
+    let mut counts = HashMap::new();
     for (owner, ..) in connections {
-        if !owners.iter().any(|(one, _)| one == owner) {
-            owners.push((*owner, count(*owner)));
-        }
+        *counts.entry(owner).or_insert(0) += 1;
     }
-    let most = owners.iter().map(|(_, count)| *count).max()?;
-    let heavy = |owner: &Owner| owners.iter().any(|(one, count)| one == owner && *count == most);
-    let candidates = connections.iter().enumerate().filter(|(_, (owner, ..))| heavy(owner));
+    let most = *counts.values().max()?;
+    let candidates = connections.iter().enumerate().filter(|(_, (owner, ..))| counts[owner] == most);
     candidates.min_by_key(|(_, (_, has_subscribed, idle_since))| (*has_subscribed, *idle_since)).map(|(index, _)| index)
 }
 
@@ -125,8 +120,10 @@ mod tests {
             // All subscribe, each from a different address; the last address has the IPv6 form.
             let mapped = Ipv4Addr::new(127, 9, 9, 9).to_ipv6_mapped();
             let addresses = (1..255).map(loopback).chain([IpAddr::from(mapped)]);
-            let connections: Vec<_> =
-                [(subscriber, true, begin)].into_iter().chain(addresses.map(|address| (Owner::of(address, stranger), true, begin))).collect();
+            let connections: Vec<_> = [(subscriber, true, begin)]
+                .into_iter()
+                .chain(addresses.map(|address| (Owner::of(address, stranger), true, begin)))
+                .collect();
             assert_eq!(displaced(&connections), Some(1), "{stranger:?}");
         }
         // A user is one owner at every address; another machine is another owner.
@@ -141,7 +138,8 @@ mod tests {
         for address in ["127.0.0.1:0", "[::1]:0", "[::]:0"] {
             let listener = std::net::TcpListener::bind(address).unwrap();
             let reached = if address == "[::]:0" { IpAddr::from([127, 0, 0, 1]) } else { listener.local_addr().unwrap().ip() };
-            let peers: Vec<_> = (0..3).map(|_| std::net::TcpStream::connect((reached, listener.local_addr().unwrap().port())).unwrap()).collect();
+            let peers: Vec<_> =
+                (0..3).map(|_| std::net::TcpStream::connect((reached, listener.local_addr().unwrap().port())).unwrap()).collect();
             let accepted: Vec<_> = peers.iter().map(|_| listener.accept().unwrap()).collect();
             let pairs: Vec<_> = accepted.iter().map(|(stream, peer)| (*peer, stream.local_addr().unwrap())).collect();
             assert_eq!(users_of(&pairs), [own; 3], "{address}");

@@ -115,7 +115,10 @@ impl Parser {
     fn greeting(&mut self) -> Result<Option<Incoming>, Fault> {
         let bytes = &self.buffer[self.start..self.end];
         // As early as possible, so that a stranger of another protocol is not waited for.
-        if bytes.first().is_some_and(|byte| *byte != 0xff) || bytes.get(9).is_some_and(|byte| *byte != 0x7f) || bytes.get(10).is_some_and(|major| *major < 3) {
+        if bytes.first().is_some_and(|byte| *byte != 0xff)
+            || bytes.get(9).is_some_and(|byte| *byte != 0x7f)
+            || bytes.get(10).is_some_and(|major| *major < 3)
+        {
             return Err(Fault::Greeting);
         }
         let Some(greeting) = bytes.get(..GREETING) else { return Ok(None) };

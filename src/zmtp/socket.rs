@@ -78,13 +78,8 @@ impl PubSocket {
             let _inside = runtime.enter();
             Listener::new(bound)?
         };
-        let shared = Arc::new(Shared {
-            limits,
-            clients: Mutex::default(),
-            left: Notify::new(),
-            counts: Mutex::default(),
-            ledger: Arc::default(),
-        });
+        let shared =
+            Arc::new(Shared { limits, clients: Mutex::default(), left: Notify::new(), counts: Mutex::default(), ledger: Arc::default() });
         let (close_by, closing) = watch::channel(None);
         let served = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("ridgewatch-zmtp".to_owned()).spawn(move || {
@@ -217,9 +212,11 @@ impl Listener {
                 () = ready(()) => break,
             }
         }
-        let pairs: Vec<_> = batch.iter().filter_map(|(_, from)| if let From::Addresses(peer, here) = from { Some((*peer, *here)) } else { None }).collect();
+        let pairs: Vec<_> =
+            batch.iter().filter_map(|(_, from)| if let From::Addresses(peer, here) = from { Some((*peer, *here)) } else { None }).collect();
         // The system's tables of connections may be long; messages must not wait for them.
-        let found = if pairs.is_empty() { Vec::new() } else { tokio::task::spawn_blocking(move || users_of(&pairs)).await.unwrap_or_default() };
+        let found =
+            if pairs.is_empty() { Vec::new() } else { tokio::task::spawn_blocking(move || users_of(&pairs)).await.unwrap_or_default() };
         let mut found = found.into_iter();
         let owner = |from| match from {
             From::User(user) => Owner::User(user),
