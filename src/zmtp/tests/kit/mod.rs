@@ -1,6 +1,8 @@
 //! A flood of subscriptions from other processes, beside a subscriber whose frames are timed. Knows ZMTP 3.0 only by its bytes (RFC 23), so that it
 //! tests any publisher.
 
+#![allow(dead_code)] // Each test binary uses its part.
+
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
 use std::process::{Child, Command};
