@@ -24,7 +24,7 @@ pub enum PublishError {
         problem: String,
     },
     /// Another program listens at the endpoint.
-    #[error("endpoint `{endpoint}` is in use by another program: choose another one (port 0: a free one), or `none`")]
+    #[error("endpoint `{endpoint}` is in use by another program: choose another one (with tcp, port 0 takes a free one), or `none`")]
     EndpointInUse {
         /// As given.
         endpoint: String,

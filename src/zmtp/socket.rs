@@ -184,7 +184,8 @@ impl Listener {
             Self::Tcp(listener) => {
                 let (stream, peer) = listener.accept().await?;
                 let here = stream.local_addr()?;
-                stream.set_nodelay(true)?;
+                // Fails for a connection that is closed already.
+                let _ = stream.set_nodelay(true);
                 Ok((Stream::Tcp(stream), From::Addresses(peer, here)))
             }
             Self::Unix(listener, _) => {
@@ -201,7 +202,8 @@ impl Listener {
         while batch.is_empty() {
             match self.accept().await {
                 Ok(accepted) => batch.push(accepted),
-                // The peer closed the connection, or no descriptor is free. Later connections may succeed.
+                Err(error) if error.kind() == io::ErrorKind::ConnectionAborted => {}
+                // No descriptor is free, for instance. Later connections may succeed.
                 Err(_) => tokio::time::sleep(PAUSE).await,
             }
         }

@@ -2,6 +2,7 @@
 //! tests any publisher.
 
 #![allow(dead_code)] // Each test binary uses its part.
+#![allow(clippy::print_stdout, clippy::unwrap_used)] // Helpers of tests may panic.
 
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpStream};
@@ -95,7 +96,7 @@ pub fn open_descriptors() -> usize {
 /// Resident memory of this process.
 pub fn resident_mib() -> u64 {
     let pages = std::fs::read_to_string("/proc/self/statm").ok().and_then(|text| text.split(' ').nth(1)?.parse::<u64>().ok());
-    pages.unwrap_or_default() * 4096 >> 20
+    pages.unwrap_or_default() / 256
 }
 
 /// A process that attacks; it ends with this value.
@@ -174,7 +175,8 @@ impl Connection {
         let end = if self.sent < GREETING.len() { GREETING.len() } else { bytes.len().min(self.sent + 65536) };
         let pushed = if self.sent == GREETING.len() && self.greeted < GREETING.len() {
             let came = stream.read(&mut [0; GREETING.len()][self.greeted..]);
-            came.and_then(|count| if count == 0 { Err(ErrorKind::UnexpectedEof.into()) } else { Ok(self.greeted += count) }).map(|()| 0)
+            self.greeted += came.as_ref().copied().unwrap_or_default();
+            came.and_then(|count| if count == 0 { Err(ErrorKind::UnexpectedEof.into()) } else { Ok(0) })
         } else if self.sent < end {
             stream.write(&bytes[self.sent..end])
         } else {
