@@ -2,7 +2,8 @@
 # make test            runs the whole suite and compiles the GPU kernels (NVRTC is fetched into target/); tests of real archives run if the archives are present
 # make test-data       runs only the tests of real archives; RIDGEWATCH_DATA=folder names the folder of the archives
 # make test-reader     tests the NumPy reader of networks
-# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, and `make fuzz`
+# make test-long       runs the tests that take minutes: subscribers that stall, in Rust and in Python, two floods of ten minutes (SECONDS=60: a minute),
+#                      with root also from another user, and `make fuzz`
 # make vendored        builds with HDF5 and NetCDF linked in, for machines without these libraries
 # make adapters        builds the C library, the Fortran module and, if pip and the network are available, the Python wheel, into out/adapters
 # make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver. The flags of the pkg-config file let
@@ -104,6 +105,9 @@ test-reader: packages .venv/installed
 
 test-long: packages .venv/installed
 	PYTHON="$(CURDIR)/.venv/bin/python" $(CARGO) test --release --test publish_stall -- --ignored --nocapture
+	@if [ "$$(id -u)" = 0 ]; then $(CARGO) test --release -p ridgewatch-zmtp -- --ignored; else \
+	  echo "NOT RUN: the test that other users are refused, since it needs root"; fi
+	FLOOD_SECONDS="$(or $(SECONDS),600)" $(CARGO) test --release --test publish_flood -- --ignored --nocapture
 	$(MAKE) --no-print-directory fuzz
 
 $(CARGO_FUZZ)/bin/cargo-fuzz:

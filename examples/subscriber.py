@@ -1,11 +1,13 @@
 #!/usr/bin/env python3
 """Prints a line for each frame that ridgewatch publishes, and saves the pictures if asked. Needs pyzmq.
 
-    python3 examples/subscriber.py tcp://127.0.0.1:5577 --save pictures
+    python3 examples/subscriber.py --save pictures                       # frames of `--publish`
+    python3 examples/subscriber.py tcp://127.0.0.1:5577                  # frames of `--publish tcp://127.0.0.1:5577`
 """
 
 import argparse
 import json
+import os
 import pathlib
 import sys
 import time
@@ -15,9 +17,20 @@ import zmq
 SUFFIX = {"jpeg": "jpg", "png": "png", "exr": "exr", "raw": "f32"}
 
 
+def private_endpoint():
+    """The endpoint of `--publish`, in a folder that only this user enters."""
+    folder = os.environ.get("XDG_RUNTIME_DIR", "")
+    if os.path.isabs(folder) and os.path.isdir(folder) and not os.path.islink(folder):
+        about = os.stat(folder)
+        if about.st_uid == os.geteuid() and about.st_mode & 0o077 == 0:
+            return f"ipc://{folder}/ridgewatch/frames"
+    name = os.environ.get("USER", "")
+    return f"ipc:///dev/shm/ridgewatch-{name if name and '/' not in name else os.geteuid()}/frames"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("endpoint", nargs="?", default="tcp://127.0.0.1:5577")
+    parser.add_argument("endpoint", nargs="?", default=private_endpoint(), help="by default that of `--publish`")
     parser.add_argument("--save", type=pathlib.Path, help="folder for the pictures")
     parser.add_argument("--frames", type=int, default=0, help="stop after so many frames")
     parser.add_argument("--records", action="store_true", help="print the record messages too")

@@ -1,7 +1,8 @@
 //! Prints a line for each frame that ridgewatch publishes, and saves the pictures if asked.
 //!
 //! ```text
-//! cargo run --release --example subscriber -- tcp://127.0.0.1:5577 pictures
+//! cargo run --release --example subscriber                                      # frames of `--publish`
+//! cargo run --release --example subscriber -- tcp://127.0.0.1:5577 pictures     # frames of `--publish tcp://127.0.0.1:5577`
 //! ```
 #![allow(clippy::print_stdout)]
 
@@ -14,7 +15,7 @@ use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
     let mut arguments = std::env::args().skip(1);
-    let endpoint = arguments.next().unwrap_or_else(|| "tcp://127.0.0.1:5577".to_owned());
+    let endpoint = arguments.next().map_or_else(|| ridgewatch_zmtp::private_endpoint("frames"), Ok)?;
     let save = arguments.next().map(PathBuf::from);
     if let Some(folder) = &save {
         std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;

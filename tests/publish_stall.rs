@@ -4,7 +4,7 @@
 
 mod kit;
 
-use kit::publishing::{GREETING, frame};
+use kit::publishing::{GREETING, READY, frame};
 use ridgewatch::publish::{FRAME_TOPIC, FrameHeader, Payload, PublishSettings, PublishStatistics, Publisher, peak_memory_bytes};
 use ridgewatch::render::Film;
 use ridgewatch::run::FrameRecord;
@@ -50,15 +50,13 @@ fn publish(publisher: &Publisher, seconds: u64, enough: &mut dyn FnMut() -> bool
     }
 }
 
-/// A subscriber that shakes hands (ZMTP 3.0, RFC 23), subscribes to everything and never reads again.
+/// A subscriber that shakes hands, subscribes to everything and never reads again.
 fn stalled(endpoint: &str) -> TcpStream {
     let mut stream = TcpStream::connect(endpoint.strip_prefix("tcp://").unwrap()).unwrap();
     stream.set_read_timeout(Some(LONG)).unwrap();
     stream.write_all(&GREETING).unwrap();
     stream.read_exact(&mut GREETING.to_owned()).unwrap();
-    let mut ready = b"\x05READY\x0bSocket-Type\x00\x00\x00\x03SUB".to_vec();
-    ready.splice(0..0, [0x04, ready.len() as u8]);
-    stream.write_all(&ready).unwrap();
+    stream.write_all(READY).unwrap();
     let mut head = [0u8; 2];
     stream.read_exact(&mut head).unwrap();
     stream.read_exact(&mut vec![0u8; usize::from(head[1])]).unwrap();
@@ -79,8 +77,7 @@ async fn listen(endpoint: String, until: tokio::sync::watch::Receiver<bool>, arr
                 assert_eq!(message.get(2).unwrap().len() as u64, FRAME_BYTES);
                 arrivals.lock().unwrap().push(Instant::now());
             }
-            // The disconnection may cut a message. The socket reconnects by itself.
-            Ok(Err(_)) => tokio::time::sleep(Duration::from_millis(10)).await,
+            Ok(Err(error)) => panic!("the healthy subscriber lost its connection: {error}"),
             Err(_) => {}
         }
     }
@@ -130,8 +127,8 @@ fn beside_a_healthy_one(seconds: u64, publisher: Publisher, other: impl FnOnce(&
 
 /// As in [`PublishSettings`].
 const STALL: f64 = 2.0;
-/// 2 s until the disconnection, 0.1 s until the healthy subscriber reconnects, 0.1 s until the next frame, and a busy machine.
-const GAP: Duration = Duration::from_secs(3);
+/// 0.1 s until the next frame, and a busy machine.
+const GAP: Duration = Duration::from_secs(1);
 
 fn check(statistics: &PublishStatistics, gap: Duration, arrivals: usize) {
     println!("{statistics:?}\nlargest gap {gap:?}, {arrivals} frames arrived, peak memory {:?} MiB", peak_memory_bytes().map(|b| b >> 20));
@@ -142,8 +139,8 @@ fn check(statistics: &PublishStatistics, gap: Duration, arrivals: usize) {
 fn check_for_a_minute(statistics: &PublishStatistics, gap: Duration, arrivals: usize) {
     check(statistics, gap, arrivals);
     assert!(gap < GAP, "the healthy subscriber waited {gap:?}");
-    // The disconnection costs two and a half seconds, and a busy machine may supersede every second frame.
-    assert!(arrivals >= (60 - 4) * 5, "{arrivals} frames in a minute");
+    // A busy machine may supersede every second frame.
+    assert!(arrivals >= 60 * 5, "{arrivals} frames in a minute");
 }
 
 /// Best of three attempts: a machine that stands still for a moment is late in one of them.
@@ -182,7 +179,7 @@ fn a_subscriber_that_lies_about_a_length_is_cut_off_and_nobody_else() {
         // A minute: a subscriber that is slow for a moment does not count as stalled.
         let Beside { statistics, gap, arrivals } = beside_a_healthy_one(5, publisher(60.0), lying, 0);
         println!("{statistics:?}\nlargest gap {gap:?}, {arrivals} frames arrived");
-        assert_eq!((statistics.stall_disconnects, statistics.socket_lost), (0, false));
+        assert_eq!((statistics.stall_disconnects, statistics.closed_connections), (0, 1));
         gap
     });
 }
@@ -270,8 +267,7 @@ fn a_minute_of_stopped_pyzmq() {
     assert!(woke > 45, "the stopped one came back: {woke} lines");
 }
 
-/// An application that is too slow for its frames and reconnects after every disconnection: the worst case of one client. (One that hangs is
-/// disconnected once: libzmq notices the closed connection only when the application reads again.)
+/// An application that is too slow for its frames, but takes each within the limit: it is served at its pace.
 #[test]
 #[ignore = "takes a minute and needs a Python with pyzmq, named by PYTHON"]
 fn a_minute_of_slow_application() {
@@ -287,7 +283,7 @@ fn a_minute_of_slow_application() {
     let statistics = publisher.finish(Duration::from_millis(500));
     let times: Vec<Instant> = arrivals.join().unwrap().into_iter().filter(|t| (start..end).contains(t)).collect();
     let gap = longest_gap(&times);
-    check(&statistics, gap, times.len());
-    assert!(statistics.stall_disconnects > 2, "it fell behind again and again: {statistics:?}");
+    println!("{statistics:?}\nlargest gap {gap:?}, {} frames arrived", times.len());
+    assert!(statistics.peak_queued_bytes <= HELD, "{} bytes held", statistics.peak_queued_bytes);
     assert!(gap < GAP, "the healthy subscriber waited {gap:?}");
 }

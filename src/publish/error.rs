@@ -1,8 +1,13 @@
 //! Errors before a run starts. During a run, faults of publishing are warnings and counts.
 
 use crate::setting::Refused;
+use ridgewatch_zmtp::BindError;
 use std::{io, path::PathBuf};
 use thiserror::Error;
+
+/// Accepted endpoints.
+const ENDPOINTS: &str =
+    "tcp://HOST:PORT (port 0 takes a free one), ipc://PATH, \"private\" (a socket that only this user reaches) or \"none\"";
 
 /// Why frames cannot be published. Every variant arises before work starts or while a file is read back.
 #[derive(Debug, Error)]
@@ -10,8 +15,8 @@ pub enum PublishError {
     /// A setting out of its range.
     #[error(transparent)]
     Setting(#[from] Refused),
-    /// An endpoint that is not `tcp://HOST:PORT`.
-    #[error("endpoint `{endpoint}`: {problem}; accepted is tcp://HOST:PORT (port 0 takes a free one) or `none`")]
+    /// Not an endpoint.
+    #[error("endpoint `{endpoint}`: {problem}; accepted: {ENDPOINTS}")]
     Endpoint {
         /// As given.
         endpoint: String,
@@ -19,18 +24,18 @@ pub enum PublishError {
         problem: String,
     },
     /// Another program listens at the endpoint.
-    #[error("endpoint `{endpoint}` is in use by another program: choose another port, port 0 for a free one, or `none`")]
-    PortInUse {
+    #[error("endpoint `{endpoint}` is in use by another program: choose another one (with tcp, port 0 takes a free one), or `none`")]
+    EndpointInUse {
         /// As given.
         endpoint: String,
     },
-    /// The system refuses to bind.
+    /// The system refuses to bind, or a file or folder is not this user's.
     #[error("endpoint `{endpoint}` cannot be bound: {source}")]
     Bind {
         /// As given.
         endpoint: String,
-        /// Error of the system.
-        source: io::Error,
+        /// Cause.
+        source: BindError,
     },
     /// A helper thread could not be started.
     #[error("cannot start the thread {name}: {source}")]
@@ -67,15 +72,22 @@ pub enum PublishError {
 }
 
 impl PublishError {
+    pub(super) fn of_bind(endpoint: &str, error: BindError) -> Self {
+        let endpoint = endpoint.to_owned();
+        match error {
+            BindError::Endpoint(problem) => Self::Endpoint { endpoint, problem },
+            BindError::InUse => Self::EndpointInUse { endpoint },
+            source => Self::Bind { endpoint, source },
+        }
+    }
+
     /// Setting at fault. `None` if the error is of another kind.
     pub fn refused(&self) -> Option<Refused> {
         match self {
             PublishError::Setting(refused) => Some(refused.clone()),
-            PublishError::Endpoint { endpoint, problem } => Some(Refused::new(
-                "publish.endpoint",
-                format_args!("is \"{endpoint}\": {problem}"),
-                "tcp://HOST:PORT (port 0 takes a free one) or \"none\"",
-            )),
+            PublishError::Endpoint { endpoint, problem } => {
+                Some(Refused::new("publish.endpoint", format_args!("is \"{endpoint}\": {problem}"), ENDPOINTS))
+            }
             _ => None,
         }
     }

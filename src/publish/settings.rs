@@ -3,8 +3,27 @@
 use crate::setting::{Refused, count, require};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Default endpoint, reachable from this machine only.
-pub const DEFAULT_ENDPOINT: &str = "tcp://127.0.0.1:5577";
+/// Word for the default endpoint, which only this user reaches: a Unix socket in `$XDG_RUNTIME_DIR/ridgewatch` or `/dev/shm/ridgewatch-$USER`.
+pub const DEFAULT_ENDPOINT: &str = "private";
+
+/// Whose subscribers are served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Peers {
+    /// Those of this user on this machine.
+    User,
+    /// Those of all who reach the endpoint.
+    Any,
+}
+
+impl From<Peers> for ridgewatch_zmtp::Peers {
+    fn from(peers: Peers) -> Self {
+        match peers {
+            Peers::User => Self::User,
+            Peers::Any => Self::Any,
+        }
+    }
+}
 
 /// Form of the published picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -46,14 +65,17 @@ pub enum WhenDiskSlow {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct PublishSettings {
-    /// ZeroMQ endpoint, `tcp://HOST:PORT`; `None` (in a file: `"none"`) opens no socket. Port 0 binds a free port.
+    /// ZeroMQ endpoint: `tcp://HOST:PORT` (port 0 binds a free port), `ipc://PATH`, or [`DEFAULT_ENDPOINT`]. `None` (in a file: `"none"`) opens no
+    /// socket.
     #[serde(deserialize_with = "endpoint_or_none", serialize_with = "none_as_word")]
     pub endpoint: Option<String>,
+    /// Whose subscribers are served. `None`: those of this user if only this machine reaches the endpoint, else all.
+    pub peers: Option<Peers>,
     /// Form of the published picture.
     pub payload: Payload,
     /// Maximum number of pictures in flight to subscribers.
     pub frames_in_flight: usize,
-    /// Seconds after which a subscriber that still holds a picture is disconnected.
+    /// Seconds after which a subscriber that is still taking a message is disconnected.
     pub stall_seconds: f64,
     /// Number of newest frames whose pictures are kept. `None` keeps all; for live runs see [`PublishSettings::of_live_run`].
     pub keep: Option<usize>,
@@ -74,6 +96,7 @@ impl Default for PublishSettings {
     fn default() -> Self {
         Self {
             endpoint: None,
+            peers: None,
             payload: Payload::Jpeg,
             frames_in_flight: 3,
             stall_seconds: 2.0,
@@ -139,7 +162,8 @@ mod tests {
 
     #[test]
     fn settings_round_trip_and_none_is_a_word() {
-        let settings = PublishSettings { endpoint: None, payload: Payload::Raw, keep: Some(3), ..Default::default() };
+        let settings =
+            PublishSettings { endpoint: None, peers: Some(Peers::Any), payload: Payload::Raw, keep: Some(3), ..Default::default() };
         let text = toml::to_string(&settings).unwrap();
         assert!(text.contains("endpoint = \"none\""), "{text}");
         assert_eq!(toml::from_str::<PublishSettings>(&text).unwrap(), settings);

@@ -67,10 +67,11 @@ impl Totals {
 
 /// Counts of the socket. `frames = sent + superseded + without_subscriber + failed`, once finished.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default)]
 pub struct PublishStatistics {
     /// Frames handed over by the cycle.
     pub frames: u64,
-    /// Pictures given to the socket.
+    /// Pictures given to subscribers.
     pub sent: u64,
     /// Pictures replaced by a newer one before they could be sent.
     pub superseded: u64,
@@ -78,18 +79,20 @@ pub struct PublishStatistics {
     pub without_subscriber: u64,
     /// Pictures that could not be encoded or sent.
     pub failed: u64,
-    /// Records given to the socket, or without a subscriber.
+    /// Records given to subscribers, or without one.
     pub records: u64,
-    /// Records dropped because too many waited.
+    /// Records dropped because too many waited, once for each subscriber.
     pub records_dropped: u64,
-    /// Times that all connections were closed because a subscriber stalled.
+    /// Times that a subscriber was disconnected because it did not read.
     pub stall_disconnects: u64,
+    /// Connections refused because of their user.
+    pub refused_connections: u64,
+    /// Connections closed for what they sent, or in favour of others.
+    pub closed_connections: u64,
     /// Maximum number of subscribers at a time.
     pub peak_subscribers: u64,
-    /// Maximum number of bytes queued in the socket at a time. Each subscriber may hold one further copy of the frame that is written to it.
+    /// Maximum number of bytes queued for all subscribers at a time.
     pub peak_queued_bytes: u64,
-    /// Whether publishing ended early because no new socket could be opened.
-    pub socket_lost: bool,
 }
 
 /// Counts of the run folder. `frames = pictures_written + pictures_dropped + pictures_failed + unfinished` if

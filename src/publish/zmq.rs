@@ -1,85 +1,73 @@
-//! ZeroMQ publisher: the newest frame wins, frames in flight are capped, stalled subscribers are disconnected.
+//! ZeroMQ publisher: the newest frame wins, and every subscriber is served at its own pace.
 //!
-//! The cycle puts a frame into the mailbox and continues. The publishing thread takes the newest frame when fewer than the cap are in flight,
-//! encodes it and sends it. The `zeromq` crate's PUB socket has no high-water mark and no call to disconnect one peer, and a writer task blocked
-//! by a peer outlives the socket. Each socket therefore lives in its own tokio runtime, a [`SocketInstance`]. If the oldest part in flight
-//! exceeds the time limit, the runtime is shut down, which closes all connections and frees their memory, and a new instance takes over.
-//! The listener stays open meanwhile, so that healthy subscribers reconnect at once and no other program takes the port.
+//! The cycle puts a frame into the mailbox and continues. The publishing thread encodes the newest frame once for all and gives it to the socket,
+//! which is the crate `ridgewatch-zmtp`.
 
 use super::error::PublishError;
-use super::guard::{guard, private_listener};
-use super::mailbox::{Kind, MAX_RECORDS, Mailbox, State};
 use super::message::{FRAME_TOPIC, RECORD_TOPIC, encode_frame};
-use super::settings::{Payload, PublishSettings};
+use super::settings::{DEFAULT_ENDPOINT, Payload, PublishSettings};
 use super::summary::PublishStatistics;
 use crate::run::{Frame, FrameRecord};
-use bytes::Bytes;
-use std::collections::HashSet;
-use std::net::{TcpListener, ToSocketAddrs};
-use std::sync::{Arc, MutexGuard};
+use ridgewatch_zmtp::{Keep, Limits, PubSocket, private_endpoint};
+use std::collections::VecDeque;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
-use zeromq::util::PeerIdentity;
-use zeromq::{PubSocket, Socket, SocketEvent, SocketSend, ZmqMessage};
 
-/// Longest wait of the publishing thread.
-const TICK: Duration = Duration::from_millis(100);
-/// Longest wait for the tasks of a socket instance that is closed.
-const SHUTDOWN_LIMIT: Duration = Duration::from_millis(500);
-/// Attempts to open a new socket instance, one a [`TICK`].
-const REOPEN_ATTEMPTS: u32 = 100;
+/// Maximum number of records that wait for the publishing thread, and for a subscriber.
+const MAX_RECORDS: usize = 256;
+/// Longest wait for room in the socket, after which records are looked at again.
+const TICK: Duration = Duration::from_millis(20);
 
 /// Publishes frames until [`Publisher::finish`].
 #[derive(Debug)]
 pub struct Publisher {
     mailbox: Arc<Mailbox>,
-    endpoint: String,
+    /// Shared with the publishing thread.
+    socket: Arc<PubSocket>,
     /// `None` once finished.
     thread: Option<JoinHandle<()>>,
 }
 
 impl Drop for Publisher {
-    /// Without [`Publisher::finish`], after an error elsewhere, the thread ends by itself.
+    /// Without [`Publisher::finish`], after an error elsewhere, the thread ends by itself and closes the socket.
     fn drop(&mut self) {
         self.mailbox.close(Instant::now());
     }
 }
 
 impl Publisher {
-    /// Binds `endpoint` (`tcp://HOST:PORT`; `*` is every interface, port 0 a free one) and starts the publishing thread. Uses the settings
-    /// `payload`, `frames_in_flight` and `stall_seconds`.
+    /// Binds `endpoint` (`tcp://HOST:PORT`, where `*` is every interface and port 0 a free one, `ipc://PATH`, or `private`) and starts the
+    /// publishing thread. Uses the settings `payload`, `frames_in_flight`, `stall_seconds` and `peers`.
     ///
     /// # Errors
-    /// A setting or an endpoint that is not accepted, a port in use, or an error of the system.
+    /// A setting or an endpoint that is not accepted or in use, or an error of the system.
     pub fn start(endpoint: &str, settings: &PublishSettings) -> Result<Self, PublishError> {
         settings.check()?;
-        let listener = bind(endpoint)?;
-        let refuse = |source| PublishError::Bind { endpoint: endpoint.to_owned(), source };
-        let resolved = format!("tcp://{}", listener.local_addr().map_err(refuse)?);
-        // In another thread, since a runtime cannot be driven or dropped inside another one.
-        let first = std::thread::scope(|scope| scope.spawn(|| SocketInstance::open(&listener, 0)).join())
-            .unwrap_or_else(|_| Err(std::io::Error::other("the socket could not be created")))
-            .map_err(refuse)?;
-        let mailbox = Arc::new(Mailbox::default());
-        let worker = Worker {
-            mailbox: Arc::clone(&mailbox),
-            listener,
-            payload: settings.payload,
-            cap: settings.frames_in_flight,
+        let limits = Limits {
+            in_flight: settings.frames_in_flight,
             stall: Duration::from_secs_f64(settings.stall_seconds),
-            number: 0,
+            queued: MAX_RECORDS,
+            ..Limits::default()
         };
+        let endpoint = match endpoint {
+            DEFAULT_ENDPOINT => private_endpoint("frames").map_err(|error| PublishError::of_bind(endpoint, error))?,
+            endpoint => endpoint.to_owned(),
+        };
+        let bound = PubSocket::bind(&endpoint, settings.peers.map(Into::into), limits);
+        let socket = Arc::new(bound.map_err(|error| PublishError::of_bind(&endpoint, error))?);
+        let mailbox = Arc::new(Mailbox::default());
+        let worker = Worker { mailbox: Arc::clone(&mailbox), socket: Arc::clone(&socket), payload: settings.payload, said: (0, 0) };
         let name = "ridgewatch-publish";
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
-            .spawn(move || worker.run(first))
+            .spawn(move || worker.run())
             .map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { mailbox, endpoint: resolved, thread: Some(thread) })
+        Ok(Self { mailbox, socket, thread: Some(thread) })
     }
-
     /// Endpoint, with the port that was bound.
     pub fn endpoint(&self) -> &str {
-        &self.endpoint
+        self.socket.endpoint()
     }
 
     /// Publishes a frame. Never waits. It replaces a picture that was not sent yet; that record is still sent.
@@ -89,281 +77,157 @@ impl Publisher {
 
     /// Counts so far.
     pub fn statistics(&self) -> PublishStatistics {
-        self.mailbox.lock().statistics
+        let (ours, socket) = (self.mailbox.lock().statistics, self.socket.counts());
+        PublishStatistics {
+            records_dropped: ours.records_dropped + socket.dropped,
+            stall_disconnects: socket.stalled,
+            refused_connections: socket.refused,
+            closed_connections: socket.faults + socket.displaced,
+            peak_subscribers: socket.peak_subscribers,
+            peak_queued_bytes: socket.peak_bytes,
+            ..ours
+        }
     }
 
     /// Sends the rest, waits at most `linger` until subscribers have it, and closes the socket.
     pub fn finish(mut self, linger: Duration) -> PublishStatistics {
-        self.mailbox.close(Instant::now() + linger);
+        let by = Instant::now() + linger;
+        self.mailbox.close(by);
         if self.thread.take().is_some_and(|thread| thread.join().is_err()) {
             tracing::error!("the publishing thread ended by a panic");
         }
-        self.mailbox.lock().statistics
+        self.socket.close(by);
+        self.statistics()
     }
 }
 
-/// Resolves and binds. The standard library sets `SO_REUSEADDR`, so that only a listener blocks the port, not connections of an earlier run.
-fn bind(endpoint: &str) -> Result<TcpListener, PublishError> {
-    let wrong = |problem: String| PublishError::Endpoint { endpoint: endpoint.to_owned(), problem };
-    let address = endpoint.strip_prefix("tcp://").ok_or_else(|| wrong("only tcp is served".to_owned()))?;
-    let (host, port) = address.rsplit_once(':').ok_or_else(|| wrong("it has no port".to_owned()))?;
-    let port: u16 = port.parse().map_err(|_| wrong(format!("`{port}` is not a port from 0 to 65535")))?;
-    let host = match host.trim_start_matches('[').trim_end_matches(']') {
-        "" => return Err(wrong("it has no host".to_owned())),
-        "*" => "0.0.0.0",
-        host => host,
-    };
-    let addresses: Vec<_> = (host, port).to_socket_addrs().map_err(|e| wrong(format!("host `{host}` is unknown: {e}")))?.collect();
-    TcpListener::bind(addresses.as_slice()).map_err(|source| match source.kind() {
-        std::io::ErrorKind::AddrInUse => PublishError::PortInUse { endpoint: endpoint.to_owned() },
-        _ => PublishError::Bind { endpoint: endpoint.to_owned(), source },
-    })
+/// Between the cycle and the publishing thread.
+#[derive(Debug, Default)]
+struct Mailbox {
+    state: Mutex<State>,
+    changed: Condvar,
 }
 
-/// A PUB socket with its own runtime: shutting the runtime down ends all tasks of the socket.
-struct SocketInstance {
-    number: u64,
-    runtime: tokio::runtime::Runtime,
-    socket: PubSocket,
-    subscribers: HashSet<PeerIdentity>,
-    next_event: Box<dyn FnMut() -> Option<SocketEvent> + Send>,
-    /// Accepts connections.
-    acceptor: tokio::task::JoinHandle<()>,
+#[derive(Debug, Default)]
+struct State {
+    /// The newest frame. It replaces one that was not sent yet.
+    frame: Option<Frame>,
+    records: VecDeque<Arc<FrameRecord>>,
+    /// Deadline of the publishing thread, once it is asked to end.
+    close_by: Option<Instant>,
+    /// Without the counts of the socket.
+    statistics: PublishStatistics,
 }
 
-impl SocketInstance {
-    fn open(listener: &TcpListener, number: u64) -> std::io::Result<Self> {
-        let listener = listener.try_clone()?;
-        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).thread_name("ridgewatch-zmq").enable_all().build()?;
-        let (socket, mut events, acceptor) = runtime.block_on(async {
-            let mut socket = PubSocket::new();
-            let events = socket.monitor();
-            let (inside, place) = private_listener()?;
-            socket.bind_listener(inside).await.map_err(std::io::Error::other)?;
-            listener.set_nonblocking(true)?;
-            let acceptor = tokio::spawn(guard(tokio::net::TcpListener::from_std(listener)?, place));
-            std::io::Result::Ok((socket, events, acceptor))
-        })?;
-        let next_event = Box::new(move || events.try_recv().ok());
-        Ok(Self { number, runtime, socket, subscribers: HashSet::new(), next_event, acceptor })
+impl Mailbox {
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Number of subscribers, after the latest connection events.
-    fn subscribers(&mut self) -> usize {
-        while let Some(event) = (self.next_event)() {
-            match event {
-                SocketEvent::Accepted(_, peer) => {
-                    self.subscribers.insert(peer);
-                }
-                SocketEvent::Disconnected(peer) => {
-                    self.subscribers.remove(&peer);
-                }
-                _ => {}
-            }
+    fn put(&self, frame: Frame) {
+        let mut state = self.lock();
+        state.statistics.frames += 1;
+        if state.records.len() >= MAX_RECORDS {
+            state.records.pop_front();
+            state.statistics.records_dropped += 1;
         }
-        self.subscribers.len()
-    }
-
-    fn send(&mut self, parts: Vec<Bytes>) -> Result<(), String> {
-        let message = ZmqMessage::try_from(parts).map_err(|e| e.to_string())?;
-        self.runtime.block_on(self.socket.send(message)).map_err(|e| e.to_string())
-    }
-
-    /// Closes all connections at once and frees their memory.
-    fn abort(self) {
-        drop(self.socket);
-        self.runtime.shutdown_timeout(SHUTDOWN_LIMIT);
-    }
-
-    /// Closes the socket when its writers are done, at the latest at `by`.
-    fn close(self, by: Instant) {
-        // Without the socket, the writer tasks end when their queues are empty, and then their connections.
-        self.acceptor.abort();
-        drop(self.socket);
-        while self.runtime.metrics().num_alive_tasks() > 0 && Instant::now() < by {
-            std::thread::sleep(Duration::from_millis(2));
+        state.records.push_back(Arc::clone(&frame.record));
+        if state.frame.replace(frame).is_some() {
+            state.statistics.superseded += 1;
         }
-        self.runtime.shutdown_timeout(SHUTDOWN_LIMIT);
+        self.changed.notify_all();
     }
-}
 
-/// Next step of the publishing thread.
-enum Step {
-    Picture(Frame),
-    Records(Vec<Arc<FrameRecord>>),
-    DisconnectAll,
-    Update,
-    Close(Instant),
+    fn close(&self, by: Instant) {
+        self.lock().close_by.get_or_insert(by);
+        self.changed.notify_all();
+    }
+
+    /// Waits until there is something to do.
+    fn wait(&self) -> MutexGuard<'_, State> {
+        let idle = |state: &mut State| state.frame.is_none() && state.records.is_empty() && state.close_by.is_none();
+        self.changed.wait_while(self.lock(), idle).unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// The publishing thread.
 struct Worker {
     mailbox: Arc<Mailbox>,
-    listener: TcpListener,
+    socket: Arc<PubSocket>,
     payload: Payload,
-    cap: usize,
-    stall: Duration,
-    number: u64,
+    /// Stalled subscribers and refused connections that were warned about.
+    said: (u64, u64),
 }
 
 impl Worker {
-    fn run(mut self, first: SocketInstance) {
-        let mut current = Some(first);
+    fn run(mut self) {
         loop {
-            if let Some(instance) = &mut current {
-                let subscribers = instance.subscribers() as u64;
-                let mut state = self.mailbox.lock();
-                state.statistics.peak_subscribers = state.statistics.peak_subscribers.max(subscribers);
+            let mut state = self.mailbox.wait();
+            let records = std::mem::take(&mut state.records);
+            let done = state.close_by.filter(|by| state.frame.is_none() || Instant::now() >= *by);
+            if done.is_some() && state.frame.take().is_some() {
+                state.statistics.superseded += 1;
             }
-            match self.next_step() {
-                Step::Records(records) => self.send_records(current.as_mut(), &records),
-                Step::Picture(frame) => self.send_picture(current.as_mut(), &frame),
-                Step::DisconnectAll => current = self.replace(current),
-                Step::Update => {}
-                Step::Close(by) => {
-                    if let Some(instance) = current {
-                        instance.close(by);
-                    }
-                    return;
-                }
+            let waits = state.frame.is_some();
+            drop(state);
+            for record in records {
+                self.send_record(&record);
             }
-        }
-    }
-
-    /// Waits for the next step, at most a tick.
-    fn next_step(&self) -> Step {
-        let mut state = self.mailbox.lock();
-        let until = Instant::now() + TICK;
-        loop {
-            if let Some(step) = self.ready(&mut state) {
-                return step;
+            if waits && (!self.socket.is_wanted(FRAME_TOPIC.as_bytes()) || self.socket.has_room(TICK)) {
+                // Maybe a newer one by now.
+                let newest = self.mailbox.lock().frame.take();
+                newest.iter().for_each(|frame| self.send_picture(frame));
             }
-            let now = Instant::now();
-            let wake = state.oldest(self.number).map_or(until, |oldest| until.min(oldest + self.stall));
-            let wake = state.close_by.map_or(wake, |by| wake.min(by));
-            if now >= until {
-                return Step::Update;
-            }
-            // A millisecond longer, so that the deadline has passed on waking.
-            state = self.mailbox.wait(state, wake.saturating_duration_since(now) + Duration::from_millis(1));
-        }
-    }
-
-    fn ready(&self, state: &mut MutexGuard<'_, State>) -> Option<Step> {
-        let now = Instant::now();
-        let oldest = state.oldest(self.number);
-        if let Some(by) = state.close_by {
-            let done = state.frame.is_none() && state.records.is_empty() && oldest.is_none();
-            if done || now >= by {
-                let left = u64::from(state.frame.take().is_some());
-                state.statistics.superseded += left;
-                state.statistics.records_dropped += state.records.len() as u64;
-                state.records.clear();
-                return Some(Step::Close(by));
-            }
-        }
-        if oldest.is_some_and(|since| now >= since + self.stall) {
-            return Some(Step::DisconnectAll);
-        }
-        let room = MAX_RECORDS.saturating_sub(state.held(Kind::Record, self.number));
-        if room > 0 && !state.records.is_empty() {
-            let count = room.min(state.records.len());
-            return Some(Step::Records(state.records.drain(..count).collect()));
-        }
-        if state.held(Kind::Picture, self.number) < self.cap {
-            return state.frame.take().map(Step::Picture);
-        }
-        None
-    }
-
-    fn send_records(&self, mut instance: Option<&mut SocketInstance>, records: &[Arc<FrameRecord>]) {
-        for record in records {
-            let sent = match instance.as_deref_mut() {
-                Some(instance) if !instance.subscribers.is_empty() => {
-                    serde_json::to_vec(&**record).map_err(|e| e.to_string()).and_then(|json| {
-                        let json = self.mailbox.count(json, Kind::Record, instance.number);
-                        instance.send(vec![Bytes::from_static(RECORD_TOPIC.as_bytes()), json])
-                    })
-                }
-                _ => Ok(()),
-            };
-            let mut state = self.mailbox.lock();
-            match sent {
-                Ok(()) => state.statistics.records += 1,
-                Err(error) => {
-                    state.statistics.records_dropped += 1;
-                    drop(state);
-                    tracing::warn!("record of frame {} was not published: {error}", record.frame);
-                }
+            self.warn();
+            if done.is_some() {
+                return;
             }
         }
     }
 
-    fn send_picture(&self, instance: Option<&mut SocketInstance>, frame: &Frame) {
-        let Some(instance) = instance.filter(|g| !g.subscribers.is_empty()) else {
+    fn send_record(&self, record: &FrameRecord) {
+        let sent = if self.socket.is_wanted(RECORD_TOPIC.as_bytes()) {
+            serde_json::to_vec(record).map(|json| self.socket.send(&[RECORD_TOPIC.as_bytes()], json, Keep::All))
+        } else {
+            Ok(())
+        };
+        let statistics = &mut self.mailbox.lock().statistics;
+        match sent {
+            Ok(()) => statistics.records += 1,
+            Err(error) => {
+                statistics.records_dropped += 1;
+                tracing::warn!("record of frame {} was not published: {error}", record.frame);
+            }
+        }
+    }
+
+    fn send_picture(&self, frame: &Frame) {
+        if !self.socket.is_wanted(FRAME_TOPIC.as_bytes()) {
             self.mailbox.lock().statistics.without_subscriber += 1;
             return;
-        };
-        let sent = encode_frame(frame, self.payload).and_then(|(header, payload)| {
-            let payload = self.mailbox.count(payload, Kind::Picture, instance.number);
-            instance.send(vec![Bytes::from_static(FRAME_TOPIC.as_bytes()), Bytes::from(header), payload])
-        });
-        let mut state = self.mailbox.lock();
+        }
+        let encoded = encode_frame(frame, self.payload);
+        let sent = encoded.map(|(header, payload)| self.socket.send(&[FRAME_TOPIC.as_bytes(), &header], payload, Keep::Newest));
+        let statistics = &mut self.mailbox.lock().statistics;
         match sent {
-            Ok(()) => state.statistics.sent += 1,
+            Ok(()) => statistics.sent += 1,
             Err(error) => {
-                state.statistics.failed += 1;
-                drop(state);
+                statistics.failed += 1;
                 tracing::warn!("frame {} was not published: {error}", frame.record.frame);
             }
         }
     }
 
-    /// Closes all connections and opens a new socket instance on the same listener.
-    fn replace(&mut self, old: Option<SocketInstance>) -> Option<SocketInstance> {
-        if let Some(old) = old {
-            let subscribers = old.subscribers.len();
-            tracing::warn!(
-                "one of {subscribers} subscribers held a message longer than {:?}: all are disconnected and may reconnect",
-                self.stall
-            );
-            old.abort();
+    /// Says what happened to subscribers: the first time, and when it has happened twice as often.
+    fn warn(&mut self) {
+        let counts = self.socket.counts();
+        if counts.stalled > 2 * self.said.0 {
+            self.said.0 = counts.stalled;
+            tracing::warn!("{} times a subscriber that did not read was disconnected; it may reconnect", counts.stalled);
         }
-        self.number += 1;
-        self.mailbox.lock().statistics.stall_disconnects += 1;
-        for attempt in 1..=REOPEN_ATTEMPTS {
-            match SocketInstance::open(&self.listener, self.number) {
-                Ok(instance) => return Some(instance),
-                Err(error) if attempt == 1 => tracing::warn!("no new socket yet: {error}"),
-                Err(_) => {}
-            }
-            if self.mailbox.lock().close_by.is_some_and(|by| Instant::now() >= by) {
-                break;
-            }
-            std::thread::sleep(TICK);
+        if counts.refused > 2 * self.said.1 {
+            self.said.1 = counts.refused;
+            tracing::warn!("{} connections of other users were refused (publish.peers = \"any\" accepts them)", counts.refused);
         }
-        tracing::error!("publishing ends: no new socket after {REOPEN_ATTEMPTS} attempts; the run continues");
-        self.mailbox.lock().statistics.socket_lost = true;
-        None
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn endpoints_are_checked() {
-        for (endpoint, hint) in [
-            ("udp://127.0.0.1:5577", "only tcp"),
-            ("tcp://127.0.0.1", "no port"),
-            ("tcp://127.0.0.1:99999", "not a port from 0"),
-            ("tcp://:5577", "no host"),
-            ("tcp://no such host:5577", "unknown"),
-        ] {
-            let error = bind(endpoint).unwrap_err().to_string();
-            assert!(error.contains(hint) && error.contains(endpoint), "{error}");
-        }
-        assert_ne!(bind("tcp://127.0.0.1:0").unwrap().local_addr().unwrap().port(), 0);
     }
 }

@@ -157,12 +157,24 @@ async fn finishing_flushes_the_last_frame() {
     while receive_header(&mut socket).await.frame != 5000 {}
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn a_unix_socket_serves_frames_and_replaces_one_that_was_left() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("frames");
+    drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
+    let publisher = Publisher::start(&format!("ipc://{}", path.display()), &settings(Payload::Jpeg)).unwrap();
+    let mut socket = subscribe(publisher.endpoint(), &[FRAME_TOPIC]).await;
+    first_message(&publisher, &mut socket).await;
+    tokio::task::spawn_blocking(move || publisher.finish(LIMIT)).await.unwrap();
+    assert!(!path.exists());
+}
+
 #[test]
-fn a_port_in_use_is_said_at_start() {
+fn an_endpoint_in_use_is_said_at_start() {
     let publisher = Publisher::start("tcp://127.0.0.1:0", &settings(Payload::Jpeg)).unwrap();
     let taken = PublishSettings { endpoint: Some(publisher.endpoint().to_owned()), ..Default::default() };
     let error = Output::start(&taken, None).unwrap_err();
-    assert!(matches!(error, PublishError::PortInUse { .. }));
+    assert!(matches!(error, PublishError::EndpointInUse { .. }));
     assert!(error.to_string().contains(publisher.endpoint()) && error.to_string().contains("in use"), "{error}");
 }
 

@@ -123,6 +123,30 @@ fn a_folder_that_cannot_be_written_is_refused_before_work_starts() {
     refused(&["replay", &scene, "--out", &below], 1, &[&below]);
 }
 
+/// Without an endpoint, frames are offered where only this user reaches them.
+#[test]
+fn frames_are_published_at_a_private_socket() {
+    use std::os::unix::fs::PermissionsExt;
+    let folder = tempfile::tempdir().unwrap();
+    let (scene, runtime) = (small_scene(folder.path(), ""), folder.path().join("runtime"));
+    std::fs::create_dir(&runtime).unwrap();
+    std::fs::set_permissions(&runtime, std::fs::Permissions::from_mode(0o700)).unwrap();
+    let publish = || {
+        let mut command = program::ridgewatch(["replay", &scene, "--publish", "--overwrite", "--out"]);
+        let output = command.arg(folder.path().join("run")).env("XDG_RUNTIME_DIR", &runtime).output().unwrap();
+        (output.status.code(), String::from_utf8(output.stderr).unwrap())
+    };
+    let socket = runtime.join("ridgewatch/frames");
+    let (status, said) = publish();
+    assert_eq!(status, Some(0), "{said}");
+    assert!(said.contains(&format!("publishing at ipc://{}", socket.display())), "{said}");
+    assert!(!socket.exists(), "its file is removed at the end");
+    assert_eq!(runtime.join("ridgewatch").metadata().unwrap().permissions().mode() & 0o777, 0o700);
+    let _taken = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+    let (status, said) = publish();
+    assert!(status == Some(1) && said.contains(socket.to_str().unwrap()) && said.contains("in use"), "{said}");
+}
+
 #[test]
 fn a_port_in_use_is_refused_before_work_starts() {
     let folder = tempfile::tempdir().unwrap();

@@ -1,0 +1,263 @@
+//! Endpoints: `tcp://HOST:PORT`, `ipc://PATH`, and the place that only this user reaches.
+
+use rustix::fs::{FlockOperation, flock};
+use std::fs::{DirBuilder, File, Permissions};
+use std::io::{self, ErrorKind};
+use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
+use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
+use std::os::unix::net::{UnixListener, UnixStream};
+use std::path::{Path, PathBuf};
+use thiserror::Error;
+
+/// Maximum length of the path of a Unix socket, in bytes.
+const MAX_PATH: usize = 107;
+
+/// Whose connections are accepted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Peers {
+    /// Processes of this machine that run as the user of this process.
+    User,
+    /// Whoever reaches the endpoint.
+    Any,
+}
+
+/// Why a socket cannot listen.
+#[derive(Debug, Error)]
+pub enum BindError {
+    /// Not an endpoint.
+    #[error("{0}")]
+    Endpoint(String),
+    /// Another program listens there.
+    #[error("another program listens there")]
+    InUse,
+    /// A file or folder that is not this user's.
+    #[error("{path} {found}; accepted: what belongs to this user alone", path = path.display())]
+    Foreign {
+        /// File or folder.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+    },
+    /// An error of the system.
+    #[error(transparent)]
+    System(#[from] io::Error),
+}
+
+/// A socket that listens. Its file, if it has one, is removed with it.
+#[derive(Debug)]
+pub(crate) enum Bound {
+    Tcp(TcpListener),
+    Unix(UnixListener, SocketFile),
+}
+
+/// File of a Unix socket, removed at the end unless another one has its name by then.
+#[derive(Debug)]
+pub(crate) struct SocketFile {
+    path: PathBuf,
+    identity: (u64, u64),
+}
+
+impl Drop for SocketFile {
+    fn drop(&mut self) {
+        let about = std::fs::symlink_metadata(&self.path);
+        if about.is_ok_and(|about| (about.dev(), about.ino()) == self.identity) {
+            let _ = std::fs::remove_file(&self.path);
+        }
+    }
+}
+
+impl Bound {
+    /// Binds an endpoint; returns it with the port that was bound.
+    pub fn open(endpoint: &str) -> Result<(Self, String), BindError> {
+        if let Some(path) = endpoint.strip_prefix("ipc://") {
+            let (listener, file) = unix(Path::new(path))?;
+            return Ok((Self::Unix(listener, file), endpoint.to_owned()));
+        }
+        let wrong = |problem: String| BindError::Endpoint(problem);
+        let address = endpoint.strip_prefix("tcp://").ok_or_else(|| wrong("neither tcp:// nor ipc://".to_owned()))?;
+        let (host, port) = address.rsplit_once(':').ok_or_else(|| wrong("it has no port".to_owned()))?;
+        let port: u16 = port.parse().map_err(|_| wrong(format!("`{port}` is not a port from 0 to 65535")))?;
+        let host = match host.trim_start_matches('[').trim_end_matches(']') {
+            "" => return Err(wrong("it has no host".to_owned())),
+            "*" => "0.0.0.0",
+            host => host,
+        };
+        let addresses: Vec<_> = (host, port).to_socket_addrs().map_err(|e| wrong(format!("host `{host}` is unknown: {e}")))?.collect();
+        // The standard library sets SO_REUSEADDR, so that only a listener blocks the port, not connections of an earlier run.
+        let listener = TcpListener::bind(addresses.as_slice()).map_err(in_use)?;
+        let resolved = format!("tcp://{}", listener.local_addr()?);
+        Ok((Self::Tcp(listener), resolved))
+    }
+
+    /// Whether only this machine reaches it.
+    pub fn is_local(&self) -> bool {
+        match self {
+            Self::Tcp(listener) => listener.local_addr().is_ok_and(|address: SocketAddr| address.ip().to_canonical().is_loopback()),
+            Self::Unix(..) => true,
+        }
+    }
+
+    /// Lets other users connect to a Unix socket, or nobody else.
+    pub fn open_to(&self, peers: Peers) -> io::Result<()> {
+        match self {
+            Self::Tcp(_) => Ok(()),
+            Self::Unix(_, file) => {
+                std::fs::set_permissions(&file.path, Permissions::from_mode(if peers == Peers::User { 0o600 } else { 0o666 }))
+            }
+        }
+    }
+}
+
+fn in_use(error: io::Error) -> BindError {
+    if error.kind() == ErrorKind::AddrInUse { BindError::InUse } else { error.into() }
+}
+
+fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
+    let bytes = path.as_os_str().len();
+    if !path.is_absolute() || bytes > MAX_PATH {
+        return Err(BindError::Endpoint(format!(
+            "the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"
+        )));
+    }
+    let folder = File::open(path.parent().unwrap_or(path))?;
+    // Two programs must not take each other's new socket for a left one.
+    flock(&folder, FlockOperation::LockExclusive).map_err(io::Error::from)?;
+    let listener = match UnixListener::bind(path) {
+        Err(error) if error.kind() == ErrorKind::AddrInUse => {
+            remove_left(path)?;
+            UnixListener::bind(path).map_err(in_use)?
+        }
+        bound => bound?,
+    };
+    let about = std::fs::symlink_metadata(path)?;
+    Ok((listener, SocketFile { path: path.to_owned(), identity: (about.dev(), about.ino()) }))
+}
+
+/// Removes a socket of this user that an ended program left.
+fn remove_left(path: &Path) -> Result<(), BindError> {
+    let about = std::fs::symlink_metadata(path)?;
+    let foreign = |found: &str| Err(BindError::Foreign { path: path.to_owned(), found: found.to_owned() });
+    if !about.file_type().is_socket() {
+        return foreign("exists and is no socket");
+    }
+    if about.uid() != user() {
+        return foreign(&format!("belongs to user {}", about.uid()));
+    }
+    match UnixStream::connect(path) {
+        Err(error) if error.kind() == ErrorKind::ConnectionRefused => Ok(std::fs::remove_file(path)?),
+        _ => Err(BindError::InUse),
+    }
+}
+
+fn user() -> u32 {
+    rustix::process::geteuid().as_raw()
+}
+
+/// Endpoint of a Unix socket in a folder that only this user enters: `$XDG_RUNTIME_DIR/ridgewatch` if the system has made that variable's folder
+/// for this user, else `/dev/shm/ridgewatch-$USER`. Creates the folder.
+///
+/// # Errors
+/// The folder cannot be created, or others have rights to it.
+pub fn private_endpoint(name: &str) -> Result<String, BindError> {
+    let runtime =
+        std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute() && check_private(folder).is_ok());
+    let folder = match runtime {
+        Some(folder) => folder.join("ridgewatch"),
+        None => {
+            let name = std::env::var("USER").ok().filter(|name| !name.is_empty() && !name.contains('/'));
+            PathBuf::from(format!("/dev/shm/ridgewatch-{}", name.unwrap_or_else(|| user().to_string())))
+        }
+    };
+    private_in(&folder, name)
+}
+
+fn private_in(folder: &Path, name: &str) -> Result<String, BindError> {
+    match DirBuilder::new().mode(0o700).create(folder) {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error.into()),
+        _ => check_private(folder)?,
+    }
+    Ok(format!("ipc://{}", folder.join(name).display()))
+}
+
+fn check_private(folder: &Path) -> Result<(), BindError> {
+    let about = std::fs::symlink_metadata(folder)?;
+    let found = if !about.is_dir() {
+        "is no folder".to_owned()
+    } else if about.uid() != user() {
+        format!("belongs to user {}", about.uid())
+    } else if about.mode() & 0o077 != 0 {
+        format!("has mode {:04o}", about.mode() & 0o7777)
+    } else {
+        return Ok(());
+    };
+    Err(BindError::Foreign { path: folder.to_owned(), found })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn endpoints_are_checked() {
+        for (endpoint, hint) in [
+            ("udp://127.0.0.1:5577", "neither"),
+            ("tcp://127.0.0.1", "no port"),
+            ("tcp://127.0.0.1:99999", "not a port from 0"),
+            ("tcp://:5577", "no host"),
+            ("tcp://no such host:5577", "unknown"),
+            ("ipc://frames", "from the root"),
+            (&format!("ipc:///{}", "a".repeat(107)), "108 bytes"),
+        ] {
+            let error = Bound::open(endpoint).unwrap_err().to_string();
+            assert!(error.contains(hint), "{error}");
+        }
+        let (bound, resolved) = Bound::open("tcp://127.0.0.1:0").unwrap();
+        assert!(bound.is_local() && !resolved.ends_with(":0"));
+        assert!(matches!(Bound::open(&resolved), Err(BindError::InUse)));
+        assert!(!Bound::open("tcp://*:0").unwrap().0.is_local());
+    }
+
+    #[test]
+    fn a_left_socket_is_replaced_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("frames");
+        let endpoint = format!("ipc://{}", path.display());
+        // Dropping the listener alone leaves its file, as a killed program does.
+        drop(UnixListener::bind(&path).unwrap());
+        let (bound, _) = Bound::open(&endpoint).unwrap();
+        assert!(matches!(Bound::open(&endpoint), Err(BindError::InUse)));
+        for (peers, mode) in [(Peers::User, 0o600), (Peers::Any, 0o666)] {
+            bound.open_to(peers).unwrap();
+            assert_eq!(path.metadata().unwrap().mode() & 0o777, mode);
+        }
+        drop(bound);
+        assert!(!path.exists());
+        std::fs::write(&path, "mine").unwrap();
+        let error = Bound::open(&endpoint).unwrap_err().to_string();
+        assert!(error.contains("no socket") && error.contains(path.to_str().unwrap()), "{error}");
+        assert!(path.exists());
+        // A socket that has taken the name meanwhile stays.
+        std::fs::remove_file(&path).unwrap();
+        let (bound, _) = Bound::open(&endpoint).unwrap();
+        std::fs::rename(&path, folder.path().join("old")).unwrap();
+        let _other = UnixListener::bind(&path).unwrap();
+        drop(bound);
+        assert!(path.exists());
+    }
+
+    #[test]
+    fn the_private_folder_is_this_users_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let own = folder.path().join("own");
+        let endpoint = private_in(&own, "frames").unwrap();
+        assert_eq!(endpoint, format!("ipc://{}/frames", own.display()));
+        assert_eq!(own.metadata().unwrap().mode() & 0o777, 0o700);
+        private_in(&own, "frames").unwrap();
+        std::fs::set_permissions(&own, Permissions::from_mode(0o755)).unwrap();
+        let error = private_in(&own, "frames").unwrap_err().to_string();
+        assert!(error.contains("mode 0755"), "{error}");
+        std::os::unix::fs::symlink(folder.path(), folder.path().join("link")).unwrap();
+        assert!(private_in(&folder.path().join("link"), "frames").unwrap_err().to_string().contains("no folder"));
+        assert!(private_in(&folder.path().join("missing/own"), "frames").is_err());
+    }
+}

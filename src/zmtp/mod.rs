@@ -1,0 +1,24 @@
+//! A ZeroMQ PUB socket (ZMTP 3.0 and 3.1, NULL mechanism) over TCP and Unix sockets, on one thread of its own.
+//!
+//! In: messages. Out: their bytes to each subscriber at that subscriber's pace. No subscriber costs another one anything: each has its own slots
+//! and its own deadline, what it may send is bounded ([`Limits`]), and a lock is held for the change of a queue, never across a read or a write.
+
+mod bind;
+mod client;
+mod message;
+mod owner;
+mod parse;
+mod socket;
+
+pub use bind::{BindError, Peers, private_endpoint};
+pub use client::Limits;
+pub use message::Keep;
+pub use parse::{Fault, Incoming, Parser};
+pub use socket::{Counts, PubSocket};
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+/// Locks; a panic elsewhere leaves all states here usable.
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
