@@ -118,9 +118,9 @@ fuzz: packages $(CARGO_FUZZ)/bin/cargo-fuzz
 	@# The versions of the dependencies are those of the program.
 	@cp Cargo.lock tests/fuzz/Cargo.lock
 	@for target in $(FUZZ_TARGETS); do \
-	  mkdir -p target/fuzz/corpus/$$target; \
+	  mkdir -p target/fuzz/corpus/$$target target/fuzz/temporary; \
 	  seeds=""; [ $$target != scene ] || seeds=configs; \
-	  PATH="$(CURDIR)/$(CARGO_FUZZ)/bin:$$PATH" $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir target/fuzz --sanitizer none $$target \
+	  TMPDIR="$(CURDIR)/target/fuzz/temporary" PATH="$(CURDIR)/$(CARGO_FUZZ)/bin:$$PATH" $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir target/fuzz --sanitizer none $$target \
 	    target/fuzz/corpus/$$target $$seeds -- -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=1024 -max_len=8192 -print_final_stats=1 || exit 1; \
 	done
 

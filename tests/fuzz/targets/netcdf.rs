@@ -77,7 +77,7 @@ fn good() -> Vec<u8> {
     }
 }
 
-/// The file that each input is written to, in memory.
+/// The file that each input is written to; `make fuzz` chooses its folder.
 fn place() -> PathBuf {
     std::env::temp_dir().join(format!("rw-fuzz-{}.nc", std::process::id()))
 }
