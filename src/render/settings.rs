@@ -108,12 +108,18 @@ impl std::str::FromStr for Target {
     }
 }
 
+impl std::fmt::Display for Target {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Self::Psnr(decibels) => write!(f, "{decibels}dB"),
+            Self::Relmse(most) => write!(f, "relmse={most:e}"),
+        }
+    }
+}
+
 impl From<Target> for String {
     fn from(target: Target) -> Self {
-        match target {
-            Target::Psnr(decibels) => format!("{decibels}dB"),
-            Target::Relmse(most) => format!("relmse={most:e}"),
-        }
+        target.to_string()
     }
 }
 

@@ -395,7 +395,7 @@ impl<B: Backend> Cycle<'_, B> {
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         self.prepare_first(&mut slide)?;
         loop {
-            self.frames(&mut slide, begun, sink)?;
+            self.frames(&*slides, &mut slide, begun, sink)?;
             transaction!(self, &slide, run, on => run.train_meanwhile(on, &*slides, begun.elapsed().as_secs_f64()));
             // Tracer and slide both hold the window, on the host and on the device.
             with!(&mut self.session, on => {
@@ -462,7 +462,7 @@ impl<B: Backend> Cycle<'_, B> {
     }
 
     /// The frames of one slide.
-    fn frames(&mut self, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
+    fn frames(&mut self, slides: &dyn Slides, slide: &mut Slide, begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         let time = &self.run.plan.scene.time;
         let warmups = if slide.index == 0 { time.warmup_frames } else { 0 };
         let target = self.run.plan.scene.render.until;
@@ -495,7 +495,12 @@ impl<B: Backend> Cycle<'_, B> {
             if self.run.options.seconds.is_some_and(|seconds| self.run.began.elapsed().as_secs_f64() >= seconds) {
                 return Err(RunEnd::TimeIsUp);
             }
-            if is_done {
+            let is_due = number + 1 >= planned && slides.is_awaited() == Some(false);
+            if let Some(target) = target.filter(|_| !is_done && (is_due || number + 1 == most)) {
+                let why = if is_due { "the next window is complete" } else { "no slide gets more frames" };
+                self.run.progress.warnings.push(format!("slide {}: the stated error is not yet below {target}, but {why}", slide.index));
+            }
+            if is_done || is_due {
                 break;
             }
         }

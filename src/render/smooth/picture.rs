@@ -21,6 +21,8 @@ use std::time::Instant;
 const LIGHT_VALUES: usize = 1 << 24;
 /// Pairs per pixel that measure the error of a marched picture.
 pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
+/// Pairs of paths that are tracked at a time, which bounds the memory of a round.
+const MAX_PAIRS: usize = 1 << 19;
 /// Seconds of marching that a round may take at least. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
 /// Radius over which the squared error of a pixel is averaged, in pixels.
@@ -178,38 +180,42 @@ impl Picture {
         let chosen = pixels(&allocation.next(pairs_per_pixel), width, height);
         // Number of each pair within its pixel, which selects its random numbers.
         let mut next: Vec<u32> = self.sums.iter().map(PairSums::pairs).collect();
-        let mut paths = Vec::with_capacity(2 * chosen.len());
-        for &pixel in &chosen {
-            let number = &mut next[pixel as usize];
-            paths.extend([(pixel, 2 * *number), (pixel, 2 * *number + 1)]);
-            *number += 1;
-        }
-        let (found, counts) = track(medium, &paths, wave_flights, answers, round.stop);
-        if counts.stopped {
-            return None;
-        }
-        let mut stats = RenderStats {
-            paths: paths.len() as u64,
-            majorant_exceeded: counts.exceeded,
-            missing: counts.missing,
-            waves: counts.waves,
-            evaluate_seconds: counts.evaluate_seconds,
-            ..RenderStats::default()
-        };
-        for (paths, halves) in paths.chunks_exact(2).zip(found.chunks_exact(2)) {
-            let (pixel, pair) = (paths[0].0 as usize, paths[0].1 as usize / 2);
-            let sums = &mut self.sums[pixel];
-            let quarter = quarter(pixel % width, pixel / width, pair);
-            for (half, difference) in halves.iter().enumerate() {
-                (0..3).for_each(|k| sums.radiance[half][quarter][k] += difference.radiance[k]);
-                sums.alpha += difference.alpha;
-                sums.queries += difference.queries;
-                sums.traced += difference.traced;
-                stats.queries += u64::from(difference.queries);
-                stats.traced += u64::from(difference.traced);
+        let mut stats = RenderStats::default();
+        // The picture keeps none of these sums if a stop comes in between.
+        let mut sums = self.sums.clone();
+        let mut paths = Vec::new();
+        for chosen in chosen.chunks(MAX_PAIRS) {
+            paths.clear();
+            for &pixel in chosen {
+                let number = &mut next[pixel as usize];
+                paths.extend([(pixel, 2 * *number), (pixel, 2 * *number + 1)]);
+                *number += 1;
             }
-            sums.pairs[quarter] += 1;
+            let (found, counts) = track(medium, &paths, wave_flights, answers, round.stop);
+            if counts.stopped {
+                return None;
+            }
+            stats.paths += paths.len() as u64;
+            stats.majorant_exceeded += counts.exceeded;
+            stats.missing += counts.missing;
+            stats.waves += counts.waves;
+            stats.evaluate_seconds += counts.evaluate_seconds;
+            for (paths, halves) in paths.chunks_exact(2).zip(found.chunks_exact(2)) {
+                let (pixel, pair) = (paths[0].0 as usize, paths[0].1 as usize / 2);
+                let sums = &mut sums[pixel];
+                let quarter = quarter(pixel % width, pixel / width, pair);
+                for (half, difference) in halves.iter().enumerate() {
+                    (0..3).for_each(|k| sums.radiance[half][quarter][k] += difference.radiance[k]);
+                    sums.alpha += difference.alpha;
+                    sums.queries += difference.queries;
+                    sums.traced += difference.traced;
+                    stats.queries += u64::from(difference.queries);
+                    stats.traced += u64::from(difference.traced);
+                }
+                sums.pairs[quarter] += 1;
+            }
         }
+        self.sums = sums;
         self.pairs += chosen.len() as u64;
         self.allocation = allocation;
         Some(stats)
