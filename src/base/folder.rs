@@ -162,7 +162,7 @@ impl Folder {
         (FileType::from_raw_mode(about.st_mode) == FileType::RegularFile).then_some(about.st_size as u64)
     }
 
-    /// Takes the lock of the folder, with the process's id in the file `name`, which stays. Where the file system has no locks, a warning says so.
+    /// Takes the lock of the folder, with the process's id in the file `name`, which stays. Where the file system has no locks, nothing is locked.
     ///
     /// # Errors
     /// `WouldBlock` if another process holds it, with its id if it is known; errors of the system; a link of that name.
