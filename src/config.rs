@@ -23,7 +23,7 @@ use crate::surrogate::{Kind, SurrogateSettings};
 use crate::trust::TrustSettings;
 use origin::Origin;
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 use toml_edit::TableLike;
 
 /// A scene file. Only the table `[source]` is required.
@@ -89,6 +89,16 @@ const COMMAND_LINE: &str = "(command line)";
 
 /// The only path of a scene that is written to.
 const WRITTEN: &str = "archive.synthetic.folder";
+/// Folder of the working directory inside which a scene file may have files written; elsewhere only an option may.
+const OUTPUT: &str = "out";
+
+/// Whether a path leads into [`OUTPUT`] of the working directory.
+fn is_output(path: &Path) -> bool {
+    let here = std::env::current_dir().unwrap_or_default();
+    let relative = if path.is_absolute() { path.strip_prefix(here).unwrap_or(path) } else { path };
+    let mut parts = relative.components().filter(|part| *part != Component::CurDir);
+    parts.next() == Some(Component::Normal(OUTPUT.as_ref())) && parts.all(|part| matches!(part, Component::Normal(_)))
+}
 
 /// Dotted keys of all values.
 fn keys_of(table: &toml::Table) -> Vec<String> {
@@ -112,6 +122,15 @@ impl SceneFile {
             .and_then(std::io::read_to_string)
             .map_err(|source| ConfigError::Unreadable { path: path.to_path_buf(), message: source.to_string() })?;
         let mut scene = Self::parse(path, &text, overrides)?;
+        let by_option = |set: &str| WRITTEN == set || WRITTEN.strip_prefix(set).is_some_and(|rest| rest.starts_with('.'));
+        if let Some(synthetic) = &scene.archive.synthetic
+            && !is_output(&synthetic.folder)
+            && !scene.origin.options().any(by_option)
+        {
+            // The scene may be a stranger's.
+            let accepted = format!("a folder inside {OUTPUT}/ of the working directory, or any with --set {WRITTEN}=FOLDER");
+            return Err(scene.locate(Refused::new(WRITTEN, format_args!("is {:?}", synthetic.folder), &accepted)));
+        }
         let folder = path.parent().unwrap_or(Path::new("."));
         let origin = scene.origin.clone();
         for (key, file) in scene.paths() {

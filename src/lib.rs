@@ -15,7 +15,7 @@ pub mod publish;
 pub mod run;
 
 pub use ridgewatch_backend as backend;
-pub use ridgewatch_base::{files, setting};
+pub use ridgewatch_base::{files, folder, setting};
 pub use ridgewatch_field as field;
 pub use ridgewatch_flow as flow;
 pub use ridgewatch_render as render;

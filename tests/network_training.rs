@@ -244,6 +244,32 @@ fn a_bad_checkpoint_is_an_error_and_changes_nothing() {
     }
     assert!(matches!(network.load(&folder.path().join("missing")), Err(CheckpointError::Io { .. })));
 
+    // Weights that are not finite, with a checksum that fits.
+    let mut odd = good.clone();
+    let begin = 8 + u64::from_le_bytes(odd[..8].try_into().unwrap()) as usize;
+    odd[begin..].chunks_exact_mut(4).for_each(|value| value.copy_from_slice(&f32::NAN.to_le_bytes()));
+    let sum = |bytes: &[u8]| {
+        let words = bytes[begin..].chunks_exact(4).map(|b| u64::from(u32::from_le_bytes(b.try_into().unwrap())));
+        format!("{:016x}", words.fold(0xcbf2_9ce4_8422_2325_u64, |sum, word| (sum ^ word).wrapping_mul(0x0000_0100_0000_01b3)))
+    };
+    let at = good.windows(16).position(|window| window == sum(&good).as_bytes()).unwrap();
+    let fitting = sum(&odd);
+    odd[at..at + 16].copy_from_slice(fitting.as_bytes());
+    std::fs::write(&path, &odd).unwrap();
+    let fault = network.load(&path).unwrap_err().to_string();
+    assert!(fault.contains("that are not finite; expected finite weights"), "{fault}");
+    assert_eq!(rms(&network, &samples), reference);
+
+    // 64 GB without content are not read: this machine has no such memory.
+    std::fs::write(&path, &good).unwrap();
+    std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len(64 << 30).unwrap();
+    assert!(matches!(network.load(&path), Err(CheckpointError::Mismatch { .. })));
+    // Nor are those that the header names.
+    let header = br#"{"__metadata__":{"format":"ridgewatch-surrogate-1","kind":"network"},"a":{"dtype":"F32","shape":[17179869184],"data_offsets":[0,68719476736]}}"#;
+    std::fs::write(&path, [&(header.len() as u64).to_le_bytes()[..], header].concat()).unwrap();
+    std::fs::OpenOptions::new().write(true).open(&path).unwrap().set_len((64 << 30) + 8 + header.len() as u64).unwrap();
+    assert!(matches!(network.load(&path), Err(CheckpointError::Mismatch { .. })));
+
     // A valid checkpoint of another shape, kind or scene.
     std::fs::write(&path, &good).unwrap();
     let wider = NetworkSettings { width: 48, ..small() };

@@ -1,5 +1,7 @@
 //! A signal at any moment of a replay: the run ends soon, and its folder is complete. Without the signal, every scene here would remain for many
 //! minutes in the stage that the signal interrupts.
+//!
+//! A stop that comes as several signals is one stop, and `--stop-within` bounds the time from the first of them to the end of the process.
 
 #![allow(clippy::unwrap_used)]
 #![cfg(unix)]
@@ -8,7 +10,9 @@ mod kit;
 
 use kit::program::{self, Outcome, Running, records, set, start, summary, text, until};
 use kit::scene::{self, double_gyre};
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// Longest time that a run may go on after the signal. It checks about twice a second, but the machine may be slow and busy.
@@ -36,6 +40,11 @@ struct Run {
 impl Run {
     /// A replay that resumes from a checkpoint, or else writes one into [`Run::weights`] if it trains.
     fn start(scene: &str, keys: &[&str], resume: Option<&Path>) -> Self {
+        Self::start_with(scene, keys, resume, |_| ())
+    }
+
+    /// As [`Run::start`], with changes to the command.
+    fn start_with(scene: &str, keys: &[&str], resume: Option<&Path>, change: impl FnOnce(&mut Command)) -> Self {
         let temporary = tempfile::tempdir().unwrap();
         let folder = temporary.path().join("run");
         let mut command = program::ridgewatch(["replay", &scene::write(temporary.path(), scene), "--out", text(&folder)]);
@@ -46,6 +55,7 @@ impl Run {
         } else if !keys.contains(&"surrogate.kind=table") {
             command.arg("--checkpoint").arg(run.weights());
         }
+        change(&mut command);
         run.process = Some(start(&mut command));
         run.wait_for("records.jsonl");
         run
@@ -144,16 +154,138 @@ fn while_a_slide_is_prepared_what_was_learned_is_kept() {
     Run::start(&gyre(), &keys[..2], Some(&run.weights())).ended().success();
 }
 
+/// A scene whose first frame takes many minutes and is prepared in a moment.
+const LONG_FRAME: [&str; 4] = ["render.width=64", "render.height=32", "render.samples=16000000", "render.method=surrogate"];
+
+/// GNU `timeout` signals its child and then the group that the child is in; systemd may send SIGHUP after SIGTERM.
+#[test]
+fn a_stop_of_several_signals_is_one() {
+    for signals in [[libc::SIGTERM, libc::SIGTERM, libc::SIGTERM], [libc::SIGTERM, libc::SIGHUP, libc::SIGINT]] {
+        let mut run = Run::start(&gyre(), &["training.steps_per_frame=100000000"], None);
+        std::thread::sleep(Duration::from_millis(1500));
+        for signal in signals {
+            run.process().signal(signal);
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        run.ended_in_order(143);
+        assert!(run.weights().exists(), "the checkpoint is written");
+    }
+}
+
+#[test]
+fn a_terminal_that_closes_ends_in_order() {
+    let mut run = Run::start(&gyre(), &["training.steps_per_frame=100000000"], None);
+    std::thread::sleep(Duration::from_millis(1500));
+    run.process().signal(libc::SIGHUP);
+    run.ended_in_order(129);
+    assert!(run.weights().exists(), "the checkpoint is written");
+}
+
+#[test]
+fn a_run_under_nohup_outlives_its_terminal() {
+    let mut run = Run::start_with(&gyre(), &["training.steps_per_frame=100000000"], None, |command| {
+        // SAFETY: between fork and exec, only `signal` is called, which is safe there.
+        unsafe {
+            command.pre_exec(|| {
+                libc::signal(libc::SIGHUP, libc::SIG_IGN);
+                Ok(())
+            })
+        };
+    });
+    run.process().signal(libc::SIGHUP);
+    std::thread::sleep(Duration::from_millis(1500));
+    assert!(!run.process().has_ended() && !run.process().stderr().contains("finishing"), "the signal is ignored");
+    run.process().signal(libc::SIGTERM);
+    run.ended_in_order(143);
+}
+
+/// Stops a run in its first frame with `--stop-within`. The frame is abandoned, and summary and checkpoint are written, all within the bound.
+#[track_caller]
+fn abandoned(keys: &[&str]) {
+    const BOUND: Duration = Duration::from_secs(20);
+    let within = BOUND.as_secs().to_string();
+    let mut run = Run::start_with(&gyre(), keys, None, |command| {
+        command.args(["--stop-within", &within]);
+    });
+    run.prints("colours from FTLE");
+    // Pilot and probes come before the frame, and take a moment.
+    std::thread::sleep(Duration::from_millis(4000));
+    let begin = Instant::now();
+    run.process().signal(libc::SIGTERM);
+    run.prints("finishing the current frame, for 10 s at most");
+    run.prints("the frame in progress is abandoned");
+    assert_eq!(run.ended_in_order(143), 0, "{keys:?}");
+    let took = begin.elapsed();
+    assert!(took < BOUND + Duration::from_secs(1), "{keys:?}: {took:?}");
+    assert!(run.weights().exists(), "the checkpoint is written");
+}
+
+#[test]
+fn a_gated_frame_is_abandoned_in_time() {
+    abandoned(&["render.width=64", "render.height=32", "render.samples=16000000", "render.method=gated"]);
+}
+
+/// A picture that is small enough for the pilot, with more samples than a wave can hold.
+const SLOW_PATHS: [&str; 6] =
+    ["flow.steps=4000", "trust.cells=[2, 1, 1]", "trust.min_samples=4", "render.width=16", "render.height=8", "render.samples=4000"];
+
+#[test]
+fn a_frame_whose_paths_are_slow_is_abandoned_in_time() {
+    // A single wave of such paths takes minutes.
+    abandoned(&[&SLOW_PATHS[..], &["render.method=gated"]].concat());
+}
+
+#[test]
+fn a_smooth_frame_is_abandoned_in_time() {
+    abandoned(&[&SLOW_PATHS[..], &["render.method=two_level"]].concat());
+}
+
+/// Whatever cannot be interrupted, the process ends in time.
+#[test]
+fn the_bound_holds_where_the_work_does_not_end() {
+    // Training looks for a stop every 32 steps, and each of these takes seconds.
+    let keys = ["training.steps_per_frame=1000", "network.batch=1048576", "network.width=128"];
+    let mut run = Run::start_with(&gyre(), &keys, None, |command| {
+        command.args(["--threads", "1", "--stop-within", "2"]);
+    });
+    run.prints("colours from FTLE");
+    std::thread::sleep(Duration::from_millis(3000));
+    let begin = Instant::now();
+    run.process().signal(libc::SIGTERM);
+    let output = run.ended().refused(143, &["stopped at once"]);
+    assert!(begin.elapsed() < Duration::from_secs(3), "{:?}: {}", begin.elapsed(), output.stderr);
+}
+
+#[test]
+fn a_relay_that_is_stopped_leaves_no_key() {
+    let folder = tempfile::tempdir_in("/dev/shm").unwrap();
+    let key = folder.path().join("key");
+    for pause in [0, 1, 20] {
+        let (ring, key) = (folder.path().join("ring"), key.clone());
+        let mut relay = start(&mut program::ridgewatch(["relay", text(&ring), "--connection", text(&key)]));
+        until("the key", || key.exists() && relay.stderr().contains("relaying"));
+        for _ in 0..3 {
+            relay.signal(libc::SIGTERM);
+            std::thread::sleep(Duration::from_millis(pause));
+            if relay.has_ended() {
+                break;
+            }
+        }
+        relay.wait_at_most(SOON).success();
+        assert!(!key.exists(), "signals {pause} ms apart");
+    }
+}
+
 #[test]
 fn a_second_signal_ends_at_once() {
-    // One frame of many minutes, prepared in a moment: the first signal lets it finish.
-    let keys = ["render.width=64", "render.height=32", "render.samples=16000000", "render.method=surrogate"];
-    let mut run = Run::start(&gyre(), &keys, None);
+    // The first signal lets the frame finish.
+    let mut run = Run::start(&gyre(), &LONG_FRAME, None);
     run.prints("colours from FTLE");
     std::thread::sleep(Duration::from_millis(3000));
     run.process().signal(libc::SIGINT);
     run.prints("finishing the current frame; once more to stop at once");
-    std::thread::sleep(Duration::from_millis(500));
+    // Later than signals of one stop may come.
+    std::thread::sleep(Duration::from_millis(1500));
     assert!(!run.process().has_ended(), "the current frame is finished first");
     run.process().signal(libc::SIGINT);
     run.prints("stopped at once");

@@ -12,6 +12,7 @@ use ridgewatch_render::Transfer;
 use ridgewatch_render::rng::{philox, unit};
 use ridgewatch_surrogate::{Predict, Samples, Trace};
 use ridgewatch_trust::{Audited, Gate, Residual, Strata, TrustedError};
+use std::sync::atomic::AtomicBool;
 
 /// Points per parallel task.
 const CHUNK: usize = 1 << 12;
@@ -146,6 +147,8 @@ pub struct AuditRequest<'a> {
     pub transfer: &'a Transfer,
     /// Extras of the samples to return for training. `None`: no samples are returned.
     pub samples: Option<Extras>,
+    /// Setting it may end the tracing early; the findings are then of no use.
+    pub stop: &'a AtomicBool,
 }
 
 /// Result of the audit of one frame.

@@ -17,7 +17,7 @@ use ridgewatch_surrogate::{
 use ridgewatch_trust::Gate;
 use std::path::Path;
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// The CPU.
 #[derive(Debug, Clone, Copy, Default)]
@@ -62,7 +62,7 @@ impl Backend for Cpu {
         tracer: &Self::Tracer,
         surrogate: Option<&FrozenOf<Self>>,
     ) -> Result<AuditFindings, DeviceError> {
-        audit(request, tracer, surrogate.map(|surrogate| surrogate as &dyn Predict))
+        audit(request, &Interruptible::new(tracer, request.stop), surrogate.map(|surrogate| surrogate as &dyn Predict))
     }
 
     fn replan(&mut self, _: &DeviceError, _: &Self::Tracer, _: &mut Option<HostSurrogate>) -> Result<Option<String>, DeviceError> {
@@ -98,20 +98,23 @@ pub struct HostPicture {
 }
 
 impl HostPicture {
-    /// Lays the surrogate out on nodes, once.
-    fn nodes(&mut self, surrogate: &dyn Predict, shape: [usize; 3]) -> Result<Nodes, DeviceError> {
+    /// Lays the surrogate out on nodes, once. `None` if `stop` ended it early.
+    fn nodes(&mut self, surrogate: &dyn Predict, shape: [usize; 3], stop: &AtomicBool) -> Result<Option<Nodes>, DeviceError> {
         /// Nodes that are predicted at once, which bounds the memory beside the nodes.
         const AT_ONCE: usize = 1 << 20;
         if let Some(nodes) = &self.nodes {
-            return Ok(nodes.clone());
+            return Ok(Some(nodes.clone()));
         }
         let mut values = vec![0.0; shape.iter().product()];
         for (part, values) in values.chunks_mut(AT_ONCE).enumerate() {
+            if stop.load(Ordering::Relaxed) {
+                return Ok(None);
+            }
             let first = part * AT_ONCE;
             let points: Vec<[f32; 3]> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;
         }
-        Ok(self.nodes.insert(Nodes::new(shape, Arc::new(values))).clone())
+        Ok(Some(self.nodes.insert(Nodes::new(shape, Arc::new(values))).clone()))
     }
 }
 
@@ -123,14 +126,15 @@ fn refine_on_cpu(
     picture: &mut HostPicture,
 ) -> Result<Rendered<Samples>, DeviceError> {
     let missing_surrogate = || DeviceError::Unsupported { what: "a smooth frame without a surrogate".into() };
-    let nodes = picture.nodes(frame.surrogate.ok_or_else(missing_surrogate)?, smooth.nodes)?;
+    let nodes = picture.nodes(frame.surrogate.ok_or_else(missing_surrogate)?, smooth.nodes, frame.stop)?;
     let flow = frame.tracer.flow();
     let is_missing = |point: [f32; 3]| flow.is_missing(point);
     let nothing_trusted = Gate::uniform(false);
     let routing = Routing { gate: &nothing_trusted, trace_budget: None, ..frame.routing };
-    let mut router = QueryRouter::new(frame.tracer, None, routing);
-    let round = Refinement {
-        nodes: &nodes,
+    let tracer = Interruptible::new(frame.tracer, frame.stop);
+    let mut router = QueryRouter::new(&tracer, None, routing);
+    let round = |nodes| Refinement {
+        nodes,
         missing: flow.has_missing().then_some(&is_missing),
         method: smooth.method,
         sum: smooth.sum,
@@ -138,7 +142,7 @@ fn refine_on_cpu(
         number: frame.picture,
         stop: frame.stop,
     };
-    let refined = renderer.refine(&mut picture.picture, &round, &mut router);
+    let refined = nodes.as_ref().and_then(|nodes| renderer.refine(&mut picture.picture, &round(nodes), &mut router));
     let (tally, samples) = router.finish()?;
     if let Some(report) = frame.progress {
         report(1.0);
@@ -164,7 +168,9 @@ pub fn render_on_cpu(frame: &HostFrame<'_>, renderer: &mut Renderer, picture: &m
     if let Some(smooth) = frame.smooth {
         return refine_on_cpu(frame, smooth, renderer, picture);
     }
-    let mut router = QueryRouter::new(frame.tracer, frame.surrogate, frame.routing);
+    // A wave of slow paths may take minutes.
+    let tracer = Interruptible::new(frame.tracer, frame.stop);
+    let mut router = QueryRouter::new(&tracer, frame.surrogate, frame.routing);
     let (film, stats) = renderer
         .render(frame.picture, &mut router, frame.samples.ceil() as usize, frame.progress.map(|report| report as &dyn Fn(f32)), frame.stop)
         .map_err(|refused| DeviceError::Unsupported { what: refused.to_string() })?;

@@ -190,7 +190,8 @@ pub struct FrameJob<'a, B: Backend> {
     pub smooth: Option<Smooth>,
     /// Called with the share of the frame that is rendered, from 0 to 1.
     pub progress: Option<&'a (dyn Fn(f32) + Sync)>,
-    /// Setting it ends the frame after the wave in progress.
+    /// Setting it ends the frame soon, within a wave where the CPU traces and after the wave in progress where a device does. The frame is then
+    /// of no use, whatever its counts say.
     pub stop: &'a AtomicBool,
 }
 

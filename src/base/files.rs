@@ -1,5 +1,6 @@
 //! Files: opened only if regular, written under their names only when whole.
 
+use crate::folder::Folder;
 use std::fs::{self, File};
 use std::io::{self, ErrorKind};
 use std::path::Path;
@@ -15,22 +16,14 @@ pub fn open(path: &Path) -> io::Result<File> {
     File::open(path)
 }
 
-/// Writes a file beside its place and renames it, so that an unfinished file never has the final name.
+/// Writes a file beside its place and renames it, so that an unfinished file never has the final name. No link is followed.
 ///
 /// # Errors
 /// Errors of the system; then the place is unchanged.
 pub fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     let name = path.file_name().ok_or_else(|| io::Error::new(ErrorKind::InvalidInput, "no file name"))?;
-    let mut hidden = std::ffi::OsString::from(".");
-    hidden.push(name);
-    hidden.push(".part");
-    let part = path.with_file_name(hidden);
-    let written = fs::write(&part, bytes).and_then(|()| fs::rename(&part, path));
-    if written.is_err() {
-        // It may not exist; `written` has the error that matters.
-        let _ = fs::remove_file(&part);
-    }
-    written
+    let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
+    Folder::open(folder)?.write_whole(name, bytes)
 }
 
 #[cfg(test)]

@@ -2,6 +2,7 @@
 
 mod device_error;
 pub mod files;
+pub mod folder;
 pub mod setting;
 
 pub use device_error::DeviceError;

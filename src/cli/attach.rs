@@ -3,7 +3,7 @@
 use super::common::{Common, Usage, is_config, located};
 use super::messages;
 use super::process::Nice;
-use super::session::{RunArguments, Session};
+use super::session::{Follows, RunArguments, Session};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::RunFolder;
@@ -16,6 +16,9 @@ use std::sync::atomic::AtomicBool;
 
 /// Seconds between two checkpoints, since the run may be killed.
 const CHECKPOINT_SECONDS: f64 = 30.0;
+
+/// Seconds from a signal to the end, unless an option gives others: less than the 20 to 30 after which a batch system kills.
+const STOP_WITHIN: f64 = 15.0;
 
 /// Options of `attach`.
 #[derive(Debug, clap::Args)]
@@ -44,14 +47,16 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         messages::note("network.size is \"auto\": weights of an earlier run are not used, since a checkpoint has one size");
     }
     options.run.apply(&mut scene)?;
-    // Without the weights of this start, since a repeated run has its own.
+    options.run.stop_within.get_or_insert(STOP_WITHIN);
     let text = scene.to_toml()?;
+    let mut resume_if_fit = None;
     if fixed && scene.training.resume.is_none() {
-        scene.training.resume = options.run.checkpoint.clone().filter(|path| path.exists());
-        if let Some(path) = &scene.training.resume {
-            messages::note(format_args!("going on from the weights in {}", path.display()));
+        resume_if_fit = options.run.checkpoint.clone().filter(|path| path.exists());
+        if let Some(path) = &resume_if_fit {
+            messages::note(format_args!("going on from the weights in {}, if they fit", path.display()));
         }
     }
+    let wanted = options.run.out.clone();
     if !options.run.overwrite {
         let out = RunFolder::vacant(&options.run.out)?;
         if out != options.run.out {
@@ -66,7 +71,8 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
         messages::note(format_args!("found {}", live.describe()));
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, RunError::refused))
     };
-    Session { common, options: &options.run, scene, text, checkpoint_seconds: Some(CHECKPOINT_SECONDS) }.run(open)
+    let follows = Some(Follows { checkpoint_seconds: CHECKPOINT_SECONDS, resume_if_fit, wanted });
+    Session { common, options: &options.run, scene, text, follows }.run(open)
 }
 
 /// Reads the scene, with the places of the simulation from the command line.

@@ -177,14 +177,28 @@ pub fn dimensions<T: std::str::FromStr>(text: &str) -> Option<Vec<T>> {
     text.split(['x', 'X']).map(|n| n.trim().parse().ok()).collect()
 }
 
-/// Prints the machine-readable result.
+/// Prints the machine-readable result. Ignores a closed pipe (`| head`).
+///
+/// # Errors
+/// Standard output does not take it, as on a full disk.
 pub fn print_json(value: &impl serde::Serialize) -> Result<()> {
-    print_text(serde_json::to_string_pretty(value)?);
-    Ok(())
+    let text = serde_json::to_string_pretty(value)?;
+    match print(text) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(error).context("the result cannot be written to standard output")
+        }
+        _ => Ok(()),
+    }
 }
 
-/// Prints the result for people. Ignores a closed pipe (`| head`).
+/// Prints the result for people. Ignores errors; a program reads the result of `--json`.
 pub fn print_text(text: impl std::fmt::Display) {
+    let _ = print(text);
+}
+
+fn print(text: impl std::fmt::Display) -> std::io::Result<()> {
     use std::io::Write;
-    let _ = writeln!(std::io::stdout(), "{text}");
+    let mut out = std::io::stdout();
+    writeln!(out, "{text}")?;
+    out.flush()
 }

@@ -50,8 +50,11 @@ pub fn progress(length: Option<u64>) -> ProgressBar {
     };
     bar.set_draw_target(target);
     bar.set_style(ProgressStyle::with_template(style).unwrap_or_else(|_| ProgressStyle::default_bar()));
-    // Keeps its clock running.
-    bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    // Keeps its clock running, on a thread, for which indicatif panics if the system refuses one.
+    let has_room = || std::thread::Builder::new().spawn(|| ()).is_ok_and(|thread| thread.join().is_ok());
+    if stderr().is_terminal() && has_room() {
+        bar.enable_steady_tick(std::time::Duration::from_millis(200));
+    }
     bar
 }
 

@@ -73,7 +73,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     messages::note(format_args!("publishing {} steps of {shape:?} nodes into {}", source.times().len(), ring.display()));
     source.describe().notes.iter().for_each(messages::note);
     let (rate, steps) = (options.rate, options.steps.unwrap_or(source.times().len() as u64));
-    let (steps, overwrote, seconds) = signals::until_stopped(move |stop| play(&mut *source, &producers, rate, steps, stop))?;
+    let (steps, overwrote, seconds) = signals::until_stopped(|| (), |stop| play(&mut *source, &producers, rate, steps, stop))?;
     if common.json {
         return print_json(&serde_json::json!({ "steps": steps, "overwrote": overwrote, "seconds": seconds }));
     }

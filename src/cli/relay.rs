@@ -53,8 +53,12 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     check_folder(&options.connection)?;
     let (counts, path) = (Arc::new(RelayCounts::default()), options.connection);
     let connection = ConnectionFile { address: format!("{host}:{port}"), key: key.clone() };
-    let relayed = counts.clone();
-    signals::until_stopped(move |stop| {
+    // However it ends, no key stays behind.
+    let last = {
+        let (connection, path) = (connection.clone(), path.clone());
+        move || connection.remove(&path)
+    };
+    signals::until_stopped(last, |stop| {
         connection.write(&path)?;
         messages::note(format_args!(
             "relaying {} at {}; on the other node: ridgewatch attach {}",
@@ -62,7 +66,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
             connection.address,
             path.display()
         ));
-        let served = serve(&ring, &listener, &key, &relayed, stop, Arc::new(messages::note));
+        let served = serve(&ring, &listener, &key, &counts, stop, Arc::new(messages::note));
         // So that nobody waits for a relay that has ended.
         connection.remove(&path);
         Ok(served?)

@@ -20,5 +20,5 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
     options.run.apply(&mut scene)?;
     let text = scene.to_toml()?;
-    Session { common, options: &options.run, scene, text, checkpoint_seconds: None }.run(|scene, _| open(scene).map(Some))
+    Session { common, options: &options.run, scene, text, follows: None }.run(|scene, _| open(scene).map(Some))
 }

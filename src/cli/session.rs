@@ -3,7 +3,8 @@
 use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
 };
-use super::{messages, signals};
+use super::messages;
+use super::signals::Stop;
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
@@ -11,7 +12,8 @@ use ridgewatch::render::Method;
 use ridgewatch::run::{self, Event, FrameRecord, RunError, RunOptions, RunReport, Setup};
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU8, Ordering};
+use std::sync::atomic::AtomicBool;
+use std::time::Duration;
 
 /// Options that `replay` and `attach` share.
 #[derive(Debug, clap::Args)]
@@ -37,6 +39,10 @@ pub struct RunArguments {
     /// Begin no further frame after N seconds of wall clock.
     #[arg(long, value_name = "N", value_parser = seconds)]
     seconds: Option<f64>,
+    /// End within N seconds of the first signal to stop: the frame in progress has half of them and is abandoned then; summary and checkpoint
+    /// have the rest. By default `attach` has 15 seconds and `replay` as long as its frame takes.
+    #[arg(long, value_name = "N", value_parser = seconds)]
+    pub stop_within: Option<f64>,
     /// Write the trained surrogate here at the end. `attach` also writes it every 30 seconds, and resumes from it when it is started again.
     #[arg(long, value_name = "FILE")]
     pub checkpoint: Option<PathBuf>,
@@ -75,26 +81,35 @@ pub struct Session<'a> {
     pub scene: SceneFile,
     /// Scene as it is kept in the run folder.
     pub text: String,
-    /// Seconds between two checkpoints of a run that follows a simulation. `None` for replays.
-    pub checkpoint_seconds: Option<f64>,
+    /// `None` for replays.
+    pub follows: Option<Follows>,
+}
+
+/// What a run that follows a simulation has besides.
+pub struct Follows {
+    /// Seconds between two checkpoints.
+    pub checkpoint_seconds: f64,
+    /// Weights of an earlier start, which need not fit.
+    pub resume_if_fit: Option<PathBuf>,
+    /// Run folder of the command line, from which the first vacant one is found.
+    pub wanted: PathBuf,
 }
 
 impl Session<'_> {
     /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
     pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
-        signals::runtime(2)?.block_on(self.frames(open))
-    }
-
-    async fn frames(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
-        let Self { common, options, scene, text, checkpoint_seconds } = self;
+        let Self { common, options, scene, text, follows: following } = self;
         // Before any wait or work. `RunFolder::create` checks again, in case another run takes the folder meanwhile.
         RunFolder::refuse_occupied(&options.out, options.overwrite)?;
-        let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
-        let watch = || signals::watch(stop.clone(), caught.clone()).map(tokio::spawn);
+        let stop = Stop::default();
+        let within = options.stop_within.map(Duration::try_from_secs_f64).transpose().unwrap_or_default();
+        let watch = || stop.watch(within, || ());
         // While `attach` waits for its source, a signal must stop the wait. While `replay` opens its source, a signal ends the process at once.
-        let follows = checkpoint_seconds.is_some();
-        let early = if follows { watch() } else { None };
-        let Some(setup) = open(&scene, &stop)? else {
+        let follows = following.is_some();
+        if follows {
+            watch();
+        }
+        let Some(setup) = open(&scene, &stop.requested)? else {
             messages::note("stopped before a simulation came");
             return Ok(());
         };
@@ -103,13 +118,25 @@ impl Session<'_> {
             check_folder(checkpoint)?;
         }
         // Before anything is written: from here on, a signal leaves a complete folder.
-        let signals = early.or_else(watch);
+        if !follows {
+            watch();
+        }
         // The socket first: a port in use must not cost the previous run in the folder.
         let publish = scene.publish_settings();
         let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
-        let mut folder = RunFolder::create(&options.out, options.overwrite)?;
+        let mut folder = RunFolder::create(&options.out, options.overwrite);
+        if let (Some(Follows { wanted, .. }), false, Err(PublishError::InUse { .. } | PublishError::Occupied { .. })) =
+            (&following, options.overwrite, &folder)
+        {
+            // Another run took it while this one waited for its simulation.
+            let out = RunFolder::vacant(wanted)?;
+            messages::note(format_args!("{} is taken by now: this run is written to {}", options.out.display(), out.display()));
+            folder = RunFolder::create(&out, false);
+        }
+        let mut folder = folder?;
+        let out = folder.path().to_owned();
         if let Err(error) = folder.write_scene(if follows { "attach" } else { "replay" }, &text) {
-            folder.restore_previous().with_context(|| format!("{}: the previous run cannot be restored", options.out.display()))?;
+            folder.restore_previous().with_context(|| format!("{}: the previous run cannot be restored", out.display()))?;
             return Err(error.into());
         }
         output.write_to(folder, &publish)?;
@@ -121,15 +148,12 @@ impl Session<'_> {
             seconds: options.seconds,
             threads: common.threads,
             checkpoint: options.checkpoint.clone(),
-            checkpoint_seconds,
+            checkpoint_seconds: following.as_ref().map(|following| following.checkpoint_seconds),
+            resume_if_fit: following.and_then(|following| following.resume_if_fit),
             device,
+            abandon: stop.abandoned.clone(),
         };
-        let flag = stop.clone();
-        let worker = tokio::task::spawn_blocking(move || work(setup, &scene, &run_options, output, &flag));
-        let (result, last, summary) = worker.await.context("the cycle stopped unexpectedly")?;
-        if let Some(signals) = signals {
-            signals.abort();
-        }
+        let (result, last, summary) = work(setup, &scene, &run_options, output, &stop.requested);
         let report = result?;
         for warning in &report.warnings {
             messages::note(format_args!("after the last frame: {warning}"));
@@ -140,10 +164,10 @@ impl Session<'_> {
             print_report(&report, last.as_deref());
         }
         if let Some(lost) = summary.files.as_ref().and_then(FileStatistics::lost) {
-            bail!("{}: {lost}", options.out.join("frames").display());
+            bail!("{}: {lost}", out.join("frames").display());
         }
         if !common.json {
-            print_text(format_args!("frames in {}", options.out.join("frames").display()));
+            print_text(format_args!("frames in {}", out.join("frames").display()));
         }
         const DONE: &str = "the run folder is complete up to the last finished frame";
         match (report.interrupted, follows) {
@@ -153,7 +177,7 @@ impl Session<'_> {
                 messages::note(format_args!("stopped by a signal; {DONE}"));
                 Ok(())
             }
-            (true, false) => Err(Interrupted { status: caught.load(Ordering::Relaxed), done: DONE }.into()),
+            (true, false) => Err(Interrupted { status: stop.status(), done: DONE }.into()),
         }
     }
 }

@@ -61,6 +61,14 @@ pub enum PublishError {
         /// A file of the older run.
         found: String,
     },
+    /// A run in progress writes into the run folder.
+    #[error("run folder {path} is in use by {holder}: choose another folder, or wait for the end of that run", path = path.display())]
+    InUse {
+        /// The folder.
+        path: PathBuf,
+        /// The process.
+        holder: String,
+    },
     /// A picture or a scene that cannot be read or written.
     #[error("{path}: {problem}", path = path.display())]
     File {

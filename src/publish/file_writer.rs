@@ -293,10 +293,12 @@ mod tests {
             }
         };
         settled(0);
-        std::fs::rename(&frames, folder.path().join("away")).unwrap();
+        // A folder in the way of the file cannot be removed as one.
+        for n in [1, 2] {
+            std::fs::create_dir(frames.join(format!(".frame_{n:06}.exr.part"))).unwrap();
+        }
         settled(1);
         settled(2);
-        std::fs::create_dir(&frames).unwrap();
         settled(3);
         let (back, statistics) = writer.finish();
         assert_eq!((statistics.pictures_written, statistics.pictures_failed, statistics.records_written), (2, 2, 4));
@@ -307,15 +309,16 @@ mod tests {
     fn a_disk_that_hangs_costs_the_limit_and_no_more() {
         let folder = tempfile::tempdir().unwrap();
         let limit = Duration::from_millis(200);
-        let run = RunFolder::create(folder.path(), false).unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        // A pipe that nobody reads hangs like a lost disk, once it is full.
+        let (_reader, mut pipe) = std::io::pipe().unwrap();
+        std::io::Write::write_all(&mut pipe, &[0; 1 << 16]).unwrap();
+        run.hang(std::fs::File::from(std::os::fd::OwnedFd::from(pipe)));
         let writer = FileWriter::start_with_limit(run, PublishSettings::default(), limit).unwrap();
-        // Opening a pipe without a reader hangs like a lost disk.
-        let pipe = folder.path().join("frames/.frame_000000.exr.part");
-        assert!(std::process::Command::new("mkfifo").arg(pipe).status().unwrap().success());
         for n in 0..2 {
             writer.frame(frame(n, 8));
         }
-        // It comes back at all: the pipe never opens.
+        // It comes back at all: the pipe takes nothing.
         let (back, statistics) = writer.finish();
         assert!(back.is_none() && statistics.unfinished == 2, "{statistics:?}");
     }

@@ -3,15 +3,18 @@
 use super::error::PublishError;
 use super::exr::encode_exr;
 use super::preview::png;
-use super::scene::{is_ours, refuse_foreign_scene, write_scene};
+use super::scene::{is_ours, refuse_foreign_scene, text_of};
 use super::settings::{ExrFrames, PublishSettings};
 use super::summary::Summary;
-use crate::files::write_whole;
+use crate::folder::{Folder, Lock};
 use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
-use std::fs::{self, File, OpenOptions};
+use std::ffi::OsString;
+use std::fs::File;
 use std::io::{self, Write};
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Folder of the pictures.
 const FRAMES: &str = "frames";
@@ -25,11 +28,17 @@ const PREVIOUS: &str = ".previous";
 const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
+/// Locked by the run that writes, and by nobody once its process has ended. It stays.
+const LOCK: &str = ".lock";
+/// Attempts to take the lock, and the pause between them: another process holds it for a moment while it looks for a vacant folder.
+const ATTEMPTS: usize = 5;
+const PAUSE: Duration = Duration::from_millis(20);
 
-/// A folder that only this run writes to.
+/// A folder that only this run writes to. It is held open, so that its files are written into the folder that was checked.
 #[derive(Debug)]
 pub struct RunFolder {
-    path: PathBuf,
+    folder: Folder,
+    frames: Folder,
     records: File,
     /// Length of `records.jsonl` up to its last complete line.
     complete: u64,
@@ -41,14 +50,15 @@ pub struct RunFolder {
     kept: VecDeque<Kept>,
     kept_bytes: u64,
     /// Folder with the files of the previous run, until this one has a frame.
-    previous: Option<PathBuf>,
+    previous: Option<Folder>,
+    _lock: Lock,
 }
 
 #[derive(Debug)]
 struct Kept {
     slide: u64,
-    /// Paths with sizes in bytes.
-    files: Vec<(PathBuf, u64)>,
+    /// Names with sizes in bytes.
+    files: Vec<(String, u64)>,
 }
 
 impl Kept {
@@ -80,7 +90,8 @@ impl RunFolder {
             PathBuf::from(name)
         });
         for place in std::iter::once(path.to_owned()).chain(numbered) {
-            if occupied(&place).map_err(|source| PublishError::Folder { path: place.clone(), source })?.is_none() {
+            let failed = |source| PublishError::Folder { path: place.clone(), source };
+            if holder(&place).map_err(failed)?.is_none() && occupied(&place).map_err(failed)?.is_none() {
                 return Ok(place);
             }
         }
@@ -90,8 +101,15 @@ impl RunFolder {
     /// Checks that a run may be written to `path`; changes nothing.
     ///
     /// # Errors
-    /// The folder holds a run (unless `overwrite`) or a scene that no run wrote, or cannot be read.
+    /// The folder holds a run (unless `overwrite`), a run that is in progress, or a scene that no run wrote, or cannot be read.
     pub fn refuse_occupied(path: &Path, overwrite: bool) -> Result<(), PublishError> {
+        if let Some(holder) = holder(path).map_err(|source| PublishError::Folder { path: path.to_owned(), source })? {
+            return Err(PublishError::InUse { path: path.to_owned(), holder });
+        }
+        Self::refuse_finished(path, overwrite)
+    }
+
+    fn refuse_finished(path: &Path, overwrite: bool) -> Result<(), PublishError> {
         refuse_foreign_scene(&path.join(SCENE))?;
         if overwrite {
             return Ok(());
@@ -102,50 +120,65 @@ impl RunFolder {
         }
     }
 
-    /// Creates the folder and checks that it can be written to. With `overwrite`, the files of a previous run, and no others, are moved to
-    /// `.previous` until this run has a frame.
+    /// Creates the folder, takes its lock and checks that it can be written to, and that nobody else can put files into it. With `overwrite`, the
+    /// files of a previous run, and no others, are moved to `.previous` until this run has a frame.
     ///
     /// # Errors
-    /// As [`RunFolder::refuse_occupied`], or a folder that cannot be written to.
+    /// As [`RunFolder::refuse_occupied`], or a folder that cannot be written to, belongs to another user or may be written into by all users.
     pub fn create(path: &Path, overwrite: bool) -> Result<Self, PublishError> {
         let refuse = |at: &Path, source| PublishError::Folder { path: at.to_owned(), source };
-        let frames = path.join(FRAMES);
-        fs::create_dir_all(&frames).map_err(|e| refuse(path, e))?;
-        Self::refuse_occupied(path, overwrite)?;
-        let old = run_files(path).map_err(|e| refuse(path, e))?;
-        let (aside, empty) = (path.join(PREVIOUS), old.iter().all(|file| is_empty(file)));
-        if aside.exists() && !empty {
-            fs::remove_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
+        let failed = |source| refuse(path, source);
+        // Whatever the umask: a folder into which all users may write is refused below.
+        let mut make = std::fs::DirBuilder::new();
+        make.recursive(true).mode(0o775);
+        make.create(path).map_err(failed)?;
+        let folder = Folder::open(path).map_err(failed)?;
+        folder.check_owner().map_err(failed)?;
+        let lock = lock(&folder).map_err(|error| match error.kind() {
+            io::ErrorKind::WouldBlock => PublishError::InUse { path: path.to_owned(), holder: error.to_string() },
+            _ => refuse(&path.join(LOCK), error),
+        })?;
+        make.create(path.join(FRAMES)).map_err(|error| refuse(&path.join(FRAMES), error))?;
+        let frames = folder.inner(FRAMES).and_then(|frames| frames.check_owner().map(|()| frames));
+        let frames = frames.map_err(|error| refuse(&path.join(FRAMES), error))?;
+        Self::refuse_finished(path, overwrite)?;
+        let old = run_files(&folder, Some(&frames)).map_err(failed)?;
+        let empty = old.iter().all(|old| old.is_empty(&folder));
+        let aside = |error| refuse(&path.join(PREVIOUS), error);
+        if !empty {
+            remove_previous(&folder).map_err(aside)?;
         }
-        for old in old {
-            if empty {
-                fs::remove_file(&old).map_err(|e| refuse(&old, e))?;
-                continue;
-            }
-            fs::create_dir_all(&aside).map_err(|e| refuse(&aside, e))?;
-            if let Some(name) = old.file_name() {
-                fs::rename(&old, aside.join(name)).map_err(|e| refuse(&old, e))?;
-            }
+        let previous = if empty { folder.existing(PREVIOUS) } else { folder.inner(PREVIOUS).map(Some) }.map_err(aside)?;
+        for old in &old {
+            let from = if old.is_picture { &frames } else { &folder };
+            let moved = match &previous {
+                Some(previous) if !empty => from.rename(&old.name, previous, &old.name),
+                _ => from.remove(&old.name),
+            };
+            moved.map_err(|error| refuse(&from.path().join(&old.name), error))?;
         }
-        let probe = frames.join(".probe");
-        if let Err(error) = fs::write(&probe, b"ridgewatch").and_then(|()| fs::remove_file(&probe)) {
-            if aside.exists() {
-                restore(path, &aside).map_err(|e| refuse(&aside, e))?;
+        let probe = ".probe";
+        // A link of this name is removed, not followed.
+        let _ = frames.remove(probe);
+        let probed = frames.create_new(probe).and_then(|mut file| file.write_all(b"ridgewatch")).and_then(|()| frames.remove(probe));
+        if let Err(error) = probed {
+            if let Some(previous) = &previous {
+                restore(&folder, &frames, previous).map_err(aside)?;
             }
-            return Err(refuse(&frames, error));
+            return Err(refuse(&path.join(FRAMES), error));
         }
-        let file = path.join(RECORDS);
-        // `create_new` refuses the second of two runs that start in one folder at the same time.
-        let records = OpenOptions::new().append(true).create_new(true).open(&file).map_err(|e| refuse(&file, e))?;
+        let records = folder.create_new(RECORDS).map_err(|e| refuse(&path.join(RECORDS), e))?;
         Ok(Self {
-            path: path.to_owned(),
+            folder,
+            frames,
             records,
             complete: 0,
             lines: [0; 2],
             records_removed: 0,
             kept: VecDeque::new(),
             kept_bytes: 0,
-            previous: Some(aside).filter(|a| a.exists()),
+            previous,
+            _lock: lock,
         })
     }
 
@@ -155,13 +188,13 @@ impl RunFolder {
     /// Errors of the system; files that could not be moved stay in `.previous`.
     pub fn restore_previous(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
-        restore(&self.path, &previous)?;
+        restore(&self.folder, &self.frames, &previous)?;
         Ok(true)
     }
 
     /// The folder.
     pub fn path(&self) -> &Path {
-        &self.path
+        self.folder.path()
     }
 
     /// Bytes of the pictures in the folder.
@@ -187,9 +220,9 @@ impl RunFolder {
                 self.complete += line.len() as u64;
                 self.lines[0] += 1;
                 if let Some(previous) = self.previous.take()
-                    && let Err(error) = fs::remove_dir_all(&previous)
+                    && let Err(error) = remove_previous(&self.folder)
                 {
-                    tracing::warn!("{}: cannot be removed: {error}", previous.display());
+                    tracing::warn!("{}: cannot be removed: {error}", previous.path().display());
                 }
                 Ok(())
             }
@@ -208,8 +241,7 @@ impl RunFolder {
 
     /// Renames `records.jsonl` to `records-1.jsonl` and begins a new file. Also completes an attempt that failed half-way.
     fn rotate_records(&mut self) -> io::Result<()> {
-        let (path, older) = (self.path.join(RECORDS), self.path.join(OLDER_RECORDS));
-        match fs::rename(&path, &older) {
+        match self.folder.rename(RECORDS, &self.folder, OLDER_RECORDS) {
             Ok(()) => {
                 self.records_removed += self.lines[1];
                 self.lines = [0, self.lines[0]];
@@ -218,7 +250,7 @@ impl RunFolder {
             Err(error) if error.kind() == io::ErrorKind::NotFound => self.lines[0] = 0,
             Err(error) => return Err(error),
         }
-        self.records = OpenOptions::new().append(true).create_new(true).open(&path)?;
+        self.records = self.folder.create_new(RECORDS)?;
         self.complete = 0;
         Ok(())
     }
@@ -247,7 +279,7 @@ impl RunFolder {
             Ok(())
         })();
         if let Err(error) = outcome {
-            remove(&new.files);
+            self.remove(&new.files);
             return Err(error);
         }
         let replaced = settings.exr == ExrFrames::Slide && self.remove_exr_of_slide(new.slide);
@@ -260,21 +292,20 @@ impl RunFolder {
     /// Deletes the EXR of the newest frame in the folder if it belongs to this slide. Its preview remains.
     fn remove_exr_of_slide(&mut self, slide: u64) -> bool {
         let Some(last) = self.kept.back_mut().filter(|last| last.slide == slide) else { return false };
-        let is_exr = |file: &(PathBuf, u64)| file.0.extension().is_some_and(|extension| extension == "exr");
+        let is_exr = |file: &(String, u64)| file.0.ends_with(".exr");
         let Some(at) = last.files.iter().position(is_exr) else { return false };
         let exr = last.files.remove(at);
         self.kept_bytes -= exr.1;
-        remove(&[exr]);
         if last.files.is_empty() {
             self.kept.pop_back();
         }
+        self.remove(&[exr]);
         true
     }
 
     fn write_picture(&self, new: &mut Kept, name: &str, bytes: &[u8]) -> io::Result<()> {
-        let path = self.path.join(FRAMES).join(name);
-        write_whole(&path, bytes)?;
-        new.files.push((path, bytes.len() as u64));
+        self.frames.write_whole(name, bytes)?;
+        new.files.push((name.to_owned(), bytes.len() as u64));
         Ok(())
     }
 
@@ -284,7 +315,7 @@ impl RunFolder {
         let mut removed = 0;
         while self.kept.len() > 1 && (self.kept.len() > max || self.kept_bytes > max_bytes) {
             let Some(oldest) = self.kept.pop_front() else { break };
-            remove(&oldest.files);
+            self.remove(&oldest.files);
             self.kept_bytes -= oldest.bytes();
             removed += 1;
         }
@@ -296,7 +327,15 @@ impl RunFolder {
     /// # Errors
     /// Errors of the system.
     pub fn write_scene(&self, command: &str, scene: &str) -> Result<(), PublishError> {
-        write_scene(&self.path.join(SCENE), command, scene)
+        let path = self.path().join(SCENE);
+        let written = self.folder.write_whole(SCENE, text_of(SCENE, command, scene).as_bytes());
+        written.map_err(|error| PublishError::File { path, problem: format!("cannot be written: {error}") })
+    }
+
+    /// Makes the file of the records one that takes no byte, as a disk that hangs.
+    #[cfg(test)]
+    pub(super) fn hang(&mut self, full: File) {
+        self.records = full;
     }
 
     /// Writes `summary.json`.
@@ -304,81 +343,113 @@ impl RunFolder {
     /// # Errors
     /// Errors of the system.
     pub fn write_summary(&self, summary: &Summary) -> Result<(), PublishError> {
-        let path = self.path.join(SUMMARY);
-        let written = serde_json::to_vec_pretty(summary).map_err(io::Error::from).and_then(|json| write_whole(&path, &json));
-        written.map_err(|source| PublishError::Folder { path, source })
+        let json = serde_json::to_vec_pretty(summary).map_err(io::Error::from);
+        let written = json.and_then(|json| self.folder.write_whole(SUMMARY, &json));
+        written.map_err(|source| PublishError::Folder { path: self.path().join(SUMMARY), source })
     }
-}
 
-/// Deletes pictures. Files that do not exist any more are ignored; other errors are warnings.
-fn remove(files: &[(PathBuf, u64)]) {
-    for (file, _) in files {
-        match fs::remove_file(file) {
-            Err(error) if error.kind() != io::ErrorKind::NotFound => {
-                tracing::warn!("{}: cannot be removed: {error}", file.display());
+    /// Deletes pictures. Files that do not exist any more are ignored; other errors are warnings.
+    fn remove(&self, files: &[(String, u64)]) {
+        for (file, _) in files {
+            match self.frames.remove(file) {
+                Err(error) if error.kind() != io::ErrorKind::NotFound => {
+                    tracing::warn!("{}: cannot be removed: {error}", self.frames.path().join(file).display());
+                }
+                _ => {}
             }
-            _ => {}
         }
     }
 }
 
+/// Takes the lock of a run folder.
+fn lock(folder: &Folder) -> io::Result<Lock> {
+    for _ in 1..ATTEMPTS {
+        match folder.lock(LOCK) {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => std::thread::sleep(PAUSE),
+            taken => return taken,
+        }
+    }
+    folder.lock(LOCK)
+}
+
+/// The process whose run writes into a folder. `None` if there is none, or no folder.
+fn holder(path: &Path) -> io::Result<Option<String>> {
+    let folder = match Folder::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        folder => folder?,
+    };
+    folder.holder(LOCK)
+}
+
+/// Removes the files of the previous run.
+fn remove_previous(folder: &Folder) -> io::Result<()> {
+    let Some(previous) = folder.existing(PREVIOUS)? else { return Ok(()) };
+    for name in previous.names()? {
+        previous.remove(name)?;
+    }
+    folder.remove_folder(PREVIOUS)
+}
+
 /// Moves the files of the previous run back.
-fn restore(path: &Path, previous: &Path) -> io::Result<()> {
+fn restore(folder: &Folder, frames: &Folder, previous: &Folder) -> io::Result<()> {
     // A previous run without a scene must not keep the scene of this one.
-    if let Err(error) = fs::remove_file(path.join(SCENE))
+    if let Err(error) = folder.remove(SCENE)
         && error.kind() != io::ErrorKind::NotFound
     {
         return Err(error);
     }
-    for entry in fs::read_dir(previous)? {
-        let entry = entry?;
-        let folder = if entry.file_name().to_str().is_some_and(is_picture) { path.join(FRAMES) } else { path.to_owned() };
-        fs::rename(entry.path(), folder.join(entry.file_name()))?;
+    for name in previous.names()? {
+        let to = if name.to_str().is_some_and(is_picture) { frames } else { folder };
+        previous.rename(&name, to, &name)?;
     }
-    fs::remove_dir(previous)
+    folder.remove_folder(PREVIOUS)
+}
+
+/// A file of a run.
+struct OldFile {
+    name: OsString,
+    /// In `frames`.
+    is_picture: bool,
+}
+
+impl OldFile {
+    /// Whether it may be lost, as the files of a run that failed before its first frame.
+    fn is_empty(&self, folder: &Folder) -> bool {
+        if self.name == RECORDS || self.name == OLDER_RECORDS { folder.length(&self.name) == Some(0) } else { !self.is_picture }
+    }
 }
 
 /// Files of a run in the folder.
-fn run_files(path: &Path) -> io::Result<Vec<PathBuf>> {
-    let mut files: Vec<PathBuf> = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"]
-        .iter()
-        .map(|f| path.join(f))
-        .filter(|f| f.exists())
-        .collect();
-    let scene = path.join(SCENE);
-    if scene.exists() && is_ours(&scene)? {
-        files.push(scene);
+fn run_files(folder: &Folder, frames: Option<&Folder>) -> io::Result<Vec<OldFile>> {
+    let known = [RECORDS, OLDER_RECORDS, SUMMARY, ".summary.json.part", ".scene.toml.part"];
+    let mut files: Vec<OldFile> =
+        known.into_iter().filter(|name| folder.has(name)).map(|name| OldFile { name: name.into(), is_picture: false }).collect();
+    if folder.has(SCENE) && is_ours(&folder.path().join(SCENE))? {
+        files.push(OldFile { name: SCENE.into(), is_picture: false });
     }
-    for entry in fs::read_dir(path.join(FRAMES))? {
-        let entry = entry?;
-        if entry.file_name().to_str().is_some_and(is_picture) {
-            files.push(entry.path());
-        }
+    if let Some(frames) = frames {
+        let pictures = frames.names()?.into_iter().filter(|name| name.to_str().is_some_and(is_picture));
+        files.extend(pictures.map(|name| OldFile { name, is_picture: true }));
     }
     Ok(files)
 }
 
 /// First file of a run in a folder. `None` if the folder holds no run or does not exist.
 fn occupied(path: &Path) -> io::Result<Option<String>> {
+    let folder = match Folder::open(path) {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
+        folder => folder?,
+    };
     // Left by a process that was killed before its first frame; it holds the previous run.
-    if path.join(PREVIOUS).exists() {
+    if folder.has(PREVIOUS) {
         return Ok(Some(PREVIOUS.into()));
     }
-    let files = match run_files(path) {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(None),
-        files => files?,
-    };
-    let holds = !files.iter().all(|file| is_empty(file));
-    Ok(files.first().filter(|_| holds).map(|file| file.strip_prefix(path).unwrap_or(file).display().to_string()))
-}
-
-/// Whether a file of a run may be lost, as those of a run that failed before its first frame.
-fn is_empty(file: &Path) -> bool {
-    match file.file_name().and_then(|name| name.to_str()) {
-        Some(RECORDS | OLDER_RECORDS) => fs::metadata(file).is_ok_and(|m| m.len() == 0),
-        Some(name) => !is_picture(name),
-        None => false,
+    let files = run_files(&folder, folder.existing(FRAMES)?.as_ref())?;
+    if files.iter().all(|file| file.is_empty(&folder)) {
+        return Ok(None);
     }
+    let shown = |file: &OldFile| if file.is_picture { Path::new(FRAMES).join(&file.name) } else { PathBuf::from(&file.name) };
+    Ok(files.first().map(|file| shown(file).display().to_string()))
 }
 
 /// Whether the name is that of a picture of a run, complete or not.
@@ -392,7 +463,60 @@ fn is_picture(name: &str) -> bool {
 mod tests {
     use super::*;
     use crate::render::Film;
+    use std::fs;
+    use std::os::unix::fs::symlink;
     use std::sync::Arc;
+
+    #[test]
+    fn a_run_in_progress_keeps_others_out() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        let run = RunFolder::create(&path, false).unwrap();
+        for overwrite in [false, true] {
+            let refused = RunFolder::create(&path, overwrite).unwrap_err();
+            let expected = format!("in use by process {}", std::process::id());
+            assert!(matches!(refused, PublishError::InUse { .. }) && refused.to_string().contains(&expected), "{refused}");
+            assert!(matches!(RunFolder::refuse_occupied(&path, overwrite), Err(PublishError::InUse { .. })));
+        }
+        assert_eq!(RunFolder::vacant(&path).unwrap(), folder.path().join("run-2"), "it has no frame yet");
+        drop(run);
+        RunFolder::create(&RunFolder::vacant(&path).unwrap(), false).unwrap();
+    }
+
+    #[test]
+    fn links_and_pipes_in_the_folder_are_not_followed() {
+        let (folder, victim) = (tempfile::tempdir().unwrap(), tempfile::NamedTempFile::new().unwrap());
+        fs::write(victim.path(), "precious").unwrap();
+        let frames = folder.path().join(FRAMES);
+        fs::create_dir(&frames).unwrap();
+        symlink(victim.path(), frames.join(".probe")).unwrap();
+        let mut run = RunFolder::create(folder.path(), false).unwrap();
+        for link in
+            [frames.join(".frame_000000.png.part"), folder.path().join(".summary.json.part"), folder.path().join(".scene.toml.part")]
+        {
+            symlink(victim.path(), link).unwrap();
+        }
+        assert!(std::process::Command::new("mkfifo").arg(frames.join(".frame_000000.exr.part")).status().unwrap().success());
+        run.write_pictures(&frame(0), &PublishSettings::default()).unwrap();
+        run.write_scene("replay", "seed = 1\n").unwrap();
+        run.write_summary(&Summary::default()).unwrap();
+        assert_eq!(fs::read(victim.path()).unwrap(), b"precious");
+        assert_eq!(names(folder.path()), ["frame_000000.exr", "frame_000000.png"]);
+        drop(run);
+        // The pictures' folder itself.
+        let (folder, elsewhere) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+        symlink(elsewhere.path(), folder.path().join(FRAMES)).unwrap();
+        assert!(RunFolder::create(folder.path(), false).is_err() && fs::read_dir(elsewhere.path()).unwrap().count() == 0);
+    }
+
+    #[test]
+    fn a_folder_that_others_may_write_into_is_refused() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
+        let refused = RunFolder::create(folder.path(), false).unwrap_err().to_string();
+        assert!(refused.contains("has mode 0777; accepted: a folder of user"), "{refused}");
+    }
 
     #[test]
     fn a_run_without_a_frame_does_not_occupy_its_folder() {
@@ -421,6 +545,7 @@ mod tests {
         failed.write_scene("replay", "seed = 1\n").unwrap();
         assert!(failed.restore_previous().unwrap() && scene().is_none(), "a run of before scenes were written");
         failed.write_scene("replay", "seed = 2\n").unwrap();
+        drop(failed);
         let mut failed = RunFolder::create(folder.path(), true).unwrap();
         failed.write_scene("replay", "seed = 3\n").unwrap();
         assert!(failed.restore_previous().unwrap() && scene().unwrap().ends_with("again.\nseed = 2\n"));
@@ -501,6 +626,7 @@ mod tests {
         assert_eq!((numbers(OLDER_RECORDS), numbers(RECORDS)), (vec![109, 110, 111], vec![113]));
         // Both files belong to the run: another run is refused, and one with `overwrite` replaces both.
         fs::remove_file(&records).unwrap();
+        drop(run);
         assert!(matches!(RunFolder::create(folder.path(), false), Err(PublishError::Occupied { .. })));
         drop(RunFolder::create(folder.path(), true).unwrap());
         assert!(!folder.path().join(OLDER_RECORDS).exists());
@@ -541,6 +667,7 @@ mod tests {
         for foreign in ["notes.txt", "frames/frame_best.png", "frames/frame_000000.tif"] {
             fs::write(folder.path().join(foreign), "mine").unwrap();
         }
+        drop(run);
         let refused = RunFolder::create(folder.path(), false).unwrap_err().to_string();
         assert!(refused.contains("--overwrite") && refused.contains("records.jsonl"), "{refused}");
         let inner = folder.path().join("run");

@@ -31,14 +31,18 @@ pub fn refuse_foreign_scene(path: &Path) -> Result<(), PublishError> {
     }
 }
 
+/// Text of a scene file of this name.
+pub(super) fn text_of(name: &str, command: &str, scene: &str) -> String {
+    let (name, version) = (name.escape_debug(), env!("CARGO_PKG_VERSION"));
+    format!("{FIRST_WORDS}{version}, whose next run here replaces it: `ridgewatch {command} {name}` makes this again.\n{scene}")
+}
+
 /// Writes a scene (TOML), with the command that repeats the run in its first line.
 ///
 /// # Errors
 /// Errors of the system.
 pub fn write_scene(path: &Path, command: &str, scene: &str) -> Result<(), PublishError> {
-    let name = path.file_name().unwrap_or_default().to_string_lossy();
-    let (name, version) = (name.escape_debug(), env!("CARGO_PKG_VERSION"));
-    let text = format!("{FIRST_WORDS}{version}, whose next run here replaces it: `ridgewatch {command} {name}` makes this again.\n{scene}");
+    let text = text_of(&path.file_name().unwrap_or_default().to_string_lossy(), command, scene);
     let failed = |error| PublishError::File { path: path.to_owned(), problem: format!("cannot be written: {error}") };
     write_whole(path, text.as_bytes()).map_err(failed)
 }

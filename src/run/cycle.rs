@@ -19,9 +19,10 @@ use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate, WhenLost};
 use crate::flow::{FlowMap, StepChoice, Steps, TimeResolution, Tracer, VelocitySource, time_resolution};
 use crate::render::{MAX_FRAMES_UNTIL, Method, RenderSettings, Renderer, Scene, Target};
 use crate::surrogate::network::{Size, Times};
-use crate::surrogate::{Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
+use crate::surrogate::{CheckpointError, Learned, MAX_DEVICE_NODES, MAX_OWN_NODES, ReplayBuffer, Resize, Sizing, SurrogateSettings, Trace};
 use crate::trust::TrustMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
 
@@ -38,8 +39,13 @@ pub struct RunOptions {
     pub checkpoint: Option<PathBuf>,
     /// Seconds between checkpoints during the run. A killed run can resume from the latest one.
     pub checkpoint_seconds: Option<f64>,
+    /// File with weights to go on from if they fit; otherwise the run begins anew, with a warning. `training.resume` goes before it, and ends the
+    /// run if it does not fit.
+    pub resume_if_fit: Option<PathBuf>,
     /// The device that computes.
     pub device: Device,
+    /// Setting it abandons the frame in progress. It has an effect once a stop is requested; the run then ends as if the frame had not begun.
+    pub abandon: Arc<AtomicBool>,
 }
 
 /// Events of a run in progress.
@@ -210,8 +216,8 @@ pub(super) struct FramePlace {
     pub(super) preparing: f64,
 }
 
-/// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame. Between frames (while the window
-/// fills, tables are traced, or cells are probed) the run ends within about a second.
+/// Runs the whole scene. `sink` receives every event. Setting `stop` ends the run after the current frame, which setting `options.abandon` ends
+/// early. Between frames (while the window fills, tables are traced, or cells are probed) the run ends within about a second.
 ///
 /// # Errors
 /// A setting, the source, the device or the last checkpoint fails.
@@ -417,11 +423,19 @@ impl<B: Backend> Cycle<'_, B> {
         if self.run.plan.scene.render.method != Method::Reference {
             transaction!(self, slide, run, on => run.build_surrogate(on));
         }
-        if let Some(path) = &self.run.plan.scene.training.resume {
+        let named = &self.run.plan.scene.training.resume;
+        if let Some(path) = named.as_ref().or(self.run.options.resume_if_fit.as_ref()) {
             let loaded = with!(&mut self.session, on => match &mut on.surrogate {
                 Some(surrogate) if surrogate.learns() => surrogate.load(path).map(|()| true),
                 _ => Ok(false),
-            })?;
+            });
+            let loaded = match loaded {
+                Err(refused) if named.is_none() => {
+                    slide.warnings.push(format!("training begins anew: {refused}{}", set_aside(path, &refused)));
+                    false
+                }
+                loaded => loaded?,
+            };
             if loaded {
                 // The checkpoint's table may be of another window.
                 transaction!(self, slide, run, on => run.slide_surrogate(on));
@@ -557,6 +571,19 @@ impl Run<'_> {
             ));
         }
         warnings
+    }
+}
+
+/// Keeps a checkpoint that does not fit from being replaced by the next one: it may be the work of another run. Returns where it is, in words.
+fn set_aside(path: &Path, refused: &CheckpointError) -> String {
+    if !matches!(refused, CheckpointError::Mismatch { .. }) {
+        return String::new();
+    }
+    let mut aside = path.as_os_str().to_owned();
+    aside.push(".unfit");
+    match std::fs::rename(path, &aside) {
+        Ok(()) => format!("; it is now {}", Path::new(&aside).display()),
+        Err(error) => format!("; it cannot be set aside: {error}"),
     }
 }
 

@@ -5,7 +5,7 @@ use super::checkpoints::Checkpoints;
 use super::cycle::{Event, FramePlace, Run, Sink, fixed_steps};
 use super::record::Frame;
 use super::slides::{Slide, Slides};
-use super::stop::RunEnd;
+use super::stop::{RunEnd, check_stop};
 use super::training::{Until, train};
 use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
@@ -57,7 +57,7 @@ impl Run<'_> {
         let frozen = on.surrogate.as_ref().map(Surrogate::freeze).transpose()?;
         let renderer = self.renderer.clone();
         let picture = Picture { gate: &gate, place, is_live: slide.live.is_some() };
-        let computed = self.picture(on, frozen.as_ref(), &picture, sink).map_err(RunEnd::from).and_then(|work| {
+        let computed = self.picture(on, frozen.as_ref(), &picture, sink).and_then(|work| {
             let assessing = Instant::now();
             let assessment = match &frozen {
                 Some(frozen) => assess(self, frozen, on.tracer(), &gate, &work)?,
@@ -143,7 +143,7 @@ impl Run<'_> {
         frozen: Option<&FrozenOf<B>>,
         picture: &Picture<'_>,
         sink: &mut Sink<'_>,
-    ) -> Result<Work<B::Samples>, DeviceError> {
+    ) -> Result<Work<B::Samples>, RunEnd> {
         self.threads.device_trains = on.surrogate.as_ref().is_some_and(Surrogate::trains_on_device);
         let learns = on.surrogate.as_ref().is_some_and(Surrogate::learns);
         let is_smooth = self.plan.scene.render.method.is_smooth();
@@ -180,7 +180,7 @@ impl Run<'_> {
         let routing = Routing { gate: picture.gate, trace_budget: scene.trust.trace_budget, keep, extras };
         let rendered = AtomicBool::new(false);
         let (buffer, trust, threads) = (&self.learning.buffer, &self.learning.trust, &self.threads);
-        let (renderer, frame, stop) = (&mut self.renderer, self.progress.frame, self.stop);
+        let (renderer, frame, stop, abandon) = (&mut self.renderer, self.progress.frame, self.stop, &*self.options.abandon);
         let mut render = || -> Result<Work<B::Samples>, DeviceError> {
             let progress = Mutex::new(&mut *sink);
             let report = |share: f32| {
@@ -197,7 +197,7 @@ impl Run<'_> {
                 samples: samples_per_pixel,
                 smooth,
                 progress: Some(&report),
-                stop: &AtomicBool::new(false),
+                stop: abandon,
             };
             let rendered = backend.render(&job, renderer, accumulated)?;
             let render_seconds = begin.elapsed().as_secs_f64();
@@ -211,14 +211,15 @@ impl Run<'_> {
                 None => Strata::even(cells, 1),
             };
             let (seed, transfer, samples) = (scene.seed, renderer.transfer(), learns.then_some(extras));
-            let audit = backend.audit(&AuditRequest { strata, seed, stream: 2 * frame, transfer, samples }, tracer, frozen)?;
+            let request = AuditRequest { strata, seed, stream: 2 * frame, transfer, samples, stop: abandon };
+            let audit = backend.audit(&request, tracer, frozen)?;
             Ok(Work { rendered, audit, samples_per_pixel, render_seconds, audit_seconds: auditing.elapsed().as_secs_f64() })
         };
-        let mut learned = Learned::default();
+        let (mut learned, mut refused) = (Learned::default(), None);
         let (work, trained) = match (surrogate.as_mut().filter(|_| learns && !buffer.is_empty()), threads.beside()) {
             (Some(surrogate), Some([beside, all])) => std::thread::scope(|scope| {
                 let (rendered, learned) = (&rendered, &mut learned);
-                let training = scope.spawn(move || {
+                let training = std::thread::Builder::new().spawn_scoped(scope, move || {
                     let mut learn = |seconds, steps| surrogate.learn(buffer, seconds, steps);
                     beside.install(|| train(&mut learn, settings, Until::Rendered(rendered), stop, learned))?;
                     let left = settings.seconds() - learned.seconds;
@@ -230,7 +231,14 @@ impl Run<'_> {
                 });
                 let work = threads.render().install(&mut render);
                 rendered.store(true, Ordering::Release);
-                (work, training.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)))
+                let trained = match training {
+                    Ok(training) => training.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)),
+                    Err(error) => {
+                        refused = Some(error);
+                        Ok(())
+                    }
+                };
+                (work, trained)
             }),
             (Some(surrogate), None) => {
                 let work = threads.render().install(&mut render);
@@ -244,10 +252,15 @@ impl Run<'_> {
             }
             (None, _) => (threads.render().install(&mut render), Ok(())),
         };
+        if let Some(error) = refused {
+            self.progress.warnings.push(format!("nothing was trained beside this frame: cannot start a thread: {error}"));
+        }
         // Reported even if the frame fails, since the weights have changed.
         self.learning.report(learned);
+        // An abandoned frame, whose picture or audit may lack parts, is dropped with its samples.
+        check_stop(abandon)?;
         trained?;
-        work
+        Ok(work?)
     }
 
     /// Trains in a live run after the frame has gone out, until the next window is complete. The CPU trains for at least `training.share` of the

@@ -1,13 +1,16 @@
 //! Checkpoints in the safetensors format: an 8-byte little-endian header length, a JSON header, then raw little-endian f32. Any
 //! safetensors reader opens them; other values (shape, step count, rate) are text under `__metadata__`.
 //!
-//! A checkpoint is written to a temporary file beside the target and then renamed, so that readers never see a partial file. On reading, the whole
-//! file is checked before any state changes.
+//! A checkpoint is written to a temporary file beside the target, brought to the disk and then renamed, so that readers never see a partial file.
+//! On reading, the header is checked first, then the size of the file, and only a file of the expected size is read. All of it is checked before
+//! any state changes.
 
 use super::CheckpointError;
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
+use std::fs::File;
 use std::io::{Read, Write};
+use std::ops::Range;
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
@@ -33,6 +36,16 @@ impl<'a> Entry<'a> {
 /// FNV-1a over 32-bit words.
 fn checksum(words: impl Iterator<Item = u32>) -> u64 {
     words.fold(0xcbf2_9ce4_8422_2325, |sum, word| (sum ^ u64::from(word)).wrapping_mul(0x0000_0100_0000_01b3))
+}
+
+/// A checkpoint file whose header has been read.
+pub(super) struct Opened {
+    file: File,
+    /// Bytes of the values.
+    bytes: u64,
+    /// Name, shape and bytes of each tensor.
+    listed: Vec<(String, Vec<usize>, Range<usize>)>,
+    checkpoint: Checkpoint<'static>,
 }
 
 /// Contents of a checkpoint file.
@@ -95,11 +108,13 @@ impl<'a> Checkpoint<'a> {
         write().map_err(io)?;
         drop(out);
         file.persist(path).map_err(|fault| io(fault.error))?;
+        // The new name, too, outlives a loss of power, where the file system can bring a folder to the disk; the file is whole in any case.
+        let _ = File::open(folder).and_then(|folder| folder.sync_all());
         Ok((8 + header.len() + offset) as u64)
     }
 
-    /// Reads a checkpoint of this kind.
-    pub(super) fn read(path: &Path, kind: &str) -> Result<Checkpoint<'static>, CheckpointError> {
+    /// Reads the header of a checkpoint of this kind.
+    pub(super) fn open(path: &Path, kind: &str) -> Result<Opened, CheckpointError> {
         let io = |source| CheckpointError::Io { path: path.into(), source };
         let foreign =
             |found: &str| CheckpointError::Mismatch { path: path.into(), found: found.into(), expected: format!("a {kind} checkpoint") };
@@ -122,13 +137,11 @@ impl<'a> Checkpoint<'a> {
         let Some(Value::Object(notes)) = header.remove("__metadata__") else {
             return Err(foreign("a header without metadata"));
         };
-        let mut checkpoint = Checkpoint { path: path.into(), notes, entries: Vec::new() };
+        let checkpoint = Checkpoint { path: path.into(), notes, entries: Vec::new() };
         checkpoint.expect_note("format", FORMAT)?;
         checkpoint.expect_note("kind", kind)?;
-        let mut data = Vec::new();
-        // Allocations are bounded by the size of the file.
-        file.read_to_end(&mut data).map_err(io)?;
-        let mut used = 0;
+        let bytes = size - 8 - length;
+        let (mut listed, mut used) = (Vec::new(), 0_u64);
         for (name, tensor) in header {
             let shape: Option<Vec<usize>> = serde_json::from_value(tensor["shape"].clone()).ok();
             let range: Option<[usize; 2]> = serde_json::from_value(tensor["data_offsets"].clone()).ok();
@@ -139,19 +152,16 @@ impl<'a> Checkpoint<'a> {
             if begin > end || count != Some(end - begin) {
                 return Err(foreign(&format!("an entry `{name}` whose size does not match its shape")));
             }
-            let Some(bytes) = data.get(begin..end) else {
-                return Err(foreign(&format!("a truncated file: entry `{name}` ends at byte {end} of {}", data.len())));
-            };
-            let values: Vec<f32> = bytes.chunks_exact(4).map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]])).collect();
-            used += end - begin;
-            checkpoint.entries.push(Entry { name, shape, values: values.into() });
+            if end as u64 > bytes {
+                return Err(foreign(&format!("a truncated file: entry `{name}` ends at byte {end} of {bytes}")));
+            }
+            used = used.saturating_add((end - begin) as u64);
+            listed.push((name, shape, begin..end));
         }
-        if used != data.len() {
-            return Err(foreign(&format!("{} bytes of data, {used} of them named", data.len())));
+        if used != bytes {
+            return Err(foreign(&format!("{bytes} bytes of data, {used} of them named")));
         }
-        let words = data.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
-        checkpoint.expect_note("checksum", &format!("{:016x}", checksum(words)))?;
-        Ok(checkpoint)
+        Ok(Opened { file, bytes, listed, checkpoint })
     }
 
     pub(super) fn mismatch(&self, found: String, expected: String) -> CheckpointError {
@@ -177,6 +187,21 @@ impl<'a> Checkpoint<'a> {
             .ok_or_else(|| self.mismatch(format!("{key} {}", text.unwrap_or("missing")), format!("{key} as a number")))
     }
 
+    /// Parses a note as a finite number.
+    pub(super) fn finite(&self, key: &str) -> Result<f32, CheckpointError> {
+        let number: f32 = self.number(key)?;
+        if number.is_finite() { Ok(number) } else { Err(self.mismatch(format!("{key} {number}"), format!("{key} as a finite number"))) }
+    }
+
+    /// A tensor of `len` finite values.
+    pub(super) fn finite_values(&self, name: &str, len: usize) -> Result<Vec<f32>, CheckpointError> {
+        let values = self.values(name, len)?;
+        match values.iter().filter(|value| !value.is_finite()).count() {
+            0 => Ok(values),
+            odd => Err(self.mismatch(format!("{name} with {odd} of {len} values that are not finite"), "finite weights".into())),
+        }
+    }
+
     /// A tensor of `len` values.
     pub(super) fn values(&self, name: &str, len: usize) -> Result<Vec<f32>, CheckpointError> {
         match self.entries.iter().find(|entry| entry.name == name) {
@@ -184,5 +209,31 @@ impl<'a> Checkpoint<'a> {
             Some(entry) => Err(self.mismatch(format!("{name} of {} values", entry.values.len()), format!("{len} values"))),
             None => Err(self.mismatch(format!("no {name}"), format!("{name} of {len} values"))),
         }
+    }
+}
+
+impl Opened {
+    /// The notes of the header.
+    pub(super) fn header(&self) -> &Checkpoint<'static> {
+        &self.checkpoint
+    }
+
+    /// Reads the values, if there are as many as expected.
+    pub(super) fn read(self, expected: usize) -> Result<Checkpoint<'static>, CheckpointError> {
+        let Self { mut file, bytes, listed, mut checkpoint } = self;
+        if bytes != 4 * expected as u64 {
+            return Err(checkpoint.mismatch(format!("{bytes} bytes of values"), format!("{} bytes", 4 * expected as u64)));
+        }
+        let mut data = vec![0; bytes as usize];
+        let path = &checkpoint.path;
+        file.read_exact(&mut data).map_err(|source| CheckpointError::Io { path: path.clone(), source })?;
+        let value = |b: &[u8]| f32::from_le_bytes([b[0], b[1], b[2], b[3]]);
+        for (name, shape, range) in listed {
+            let values: Vec<f32> = data[range].chunks_exact(4).map(value).collect();
+            checkpoint.entries.push(Entry { name, shape, values: values.into() });
+        }
+        let words = data.chunks_exact(4).map(|b| u32::from_le_bytes([b[0], b[1], b[2], b[3]]));
+        checkpoint.expect_note("checksum", &format!("{:016x}", checksum(words)))?;
+        Ok(checkpoint)
     }
 }

@@ -255,7 +255,14 @@ impl<D: SurrogateDevice> Hybrid<D> {
     /// # Errors
     /// The file cannot be read, or is a checkpoint of another shape. Then nothing changes.
     pub fn load(&mut self, path: &Path) -> Result<(), CheckpointError> {
-        let checkpoint = Checkpoint::read(path, self.name())?;
+        // The notes tell another surrogate before its values are read.
+        let opened = Checkpoint::open(path, self.name())?;
+        let mut expected = self.trainer.as_ref().map_or(Ok(0), |trainer| trainer.checkpoint_values(opened.header()))?;
+        if self.kind != Kind::Network {
+            opened.header().expect_note("table.nodes", &format!("{:?}", self.nodes))?;
+            expected += self.nodes.iter().product::<usize>();
+        }
+        let checkpoint = opened.read(expected)?;
         let lost = |source| CheckpointError::Lost { path: path.into(), what: "the present table", source };
         let table = match &self.table {
             Some(table) => {
@@ -266,7 +273,7 @@ impl<D: SurrogateDevice> Hybrid<D> {
         };
         let (mut slid, mut shrinkage) = (self.slid, self.shrinkage);
         if self.kind == Kind::Residual {
-            (slid, shrinkage) = (checkpoint.number("slid")?, checkpoint.number("shrinkage")?);
+            (slid, shrinkage) = (checkpoint.number("slid")?, checkpoint.finite("shrinkage")?);
         }
         if let Some(trainer) = &mut self.trainer {
             trainer.restore(&checkpoint)?;

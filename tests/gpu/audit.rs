@@ -10,6 +10,7 @@ use ridgewatch::surrogate::Kind;
 use ridgewatch::surrogate::Predict;
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::trust::{CellErrors, Strata};
+use std::sync::atomic::AtomicBool;
 
 fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], strata: &Strata, land: bool) {
     let gpu = gpu();
@@ -21,7 +22,8 @@ fn check(source: &VelocitySource, map: &FlowMap, t0: f64, nodes: [usize; 3], str
     let transfer = Transfer::new(&settings, 1.0).unwrap();
     let mut audits = Audits::new(&gpu).unwrap();
     for (stream, samples) in [(0, None), (1, Some(Extras { arrival: true, jacobian: false })), (1 << 40, Some(Extras::default()))] {
-        let request = AuditRequest { strata: strata.clone(), seed: 77, stream, transfer: &transfer, samples };
+        let request =
+            AuditRequest { strata: strata.clone(), seed: 77, stream, transfer: &transfer, samples, stop: &AtomicBool::new(false) };
         let expected = audit(&request, &tracer, Some(&frozen)).unwrap();
         let found = audits.audit(&request, &tracer, on_device).unwrap();
         assert_eq!((found.drawn, found.points), (expected.drawn, expected.points));
@@ -81,7 +83,7 @@ fn memory_is_kept_from_audit_to_audit() {
     for stream in 0..50 {
         let strata = Strata::even([16, 8, 8], 20 + (stream % 7) as u32);
         let points = stratified_points(&strata, 77, stream).len();
-        let request = AuditRequest { strata, seed: 77, stream, transfer: &transfer, samples: None };
+        let request = AuditRequest { strata, seed: 77, stream, transfer: &transfer, samples: None, stop: &AtomicBool::new(false) };
         assert_eq!(audits.audit(&request, &tracer, table).unwrap().drawn, points);
         if stream >= 7 {
             assert_eq!(*taken.get_or_insert(gpu.memory().0), gpu.memory().0);

@@ -88,6 +88,29 @@ fn a_checkpoint_holds_the_weights_after_its_frame() {
     assert!((gone_on - expected).abs() < 1.5, "{gone_on} dB, where the run had {expected} dB");
 }
 
+/// Weights that were found, and not named for this run, need not fit: they are set aside, and the run begins anew.
+#[test]
+fn weights_that_were_found_need_not_fit() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = |name: &str| folder.path().join(name);
+    frames(1, &["time.tau=4"], &ending_in(&file("of another tau")), |_| ());
+    std::fs::write(file("damaged"), "no weights").unwrap();
+    for (name, why) in [("of another tau", "network.tau 4; expected network.tau 5"), ("damaged", "no safetensors header")] {
+        let (found, content) = (file(name), std::fs::read(file(name)).unwrap());
+        let options = RunOptions { resume_if_fit: Some(found.clone()), ..ending_in(&found) };
+        let mut warnings = Vec::new();
+        frames(1, &[], &options, |record| warnings.extend(record.warnings.clone()));
+        let aside = file(&format!("{name}.unfit"));
+        let warning = warnings.iter().find(|warning| warning.contains("training begins anew")).unwrap();
+        assert!(warning.contains(why) && warning.contains(&format!("it is now {}", aside.display())), "{warning}");
+        assert_eq!(std::fs::read(aside).unwrap(), content);
+        // The run's own weights are in its place, and fit.
+        let mut warnings = Vec::new();
+        frames(1, &[], &options, |record| warnings.extend(record.warnings.clone()));
+        assert!(!warnings.iter().any(|warning| warning.contains("anew")), "{warnings:?}");
+    }
+}
+
 /// Environment variable that names the checkpoint of the process that is killed.
 const TARGET: &str = "RIDGEWATCH_TEST_CHECKPOINT";
 

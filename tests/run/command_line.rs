@@ -4,6 +4,7 @@
 use crate::kit::program::{config, project, records, run, start, summary, text, until};
 use crate::kit::{program, scene};
 use crate::ridgewatch;
+use std::os::unix::process::CommandExt;
 use std::path::Path;
 
 /// Asserts the status and that standard error holds all `parts`.
@@ -39,6 +40,103 @@ fn bad_usage_is_status_2() {
     refused(&["render", &config("saddle.toml"), "--device", "tpu"], 2, &["--device tpu", "auto, cpu"]);
     refused(&["render", &config("saddle.toml"), "--method", "magic"], 2, &["reference, surrogate, neural, gated"]);
     refused(&["render", &config("saddle.toml"), "--out", "picture.tiff"], 2, &[".exr or .png"]);
+}
+
+/// A result that nobody got is no success, unlike one whose reader has left.
+#[test]
+fn a_result_that_cannot_be_written_is_an_error() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut command = program::ridgewatch(["doctor", "--json"]);
+    let full = || std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    assert_eq!(command.stdout(full()).stderr(std::process::Stdio::null()).status().unwrap().code(), Some(1));
+    let scene = small_scene(folder.path(), "");
+    let mut command = program::ridgewatch(["replay", &scene, "--json", "--out", "run"]);
+    let done = command.current_dir(folder.path()).stdout(full()).output().unwrap();
+    let said = String::from_utf8_lossy(&done.stderr);
+    assert!(done.status.code() == Some(1) && said.contains("the result cannot be written to standard output: No space left"), "{said}");
+    assert!(folder.path().join("run/summary.json").exists());
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    assert_eq!(program::ridgewatch(["doctor", "--json"]).stdout(writer).status().unwrap().code(), Some(0));
+}
+
+/// However few threads the system grants, a run ends, with an error or without the help of those that are missing.
+#[test]
+fn threads_that_are_refused_end_no_run_in_a_panic() {
+    /// A user without other processes, whom a limit counts alone; another user than root can only be refused every thread.
+    const USER: u32 = 54_321;
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    let program = folder.path().join("ridgewatch");
+    std::fs::copy(env!("CARGO_BIN_EXE_ridgewatch"), &program).unwrap();
+    // SAFETY: has no arguments and cannot fail.
+    let is_root = unsafe { libc::geteuid() } == 0;
+    if is_root {
+        std::os::unix::fs::chown(folder.path(), Some(USER), None).unwrap();
+    }
+    for limit in (1..12).chain([16, 24]) {
+        let out = format!("run-{limit}");
+        let mut command = std::process::Command::new(&program);
+        command.args(["replay", &scene, "--threads", "2", "--stop-within", "30", "--out", &out]).current_dir(folder.path());
+        if is_root {
+            command.uid(USER);
+        }
+        // SAFETY: between fork and exec, only `setrlimit` is called, which is safe there.
+        unsafe {
+            command.pre_exec(move || {
+                let limit = libc::rlimit { rlim_cur: limit, rlim_max: limit };
+                if libc::setrlimit(libc::RLIMIT_NPROC, &raw const limit) == 0 { Ok(()) } else { Err(std::io::Error::last_os_error()) }
+            })
+        };
+        let done = start(&mut command).wait_at_most(std::time::Duration::from_secs(120));
+        assert!(matches!(done.status, Some(0 | 1)) && !done.stderr.contains("panicked"), "{limit} threads: {done:?}");
+    }
+}
+
+/// Two runs in one folder would mix their frames.
+#[test]
+fn a_folder_takes_one_run_at_a_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = small_scene(folder.path(), "");
+    let command = |more: &[&str]| {
+        let mut command = program::ridgewatch([&["replay", &scene, "--out", "run"], more].concat());
+        command.current_dir(folder.path());
+        command
+    };
+    let first = start(&mut command(&["--set", "training.steps_per_frame=100000000"]));
+    until("the first run", || folder.path().join("run/records.jsonl").exists());
+    let holder = format!("run folder run is in use by process {}", first.id());
+    for more in [&[][..], &["--overwrite"]] {
+        run(&mut command(more)).refused(1, &[&holder]);
+    }
+    first.signal(libc::SIGTERM);
+    first.wait().refused(143, &[]);
+    run(&mut command(&["--overwrite"])).success();
+    assert_eq!(summary(&folder.path().join("run"))["run"]["interrupted"], false);
+}
+
+/// A scene of somebody else may have files written inside `out/` only.
+#[test]
+fn a_scene_file_chooses_no_folder_outside_of_out() {
+    let folder = tempfile::tempdir().unwrap();
+    let target = folder.path().join("elsewhere");
+    let write = |written: &str| {
+        let archive = format!("[archive.synthetic]\nshape = \"flame\"\nnodes = [8, 8, 8]\nsnapshots = 3\nfolder = {written:?}\n");
+        scene::write(folder.path(), &format!("[source]\nkind = \"archive\"\n[time]\ntau = 1\n{archive}"))
+    };
+    let inspect = |scene: &str, more: &[&str]| {
+        let mut command = program::ridgewatch([&["inspect", scene], more].concat());
+        run(command.current_dir(folder.path()))
+    };
+    for written in [text(&target), "elsewhere", "../elsewhere", "out/../elsewhere"] {
+        inspect(&write(written), &[])
+            .refused(2, &["scene.toml:", "archive.synthetic.folder", "inside out/ of the working directory", "--set"]);
+        assert!(!target.exists());
+    }
+    inspect(&write("out/mine"), &[]).success();
+    assert!(folder.path().join("out/mine").exists());
+    inspect(&write(text(&target)), &["--set", &format!("archive.synthetic.folder={:?}", text(&target))]).success();
+    assert!(target.exists());
 }
 
 /// Standard error on a full disk changes no exit status, and a run goes to its end.

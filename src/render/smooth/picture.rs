@@ -44,7 +44,7 @@ pub struct Refinement<'a> {
     pub samples: f64,
     /// Number that selects the random stream when the picture starts anew.
     pub number: u64,
-    /// Setting it ends the round early, without a film.
+    /// Setting it ends the round early, without a film; the picture then starts anew.
     pub stop: &'a AtomicBool,
 }
 
@@ -99,9 +99,9 @@ impl Picture {
         self.settle(scene, frame.inverse_tau, round.nodes, round.number);
         let frame = &FrameScene { random: FrameRandom::new(scene.seed, self.number), ..*frame };
         let medium = Medium { scene: frame, nodes: round.nodes, missing: round.missing };
-        let mut marching = self.march(&medium, round.sum);
+        let mut marching = self.march(&medium, round);
         let sampling = Instant::now();
-        let mut stats = self.sample(&medium, round, wave_flights, answers)?;
+        let Some(mut stats) = self.sample(&medium, round, wave_flights, answers) else { return self.stopped() };
         let allowed = sampling.elapsed().as_secs_f64().max(MIN_MARCH_SECONDS);
         let how = match (round.method, round.sum) {
             (Method::Marched, _) => Correction::Left,
@@ -114,7 +114,7 @@ impl Picture {
             self.allocation.learn(tiles.iter().map(TileSums::sample_variance));
             let others = error.rms.value.powi(2) - self.march.error();
             if round.stop.load(Ordering::Relaxed) {
-                return None;
+                return self.stopped();
             }
             match self.march.decide(others, marching < allowed) {
                 Marching::Enough => break (film, error),
@@ -124,25 +124,32 @@ impl Picture {
                 }
                 Marching::More => {}
             }
-            marching += self.march(&medium, round.sum);
+            marching += self.march(&medium, round);
         };
         stats.walk_seconds = began.elapsed().as_secs_f64() - stats.evaluate_seconds;
         Some((film, stats, error))
     }
 
-    /// Marches more rays, and compares some pixels with a finer march. Returns the seconds that it took.
-    fn march(&mut self, medium: &Medium<'_>, shift: bool) -> f64 {
+    /// Ends a round early: rays may be missing, so that nothing of the picture is kept.
+    fn stopped<T>(&mut self) -> Option<T> {
+        self.shows = None;
+        None
+    }
+
+    /// Marches more rays, and compares some pixels with a finer march. Returns the seconds that it took. `stop` ends it early.
+    fn march(&mut self, medium: &Medium<'_>, round: &Refinement<'_>) -> f64 {
         if self.march.next_rays == 0 {
             return 0.0;
         }
         let began = Instant::now();
+        let shift = round.sum;
         let refine = self.march.refine();
         let light = &*self.light.get_or_insert_with(|| LightVolume::new(medium, LIGHT_VALUES, refine));
         let step = medium.spacing() as f32 * self.march.step;
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
-            for j in rays.clone() {
+            for j in rays.clone().take_while(|_| !round.stop.load(Ordering::Relaxed)) {
                 sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(light), shift));
             }
         });

@@ -111,8 +111,18 @@ impl<T: Training> Trainer<T> {
         fixed
     }
 
-    /// Restores the trainer. The whole checkpoint is checked before any state changes.
-    pub(crate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
+    /// Number of values that a checkpoint of this trainer has.
+    ///
+    /// # Errors
+    /// The notes are those of another network or of another tau.
+    pub(crate) fn checkpoint_values(&self, checkpoint: &Checkpoint<'_>) -> Result<usize, CheckpointError> {
+        self.expect_notes(checkpoint)?;
+        let shape = self.training.shape();
+        // Weights, two moments, and the average.
+        Ok(4 * (shape.table_entries() * shape.features + shape.layer_parameters()))
+    }
+
+    fn expect_notes(&self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
         for (key, text) in self.fixed() {
             checkpoint.expect_note(&format!("network.{key}"), &text)?;
         }
@@ -121,6 +131,12 @@ impl<T: Training> Trainer<T> {
         if tau as f32 != self.objective.tau {
             return Err(checkpoint.mismatch(format!("network.tau {tau}"), format!("network.tau {}", self.times.tau)));
         }
+        Ok(())
+    }
+
+    /// Restores the trainer. The whole checkpoint is checked before any state changes.
+    pub(crate) fn restore(&mut self, checkpoint: &Checkpoint<'_>) -> Result<(), CheckpointError> {
+        self.expect_notes(checkpoint)?;
         let progress = Progress {
             drawn: checkpoint.number("network.drawn")?,
             averaged: checkpoint.number("network.averaged")?,
@@ -134,21 +150,21 @@ impl<T: Training> Trainer<T> {
         let steps = checkpoint.number("network.steps")?;
         let mut scale = self.objective.scale;
         for output in 0..3 {
-            scale.mean[output] = checkpoint.number(&format!("network.mean.{output}"))?;
-            scale.deviation[output] = checkpoint.number(&format!("network.deviation.{output}"))?;
+            scale.mean[output] = checkpoint.finite(&format!("network.mean.{output}"))?;
+            scale.deviation[output] = checkpoint.finite(&format!("network.deviation.{output}"))?;
         }
         let shape = self.training.shape();
         let read = |name: &str, len: usize| -> Result<[Vec<f32>; 3], CheckpointError> {
             if len == 0 {
                 return Ok(Default::default());
             }
-            let part = |part: &str| checkpoint.values(&format!("network.{name}{part}"), len);
+            let part = |part: &str| checkpoint.finite_values(&format!("network.{name}{part}"), len);
             Ok([part("")?, part(".moment_1")?, part(".moment_2")?])
         };
         let (table_values, layer_values) = (shape.table_entries() * shape.features, shape.layer_parameters());
         let state = [read("tables", table_values)?, read("layers", layer_values)?];
-        let tables = if table_values == 0 { Vec::new() } else { checkpoint.values("network.tables.average", table_values)? };
-        let layers = checkpoint.values("network.layers.average", layer_values)?;
+        let tables = if table_values == 0 { Vec::new() } else { checkpoint.finite_values("network.tables.average", table_values)? };
+        let layers = checkpoint.finite_values("network.layers.average", layer_values)?;
         let mut model = self.training.host_copy().model.clone();
         model.set_state(state, steps);
         self.training.restore(HostNetwork { model, average: Arc::new(Average { tables, layers }) });

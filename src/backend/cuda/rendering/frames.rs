@@ -9,7 +9,7 @@ use crate::cuda::network::{Filled, LabelPool, LabelSink, NetworkAbove, OnGpu, fr
 use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::{AuditFindings, AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, Rendered, Smooth, Tally};
 use ridgewatch_render::smooth::PictureError;
-use ridgewatch_render::{RenderStats, Renderer};
+use ridgewatch_render::{Film, RenderStats, Renderer};
 use ridgewatch_surrogate::{FrozenHybrid, Samples};
 use ridgewatch_trust::Gate;
 use std::sync::Arc;
@@ -184,9 +184,9 @@ impl GpuFrames {
         let pool = frozen.network.as_ref().and_then(|network| network.pool().cloned());
         let mut labels = CudaSamples { host: Samples::default(), uncommitted: pool.map(|pool| (pool.clone(), pool.mark())) };
         let nothing_trusted = Gate::uniform(false);
-        let ((film, stats, error), trace_seconds) = if routing.keep <= 1 && predictor.label_sink().is_none() {
+        let (refined, trace_seconds) = if routing.keep <= 1 && predictor.label_sink().is_none() {
             let refined = own.refine(&round, renderer, &mut TraceAll(tracer.device()))?;
-            let seconds = refined.1.evaluate_seconds;
+            let seconds = refined.as_ref().map_or(0.0, |(_, stats, _)| stats.evaluate_seconds);
             (refined, seconds)
         } else {
             let mut answers = self.router.begin(FrameQueries {
@@ -207,6 +207,11 @@ impl GpuFrames {
         if let Some(report) = job.progress {
             report(1.0);
         }
+        let Some((film, stats, error)) = refined else {
+            let settings = &renderer.scene().settings;
+            let (film, stats) = (Film::new(settings.width, settings.height), RenderStats { stopped: true, ..RenderStats::default() });
+            return Ok(Rendered { film, stats, tally: Tally::default(), samples: labels, error: None });
+        };
         let tally = Tally { queries: stats.queries, traced: stats.traced, missing: stats.missing, trace_seconds, ..Tally::default() };
         Ok(Rendered { film, stats, tally, samples: labels, error: Some(error).filter(PictureError::is_known) })
     }

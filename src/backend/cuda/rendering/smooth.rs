@@ -16,7 +16,7 @@ use ridgewatch_render::smooth::{
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
 
 /// Largest number of values of the light volume, 512 MiB, and the share of the free memory that it takes at most.
@@ -117,7 +117,7 @@ impl GpuSmooth {
         self.march.prepare(renderer, &medium, most as usize, self.control.refine())
     }
 
-    /// Adds rays and pairs to the picture and returns it with its error.
+    /// Adds rays and pairs to the picture and returns it with its error. `None` if `stop` ended the round early; the picture then starts anew.
     ///
     /// # Errors
     /// The device fails or lacks memory. The samples of the round may be lost then.
@@ -126,7 +126,7 @@ impl GpuSmooth {
         round: &SmoothRound<'_>,
         renderer: &mut Renderer,
         answers: &mut dyn DeviceLogStretch,
-    ) -> Result<(Film, RenderStats, PictureError), DeviceError> {
+    ) -> Result<Option<(Film, RenderStats, PictureError)>, DeviceError> {
         self.settle(round, renderer)?;
         let parameters = renderer.round_setup(self.number).parameters;
         let mut marching = self.march(round, renderer, &parameters)?;
@@ -141,6 +141,10 @@ impl GpuSmooth {
         };
         let samples_per_pixel = 2.0 * self.pairs as f64 / (width * height) as f64;
         let error = loop {
+            if stats.stopped || round.stop.load(Ordering::Relaxed) {
+                self.shows = None;
+                return Ok(None);
+            }
             let Some(pairs) = &self.sums else { return Err(unsupported("a picture without sums")) };
             let input = CombineInput { size: [width, height], pairs, march: &self.march, how, tone_map, lit: LIT };
             let tiles = self.combine.combine(&input)?;
@@ -162,7 +166,7 @@ impl GpuSmooth {
         let floor = if error.is_known() { ERROR_FLOOR * (error.rms.value.powi(2) - march).max(0.0) } else { 0.0 };
         let film = film(&self.combine.finish(ERROR_RADIUS as u32, floor as f32, march as f32)?, width, height);
         stats.device_seconds = stats.walk_seconds + stats.evaluate_seconds;
-        Ok((film, stats, error))
+        Ok(Some((film, stats, error)))
     }
 
     /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
@@ -233,6 +237,9 @@ impl GpuSmooth {
             stats.walk_seconds += found.walk_seconds;
             stats.evaluate_seconds += found.answer_seconds;
             stats.stopped |= found.stopped;
+            if stats.stopped {
+                break;
+            }
         }
         Ok(stats)
     }
