@@ -198,7 +198,8 @@ impl ArchiveSettings {
     pub fn check_window(&self, bytes: u64) -> Result<(), SourceError> {
         let limits = Limits::new(self.memory_gib, self.external);
         let found = format!("{:.2}", gib(limits.memory));
-        let needed = format!("{:.2} GiB for the window at least: or reduce tau, or read a part (`archive.region`, `archive.level`)", gib(bytes));
+        let needed =
+            format!("{:.2} GiB for the window at least: or reduce tau, or read a part (`archive.region`, `archive.level`)", gib(bytes));
         if bytes <= limits.memory { Ok(()) } else { Err(SourceError::setting("memory_gib", found, needed)) }
     }
 }

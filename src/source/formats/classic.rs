@@ -34,7 +34,14 @@ impl ClassicStore {
     pub fn open(listing: Listing, file: File, version: u8) -> Result<(Listing, Self), FormatError> {
         let (path, bytes) = (listing.path.clone(), listing.bytes);
         let damaged = |what| FormatFault::Damaged(what).of(&path);
-        let mut parser = Parser { input: BufReader::new(&file), left: bytes, wide: version == 5, wide_offsets: version != 1, attributes: 0, attribute_bytes: 0 };
+        let mut parser = Parser {
+            input: BufReader::new(&file),
+            left: bytes,
+            wide: version == 5,
+            wide_offsets: version != 1,
+            attributes: 0,
+            attribute_bytes: 0,
+        };
         let parsed = parser.header().map_err(|fault| match fault {
             Fault::Ended => damaged(format!("its header does not end within {bytes} bytes")),
             Fault::Io(cause) => FormatFault::Open(cause.to_string()).of(&path),
@@ -215,13 +222,7 @@ impl Parser<'_> {
         Ok(String::from_utf8_lossy(&self.padded(length)?).into_owned())
     }
 
-    fn list<T>(
-        &mut self,
-        tag: u32,
-        of: &str,
-        most: usize,
-        mut item: impl FnMut(&mut Self) -> Result<T, Fault>,
-    ) -> Result<Vec<T>, Fault> {
+    fn list<T>(&mut self, tag: u32, of: &str, most: usize, mut item: impl FnMut(&mut Self) -> Result<T, Fault>) -> Result<Vec<T>, Fault> {
         let found = u32::from_be_bytes(self.bytes()?);
         let length = self.length(of)?;
         if found != tag && (found, length) != (0, 0) {

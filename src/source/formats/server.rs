@@ -50,7 +50,7 @@ impl FormatServer {
             Request::Read { path, variable, start, count } => {
                 let limits = self.limits;
                 self.opened(&path)?.read(&variable, &start, &count, &limits).map(Response::Values)
-            },
+            }
         }
     }
 
@@ -76,7 +76,9 @@ impl OpenFile {
             let (listing, store) = ClassicStore::open(empty(format), file, version)?;
             return Ok(Self { listing, store: Box::new(store), chunks: Chunks::new() });
         }
-        if let Some((listing, store, chunks)) = expected.and_then(|expected| Hdf5Store::open_expected(empty(Format::NetCdf4), expected, limits)) {
+        if let Some((listing, store, chunks)) =
+            expected.and_then(|expected| Hdf5Store::open_expected(empty(Format::NetCdf4), expected, limits))
+        {
             return Ok(Self { listing, store: Box::new(store), chunks });
         }
         // libnetcdf reads all groups, follows all links and reads all attributes when it opens a file.
