@@ -152,12 +152,18 @@ impl Setup {
             notes.push("training.resume is ignored: method reference and tables cannot resume from a checkpoint".to_owned());
         }
         let times = snapshots.as_ref().map(|s| s.times().to_vec());
+        if scene.source.kind == SourceKind::Archive
+            && let (Some(times), Some(grid)) = (&times, &grid)
+        {
+            // Before the first snapshot is read.
+            scene.archive.check_window(window_bytes(times, tau, grid.nodes()))?;
+        }
         let slides = match live {
             Some(live) => live_slides(&scene, live.follow(tau, scene.time.snapshots_per_slide)?, direction),
             None => open_slides(&scene, snapshots, tau, direction)?,
         };
         if let (Some(times), Some(grid)) = (&times, &grid) {
-            notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), memory::available()));
+            notes.extend(memory::short(window_bytes(times, tau, grid.nodes()), ridgewatch_base::memory::available()));
         }
         notes.extend(settle_starts(&mut scene, times.as_deref(), tau, direction)?);
         let time_unit = unit.unwrap_or_default();

@@ -1,5 +1,8 @@
 //! `[archive]` of a scene file.
 
+use crate::error::SourceError;
+use crate::formats::Limits;
+use ridgewatch_base::memory::gib;
 use serde::{Deserialize, Deserializer, Serialize};
 use std::path::PathBuf;
 
@@ -177,10 +180,28 @@ pub struct ArchiveSettings {
     /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
     /// decided by their standard names.
     pub grid_relative: Option<bool>,
+    /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
+    pub external: bool,
+    /// Most memory that reading may need, in GiB; by default nine tenths of what is free.
+    pub memory_gib: Option<f64>,
     /// If no files are named: an archive of the standard turbulence, which is written unless it exists, and read.
     pub synthetic: Option<SyntheticSettings>,
     /// Lower and upper end of the slab over which a two-dimensional flow is extruded; by default 0 and a tenth of the longer edge.
     pub slab: Option<[f64; 2]>,
+}
+
+impl ArchiveSettings {
+    /// Compares the bytes of a window with the memory that reading may need.
+    ///
+    /// # Errors
+    /// The window needs more.
+    pub fn check_window(&self, bytes: u64) -> Result<(), SourceError> {
+        let limits = Limits::new(self.memory_gib, self.external);
+        let found = format!("{:.2}", gib(limits.memory));
+        let needed =
+            format!("{:.2} GiB for the window at least: or reduce tau, or read a part (`archive.region`, `archive.level`)", gib(bytes));
+        if bytes <= limits.memory { Ok(()) } else { Err(SourceError::setting("memory_gib", found, needed)) }
+    }
 }
 
 fn one_or_many<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Vec<PathBuf>, D::Error> {

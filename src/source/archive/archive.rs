@@ -7,7 +7,7 @@ use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::calendar::Calendar;
 use crate::cf::coordinate::Kind;
 use crate::error::SourceError;
-use crate::formats::{DataFile, Format, Listing};
+use crate::formats::{DataFile, Format, Limits, Listing};
 use crate::grids::{AxisPlan, ComponentPlan, Layout, Orders, Poles, Resampling, VelocityScale, difference, plan, read_component, slab_of};
 use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
@@ -53,6 +53,7 @@ pub struct Archive {
     open: Option<(usize, DataFile)>,
     /// Listing of the velocities, if it suffices to open files.
     expected: Option<Listing>,
+    limits: Limits,
 }
 
 impl Archive {
@@ -79,6 +80,7 @@ impl Archive {
     /// Opens a list of files. See [`Archive::open`].
     pub(super) fn open_files(paths: Vec<PathBuf>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         check(settings)?;
+        let limits = limits(settings);
         let mut first: Option<Layout> = None;
         let mut format = Format::Hdf5;
         let mut entries: Vec<(f64, Place)> = Vec::new();
@@ -87,7 +89,7 @@ impl Archive {
         let mut expected: Option<Listing> = None;
         let mut synthetic = None;
         for path in paths {
-            let (file, layout) = open_next(&path, settings, first.as_ref(), expected.as_ref())?;
+            let (file, layout) = open_next(&path, settings, first.as_ref(), expected.as_ref(), limits)?;
             if expected.is_none() && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
@@ -126,6 +128,7 @@ impl Archive {
             (Metric::Cartesian, VelocityUnit::Si) if on_sphere => Some(VelocityScale::to_degrees(&layout.axes)),
             _ => None,
         };
+        check_memory(&files[0].path, &layout, &limits)?;
         let grid = Arc::new(build_grid(&files[0].path, &layout, settings)?);
         let description = describe(&layout, format, files.len(), &seconds);
         let names: Vec<String> = layout.frames.iter().flatten().map(|c| c.name.clone()).collect();
@@ -145,6 +148,7 @@ impl Archive {
             description,
             open,
             expected: expected.map(|listing| listing.part(&names)),
+            limits,
             files,
         };
         if let Some(what) = synthetic {
@@ -231,7 +235,7 @@ impl Archive {
                 // Closed before the next file opens.
                 drop(other);
                 let ArchiveFile { path, frames } = &self.files[place.file];
-                let file = DataFile::open(path, self.expected.as_ref())?;
+                let file = DataFile::open(path, self.expected.as_ref(), self.limits)?;
                 for component in frames.iter().flatten() {
                     let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
                     if shape.ok().as_ref() != Some(&component.shape) {
@@ -355,19 +359,35 @@ pub(super) fn files_of(paths: &[PathBuf], settings: &ArchiveSettings) -> Result<
     }
 }
 
+/// Limits that the settings give.
+pub(super) fn limits(settings: &ArchiveSettings) -> Limits {
+    Limits::new(settings.memory_gib, settings.external)
+}
+
+/// Bytes of a node while a snapshot is read: a value of the file, in the library and converted; three components; the snapshot.
+const NODE_BYTES: u64 = 2 * 8 + 3 * 4 + 16;
+
+/// Compares what one snapshot needs with the memory that reading may need. The window is compared when a run is set up.
+fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), SourceError> {
+    let nodes = layout.axes.iter().fold(1u64, |n, axis| n.saturating_mul(axis.axis.len() as u64));
+    let what = limits.check(nodes.saturating_mul(NODE_BYTES), &format!("snapshots of {nodes} nodes"));
+    what.map_err(|what| SourceError::file(path, what))
+}
+
 /// Opens and plans the next file of an archive whose first file has the layout `first`.
 fn open_next(
     path: &Path,
     settings: &ArchiveSettings,
     first: Option<&Layout>,
     expected: Option<&Listing>,
+    limits: Limits,
 ) -> Result<(DataFile, Layout), SourceError> {
-    let mut file = DataFile::open(path, expected)?;
+    let mut file = DataFile::open(path, expected, limits)?;
     let mut planned = plan(&file, settings, first);
     let fits = planned.as_ref().is_ok_and(|layout| first.is_none_or(|first| difference(first, layout).is_none()));
     if expected.is_some() && !fits {
         // The part of the listing that suffices for the first file may not suffice for this one.
-        file = DataFile::open(path, None)?;
+        file = DataFile::open(path, None, limits)?;
         planned = plan(&file, settings, first);
     }
     Ok((file, planned?))

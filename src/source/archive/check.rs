@@ -26,6 +26,11 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
     {
         return fault("vertical_scale", scale.to_string(), "a number above 0");
     }
+    if let Some(gib) = settings.memory_gib
+        && !(gib.is_finite() && gib > 0.0)
+    {
+        return fault("memory_gib", gib.to_string(), "a number above 0");
+    }
     if settings.level.is_some_and(|l| !l.is_finite()) {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
     }

@@ -1,6 +1,7 @@
 //! Inspection of an archive: what would be read from it, and why.
 
-use super::archive::{Archive, Displacement, files_of};
+use super::archive::{Archive, Displacement, files_of, limits};
+use super::check::check;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::velocity;
 use crate::error::SourceError;
@@ -152,7 +153,8 @@ pub struct ResolutionReport {
 pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) -> Result<Inspection, SourceError> {
     let files = files_of(paths, settings)?;
     let Some(file) = files.first().cloned() else { return Err(SourceError::NoFiles) };
-    let first = DataFile::open(&file, None)?;
+    check(settings)?;
+    let first = DataFile::open(&file, None, limits(settings))?;
     let mut inspection = Inspection {
         file,
         files: files.len(),

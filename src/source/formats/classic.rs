@@ -4,6 +4,7 @@
 //! case. Once the header is known, a value is one seek away, reading needs no global lock, and a damaged byte cannot crash C code.
 //! Source: "NetCDF Classic Format Specification", NetCDF User's Guide, appendix B.
 
+use super::limits::{MAX_ATTRIBUTE_BYTES, MAX_ATTRIBUTES, MAX_OBJECTS};
 use super::messages::{Attribute, Dimension, FormatError, FormatFault, Listing, NumberType, Variable};
 use super::store::Store;
 use std::fs::File;
@@ -11,6 +12,8 @@ use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
 /// Largest piece that is read at once if only parts of it are wanted.
 const PIECE: usize = 1 << 20;
+/// Most dimensions of a variable that libnetcdf writes.
+const MAX_RANK: usize = 1024;
 
 /// An open classic file.
 pub struct ClassicStore {
@@ -31,11 +34,19 @@ impl ClassicStore {
     pub fn open(listing: Listing, file: File, version: u8) -> Result<(Listing, Self), FormatError> {
         let (path, bytes) = (listing.path.clone(), listing.bytes);
         let damaged = |what| FormatFault::Damaged(what).of(&path);
-        let mut parser = Parser { input: BufReader::new(&file), left: bytes, wide: version == 5, wide_offsets: version != 1 };
+        let mut parser = Parser {
+            input: BufReader::new(&file),
+            left: bytes,
+            wide: version == 5,
+            wide_offsets: version != 1,
+            attributes: 0,
+            attribute_bytes: 0,
+        };
         let parsed = parser.header().map_err(|fault| match fault {
             Fault::Ended => damaged(format!("its header does not end within {bytes} bytes")),
             Fault::Io(cause) => FormatFault::Open(cause.to_string()).of(&path),
             Fault::Nonsense(what) => damaged(what),
+            Fault::TooMany(what) => FormatFault::Refused(what).of(&path),
         })?;
         let (listing, places, record_bytes, needed) = parsed.lay_out(listing).map_err(damaged)?;
         if needed > bytes {
@@ -126,6 +137,7 @@ enum Fault {
     Ended,
     Io(io::Error),
     Nonsense(String),
+    TooMany(String),
 }
 
 /// Header of the file, before shapes are resolved.
@@ -142,6 +154,9 @@ struct Parser<'a> {
     left: u64,
     wide: bool,
     wide_offsets: bool,
+    /// Attributes so far, and their bytes.
+    attributes: usize,
+    attribute_bytes: u64,
 }
 
 impl Parser<'_> {
@@ -149,11 +164,14 @@ impl Parser<'_> {
         self.bytes::<4>()?;
         let records = self.count()?;
         let streaming = if self.wide { u64::MAX } else { u64::from(u32::MAX) };
-        let dimensions = self.list(0x0a, "dimensions", |p| Ok((p.name()?, p.count()?)))?;
+        let dimensions = self.list(0x0a, "dimensions", MAX_OBJECTS, |p| Ok((p.name()?, p.count()?)))?;
         let attributes = self.attributes()?;
-        let variables = self.list(0x0b, "variables", |p| {
+        let variables = self.list(0x0b, "variables", MAX_OBJECTS, |p| {
             let name = p.name()?;
             let rank = p.length("dimensions")?;
+            if rank > MAX_RANK {
+                return Err(Fault::Nonsense(format!("variable `{name}` has {rank} dimensions")));
+            }
             let mut ids = Vec::with_capacity(rank);
             for _ in 0..rank {
                 ids.push(p.count()? as usize);
@@ -204,11 +222,14 @@ impl Parser<'_> {
         Ok(String::from_utf8_lossy(&self.padded(length)?).into_owned())
     }
 
-    fn list<T>(&mut self, tag: u32, of: &str, mut item: impl FnMut(&mut Self) -> Result<T, Fault>) -> Result<Vec<T>, Fault> {
+    fn list<T>(&mut self, tag: u32, of: &str, most: usize, mut item: impl FnMut(&mut Self) -> Result<T, Fault>) -> Result<Vec<T>, Fault> {
         let found = u32::from_be_bytes(self.bytes()?);
         let length = self.length(of)?;
         if found != tag && (found, length) != (0, 0) {
             return Err(Fault::Nonsense(format!("its list of {of} starts with tag {found}, not {tag}")));
+        }
+        if length > most {
+            return Err(Fault::TooMany(format!("it holds {length} {of}; accepted are {most} at most")));
         }
         (0..length).map(|_| item(self)).collect()
     }
@@ -222,11 +243,17 @@ impl Parser<'_> {
     }
 
     fn attributes(&mut self) -> Result<Vec<(String, Attribute)>, Fault> {
-        self.list(0x0c, "attributes", |p| {
+        self.list(0x0c, "attributes", MAX_ATTRIBUTES, |p| {
             let name = p.name()?;
             let number = p.number_type()?;
             let length = p.length("values of an attribute")?;
             let bytes = length.checked_mul(number.bytes()).filter(|&b| b as u64 <= p.left).ok_or(Fault::Ended)?;
+            p.attributes += 1;
+            p.attribute_bytes += bytes as u64;
+            if p.attributes > MAX_ATTRIBUTES || p.attribute_bytes > MAX_ATTRIBUTE_BYTES {
+                let megabytes = MAX_ATTRIBUTE_BYTES >> 20;
+                return Err(Fault::TooMany(format!("it holds more than {MAX_ATTRIBUTES} attributes, or {megabytes} MiB of them")));
+            }
             let bytes = p.padded(bytes)?;
             if number == NumberType::Text {
                 let text = bytes.split(|&b| b == 0).next().unwrap_or_default();

@@ -1,5 +1,6 @@
 //! One file, seen through requests.
 
+use super::limits::Limits;
 use super::messages::{Description, FormatError, FormatFault, Listing, Request, Response};
 use super::server::FormatServer;
 use std::cell::RefCell;
@@ -9,6 +10,8 @@ use std::path::Path;
 pub struct DataFile {
     /// Contents of the file.
     pub listing: Listing,
+    /// What reading it may cost.
+    pub limits: Limits,
     server: RefCell<FormatServer>,
 }
 
@@ -16,11 +19,11 @@ impl DataFile {
     /// Opens a file and lists it. See [`Request::List`] for `expected`.
     ///
     /// # Errors
-    /// A file that is missing, damaged or of another format.
-    pub fn open(path: &Path, expected: Option<&Listing>) -> Result<Self, FormatError> {
-        let mut server = FormatServer::default();
+    /// A file that is missing, damaged, of another format or beyond the limits.
+    pub fn open(path: &Path, expected: Option<&Listing>, limits: Limits) -> Result<Self, FormatError> {
+        let mut server = FormatServer::new(limits);
         match server.answer(Request::List { path: path.into(), expected: expected.cloned() })? {
-            Response::Listing(listing) => Ok(Self { listing, server: RefCell::new(server) }),
+            Response::Listing(listing) => Ok(Self { listing, limits, server: RefCell::new(server) }),
             _ => Err(FormatFault::Damaged("it was not listed".into()).of(path)),
         }
     }

@@ -2,16 +2,16 @@
 //! library.
 
 use super::guard::{guarded, open_guarded};
+use super::limits::{Limits, MAX_DEPTH, MAX_OBJECTS};
 use super::messages::{Attribute, Dimension, FormatError, Listing, NumberType, Variable};
+use super::scan::{Chunks, look_at};
 use super::store::Store;
 use hdf5_metno::types::{FixedAscii, FixedUnicode, FloatSize, IntSize, TypeDescriptor, VarLenAscii, VarLenUnicode};
 use hdf5_metno::{Group, Hyperslab, LinkType, SliceOrIndex};
 use ndarray::ArrayD;
+use std::collections::HashSet;
 use std::path::PathBuf;
 
-/// Depth of groups within groups, and number of datasets: more than any archive has, and a bound for a damaged one.
-const MAX_DEPTH: usize = 8;
-const MAX_DATASETS: usize = 100_000;
 /// Values of an attribute that are read.
 const MAX_ATTRIBUTE: usize = 4096;
 /// Characters of a text attribute that are read.
@@ -26,25 +26,42 @@ pub struct Hdf5Store {
 impl Hdf5Store {
     /// Opens the file of an empty listing and fills the listing. Datasets become variables, named by their path without the leading
     /// `/`. Their axes become dimensions, shared by axes of one place and length.
-    pub fn open(mut listing: Listing) -> Result<(Listing, Self), FormatError> {
+    pub fn open(mut listing: Listing, limits: &Limits) -> Result<(Listing, Self), FormatError> {
         let path = listing.path.clone();
         let file = open_guarded(&path, "the HDF5 library failed on it", || -> hdf5_metno::Result<_> {
             let file = hdf5_metno::File::open(&path)?;
             listing.attributes = attributes(&file);
-            collect(&file, "", 0, &mut listing)?;
+            collect(&file, "", 0, limits.external, &mut listing)?;
             Ok(file)
         })?;
         Ok((listing, Self { file, path }))
     }
 
     /// Opens the file of an empty listing, which is expected to resemble another: only the variables of `expected` are looked up,
-    /// by name, and their dimensions are assumed to have the same names. `None` if something differs.
-    pub fn open_expected(mut listing: Listing, expected: &Listing) -> Option<(Listing, Self)> {
+    /// by name, and their dimensions are assumed to have the same names. Also returns the bytes of their chunks. `None` if something differs.
+    pub fn open_expected(mut listing: Listing, expected: &Listing, limits: &Limits) -> Option<(Listing, Self, Chunks)> {
         let path = listing.path.clone();
+        let mut chunks = Chunks::new();
         let mut open = || {
             let file = hdf5_metno::File::open(&path).ok()?;
+            // Whatever is unusual is left to the scan of the whole file: a link may leave the file, and it may hold too much.
+            let mut own = HashSet::new();
+            if file.len() > MAX_OBJECTS as u64 {
+                return None;
+            }
+            file.iter_visit_default(|name, info| {
+                if info.link_type == LinkType::Hard {
+                    own.insert(name.to_owned());
+                }
+                Ok(())
+            })
+            .ok()?;
             for wanted in &expected.variables {
-                let dataset = file.dataset(&wanted.name).ok()?;
+                let dataset = own.contains(&wanted.name).then(|| file.dataset(&wanted.name).ok()).flatten()?;
+                if dataset.loc_info().ok()?.num_attrs > MAX_ATTRIBUTE {
+                    return None;
+                }
+                chunks.insert(wanted.name.clone(), look_at(&dataset, &wanted.name, limits).ok()?.ok()?);
                 let shape = dataset.shape();
                 let number = number_type(&dataset.dtype().ok()?.to_descriptor().ok()?);
                 if shape.len() != wanted.dimensions.len() || number != wanted.number {
@@ -58,7 +75,7 @@ impl Hdf5Store {
             Some(file)
         };
         let file = open_guarded(&path, "", || open().ok_or("it differs")).ok()?;
-        Some((listing, Self { file, path }))
+        Some((listing, Self { file, path }, chunks))
     }
 }
 
@@ -79,17 +96,18 @@ impl Store for Hdf5Store {
     }
 }
 
-/// Lists the datasets of a group and of the groups in it. Follows hard links only: others may leave the file or form circles.
-fn collect(group: &Group, prefix: &str, depth: usize, listing: &mut Listing) -> hdf5_metno::Result<()> {
+/// Lists the datasets of a group and of the groups in it. Follows hard links only, and those to other files where that is allowed:
+/// soft ones may form circles. The scan has counted all of them.
+fn collect(group: &Group, prefix: &str, depth: usize, external: bool, listing: &mut Listing) -> hdf5_metno::Result<()> {
     let mut names = Vec::new();
     group.iter_visit_default(|name, info| {
-        if info.link_type == LinkType::Hard {
+        if info.link_type == LinkType::Hard || (external && info.link_type == LinkType::External) {
             names.push(name.to_owned());
         }
         Ok(())
     })?;
     for name in names {
-        if listing.variables.len() >= MAX_DATASETS {
+        if listing.variables.len() >= MAX_OBJECTS {
             return Ok(());
         }
         let path = if prefix.is_empty() { name.clone() } else { format!("{prefix}/{name}") };
@@ -101,7 +119,7 @@ fn collect(group: &Group, prefix: &str, depth: usize, listing: &mut Listing) -> 
         } else if depth < MAX_DEPTH
             && let Ok(inner) = group.group(&name)
         {
-            collect(&inner, &path, depth + 1, listing)?;
+            collect(&inner, &path, depth + 1, external, listing)?;
         }
     }
     Ok(())

@@ -282,6 +282,9 @@ pub enum FormatFault {
     /// A header that contradicts itself, or that a library refuses.
     #[error("damaged or truncated: {0}")]
     Damaged(String),
+    /// The file may be whole, but reading it would reach other files, or cost more than is accepted: the reason.
+    #[error("refused: {0}")]
+    Refused(String),
     /// The values of this variable cannot be read, for this reason.
     #[error("variable `{0}` cannot be read: {1}")]
     Read(String, String),

@@ -2,25 +2,34 @@
 
 use super::classic::ClassicStore;
 use super::hdf5::Hdf5Store;
+use super::limits::Limits;
 use super::messages::{Description, Format, FormatError, FormatFault, Listing, NumberType, Request, Response};
 use super::netcdf4::NetCdf4Store;
+use super::scan::{Chunks, scan};
 use super::store::Store;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
 
 /// The formats, reached through requests.
-#[derive(Default)]
 pub struct FormatServer {
+    limits: Limits,
     open: Option<OpenFile>,
 }
 
 struct OpenFile {
     listing: Listing,
     store: Box<dyn Store>,
+    /// Bytes of a chunk of each variable; empty for formats without chunks.
+    chunks: Chunks,
 }
 
 impl FormatServer {
+    /// A server without an open file.
+    pub fn new(limits: Limits) -> Self {
+        Self { limits, open: None }
+    }
+
     /// Answers one request.
     ///
     /// # Errors
@@ -30,7 +39,7 @@ impl FormatServer {
             Request::List { path, expected } => {
                 // The previous file closes before the next one opens.
                 self.open = None;
-                Ok(Response::Listing(self.open.insert(OpenFile::open(&path, expected.as_ref())?).listing.clone()))
+                Ok(Response::Listing(self.open.insert(OpenFile::open(&path, expected.as_ref(), &self.limits)?).listing.clone()))
             }
             Request::Describe { path, variable } => {
                 let listing = &self.opened(&path)?.listing;
@@ -38,14 +47,17 @@ impl FormatServer {
                 let dimensions = found.dimensions.iter().map(|&d| listing.dimensions[d].clone()).collect();
                 Ok(Response::Description(Description { number: found.number, dimensions, attributes: found.attributes.clone() }))
             }
-            Request::Read { path, variable, start, count } => self.opened(&path)?.read(&variable, &start, &count).map(Response::Values),
+            Request::Read { path, variable, start, count } => {
+                let limits = self.limits;
+                self.opened(&path)?.read(&variable, &start, &count, &limits).map(Response::Values)
+            }
         }
     }
 
     fn opened(&mut self, path: &Path) -> Result<&OpenFile, FormatError> {
         let open = match self.open.take() {
             Some(open) if open.listing.path == path => open,
-            _ => OpenFile::open(path, None)?,
+            _ => OpenFile::open(path, None, &self.limits)?,
         };
         Ok(self.open.insert(open))
     }
@@ -54,7 +66,7 @@ impl FormatServer {
 impl OpenFile {
     /// Opens a file and reads its header, nothing else. libnetcdf reads all variables of a NetCDF-4 file when it opens it, which
     /// takes milliseconds and many small reads; a file that resembles `expected` is opened through libhdf5 instead.
-    fn open(path: &Path, expected: Option<&Listing>) -> Result<Self, FormatError> {
+    fn open(path: &Path, expected: Option<&Listing>, limits: &Limits) -> Result<Self, FormatError> {
         let failed = |cause: std::io::Error| FormatFault::Open(cause.to_string()).of(path);
         let mut file = ridgewatch_base::files::open(path).map_err(failed)?;
         let bytes = file.metadata().map_err(failed)?.len();
@@ -62,19 +74,23 @@ impl OpenFile {
         let empty = |format| Listing { path: path.into(), format, bytes, dimensions: vec![], variables: vec![], attributes: vec![] };
         if let Format::Classic(version) = format {
             let (listing, store) = ClassicStore::open(empty(format), file, version)?;
-            return Ok(Self { listing, store: Box::new(store) });
+            return Ok(Self { listing, store: Box::new(store), chunks: Chunks::new() });
         }
-        if let Some((listing, store)) = expected.and_then(|expected| Hdf5Store::open_expected(empty(Format::NetCdf4), expected)) {
-            return Ok(Self { listing, store: Box::new(store) });
+        if let Some((listing, store, chunks)) =
+            expected.and_then(|expected| Hdf5Store::open_expected(empty(Format::NetCdf4), expected, limits))
+        {
+            return Ok(Self { listing, store: Box::new(store), chunks });
         }
+        // libnetcdf reads all groups, follows all links and reads all attributes when it opens a file.
+        let chunks = scan(path, limits)?;
         if let Some((listing, store)) = NetCdf4Store::open(empty(Format::NetCdf4))? {
-            return Ok(Self { listing, store: Box::new(store) });
+            return Ok(Self { listing, store: Box::new(store), chunks });
         }
-        let (listing, store) = Hdf5Store::open(empty(Format::Hdf5))?;
-        Ok(Self { listing, store: Box::new(store) })
+        let (listing, store) = Hdf5Store::open(empty(Format::Hdf5), limits)?;
+        Ok(Self { listing, store: Box::new(store), chunks })
     }
 
-    fn read(&self, name: &str, start: &[usize], count: &[usize]) -> Result<Vec<f64>, FormatError> {
+    fn read(&self, name: &str, start: &[usize], count: &[usize], limits: &Limits) -> Result<Vec<f64>, FormatError> {
         let failed = |what: String| self.listing.read_error(name, what);
         let index = self.listing.find(name).ok_or_else(|| failed("it is gone".into()))?;
         let variable = &self.listing.variables[index];
@@ -87,6 +103,8 @@ impl OpenFile {
             return Err(failed("it holds no numbers".into()));
         }
         let total = self.listing.check_count(variable, count)?;
+        let chunk = self.chunks.get(name).copied().unwrap_or(0);
+        limits.check_read(total, chunk).map_err(failed)?;
         let mut values: Vec<f64> = Vec::new();
         values.try_reserve_exact(total).map_err(|_| failed(format!("out of memory for {total} values")))?;
         if total > 0 {
@@ -142,7 +160,7 @@ mod tests {
         let units = vec![("units", Attribute::Text("m s-1".into()))];
         let values = Values::Float32((0..6).map(|i| i as f32).collect());
         write_netcdf(&path, &[], &[NewVariable { name: "u", dimensions: vec![("y", 2), ("x", 3)], attributes: units, values }]).unwrap();
-        let mut server = FormatServer::default();
+        let mut server = FormatServer::new(Limits::NONE);
         let mut ask = |request: Request| -> Response {
             let request = serde_json::from_str(&serde_json::to_string(&request).unwrap()).unwrap();
             serde_json::from_str(&serde_json::to_string(&server.answer(request).unwrap()).unwrap()).unwrap()

@@ -50,7 +50,12 @@ pub type Orders = [Vec<usize>; 3];
 pub fn read_component(file: &DataFile, component: &ComponentPlan, orders: &Orders, entry: usize) -> Result<Vec<f32>, SourceError> {
     let [nx, ny, nz] = [0, 1, 2].map(|k| orders[k].len());
     let variable = file.listing.find(&component.name).ok_or_else(|| file.listing.read_error(&component.name, "it is gone"))?;
-    let mut values = vec![f32::NAN; nx * ny * nz];
+    // Before memory is taken: a file of a few bytes may claim any extent.
+    let total = file.listing.check_count(&file.listing.variables[variable], &[nx, ny, nz])?;
+    let mut values = Vec::new();
+    let lacking = |_| file.listing.read_error(&component.name, format!("out of memory for {total} values"));
+    values.try_reserve_exact(total).map_err(lacking)?;
+    values.resize(total, f32::NAN);
     let (runs_x, runs_y, runs_z) = (runs(&orders[0]), runs(&orders[1]), runs(&orders[2]));
     for run_z in &runs_z {
         for run_y in &runs_y {

@@ -18,6 +18,9 @@ use std::sync::Arc;
 /// Longitude and latitude variables of a component.
 type Pair = [usize; 2];
 
+/// Bytes of a point of a mesh: coordinates, directions, and up to four nodes with their places, bases and velocities.
+const POINT_BYTES: u64 = 500;
+
 impl Planner<'_> {
     /// Coordinate arrays of each component. `None` if the horizontal dimensions have coordinates of their own.
     pub fn curvilinear_coordinates(&self, velocity: &Velocity) -> Option<Vec<Pair>> {
@@ -67,6 +70,10 @@ impl Planner<'_> {
     /// Points of a pair of coordinate arrays, at the first entry along all dimensions but the last two.
     fn mesh(&self, [longitude, latitude]: Pair) -> Result<Mesh, SourceError> {
         let shape = self.plane_of(longitude).map(|d| self.listing().dimensions[d].len);
+        let points = shape[0].saturating_mul(shape[1]);
+        self.listing().check_count(self.variable(longitude), &shape)?;
+        let needed = (points as u64).saturating_mul(POINT_BYTES);
+        self.file.limits.check(needed, &format!("{points} points of a mesh")).map_err(|what| self.misfit(longitude, what))?;
         let mesh = Mesh { shape, longitude: self.degrees(longitude, None)?, latitude: self.degrees(latitude, None)? };
         match mesh.latitude.iter().find(|l| l.abs() > 90.001) {
             Some(odd) => Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90"))),

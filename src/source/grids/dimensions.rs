@@ -7,6 +7,8 @@ use crate::formats::NumberType;
 
 /// Longest coordinate variable that is read: a damaged header must not exhaust the memory.
 const MAX_COORDINATES: usize = 1 << 26;
+/// Most nodes along an axis: single precision tells no more apart.
+const MAX_NODES: usize = 1 << 24;
 
 /// A dimension, what it measures and its coordinate variable.
 #[derive(Clone, Copy)]
@@ -147,9 +149,23 @@ impl Planner<'_> {
         Ok(Some((extent.dimension, index)))
     }
 
+    /// Refuses a variable whose dimensions its file cannot hold, before coordinates are made for them: each, and the last two, of
+    /// which a snapshot has every entry. The first one may be time.
+    pub fn check_extents(&self, variable: usize) -> Result<(), SourceError> {
+        let shape = self.shape(variable);
+        self.listing().check_count(self.variable(variable), &shape[shape.len().saturating_sub(2)..])?;
+        for (place, len) in shape.into_iter().enumerate() {
+            self.listing().check_count(self.variable(variable), &[len])?;
+            if place > 0 && len > MAX_NODES {
+                return Err(self.misfit(variable, format!("{len} nodes along a dimension are too many; accepted are up to {MAX_NODES}")));
+            }
+        }
+        Ok(())
+    }
+
     /// All values of a coordinate variable, unpacked.
     pub fn coordinate_values(&self, variable: usize) -> Result<Vec<f64>, SourceError> {
-        let count: usize = self.shape(variable).iter().product();
+        let count = self.shape(variable).into_iter().fold(1, usize::saturating_mul);
         if count > MAX_COORDINATES {
             return Err(self.misfit(variable, format!("{count} coordinates are too many; accepted are up to {MAX_COORDINATES}")));
         }

@@ -18,6 +18,8 @@ pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>)
         return planner.plan_datasets();
     }
     let velocity = planner.velocity()?;
+    let components = [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()];
+    components.into_iter().flatten().try_for_each(|c| planner.check_extents(c.variable))?;
     if planner.is_staggered(&velocity) {
         planner.plan_staggered(&velocity, first)
     } else if let Some(coordinates) = planner.curvilinear_coordinates(&velocity) {
