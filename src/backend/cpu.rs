@@ -7,6 +7,7 @@ use super::interruptible::Interruptible;
 use super::router::QueryRouter;
 use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement};
 use ridgewatch_render::{Film, RenderStats, Renderer};
@@ -107,6 +108,7 @@ impl HostPicture {
         }
         let mut values = vec![0.0; shape.iter().product()];
         for (part, values) in values.chunks_mut(AT_ONCE).enumerate() {
+            progress::mark();
             let first = part * AT_ONCE;
             let points: Vec<[f32; 3]> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;

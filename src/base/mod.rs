@@ -1,7 +1,8 @@
-//! What every room may use: checks of settings, files written whole, and the errors of devices. Uses no other room.
+//! What every room may use: checks of settings, files written whole, signs of progress, and the errors of devices. Uses no other room.
 
 mod device_error;
 pub mod files;
+pub mod progress;
 pub mod setting;
 
 pub use device_error::DeviceError;

@@ -13,6 +13,7 @@ use crate::rng::FrameRandom;
 use crate::tracking::FrameScene;
 use crate::{Film, LogStretch, Method, Scene};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -23,6 +24,8 @@ const LIGHT_VALUES: usize = 1 << 24;
 pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
 /// Seconds of marching that a round may take at least. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
+/// Pixels of which one leaves a mark of progress.
+const MARKED: usize = 1 << 10;
 /// Radius over which the squared error of a pixel is averaged, in pixels.
 pub const ERROR_RADIUS: usize = 8;
 /// Floor of a pixel's squared error, as a share of the frame's mean.
@@ -140,6 +143,9 @@ impl Picture {
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
+            if pixel % MARKED == 0 {
+                progress::mark();
+            }
             for j in rays.clone() {
                 sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(light), shift));
             }
