@@ -3,7 +3,7 @@
 use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
 };
-use super::{messages, signals};
+use super::{messages, notify, signals};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
@@ -91,6 +91,7 @@ impl Session<'_> {
         RunFolder::refuse_occupied(&options.out, options.overwrite)?;
         let (stop, caught) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU8::new(0)));
         let watch = || signals::watch(stop.clone(), caught.clone()).map(tokio::spawn);
+        let _notifying = notify::begin(stop.clone());
         // While `attach` waits for its source, a signal must stop the wait. While `replay` opens its source, a signal ends the process at once.
         let follows = checkpoint_seconds.is_some();
         let early = if follows { watch() } else { None };
@@ -206,12 +207,19 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
         Event::Begin { frames, notes } => {
             *bar = messages::progress(frames);
             bar.set_message("filling the first window");
+            notify::running(|| "filling the first window".into());
             for text in notes {
                 bar.suspend(|| messages::note(text));
             }
         }
         Event::Note(text) => bar.suspend(|| messages::note(text)),
-        Event::Progress(share) => bar.set_message(format!("frame {:3.0} %", share * 100.0)),
+        Event::Progress(share) => {
+            bar.set_message(format!("frame {:3.0} %", share * 100.0));
+            notify::running(|| match last {
+                Some(last) => format!("frame {}: {:.0} %; {}", last.frame + 1, share * 100.0, line(last)),
+                None => format!("frame 0: {:.0} %", share * 100.0),
+            });
+        }
         Event::Frame(frame) => {
             for warning in &frame.record.warnings {
                 bar.suspend(|| messages::note(format_args!("frame {}: {warning}", frame.record.frame)));
@@ -222,6 +230,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
                 bar.suspend(|| messages::note(chosen_steps(steps, difference)));
             }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
+            notify::running(|| format!("frame {}: {}", frame.record.frame, line(&frame.record)));
             *last = Some(frame.record.clone());
             output.frame(frame);
             bar.inc(1);
