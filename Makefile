@@ -9,6 +9,7 @@
 # make install-adapters PREFIX=...   installs header, libraries, module and pkg-config file for the build of a solver. The flags of the pkg-config file let
 #                      a solver find the shared library in PREFIX/lib when it runs
 # make fuzz            runs each fuzz target in tests/fuzz for FUZZ_SECONDS (60); cargo-fuzz goes into target/cargo-fuzz only
+# make deny            checks licences, sources and duplicates of the dependencies against deny.toml; cargo-deny goes into target/cargo-deny only
 # make test-adapters   tests the adapters with gfortran, mpicc and Python. Missing compilers are installed if apt is available (gfortran, openmpi-bin,
 #                      libopenmpi-dev, python3-venv), else named as NOT RUN; maturin, numpy, pytest and mypy go into out/adapters/venv only
 # make live-figures    measures the figures of docs/live.md that need no GPU and prints their tables, in some 20 minutes; with SHORT=1 in a few
@@ -30,6 +31,9 @@ MYPY_VERSION := 2.4.1
 # The fuzzer of tests/fuzz.
 CARGO_FUZZ := target/cargo-fuzz
 CARGO_FUZZ_VERSION := 0.13.2
+# Checks the dependencies.
+CARGO_DENY := target/cargo-deny
+CARGO_DENY_VERSION := 0.19.0
 FUZZ_TARGETS := ring message netcdf checkpoint scene
 FUZZ_SECONDS ?= 60
 SUDO := $(shell [ "$$(id -u)" = 0 ] || echo sudo)
@@ -44,7 +48,7 @@ PREFIX ?= /usr/local
 SONAME := libridgewatch_adapter.so.$(shell sed -n 's/^.define RW_VERSION //p' adapters/c/include/ridgewatch.h)
 VERSION := $(shell sed -n '/^\[workspace.package\]/,/^\[/s/^version = "\(.*\)"/\1/p' Cargo.toml)
 
-.PHONY: all demo test test-data test-reader test-long fuzz packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
+.PHONY: all demo test test-data test-reader test-long fuzz deny packages python-packages vendored build check bench gpu-check clean header adapters install-adapters adapter-packages test-adapters python-adapter live-figures
 
 all: build
 
@@ -123,6 +127,13 @@ fuzz: packages $(CARGO_FUZZ)/bin/cargo-fuzz
 	  TMPDIR="$(CURDIR)/target/fuzz/temporary" PATH="$(CURDIR)/$(CARGO_FUZZ)/bin:$$PATH" $(CARGO) fuzz run --fuzz-dir tests/fuzz --target-dir target/fuzz --sanitizer none $$target \
 	    target/fuzz/corpus/$$target $$seeds -- -max_total_time=$(FUZZ_SECONDS) -timeout=10 -rss_limit_mb=1024 -max_len=8192 -print_final_stats=1 || exit 1; \
 	done
+
+$(CARGO_DENY)/bin/cargo-deny:
+	$(CARGO) install --quiet --locked --root $(CARGO_DENY) cargo-deny --version $(CARGO_DENY_VERSION)
+
+# Without the advisories, whose database needs the network: `target/cargo-deny/bin/cargo-deny check advisories`.
+deny: $(CARGO_DENY)/bin/cargo-deny
+	$(CARGO_DENY)/bin/cargo-deny --locked check bans licenses sources
 
 .venv/installed: | python-packages
 	$(PYTHON) -m venv .venv

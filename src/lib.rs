@@ -5,7 +5,7 @@
 //! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`] ← [`config`] ← the command line.
 //!
 //! Each room defines its settings and checks them with [`setting`]; [`config`] reads them from a scene file and finds the line of a fault.
-//! All rooms may call [`files`], [`setting`] and [`simd`]. Every room up to [`backend`] is a crate of its own.
+//! All rooms may call [`files`], [`progress`], [`setting`] and [`simd`]. Every room up to [`backend`] is a crate of its own.
 //!
 //! A cycle takes the newest snapshots, slides the window, renders with the weights of the previous cycle, compares every traced sample with
 //! the surrogate, which updates the trust map, and then trains on it.
@@ -15,7 +15,7 @@ pub mod publish;
 pub mod run;
 
 pub use ridgewatch_backend as backend;
-pub use ridgewatch_base::{files, folder, setting};
+pub use ridgewatch_base::{files, folder, progress, setting};
 pub use ridgewatch_field as field;
 pub use ridgewatch_flow as flow;
 pub use ridgewatch_render as render;

@@ -61,5 +61,10 @@ fn without_descriptors_no_temporary_folder_is_left() {
         shell.args(["replay", &scene, "--publish=tcp://127.0.0.1:0", "--method", "reference", "--overwrite", "--out"]);
         let outcome = run(shell.arg(files.path().join("run")).env("TMPDIR", &temporary));
         assert_eq!(names(&temporary), [""; 0], "{descriptors} descriptors: {}", outcome.stderr);
+        assert!(
+            matches!(outcome.status, Some(0 | 1)) && !outcome.stderr.contains("panicked"),
+            "{descriptors} descriptors: {}",
+            outcome.stderr
+        );
     }
 }

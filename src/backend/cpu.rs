@@ -7,6 +7,7 @@ use super::interruptible::Interruptible;
 use super::router::QueryRouter;
 use super::{Backend, BackendError, DeviceError, FrameJob, FrozenOf, Rendered, Routing, Smooth, Surrogate, SurrogateRequest};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use ridgewatch_flow::{FlowMap, Tracer, VelocitySource, cpu_tracer};
 use ridgewatch_render::smooth::{Nodes, Picture, PictureError, Refinement};
 use ridgewatch_render::{Film, RenderStats, Renderer};
@@ -110,6 +111,7 @@ impl HostPicture {
             if stop.load(Ordering::Relaxed) {
                 return Ok(None);
             }
+            progress::mark();
             let first = part * AT_ONCE;
             let points: Vec<[f32; 3]> = (first..first + values.len()).into_par_iter().map(|i| Nodes::unit(shape, i)).collect();
             surrogate.predict(&points, values)?;

@@ -1,6 +1,7 @@
 //! A tracer that can be stopped. It traces large batches in parts and checks the stop flag between them, because preparing a slide may take minutes.
 
 use super::DeviceError;
+use ridgewatch_base::progress;
 use ridgewatch_flow::{Extras, Traced, Tracer};
 use ridgewatch_surrogate::Trace;
 use std::sync::Mutex;
@@ -51,6 +52,7 @@ impl Trace for Interruptible<'_> {
         let mut piece = Traced::default();
         *out = Traced::default();
         while done < seeds.len() && !self.stop.load(Ordering::Relaxed) {
+            progress::mark();
             let part = &seeds[done..seeds.len().min(done + self.part())];
             let start = Instant::now();
             if part.len() == seeds.len() {

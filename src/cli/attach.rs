@@ -1,9 +1,9 @@
 //! `ridgewatch attach`.
 
 use super::common::{Common, Usage, is_config, located};
-use super::messages;
 use super::process::Nice;
 use super::session::{Follows, RunArguments, Session};
+use super::{messages, notify};
 use anyhow::{Result, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::RunFolder;
@@ -67,7 +67,11 @@ pub fn run(common: &Common, mut options: Options) -> Result<()> {
     options.nice.apply();
     let open = |scene: &SceneFile, stop: &AtomicBool| {
         let refused = |error| located(scene, error, SourceError::refused);
-        let Some(live) = Live::connect(&scene.live, stop, &mut messages::note).map_err(refused)? else { return Ok(None) };
+        let mut tell = |text: String| {
+            notify::running(|| text.clone());
+            messages::note(text);
+        };
+        let Some(live) = Live::connect(&scene.live, stop, &mut tell).map_err(refused)? else { return Ok(None) };
         messages::note(format_args!("found {}", live.describe()));
         Setup::live(scene.settings(), live).map(Some).map_err(|error| located(scene, error, RunError::refused))
     };

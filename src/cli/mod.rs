@@ -8,6 +8,7 @@ mod doctor;
 mod ftle;
 mod inspect;
 pub mod messages;
+mod notify;
 mod process;
 mod publish;
 mod relay;

@@ -3,8 +3,8 @@
 use super::common::{
     Common, Interrupted, Usage, check_folder, check_learns, chosen_steps, device, located, method, print_json, print_text, seconds,
 };
-use super::messages;
 use super::signals::Stop;
+use super::{messages, notify};
 use anyhow::{Context, Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
@@ -104,6 +104,7 @@ impl Session<'_> {
         let stop = Stop::default();
         let within = options.stop_within.map(Duration::try_from_secs_f64).transpose().unwrap_or_default();
         let watch = || stop.watch(within, || ());
+        let _notifying = notify::begin(stop.requested.clone());
         // While `attach` waits for its source, a signal must stop the wait. While `replay` opens its source, a signal ends the process at once.
         let follows = following.is_some();
         if follows {
@@ -230,12 +231,19 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
         Event::Begin { frames, notes } => {
             *bar = messages::progress(frames);
             bar.set_message("filling the first window");
+            notify::running(|| "filling the first window".into());
             for text in notes {
                 bar.suspend(|| messages::note(text));
             }
         }
         Event::Note(text) => bar.suspend(|| messages::note(text)),
-        Event::Progress(share) => bar.set_message(format!("frame {:3.0} %", share * 100.0)),
+        Event::Progress(share) => {
+            bar.set_message(format!("frame {:3.0} %", share * 100.0));
+            notify::running(|| match last {
+                Some(last) => format!("frame {}: {:.0} %; {}", last.frame + 1, share * 100.0, line(last)),
+                None => format!("frame 0: {:.0} %", share * 100.0),
+            });
+        }
         Event::Frame(frame) => {
             for warning in &frame.record.warnings {
                 bar.suspend(|| messages::note(format_args!("frame {}: {warning}", frame.record.frame)));
@@ -246,6 +254,7 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
                 bar.suspend(|| messages::note(chosen_steps(steps, difference)));
             }
             tracing::info!("frame {}: {}", frame.record.frame, line(&frame.record));
+            notify::running(|| format!("frame {}: {}", frame.record.frame, line(&frame.record)));
             *last = Some(frame.record.clone());
             output.frame(frame);
             bar.inc(1);

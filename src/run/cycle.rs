@@ -574,17 +574,25 @@ impl Run<'_> {
     }
 }
 
+/// Largest number of checkpoints that are kept aside.
+const MAX_UNFIT: usize = 99;
+
 /// Keeps a checkpoint that does not fit from being replaced by the next one: it may be the work of another run. Returns where it is, in words.
 fn set_aside(path: &Path, refused: &CheckpointError) -> String {
-    if !matches!(refused, CheckpointError::Mismatch { .. }) {
+    if !matches!(refused, CheckpointError::Mismatch { .. } | CheckpointError::Io { .. }) {
         return String::new();
     }
-    let mut aside = path.as_os_str().to_owned();
-    aside.push(".unfit");
-    match std::fs::rename(path, &aside) {
-        Ok(()) => format!("; it is now {}", Path::new(&aside).display()),
-        Err(error) => format!("; it cannot be set aside: {error}"),
+    for number in 1..=MAX_UNFIT {
+        let mut aside = path.as_os_str().to_owned();
+        aside.push(if number == 1 { ".unfit".to_owned() } else { format!(".unfit-{number}") });
+        // A link takes the name only if it is free.
+        match std::fs::hard_link(path, &aside).and_then(|()| std::fs::remove_file(path)) {
+            Ok(()) => return format!("; it is now {}", Path::new(&aside).display()),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => {}
+            Err(error) => return format!("; it cannot be set aside: {error}"),
+        }
     }
+    format!("; it cannot be set aside: {MAX_UNFIT} such files are there")
 }
 
 /// Maximum number of table nodes for a live simulation, since every slide traces the table again. On the CPU it is the number of camera paths of

@@ -11,6 +11,7 @@ use super::transaction::{On, present};
 use super::{FrameRecord, StageSeconds};
 use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, Surrogate};
 use crate::flow::VelocitySource;
+use crate::progress;
 use crate::render::{Combine, Method};
 use crate::surrogate::{Learned, Predict, Trace};
 use crate::trust::{Gate, Strata};
@@ -184,6 +185,7 @@ impl Run<'_> {
         let mut render = || -> Result<Work<B::Samples>, DeviceError> {
             let progress = Mutex::new(&mut *sink);
             let report = |share: f32| {
+                progress::mark();
                 if let Ok(mut sink) = progress.lock() {
                     (*sink)(Event::Progress(share));
                 }
@@ -281,6 +283,7 @@ impl Run<'_> {
                 match self.learning.budget.due(self.began.elapsed().as_secs_f64()) {
                     Some(due) => slice = slice.min(due),
                     None if is_awaited() => {
+                        progress::mark();
                         std::thread::sleep(GLANCE);
                         continue;
                     }

@@ -5,6 +5,7 @@ use crate::field::analytic::Analytic;
 use crate::field::turbulence::Turbulence;
 use crate::field::{Domain, Window};
 use crate::flow::{Direction, VelocitySource};
+use crate::progress;
 use crate::setting::{Refused, shown};
 use crate::source::live::{LiveRecord, LiveWindow};
 use crate::source::{
@@ -80,6 +81,7 @@ impl Count {
 /// Returns the next item of a source that another thread reads; `None` if the source has ended or `stop` is set.
 fn wait_for<T>(stop: &AtomicBool, mut next: impl FnMut(Duration) -> Result<Option<T>, StillReading>) -> Option<T> {
     while !stop.load(Ordering::Relaxed) {
+        progress::mark();
         if let Ok(item) = next(LOOK_UP) {
             return item;
         }

@@ -2,6 +2,7 @@
 
 use super::{RunError, Settings, TrainingSettings};
 use crate::backend::DeviceError;
+use crate::progress;
 use crate::render::Method;
 use crate::surrogate::{Kind, Learned};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -112,6 +113,7 @@ pub(super) fn train(
     let start = Instant::now();
     let (mut sum, mut result) = (Learned::default(), Ok(()));
     while !stop.load(Ordering::Relaxed) {
+        progress::mark();
         let (seconds, steps) = match settings.steps_per_frame {
             Some(steps) if sum.steps >= steps => break,
             Some(steps) => (f64::INFINITY, (steps - sum.steps).min(SLICE_STEPS)),

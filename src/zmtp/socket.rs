@@ -217,8 +217,7 @@ impl Listener {
         let pairs: Vec<_> =
             batch.iter().filter_map(|(_, from)| if let From::Addresses(peer, here) = from { Some((*peer, *here)) } else { None }).collect();
         // The system's tables of connections may be long; messages must not wait for them.
-        let found =
-            if pairs.is_empty() { Vec::new() } else { tokio::task::spawn_blocking(move || users_of(&pairs)).await.unwrap_or_default() };
+        let found = if pairs.is_empty() { Vec::new() } else { look_up(pairs).await };
         let mut found = found.into_iter();
         let owner = |from| match from {
             From::User(user) => Owner::User(user),
@@ -226,6 +225,19 @@ impl Listener {
         };
         let (streams, from): (Vec<_>, Vec<_>) = batch.into_iter().unzip();
         streams.into_iter().zip(from.into_iter().map(owner)).collect()
+    }
+}
+
+/// [`users_of`] in a thread of its own. If the system refuses the thread, no user is known. (`spawn_blocking` panics then.)
+async fn look_up(pairs: Vec<(SocketAddr, SocketAddr)>) -> Vec<Option<u32>> {
+    let (send, receive) = tokio::sync::oneshot::channel();
+    let work = move || {
+        // The receiver is gone only when the socket closes.
+        let _ = send.send(users_of(&pairs));
+    };
+    match std::thread::Builder::new().name("ridgewatch-peers".to_owned()).spawn(work) {
+        Ok(_) => receive.await.unwrap_or_default(),
+        Err(_) => Vec::new(),
     }
 }
 

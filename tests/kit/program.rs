@@ -28,10 +28,10 @@ pub fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// The program with these arguments, without the user's own ring and log level.
+/// The program with these arguments, without the user's own ring and log level, and without a service manager.
 pub fn ridgewatch<S: AsRef<OsStr>>(arguments: impl IntoIterator<Item = S>) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_ridgewatch"));
-    command.args(arguments).env_remove("RIDGEWATCH_RING").env_remove("RIDGEWATCH_LOG");
+    command.args(arguments).env_remove("RIDGEWATCH_RING").env_remove("RIDGEWATCH_LOG").env_remove("NOTIFY_SOCKET");
     command
 }
 

@@ -5,6 +5,7 @@
 mod network_support;
 mod protocol;
 mod scene;
+mod security;
 
 /// Text of a page in `docs`.
 fn page(name: &str) -> String {

@@ -11,6 +11,7 @@ use crate::LogStretch;
 use crate::rng::unit;
 use crate::tracking::{FrameScene, Hit, PHASE, ROULETTE, walk};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Index of the traced field; the other is the surrogate, which counts negative.
@@ -289,6 +290,7 @@ pub(super) fn track(
         let mut live: Vec<u32> = (0..flights.len() as u32).filter(|&i| pending[i as usize]).collect();
         let (mut points, mut log_stretch, mut traced) = (Vec::new(), Vec::new(), Vec::new());
         while !live.is_empty() && !stop.load(Ordering::Relaxed) {
+            progress::mark();
             points.clear();
             points.extend(live.iter().map(|&i| flights[i as usize].point(medium)));
             log_stretch.resize(points.len(), 0.0);

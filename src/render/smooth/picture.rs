@@ -13,6 +13,7 @@ use crate::rng::FrameRandom;
 use crate::tracking::FrameScene;
 use crate::{Film, LogStretch, Method, Scene};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use std::ops::Range;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -25,6 +26,8 @@ pub const AUDIT_PAIRS: f64 = 1.0 / 16.0;
 const MAX_PAIRS: usize = 1 << 19;
 /// Seconds of marching that a round may take at least. It may also take as long as its samples.
 const MIN_MARCH_SECONDS: f64 = 0.1;
+/// Pixels of which one leaves a mark of progress.
+const MARKED: usize = 1 << 10;
 /// Radius over which the squared error of a pixel is averaged, in pixels.
 pub const ERROR_RADIUS: usize = 8;
 /// Floor of a pixel's squared error, as a share of the frame's mean.
@@ -149,6 +152,9 @@ impl Picture {
         let audited = self.march.audit_pixels(&medium.scene.random, self.base.len());
         let rays = self.march.rays..self.march.rays + self.march.next_rays;
         self.base.par_iter_mut().enumerate().with_min_len(64).for_each(|(pixel, sum)| {
+            if pixel % MARKED == 0 {
+                progress::mark();
+            }
             for j in rays.clone().take_while(|_| !round.stop.load(Ordering::Relaxed)) {
                 sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(light), shift));
             }
@@ -188,8 +194,6 @@ impl Picture {
         // Number of each pair within its pixel, which selects its random numbers.
         let mut next: Vec<u32> = self.sums.iter().map(PairSums::pairs).collect();
         let mut stats = RenderStats::default();
-        // The picture keeps none of these sums if a stop comes in between.
-        let mut sums = self.sums.clone();
         let mut paths = Vec::new();
         for chosen in chosen.chunks(MAX_PAIRS) {
             paths.clear();
@@ -209,7 +213,7 @@ impl Picture {
             stats.evaluate_seconds += counts.evaluate_seconds;
             for (paths, halves) in paths.chunks_exact(2).zip(found.chunks_exact(2)) {
                 let (pixel, pair) = (paths[0].0 as usize, paths[0].1 as usize / 2);
-                let sums = &mut sums[pixel];
+                let sums = &mut self.sums[pixel];
                 let quarter = quarter(pixel % width, pixel / width, pair);
                 for (half, difference) in halves.iter().enumerate() {
                     (0..3).for_each(|k| sums.radiance[half][quarter][k] += difference.radiance[k]);
@@ -222,7 +226,6 @@ impl Picture {
                 sums.pairs[quarter] += 1;
             }
         }
-        self.sums = sums;
         self.pairs += chosen.len() as u64;
         self.allocation = allocation;
         Some(stats)

@@ -4,6 +4,7 @@ use super::link::Link;
 use super::settings::LiveSettings;
 use crate::error::SourceError;
 use crate::grids::slab_of;
+use ridgewatch_base::progress;
 use ridgewatch_field::{Axis, AxisFault, Geometry, Grid};
 use ridgewatch_wire::{Description, Event, Limits};
 use std::sync::Arc;
@@ -29,6 +30,7 @@ impl Live {
         tell(how);
         let mut values = Vec::new();
         while !stop.load(Ordering::Relaxed) {
+            progress::mark();
             match link.poll(&mut values, &|_, _| false) {
                 Some(Event::Opened { description, generation }) => match grid(&description) {
                     Ok(grid) => {

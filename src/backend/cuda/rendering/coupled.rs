@@ -13,6 +13,7 @@ use crate::cuda::rendering::renderer::{GridArgument, MEMORY_SHARE, WatchArgument
 use crate::cuda::{Buffer, DeviceError, DeviceLogStretch, DeviceMissingCells, Gpu, launch, threads};
 use bytemuck::Zeroable;
 use cudarc::driver::{CudaEvent, CudaFunction, DeviceRepr, PushKernelArg};
+use ridgewatch_base::progress;
 use ridgewatch_render::smooth::{TILE, bayer_rank};
 use ridgewatch_render::{CellObservations, FrameParameters, Renderer};
 use std::mem::offset_of;
@@ -341,6 +342,7 @@ impl CoupledTracker {
             if live == 0 {
                 return Ok(false);
             }
+            progress::mark();
             if stop.load(Ordering::Relaxed) {
                 return Ok(true);
             }
