@@ -159,6 +159,25 @@ fn fields_that_a_file_cannot_hold_cost_no_memory() {
     }
 }
 
+/// Adds a dataset of 2 x 2 x 2 nodes with two deflate filters, which the binding would refuse.
+fn compressed_twice(file: &File, name: &str) {
+    unsafe extern "C" {
+        fn H5Pset_deflate(plist: i64, level: u32) -> i32;
+        fn H5Dcreate2(place: i64, name: *const std::ffi::c_char, kind: i64, space: i64, link: i64, created: i64, access: i64) -> i64;
+        fn H5Dclose(dataset: i64) -> i32;
+    }
+    let created = hdf5_metno::plist::DatasetCreate::build().chunk((2, 2, 2)).deflate(9).finish().unwrap();
+    let kind = hdf5_metno::Datatype::from_type::<f32>().unwrap();
+    let space = hdf5_metno::Dataspace::try_new((2, 2, 2)).unwrap();
+    let name = std::ffi::CString::new(name).unwrap();
+    // SAFETY: open objects and a string that ends in NUL; no other test uses the library meanwhile.
+    let made = unsafe {
+        assert!(H5Pset_deflate(created.id(), 9) >= 0);
+        H5Dclose(H5Dcreate2(file.id(), name.as_ptr(), kind.id(), space.id(), 0, created.id(), 0))
+    };
+    assert!(made >= 0);
+}
+
 #[test]
 fn fields_larger_than_the_memory_allowed_are_refused() {
     let _alone = alone();
@@ -178,6 +197,12 @@ fn fields_larger_than_the_memory_allowed_are_refused() {
     assert!(std::fs::metadata(&path).unwrap().len() < 100_000);
     refused(&path, "memory_gib = 0.1", &["deep.h5", "4194304 nodes", "archive.memory_gib", "0.1"]);
     assert_eq!(open_with(&path, "memory_gib = 0.5").grid().nodes(), 1 << 22);
+    // Compressed twice, a chunk of a few bytes may unpack to a million times as many.
+    let path = dir.path().join("twice.h5");
+    let file = without_u(&path);
+    compressed_twice(&file, "u");
+    drop(file);
+    refused(&path, "", &["twice.h5", "`u`", "compressed 2 times"]);
     // A chunk is unpacked as a whole, however little of it is read.
     let path = dir.path().join("chunk.h5");
     let file = without_u(&path);
@@ -259,6 +284,10 @@ fn groups_and_datasets_are_counted_before_a_library_reads_them() {
     (0..10).for_each(|i| file.link_hard("/", &format!("again{i}")).unwrap());
     drop(file);
     quick(&circle, &["nested more than 64 deep"]);
+    // A soft link to the root.
+    let soft = dir.path().join("soft.h5");
+    File::create(&soft).unwrap().link_soft("/", "again").unwrap();
+    quick(&soft, &["nested more than 64 deep"]);
 }
 
 #[test]
