@@ -1,7 +1,6 @@
 //! Archives of every format and grid: the snapshots that they give, the reasons for which they are refused, and fields traced in them.
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // Tests: a panic is the report.
 
-mod bombs;
 mod curvilinear;
 mod hdf5;
 mod hemispheres;

@@ -7,6 +7,7 @@ use super::guard::open_guarded;
 use super::limits::{Limits, MAX_ATTRIBUTE_BYTES, MAX_ATTRIBUTES, MAX_DEPTH, MAX_OBJECTS};
 use super::messages::{FormatError, FormatFault};
 use hdf5_metno::dataset::Layout;
+use hdf5_metno::filters::Filter;
 use hdf5_metno::types::TypeDescriptor;
 use hdf5_metno::{Dataset, Group, LinkType, Location};
 use std::collections::HashMap;
@@ -55,7 +56,7 @@ pub fn scan(path: &Path, limits: &Limits) -> Result<Chunks, FormatError> {
     scanned.map_err(|what| FormatFault::Refused(what).of(path))
 }
 
-/// Refuses a dataset whose values lie in other files, unless the limits allow it. Returns the bytes of a chunk, 0 without chunks.
+/// Refuses a dataset whose values lie in other files, unless the limits allow it, and one that is compressed more than once. Returns the bytes of a chunk, 0 without chunks.
 ///
 /// # Errors
 /// The reason, about the dataset of this path.
@@ -70,6 +71,11 @@ pub fn look_at(dataset: &Dataset, path: &str, limits: &Limits) -> hdf5_metno::Re
             let other = maps.first().map_or("none", |map| map.src_filename.as_str());
             return Ok(Err(elsewhere(path, &format!("is virtual: its values lie in other datasets, of the file `{}`", shown(other)))));
         }
+    }
+    // What deflate shrinks once, it shrinks 1032 times at most: a chunk compressed twice could unpack to anything.
+    let deflated = created.get_filters().unwrap_or_default().iter().filter(|f| matches!(f, Filter::Deflate(_))).count();
+    if deflated > 1 {
+        return Ok(Err(format!("`{}` is compressed {deflated} times by deflate; accepted is once", shown(path))));
     }
     let values = created.get_chunk()?.map_or(0, |chunk| chunk.iter().fold(1u64, |n, &c| n.saturating_mul(c as u64)));
     Ok(Ok(values.saturating_mul(dataset.dtype()?.size() as u64)))

@@ -1,16 +1,45 @@
 //! Files that claim or hold far more than their length, or that reach other files: each is refused before it costs memory or time.
+//!
+//! The tests run one after the other: a process that one of them starts inherits, for a moment, the locks of HDF5 files that others write.
+#![allow(clippy::unwrap_used)] // Tests: a panic is the report.
 #![cfg(target_os = "linux")]
 
-use crate::kit::netcdf::*;
-use crate::kit::program::{Outcome, ridgewatch, run};
-use crate::{open_with, refused};
+mod kit;
+
 use hdf5_metno::{File, Group};
+use kit::netcdf::*;
+use kit::program::{Outcome, ridgewatch, run};
 use ndarray::{Array1, Array3};
-use ridgewatch::source::SnapshotSource;
+use ridgewatch::source::{Archive, SnapshotSource, SourceError};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 use tempfile::tempdir;
+
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn alone() -> MutexGuard<'static, ()> {
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn try_open(file: &Path, toml: &str) -> Result<Archive, SourceError> {
+    Archive::open(&[file.to_owned()], &toml::from_str(toml).unwrap())
+}
+
+fn open_with(file: &Path, toml: &str) -> Archive {
+    try_open(file, toml).unwrap()
+}
+
+/// Asserts that a file is refused with a message that holds each part.
+#[track_caller]
+fn refused(file: &Path, toml: &str, parts: &[&str]) {
+    let Err(error) = try_open(file, toml) else { panic!("accepted with {toml:?}") };
+    let message = error.to_string();
+    for part in parts {
+        assert!(message.contains(part), "{toml:?}: `{part}` is missing in: {message}");
+    }
+}
 
 /// Address space of a program that inspects a bomb, kB: a third of it is the program itself.
 const MEMORY: u64 = 1_500_000;
@@ -46,18 +75,20 @@ fn secret(folder: &Path) -> (PathBuf, Vec<f32>) {
 
 #[test]
 fn external_storage_is_refused_unless_allowed() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     let (other, values) = secret(dir.path());
     let path = dir.path().join("external.h5");
     let file = without_u(&path);
     file.new_dataset::<f32>().shape((2, 2, 2)).external(other.to_str().unwrap(), 0, 32).create("u").unwrap();
     drop(file);
-    refused(&[&path], "", &["external.h5", "`u`", "secret", "external = true"]);
-    assert_eq!(us(&open_with(&[&path], "external = true").read(0).unwrap()), values);
+    refused(&path, "", &["external.h5", "`u`", "secret", "external = true"]);
+    assert_eq!(us(&open_with(&path, "external = true").read(0).unwrap()), values);
 }
 
 #[test]
 fn virtual_datasets_are_refused_unless_allowed() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     let other = dir.path().join("other.h5");
     let values = Array3::from_shape_fn((2, 2, 2), |(z, y, x)| (4 * z + 2 * y + x) as f32);
@@ -67,12 +98,13 @@ fn virtual_datasets_are_refused_unless_allowed() {
     let builder = file.new_dataset::<f32>().shape((2, 2, 2));
     builder.virtual_map(other.to_str().unwrap(), "there", (2, 2, 2), .., (2, 2, 2), ..).create("u").unwrap();
     drop(file);
-    refused(&[&path], "", &["virtual.h5", "`u`", "other.h5", "external = true"]);
-    assert_eq!(us(&open_with(&[&path], "external = true").read(0).unwrap()), values.into_iter().collect::<Vec<_>>());
+    refused(&path, "", &["virtual.h5", "`u`", "other.h5", "external = true"]);
+    assert_eq!(us(&open_with(&path, "external = true").read(0).unwrap()), values.into_iter().collect::<Vec<_>>());
 }
 
 #[test]
 fn links_to_other_files_are_refused_unless_allowed() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     let other = dir.path().join("other.h5");
     let values = Array3::from_shape_fn((2, 2, 2), |(z, y, x)| (4 * z + 2 * y + x) as f32);
@@ -81,8 +113,8 @@ fn links_to_other_files_are_refused_unless_allowed() {
     let file = without_u(&path);
     file.link_external(other.to_str().unwrap(), "there", "u").unwrap();
     drop(file);
-    refused(&[&path], "", &["linked.h5", "`u`", "links to another file", "external = true"]);
-    assert_eq!(us(&open_with(&[&path], "external = true").read(0).unwrap()), values.into_iter().collect::<Vec<_>>());
+    refused(&path, "", &["linked.h5", "`u`", "links to another file", "external = true"]);
+    assert_eq!(us(&open_with(&path, "external = true").read(0).unwrap()), values.into_iter().collect::<Vec<_>>());
     // A name that leads to the link by a way around is no way around.
     let path = dir.path().join("linked.nc");
     plane(NETCDF4, &[0.0], "days since 2000-01-01").write(&path);
@@ -90,7 +122,7 @@ fn links_to_other_files_are_refused_unless_allowed() {
     file.link_external(other.to_str().unwrap(), "there", "u2").unwrap();
     file.link_soft("u2", "u3").unwrap();
     drop(file);
-    refused(&[&path], "", &["linked.nc", "`u2`", "links to another file"]);
+    refused(&path, "", &["linked.nc", "`u2`", "links to another file"]);
 }
 
 /// A NetCDF-4 file of `n` x `n` nodes at one time, of which no velocity was ever written.
@@ -116,6 +148,7 @@ fn unwritten(path: &Path, n: usize) {
 
 #[test]
 fn fields_that_a_file_cannot_hold_cost_no_memory() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     for n in [30_000, 100_000] {
         let path = dir.path().join(format!("claims_{n}.nc"));
@@ -126,8 +159,28 @@ fn fields_that_a_file_cannot_hold_cost_no_memory() {
     }
 }
 
+/// Adds a dataset of 2 x 2 x 2 nodes with two deflate filters, which the binding would refuse.
+fn compressed_twice(file: &File, name: &str) {
+    unsafe extern "C" {
+        fn H5Pset_deflate(plist: i64, level: u32) -> i32;
+        fn H5Dcreate2(place: i64, name: *const std::ffi::c_char, kind: i64, space: i64, link: i64, created: i64, access: i64) -> i64;
+        fn H5Dclose(dataset: i64) -> i32;
+    }
+    let created = hdf5_metno::plist::DatasetCreate::build().chunk((2, 2, 2)).deflate(9).finish().unwrap();
+    let kind = hdf5_metno::Datatype::from_type::<f32>().unwrap();
+    let space = hdf5_metno::Dataspace::try_new((2, 2, 2)).unwrap();
+    let name = std::ffi::CString::new(name).unwrap();
+    // SAFETY: open objects and a string that ends in NUL; no other test uses the library meanwhile.
+    let made = unsafe {
+        assert!(H5Pset_deflate(created.id(), 9) >= 0);
+        H5Dclose(H5Dcreate2(file.id(), name.as_ptr(), kind.id(), space.id(), 0, created.id(), 0))
+    };
+    assert!(made >= 0);
+}
+
 #[test]
 fn fields_larger_than_the_memory_allowed_are_refused() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     // 64 MiB of zeros, a thousandth of that in the file.
     let path = dir.path().join("deep.h5");
@@ -142,15 +195,21 @@ fn fields_larger_than_the_memory_allowed_are_refused() {
     }
     drop(file);
     assert!(std::fs::metadata(&path).unwrap().len() < 100_000);
-    refused(&[&path], "memory_gib = 0.1", &["deep.h5", "4194304 nodes", "archive.memory_gib", "0.1"]);
-    assert_eq!(open_with(&[&path], "memory_gib = 0.5").grid().nodes(), 1 << 22);
+    refused(&path, "memory_gib = 0.1", &["deep.h5", "4194304 nodes", "archive.memory_gib", "0.1"]);
+    assert_eq!(open_with(&path, "memory_gib = 0.5").grid().nodes(), 1 << 22);
+    // Compressed twice, a chunk of a few bytes may unpack to a million times as many.
+    let path = dir.path().join("twice.h5");
+    let file = without_u(&path);
+    compressed_twice(&file, "u");
+    drop(file);
+    refused(&path, "", &["twice.h5", "`u`", "compressed 2 times"]);
     // A chunk is unpacked as a whole, however little of it is read.
     let path = dir.path().join("chunk.h5");
     let file = without_u(&path);
     let builder = file.new_dataset::<f32>().shape((2.., 2.., 2..)).chunk((1, 4096, 4096)).deflate(9);
     builder.create("u").unwrap().write(&Array3::<f32>::zeros((2, 2, 2))).unwrap();
     drop(file);
-    let message = open_with(&[&path], "memory_gib = 0.1").read(0).unwrap_err().to_string();
+    let message = open_with(&path, "memory_gib = 0.1").read(0).unwrap_err().to_string();
     for part in ["chunk.h5", "`u`", "its chunks of 67108864 bytes", "archive.memory_gib"] {
         assert!(message.contains(part), "{message}");
     }
@@ -158,6 +217,7 @@ fn fields_larger_than_the_memory_allowed_are_refused() {
 
 #[test]
 fn dimensions_and_coordinates_are_bounded() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     hdf5_metno::silence_errors(true);
     // A dimension of 2^40 entries that nothing was ever written along.
@@ -202,6 +262,7 @@ fn nested(path: &Path, depth: usize) {
 
 #[test]
 fn groups_and_datasets_are_counted_before_a_library_reads_them() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     let quick = |path: &Path, parts: &[&str]| {
         let (outcome, took) = inspected(path);
@@ -223,10 +284,15 @@ fn groups_and_datasets_are_counted_before_a_library_reads_them() {
     (0..10).for_each(|i| file.link_hard("/", &format!("again{i}")).unwrap());
     drop(file);
     quick(&circle, &["nested more than 64 deep"]);
+    // A soft link to the root.
+    let soft = dir.path().join("soft.h5");
+    File::create(&soft).unwrap().link_soft("/", "again").unwrap();
+    quick(&soft, &["nested more than 64 deep"]);
 }
 
 #[test]
 fn attributes_are_bounded() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     // Many names for one dataset of many attributes, which a library would read once for each name.
     for (length, said) in [(1, "more than 100000 attributes"), (7000, "more than 16 MiB of attributes")] {
@@ -245,6 +311,7 @@ fn attributes_are_bounded() {
 
 #[test]
 fn windows_larger_than_the_memory_allowed_are_refused() {
+    let _alone = alone();
     let dir = tempdir().unwrap();
     let path = plane(NETCDF4, &[0.0, 1.0, 2.0, 3.0, 4.0], "days since 2000-01-01").write(&dir.path().join("window.nc"));
     let outcome = |gib: &str| {
