@@ -87,8 +87,10 @@ pub struct SceneFile {
 /// Stands for the scene file if there is none.
 const COMMAND_LINE: &str = "(command line)";
 
-/// The only path of a scene that is written to.
+/// The only path of a scene that is written to, but for a Unix socket.
 const WRITTEN: &str = "archive.synthetic.folder";
+/// The endpoint of frames, which may be a Unix socket.
+const ENDPOINT: &str = "publish.endpoint";
 /// Folder of the working directory inside which a scene file may have files written; elsewhere only an option may.
 const OUTPUT: &str = "out";
 
@@ -130,6 +132,15 @@ impl SceneFile {
             // The scene may be a stranger's.
             let accepted = format!("a folder inside {OUTPUT}/ of the working directory, or any with --set {WRITTEN}=FOLDER");
             return Err(scene.locate(Refused::new(WRITTEN, format_args!("is {:?}", synthetic.folder), &accepted)));
+        }
+        // A Unix socket is a file too, and one that is left there is replaced.
+        if let Some(endpoint) = &scene.publish.endpoint
+            && let Some(socket) = endpoint.strip_prefix("ipc://")
+            && !is_output(Path::new(socket))
+            && !scene.origin.options().any(|set| set == ENDPOINT || set == "publish")
+        {
+            let accepted = format!("tcp://HOST:PORT, \"private\", a path inside {OUTPUT}/, or any with --set {ENDPOINT}={endpoint}");
+            return Err(scene.locate(Refused::new(ENDPOINT, format_args!("is {endpoint:?}"), &accepted)));
         }
         let folder = path.parent().unwrap_or(Path::new("."));
         let origin = scene.origin.clone();

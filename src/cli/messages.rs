@@ -41,6 +41,13 @@ pub fn note(text: impl std::fmt::Display) {
     let _ = writeln!(stderr(), "ridgewatch: {text}");
 }
 
+/// Prints a line of information from a thread of its own, for those who must not wait for standard error. If the system refuses the thread, the line
+/// is lost.
+pub fn note_aside(text: impl std::fmt::Display) {
+    let text = text.to_string();
+    let _ = std::thread::Builder::new().spawn(move || note(text));
+}
+
 /// A progress bar over `length` steps (a spinner if unknown), drawn only when standard error is a terminal.
 pub fn progress(length: Option<u64>) -> ProgressBar {
     let target = if stderr().is_terminal() { ProgressDrawTarget::stderr() } else { ProgressDrawTarget::hidden() };

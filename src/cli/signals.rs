@@ -49,6 +49,7 @@ impl Stop {
         }
     }
 
+    /// Never waits for anything but signals and the bound.
     fn hear(&self, mut signals: std::io::PipeReader, within: Option<Duration>, last: impl FnOnce() + Send + 'static) {
         let mut first: Option<Instant> = None;
         loop {
@@ -59,7 +60,7 @@ impl Stop {
                     self.leave(&format!("after the {} s of --stop-within", bound.as_secs_f64()), last);
                 }
                 if left <= bound / 2 && !self.abandoned.swap(true, Ordering::Relaxed) {
-                    messages::note("the frame in progress is abandoned, to save what was finished before");
+                    messages::note_aside("the frame in progress is abandoned, to save what was finished before");
                 }
                 due = Some(if left > bound / 2 { left - bound / 2 } else { left });
             }
@@ -76,11 +77,11 @@ impl Stop {
                 self.caught.store(128 + signal[0], Ordering::Relaxed);
                 self.requested.store(true, Ordering::Relaxed);
                 match within {
-                    Some(bound) => messages::note(format_args!(
+                    Some(bound) => messages::note_aside(format_args!(
                         "finishing the current frame, for {} s at most; once more to stop at once",
                         bound.as_secs_f64() / 2.0
                     )),
-                    None => messages::note("finishing the current frame; once more to stop at once"),
+                    None => messages::note_aside("finishing the current frame; once more to stop at once"),
                 }
                 continue;
             };
@@ -92,10 +93,12 @@ impl Stop {
 
     /// Ends the process.
     fn leave(&self, why: &str, last: impl FnOnce() + Send + 'static) -> ! {
-        messages::note(format_args!("stopped at once {why}; unwritten output is lost"));
         let (done, wait) = std::sync::mpsc::channel();
+        let text = format!("stopped at once {why}; unwritten output is lost");
         let act = move || {
             last();
+            // Standard error may be on a disk that does not answer either.
+            messages::note(text);
             let _ = done.send(());
         };
         if std::thread::Builder::new().spawn(act).is_ok() {

@@ -60,6 +60,8 @@ struct Shared {
     /// A client has left.
     left: Notify,
     counts: Mutex<Counts>,
+    /// Topic of the latest message of [`Keep::Newest`].
+    newest: Mutex<Vec<u8>>,
     ledger: Arc<Ledger>,
 }
 
@@ -78,8 +80,14 @@ impl PubSocket {
             let _inside = runtime.enter();
             Listener::new(bound)?
         };
-        let shared =
-            Arc::new(Shared { limits, clients: Mutex::default(), left: Notify::new(), counts: Mutex::default(), ledger: Arc::default() });
+        let shared = Arc::new(Shared {
+            limits,
+            clients: Mutex::default(),
+            left: Notify::new(),
+            counts: Mutex::default(),
+            newest: Mutex::default(),
+            ledger: Arc::default(),
+        });
         let (close_by, closing) = watch::channel(None);
         let served = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("ridgewatch-zmtp".to_owned()).spawn(move || {
@@ -103,6 +111,9 @@ impl PubSocket {
     /// Sends a message of several parts, of which the first is its topic, to those who subscribe to it. Never waits.
     pub fn send(&self, parts: &[&[u8]], last: Vec<u8>, keep: Keep) {
         let message = self.shared.ledger.message(parts, last, keep);
+        if keep == Keep::Newest {
+            lock(&self.shared.newest).clone_from(&message.topic);
+        }
         let clients = lock(&self.shared.clients).clone();
         let dropped = clients.iter().filter(|client| client.give(&message, self.shared.limits.queued)).count();
         lock(&self.shared.counts).dropped += dropped as u64;
@@ -117,10 +128,11 @@ impl PubSocket {
         }
         let patience = self.shared.limits.stall / GIVE_WAY;
         let clients = lock(&self.shared.clients).clone();
+        let newest = lock(&self.shared.newest).clone();
         let oldest = clients.iter().filter_map(|client| client.writing()).min();
         if let Some((number, since)) = oldest
             && since.elapsed() >= patience
-            && clients.iter().any(|client| client.has_subscribed() && client.writing().is_none())
+            && clients.iter().any(|client| client.wants(&newest) && client.writing().is_none())
         {
             let holders = clients.iter().filter(|client| client.writing().is_some_and(|(held, _)| held == number));
             let closed = holders.map(|client| client.close()).count();

@@ -137,6 +137,10 @@ fn a_scene_file_chooses_no_folder_outside_of_out() {
     assert!(folder.path().join("out/mine").exists());
     inspect(&write(text(&target)), &["--set", &format!("archive.synthetic.folder={:?}", text(&target))]).success();
     assert!(target.exists());
+    let socket = format!("[publish]\nendpoint = \"ipc://{}\"\n", text(&folder.path().join("socket")));
+    let scene = scene::write(folder.path(), &(scene::double_gyre([8, 4, 1], "time.tau = 1") + &socket));
+    let mut command = program::ridgewatch(["replay", &scene, "--out", "out/run"]);
+    run(command.current_dir(folder.path())).refused(2, &["scene.toml:", "publish.endpoint", "--set publish.endpoint"]);
 }
 
 /// Standard error on a full disk changes no exit status, and a run goes to its end.
