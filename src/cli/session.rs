@@ -236,7 +236,10 @@ fn show(event: Event, bar: &mut indicatif::ProgressBar, last: &mut Option<Arc<Fr
                 bar.suspend(|| messages::note(text));
             }
         }
-        Event::Note(text) => bar.suspend(|| messages::note(text)),
+        Event::Note(text) => {
+            bar.suspend(|| messages::note(text));
+            notify::running(|| "preparing the first frame".into());
+        }
         Event::Progress(share) => {
             bar.set_message(format!("frame {:3.0} %", share * 100.0));
             notify::running(|| match last {

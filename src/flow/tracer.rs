@@ -5,6 +5,7 @@ use super::rk4::{self, MAX_LANES, TracedBatch};
 use super::velocity::{Coordinates, Velocity};
 use super::{Boundary, Extras, Normalisation, StepChoice, Traced, Tracer, dormand_prince};
 use rayon::prelude::*;
+use ridgewatch_base::progress;
 use ridgewatch_field::Domain;
 use ridgewatch_simd::{Lanes, Mask, Real};
 use std::marker::PhantomData;
@@ -237,6 +238,7 @@ where
             // Several chunks per thread, so that no thread waits long for the last one.
             let chunk = (seeds.len() / (8 * threads)).next_multiple_of(L::LANES).clamp(L::LANES, CHUNK);
             (0..seeds.len().div_ceil(chunk)).into_par_iter().for_each(|c| {
+                progress::mark();
                 let mut points = [[0.0f32; 3]; MAX_LANES];
                 let mut indices = [0usize; MAX_LANES];
                 let end = ((c + 1) * chunk).min(seeds.len());

@@ -301,6 +301,7 @@ impl Renderer {
         let mut schedule = Schedule::new(film.samples.len() as u32, count);
         let (mut points, mut log_stretch, mut traced) = (Vec::new(), Vec::new(), Vec::new());
         loop {
+            ridgewatch_base::progress::mark();
             let began = Instant::now();
             schedule.assign_tiles(&mut groups, count);
             advance(&mut groups, &scene, &log_stretch, &traced, &samples);

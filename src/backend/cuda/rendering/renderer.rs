@@ -323,6 +323,7 @@ impl GpuRenderer {
             }
             *(if number == 0 { &mut timeline.start } else { &mut timeline.advance }) += seconds(&began, &ended)?;
             report(control.totals[4]);
+            ridgewatch_base::progress::mark();
             let stopped = stop.load(Ordering::Relaxed);
             if control.live == 0 || stopped {
                 self.timeline.add(&timeline);
