@@ -14,6 +14,8 @@ use std::time::{Duration, Instant};
 use tokio::net::{TcpListener, TcpStream, UnixListener, UnixStream};
 use tokio::sync::{Notify, watch};
 
+/// Descriptors that a runtime needs at most, with some to spare.
+const SPARE_DESCRIPTORS: usize = 12;
 /// Maximum number of connections whose users are looked up together.
 const BATCH: usize = 64;
 /// Pause after a connection could not be accepted, because no descriptor is free for instance.
@@ -75,6 +77,9 @@ impl PubSocket {
         let (bound, endpoint) = Bound::open(endpoint)?;
         let peers = peers.unwrap_or(if bound.is_local() { Peers::User } else { Peers::Any });
         bound.open_to(peers)?;
+        // Where another crate enables tokio's signals, the runtime panics without these descriptors.
+        let spare = (0..SPARE_DESCRIPTORS).map(|_| std::fs::File::open("/dev/null")).collect::<io::Result<Vec<_>>>()?;
+        drop(spare);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().max_blocking_threads(1).build()?;
         let listener = {
             let _inside = runtime.enter();
