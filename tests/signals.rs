@@ -243,17 +243,21 @@ fn a_smooth_frame_is_abandoned_in_time() {
 /// Whatever cannot be interrupted, the process ends in time.
 #[test]
 fn the_bound_holds_where_the_work_does_not_end() {
-    // Training looks for a stop every 32 steps, and each of these takes seconds.
+    // Training looks for a stop every 32 steps. How long these take depends on the machine, so the bound becomes shorter until they outlast it.
     let keys = ["training.steps_per_frame=1000", "network.batch=1048576", "network.width=128"];
-    let mut run = Run::start_with(&gyre(), &keys, None, |command| {
-        command.args(["--threads", "1", "--stop-within", "2"]);
+    let ended_at_once = [2.0, 0.5, 0.1, 0.02].into_iter().any(|bound: f64| {
+        let mut run = Run::start_with(&gyre(), &keys, None, |command| {
+            command.args(["--threads", "1", "--stop-within", &bound.to_string()]);
+        });
+        run.prints("colours from FTLE");
+        std::thread::sleep(Duration::from_millis(3000));
+        let begin = Instant::now();
+        run.process().signal(libc::SIGTERM);
+        let output = run.ended().refused(143, &[]);
+        assert!(begin.elapsed().as_secs_f64() < bound + 1.0, "{:?}: {}", begin.elapsed(), output.stderr);
+        output.stderr.contains("stopped at once")
     });
-    run.prints("colours from FTLE");
-    std::thread::sleep(Duration::from_millis(3000));
-    let begin = Instant::now();
-    run.process().signal(libc::SIGTERM);
-    let output = run.ended().refused(143, &["stopped at once"]);
-    assert!(begin.elapsed() < Duration::from_secs(3), "{:?}: {}", begin.elapsed(), output.stderr);
+    assert!(ended_at_once, "the work ended by itself within every bound");
 }
 
 #[test]

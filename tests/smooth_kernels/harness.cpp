@@ -166,7 +166,7 @@ int main(int, char** arguments) {
                 }
             }
             for (int number = 0; number <= 5; ++number) {
-                const int spacing = 1 << number, radius = min_(4 * spacing, 32);
+                const int spacing = 1 << number, radius = 32;
                 if (number == 5) {
                     for (size_t at = 0; at < pixels; ++at) last_level(fine, level, int(at));
                 } else {

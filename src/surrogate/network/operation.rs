@@ -3,7 +3,7 @@
 //! ```
 //! use burn::backend::{Autodiff, Flex};
 //! use burn::tensor::Tensor;
-//! use ridgewatch::surrogate::network::{Architecture, FusedNetwork, Network, NetworkSettings};
+//! use ridgewatch_surrogate::network::{Architecture, FusedNetwork, Network, NetworkSettings};
 //! use std::sync::Arc;
 //!
 //! type B = Autodiff<Flex>;

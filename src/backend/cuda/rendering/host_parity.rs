@@ -342,7 +342,7 @@ fn a_device_agrees() {
     // The combination, with all three corrections, of the last picture's rays.
     let (width, height) = (150, 141);
     let sums = some_pairs(width, height);
-    let planes = pair_planes(&sums);
+    let mut planes = pair_planes(&sums);
     let case = &cases()[0];
     let nodes = some_nodes(case.shape);
     let mut renderer = case.renderer();
@@ -355,6 +355,7 @@ fn a_device_agrees() {
     let medium = DeviceMedium { parameters: &parameters, nodes: laid.grid(Some(&table)).unwrap(), missing_cells: None };
     march.prepare(&renderer, &medium, case.values, 1).unwrap();
     march.march(&medium, 0.05, 2, false).unwrap();
+    planes.resize(SUM_PLANES * width * height, 0.0);
     let pairs = gpu.upload("pairs", &planes).unwrap();
     let mut base = Vec::new();
     for (how, correction) in
