@@ -7,6 +7,7 @@ use ridgewatch::flow::Tracer;
 use ridgewatch::run::{FrameRecord, RunOptions, RunReport};
 use ridgewatch::surrogate::network::NetworkSettings;
 use ridgewatch::surrogate::{HostSurrogate, Kind, ReplayBuffer, SurrogateSettings, build};
+use std::fs::File;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
@@ -38,16 +39,17 @@ fn a_checkpoint_holds_the_weights_after_its_frame() {
     let options = RunOptions { checkpoint_seconds: Some(0.0), ..ending_in(&file("weights")) };
     let mut written = Vec::new();
     let mut steps = Vec::new();
-    // Inode under the name of the checkpoint.
-    let mut shown = None;
+    // The last checkpoint that was seen. It stays open, so that no later one is given its inode.
+    let mut seen: Option<File> = None;
     let report = frames(FRAMES, &[], &options, |record| {
         steps.push(record.training.as_ref().map_or(0, |learned| learned.steps));
         let Some(checkpoint) = record.checkpoint.clone() else { return };
         if checkpoint.bytes.is_none() {
-            let before = shown;
+            let inode = |file: &File| file.metadata().unwrap().ino();
+            let before = seen.as_ref().map(inode);
             until("the write of the checkpoint", || {
-                shown = std::fs::metadata(file("weights")).ok().map(|metadata| metadata.ino());
-                shown != before
+                seen = File::open(file("weights")).ok().filter(|file| Some(inode(file)) != before);
+                seen.is_some()
             });
         }
         assert_eq!((&checkpoint.failed, checkpoint.asynchronous), (&None, true));
