@@ -6,26 +6,15 @@
 
 #![allow(clippy::unwrap_used, clippy::print_stdout)] // a measurement, which may stop and prints
 
-use ridgewatch::backend::{Device, DeviceChoice, DeviceSettings, TracedOnce, stratified_points};
+use ridgewatch::backend::{Device, DeviceChoice, DeviceSettings};
+use ridgewatch::chart::{Truth, fixed_colours, picture_errors};
 use ridgewatch::config::SceneFile;
-use ridgewatch::render::{Film, Method, TransferSettings};
+use ridgewatch::render::{Film, Method};
 use ridgewatch::run::{Event, Frame, RunOptions, Settings, Setup, run};
-use ridgewatch::trust::Strata;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
 static NEVER: AtomicBool = AtomicBool::new(false);
-
-/// Transfer function for all pictures, scaled to this field as by default.
-fn colours(settings: &Settings, device: &Device) -> TransferSettings {
-    let mut setup = Setup::new(settings.clone()).unwrap();
-    let slide = setup.slides.next_slide(&NEVER).unwrap().unwrap();
-    let points = stratified_points(&Strata::even([64, 64, 16], 1), settings.seed, 0);
-    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
-    let TracedOnce { flow, traced, .. } = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).unwrap();
-    let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
-    settings.transfer.clone().unwrap_or_default().scaled_to(&ftle)
-}
 
 fn frames(settings: &Settings, device: &Device, mut seen: impl FnMut(Frame) + Send) {
     let options = RunOptions { device: device.clone(), ..RunOptions::default() };
@@ -37,32 +26,6 @@ fn frames(settings: &Settings, device: &Device, mut seen: impl FnMut(Frame) + Se
     run(Setup::new(settings.clone()).unwrap(), &options, &mut sink, &NEVER).unwrap();
 }
 
-/// True errors of a film.
-struct Errors {
-    rms: f64,
-    /// Tone-mapped, over lit pixels and over all.
-    psnr: [f64; 2],
-}
-
-fn errors(film: &Film, [a, b]: &[Film; 2], [contrast, brightness, gamma]: [f64; 3]) -> Errors {
-    let tone = |c: f32| ((f64::from(c) - 0.5) * contrast + brightness).clamp(0.0, 1.0).powf(1.0 / gamma);
-    let (mut linear, mut mapped, mut lit) = (0.0, [0.0; 2], 0.0);
-    for i in 0..film.rgba.len() {
-        let (mut square, mut product) = (0.0, 0.0);
-        for k in 0..3 {
-            let (c, a, b) = (film.rgba[i][k], a.rgba[i][k], b.rgba[i][k]);
-            product += f64::from(c - a) * f64::from(c - b) / 3.0;
-            square += (tone(c) - tone(a)) * (tone(c) - tone(b)) / 3.0;
-        }
-        mapped[1] += square;
-        if a.rgba[i][3] + b.rgba[i][3] > 0.02 {
-            (linear, mapped[0], lit) = (linear + product, mapped[0] + square, lit + 1.0);
-        }
-    }
-    let decibels = |mean: f64| -10.0 * mean.max(1e-12).log10();
-    Errors { rms: (linear / lit).max(0.0).sqrt(), psnr: [decibels(mapped[0] / lit), decibels(mapped[1] / film.rgba.len() as f64)] }
-}
-
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let (keys, words): (Vec<String>, Vec<String>) = arguments.into_iter().partition(|a| a.contains('='));
@@ -72,16 +35,17 @@ fn main() {
     let text = std::fs::read_to_string(file).unwrap();
     let mut scene = SceneFile::parse(file, &text, &keys).unwrap().settings();
     let device = Device::open(DeviceChoice::Auto, &DeviceSettings::default()).unwrap();
-    scene.transfer = Some(colours(&scene, &device));
+    scene.transfer = Some(fixed_colours(&scene, &device).unwrap());
     (scene.time.warmup_frames, scene.time.slides) = (0, Some(1));
-    let truth = [77, 78].map(|seed| {
+    let truth = Truth::new([77, 78].map(|seed| {
         let mut scene = Settings { seed, ..scene.clone() };
         (scene.render.method, scene.render.samples) = (Method::Reference, truth_samples as f64);
         (scene.render.until, scene.render.budget, scene.time.frames_per_slide) = (None, None, 1);
         let mut film = None;
         frames(&scene, &device, |frame| film = Some((*frame.film).clone()));
         film.unwrap()
-    });
+    }))
+    .unwrap();
     let tone_map = scene.render.tone_map;
     let size = [scene.render.width, scene.render.height];
     println!("{}: {size:?} pixels, truth of 2 x {truth_samples} samples; seconds since the window was there", file.display());
@@ -109,7 +73,7 @@ fn main() {
                 sum.accumulate(&frame.film).unwrap();
             }
             let film = if stated.is_some() { &frame.film } else { &sum };
-            let true_error = errors(film, &truth, tone_map);
+            let true_error = picture_errors(film, &truth, tone_map);
             let samples = stated.map_or(record.samples_per_pixel * (record.frame + 1) as f64, |s| s.samples_per_pixel);
             let stated = stated.unwrap_or_default();
             println!(
@@ -119,8 +83,8 @@ fn main() {
                 1e3 * stages.trace,
                 1e3 * (stages.audit + stages.train),
                 stated.rays_per_pixel,
-                true_error.psnr[0],
-                true_error.psnr[1],
+                true_error.psnr,
+                true_error.psnr_all,
                 true_error.rms,
                 stated.psnr.value,
                 stated.psnr.low,

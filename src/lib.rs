@@ -2,7 +2,7 @@
 //!
 //! The rooms; a room calls only those to its left:
 //!
-//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`] ← [`config`] ← the command line.
+//! [`field`] ← [`source`], [`flow`] ← [`surrogate`], [`trust`], [`render`] ← [`backend`] ← [`run`] ← [`publish`] ← [`chart`] ← [`config`] ← the command line.
 //!
 //! Each room defines its settings and checks them with [`setting`]; [`config`] reads them from a scene file and finds the line of a fault.
 //! All rooms may call [`files`], [`progress`], [`setting`] and [`simd`]. Every room up to [`backend`] is a crate of its own.
@@ -10,6 +10,7 @@
 //! A cycle takes the newest snapshots, slides the window, renders with the weights of the previous cycle, compares every traced sample with
 //! the surrogate, which updates the trust map, and then trains on it.
 
+pub mod chart;
 pub mod config;
 pub mod publish;
 pub mod run;

@@ -3,6 +3,7 @@
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, DeviceChoice};
+use ridgewatch::chart::{Choice, choose};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
@@ -11,6 +12,7 @@ use ridgewatch::setting::Refused;
 use ridgewatch::source::SourceError;
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicBool;
 
 /// Options of every command.
 #[derive(Debug, clap::Args)]
@@ -92,6 +94,51 @@ pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
     Ok(scene)
 }
 
+/// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene on the same device.
+pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<()> {
+    if scene.render.method != Method::Auto {
+        return Ok(());
+    }
+    if scene.render.until.is_some() || scene.render.budget.is_some() {
+        scene.render.method = Method::TwoLevel;
+        messages::note("render.method = \"auto\": two_level, since only smooth methods have render.until and render.budget");
+        return Ok(());
+    }
+    let remembered = match paths {
+        [one] if is_config(one) => Some(one.with_extension("auto.json")),
+        _ => None,
+    };
+    let asked = format!("{} {:?} {}", env!("CARGO_PKG_VERSION"), common.device, scene.to_toml()?);
+    let earlier = remembered.as_deref().and_then(|file| std::fs::read(file).ok()).and_then(|bytes| serde_json::from_slice(&bytes).ok());
+    let choice = match earlier.filter(|earlier: &Remembered| earlier.asked == asked) {
+        Some(Remembered { choice, .. }) => choice,
+        None => {
+            let _spinner = messages::spinner("trying methods on the first slide".into());
+            let choice = choose(&scene.settings(), device, common.threads, &AtomicBool::new(false))
+                .map_err(|error| located(scene, error, RunError::refused))?;
+            if let Some(file) = &remembered {
+                // A folder that cannot be written costs the next start its trial, and nothing else.
+                let text = serde_json::to_vec_pretty(&Remembered { asked, choice: choice.clone() })?;
+                if let Err(error) = ridgewatch::files::write_whole(file, &text) {
+                    messages::note(format_args!("the choice is not remembered: {}: {error}", file.display()));
+                }
+            }
+            choice
+        }
+    };
+    messages::note(&choice);
+    scene.render.method = choice.method;
+    Ok(())
+}
+
+/// File beside a scene file with the choice of `render.method = "auto"`.
+#[derive(serde::Serialize, serde::Deserialize)]
+struct Remembered {
+    /// What was asked: version, device and scene.
+    asked: String,
+    choice: Choice,
+}
+
 /// Adds the place of the setting at fault, if a setting is at fault.
 pub fn located<E>(scene: &SceneFile, error: E, refused: impl FnOnce(&E) -> Option<Refused>) -> anyhow::Error
 where
@@ -159,7 +206,7 @@ pub fn word<T: serde::de::DeserializeOwned>(word: &str, accepted: &str) -> Resul
 
 /// Parses a method.
 pub fn method(text: &str) -> Result<Method, String> {
-    word(text, "reference, surrogate, neural, gated, marched, two_level")
+    word(text, "auto, reference, surrogate, neural, gated, marched, two_level")
 }
 
 /// Parses a number of threads.

@@ -1,6 +1,7 @@
 //! The command line, one file a command.
 
 mod attach;
+mod chart;
 mod clean;
 mod common;
 mod compare;
@@ -17,6 +18,7 @@ mod replay;
 mod session;
 mod signals;
 mod synthesize;
+mod train;
 
 use anyhow::Result;
 use clap::error::{ContextKind, ContextValue, ErrorKind};
@@ -51,6 +53,10 @@ enum Command {
     Render(render::Options),
     /// Compute the FTLE field on a grid as NetCDF; `--check` compares it with the truth.
     Ftle(ftle::Options),
+    /// Chart speed against accuracy of a scene: methods and settings, the Pareto front, and the pick.
+    Chart(chart::Options),
+    /// Train the scene's network offline on a still window, and show how its error falls.
+    Train(train::Options),
     /// Compare two EXR pictures: PSNR, SSIM, relative error.
     Compare(compare::Options),
     /// Show how files would be read, and why.
@@ -90,6 +96,8 @@ pub fn run(arguments: Arguments) -> Result<()> {
         Command::Clean(options) => clean::run(&common, &options),
         Command::Render(options) => render::run(&common, options),
         Command::Ftle(options) => ftle::run(&common, &options),
+        Command::Chart(options) => chart::run(&common, &options),
+        Command::Train(options) => train::run(&common, &options),
         Command::Compare(options) => compare::run(&common, &options),
         Command::Inspect(options) => inspect::run(&common, &options),
         Command::Synthesize(options) => synthesize::run(&common, &options),

@@ -1,7 +1,7 @@
 //! `ridgewatch render`.
 
 use super::common::{
-    Common, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene,
+    Common, Usage, check_folder, check_learns, chosen_steps, device, located, method, open, print_json, print_text, scene, settle_method,
 };
 use super::{messages, session};
 use anyhow::{Context, Result, bail};
@@ -17,7 +17,7 @@ pub struct Options {
     /// A scene file (.toml), or data files and globs.
     #[arg(required = true, value_name = "CONFIG | FILES")]
     paths: Vec<PathBuf>,
-    /// reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
+    /// auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
@@ -71,12 +71,14 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
         scene.time.warmup_frames = frames;
         scene.set_by("time.warmup_frames", format!("--warmup {frames}"));
     }
+    let device = device(common, &scene)?;
+    settle_method(common, &mut scene, &options.paths, &device)?;
     check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
     let run_options = RunOptions {
         verify_points: options.verify as usize,
         threads: common.threads,
-        device: device(common, &scene)?,
+        device,
         ..RunOptions::default()
     };
     let scene_text = scene.to_toml()?;

@@ -1,6 +1,6 @@
 //! `ridgewatch replay`.
 
-use super::common::{Common, open, scene};
+use super::common::{Common, device, open, scene, settle_method};
 use super::session::{RunArguments, Session};
 use anyhow::Result;
 use std::path::PathBuf;
@@ -19,6 +19,8 @@ pub struct Options {
 pub fn run(common: &Common, options: Options) -> Result<()> {
     let mut scene = scene(common, &options.paths)?;
     options.run.apply(&mut scene)?;
+    let device = device(common, &scene)?;
+    settle_method(common, &mut scene, &options.paths, &device)?;
     let text = scene.to_toml()?;
     Session { common, options: &options.run, scene, text, follows: None }.run(|scene, _| open(scene).map(Some))
 }

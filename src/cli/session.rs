@@ -27,7 +27,7 @@ pub struct RunArguments {
     /// Keep only the newest N frames on disk.
     #[arg(long, value_name = "N")]
     keep: Option<usize>,
-    /// reference, surrogate (neural) or gated; overrides the scene's.
+    /// auto, reference, surrogate (neural), gated, marched or two_level; overrides the scene's.
     #[arg(long, value_parser = method)]
     method: Option<Method>,
     /// Publish frames at this ZeroMQ endpoint (port 0: any free one, which is printed); by default they go to files only.

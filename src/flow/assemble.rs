@@ -30,6 +30,16 @@ pub fn tracer_in_order(source: VelocitySource, map: &FlowMap, t0: f64, order: Or
     TracerBuilder::new(source, map, t0, order)?.build::<f32x8, f64x4, LanePair<f32x8>>()
 }
 
+/// [`cpu_tracer`] by the adaptive pair of Dormand and Prince in f64, whatever the integrator of the map, with this local error tolerance.
+///
+/// # Errors
+/// As [`cpu_tracer`].
+pub fn dormand_prince_tracer(source: VelocitySource, map: &FlowMap, t0: f64, tolerance: f64) -> Result<Box<dyn Tracer>, FlowError> {
+    positive("tolerance", tolerance)?;
+    let map = FlowMap { integrator: Integrator::DormandPrince, precision: Precision::F64, ..map.clone() };
+    TracerBuilder { tolerance, ..TracerBuilder::new(source, &map, t0, Order::Auto)? }.build::<f32x8, f64x4, LanePair<f32x8>>()
+}
+
 /// [`cpu_tracer`] without vectors, one sample at a time, for benchmarks.
 ///
 /// # Errors
@@ -46,6 +56,8 @@ struct TracerBuilder<'a> {
     from: f64,
     to: f64,
     order: Order,
+    /// Local error tolerance of Dormand-Prince.
+    tolerance: f64,
 }
 
 fn positive(key: &'static str, value: f64) -> Result<(), FlowError> {
@@ -88,7 +100,7 @@ impl<'a> TracerBuilder<'a> {
                 }
             }
         }
-        Ok(Self { source, domain, map, from: t0, to, order })
+        Ok(Self { source, domain, map, from: t0, to, order, tolerance: dormand_prince::TOLERANCE })
     }
 
     /// `S` and `D` are the single- and double-precision lanes. `P` are the single-precision lanes for closed forms in the plane: their state
@@ -167,7 +179,7 @@ impl<'a> TracerBuilder<'a> {
     {
         let (from, to) = (self.from, self.to);
         if self.map.integrator == Integrator::DormandPrince {
-            let kernel = AdaptiveKernel { from, to, tolerance: dormand_prince::TOLERANCE };
+            let kernel = AdaptiveKernel { from, to, tolerance: self.tolerance };
             return Ok(Box::new(self.tracer::<_, _, f64, N, C>(double()?, kernel)));
         }
         let (count, chosen) = match self.map.steps {

@@ -12,6 +12,7 @@ use std::sync::Arc;
 
 mod assemble;
 mod axis_map;
+mod composition;
 mod displacement;
 mod dormand_prince;
 mod error;
@@ -29,8 +30,9 @@ mod stretch;
 mod tracer;
 mod velocity;
 
-pub use assemble::{cpu_tracer, scalar_tracer, tracer_in_order};
+pub use assemble::{cpu_tracer, dormand_prince_tracer, scalar_tracer, tracer_in_order};
 pub use axis_map::AxisMap;
+pub use composition::Composition;
 pub use error::FlowError;
 pub use missing_cells::MissingCells;
 pub use resolution::{TimeResolution, time_resolution};

@@ -32,6 +32,8 @@ pub enum Method {
     /// The marched picture, corrected by traced samples. The default.
     #[serde(rename = "two_level")]
     TwoLevel,
+    /// `two_level` or `reference`, by a trial before the run. A run itself has one of the others.
+    Auto,
 }
 
 impl Method {
@@ -43,12 +45,13 @@ impl Method {
             Self::Gated => "gated",
             Self::Marched => "marched",
             Self::TwoLevel => "two_level",
+            Self::Auto => "auto",
         }
     }
 
-    /// True if the picture accumulates and its error is stated ([`super::smooth`]).
+    /// True if the picture accumulates and its error is stated ([`super::smooth`]), or may do so.
     pub fn is_smooth(self) -> bool {
-        matches!(self, Self::Marched | Self::TwoLevel)
+        matches!(self, Self::Marched | Self::TwoLevel | Self::Auto)
     }
 }
 

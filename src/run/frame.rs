@@ -50,7 +50,7 @@ impl Run<'_> {
         let preparation_seconds = start.elapsed().as_secs_f64();
         let scene = &self.plan.scene;
         let gate = match scene.render.method {
-            Method::Gated | Method::Marched | Method::TwoLevel => self.learning.trust.gate(),
+            Method::Gated | Method::Marched | Method::TwoLevel | Method::Auto => self.learning.trust.gate(),
             Method::Reference => Gate::uniform(false),
             Method::Surrogate => Gate::uniform(true),
         };

@@ -66,6 +66,10 @@ impl Setup {
     }
 
     fn settle(mut scene: Settings, mut snapshots: Option<Box<dyn SnapshotSource>>, live: Option<Live>) -> Result<Self, RunError> {
+        if scene.render.method == Method::Auto {
+            let accepted = "a method: the commands replay and render choose it by a trial";
+            return Err(Refused::new("render.method", "is \"auto\"", accepted).into());
+        }
         let mut notes = Vec::new();
         let closed = closed_form(&scene.source);
         let grid = snapshots.as_ref().map(|s| s.grid().clone()).or(live.as_ref().map(|l| l.grid().clone()));

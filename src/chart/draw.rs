@@ -1,0 +1,307 @@
+//! The panels of a chart as one picture, drawn by plotters.
+
+use super::ftle::{FtlePanel, FtlePoint};
+use super::picture::PicturePanel;
+use super::scaling::ScalingPanel;
+use super::verdict::{CHARGED, size};
+use super::{Chart, front, pick};
+use image::{ImageFormat, RgbImage};
+use plotters::coord::Shift;
+use plotters::coord::ranged1d::{AsRangedCoord, Ranged, ValueFormatter};
+use plotters::prelude::*;
+use plotters::style::{FontStyle, register_font};
+use std::io::Cursor;
+use std::ops::Range;
+use thiserror::Error;
+
+/// Width of the picture and height of a row of panels, in pixels.
+const WIDTH: u32 = 1800;
+const ROW: u32 = 620;
+/// Width of the legend beside each panel.
+const LEGEND: u32 = 230;
+/// Font that is built in, so that a chart looks the same on every machine.
+const FONT: &str = "sans-serif";
+
+/// Colours that remain distinct with colour blindness (Okabe and Ito 2008), without yellow, which is faint on white.
+const COLOURS: [RGBColor; 7] = [
+    RGBColor(0, 114, 178),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(86, 180, 233),
+    RGBColor(230, 159, 0),
+    RGBColor(90, 90, 90),
+];
+
+/// Error of drawing a chart.
+#[derive(Debug, Error)]
+pub enum DrawError {
+    /// plotters fails.
+    #[error("the chart cannot be drawn: {0}")]
+    Plot(String),
+    /// The PNG cannot be encoded.
+    #[error("the chart cannot be encoded: {0}")]
+    Encode(#[from] image::ImageError),
+}
+
+fn plot_error(error: impl std::fmt::Display) -> DrawError {
+    DrawError::Plot(error.to_string())
+}
+
+/// Draws a chart as SVG.
+///
+/// # Errors
+/// plotters fails.
+pub fn write_svg(chart: &Chart) -> Result<String, DrawError> {
+    let mut text = String::new();
+    let panels = panels(chart);
+    draw(&SVGBackend::with_string(&mut text, picture_size(&panels)).into_drawing_area(), chart, &panels)?;
+    Ok(text)
+}
+
+/// Draws a chart as PNG.
+///
+/// # Errors
+/// plotters fails, or the picture cannot be encoded.
+pub fn write_png(chart: &Chart) -> Result<Vec<u8>, DrawError> {
+    let panels = panels(chart);
+    let (width, height) = picture_size(&panels);
+    let mut pixels = vec![0; (width * height * 3) as usize];
+    draw(&BitMapBackend::with_buffer(&mut pixels, (width, height)).into_drawing_area(), chart, &panels)?;
+    let picture = RgbImage::from_raw(width, height, pixels).ok_or_else(|| plot_error("the picture has another size than its buffer"))?;
+    let mut bytes = Cursor::new(Vec::new());
+    picture.write_to(&mut bytes, ImageFormat::Png)?;
+    Ok(bytes.into_inner())
+}
+
+/// Points of one entry of the legend.
+struct Series {
+    name: String,
+    points: Vec<(f64, f64)>,
+    is_line: bool,
+}
+
+/// One panel. The horizontal axis is logarithmic.
+struct Panel {
+    title: String,
+    x: String,
+    y: String,
+    is_y_log: bool,
+    series: Vec<Series>,
+    /// Pareto front, with labels.
+    front: Vec<(f64, f64, String)>,
+    /// The pick on the front.
+    pick: Option<(f64, f64)>,
+    /// Horizontal lines with labels.
+    levels: Vec<(f64, String)>,
+}
+
+fn panels(chart: &Chart) -> Vec<Panel> {
+    let unit = if chart.time_unit.is_empty() { String::new() } else { format!(", 1/{}", chart.time_unit) };
+    let mut panels = Vec::new();
+    if let Some(panel) = &chart.ftle {
+        panels.push(ftle_panel(panel, &unit, "FTLE: error against cost of a sample".into(), "seconds per sample", |point| {
+            1.0 / point.samples_per_second
+        }));
+        for samples in [CHARGED[0], CHARGED[1]] {
+            let title = format!("FTLE: error against seconds of {samples:.0e} samples, building included");
+            panels.push(ftle_panel(panel, &unit, title, "seconds", |point| point.seconds(samples)));
+        }
+    }
+    panels.extend(chart.pictures.as_ref().map(picture_panel));
+    panels.extend(chart.scaling.as_ref().and_then(|panel| scaling_panel(panel, &chart.time_unit)));
+    panels
+}
+
+fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl Fn(&FtlePoint) -> f64) -> Panel {
+    let at: Vec<[f64; 2]> = panel.methods.iter().map(|point| [cost(point), point.rms]).collect();
+    let mut series: Vec<Series> = Vec::new();
+    for (point, [x, y]) in panel.methods.iter().zip(&at) {
+        match series.iter_mut().find(|series| series.name == point.method) {
+            Some(series) => series.points.push((*x, *y)),
+            None => series.push(Series { name: point.method.clone(), points: vec![(*x, *y)], is_line: false }),
+        }
+    }
+    let label = |i: usize| (at[i][0], at[i][1], format!("{}, {}", panel.methods[i].setting, size(panel.methods[i].bytes)));
+    Panel {
+        title,
+        x: x.into(),
+        y: format!("root mean square error of the FTLE{unit}"),
+        is_y_log: true,
+        series,
+        front: front(&at).into_iter().map(label).collect(),
+        pick: pick(&at, panel.tolerance).map(|i| (at[i][0], at[i][1])),
+        levels: vec![(panel.tolerance, "tolerance".into())],
+    }
+}
+
+fn picture_panel(panel: &PicturePanel) -> Panel {
+    let series = panel.curves.iter().map(|curve| Series {
+        name: curve.name(),
+        points: curve.frames.iter().map(|frame| (frame.seconds, frame.psnr)).collect(),
+        is_line: true,
+    });
+    let [width, height] = panel.size;
+    Panel {
+        title: format!("Pictures of {width} x {height}: time to error, still window"),
+        x: "seconds since the slide, preparation and training included".into(),
+        y: "PSNR over lit pixels, dB".into(),
+        is_y_log: false,
+        series: series.collect(),
+        front: Vec::new(),
+        pick: None,
+        levels: [35.0, 40.0].map(|level| (level, format!("{level} dB"))).to_vec(),
+    }
+}
+
+/// Costs against tau; the other axes are in the verdict and in the CSV.
+fn scaling_panel(panel: &ScalingPanel, time_unit: &str) -> Option<Panel> {
+    let along: Vec<_> = panel.points.iter().filter(|point| point.axis == "tau").collect();
+    if along.len() < 2 {
+        return None;
+    }
+    let series = |name: &str, value: &dyn Fn(&super::ScalingPoint) -> f64| Series {
+        name: name.into(),
+        points: along.iter().map(|point| (point.value, value(point))).collect(),
+        is_line: true,
+    };
+    Some(Panel {
+        title: "Cost of a sample against tau, steps by error".into(),
+        x: if time_unit.is_empty() { "tau".into() } else { format!("tau, {time_unit}") },
+        y: "nanoseconds per sample".into(),
+        is_y_log: true,
+        series: vec![series("tracing", &|point| point.trace_ns), series("table (built)", &|point| point.table_ns)],
+        front: Vec::new(),
+        pick: None,
+        levels: Vec::new(),
+    })
+}
+
+fn picture_size(panels: &[Panel]) -> (u32, u32) {
+    (WIDTH, 60 + ROW * panels.len().div_ceil(2).max(1) as u32)
+}
+
+fn draw<B: DrawingBackend>(area: &DrawingArea<B, Shift>, chart: &Chart, panels: &[Panel]) -> Result<(), DrawError> {
+    register_font(FONT, FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT).map_err(|_| plot_error("the built-in font is not read"))?;
+    area.fill(&WHITE).map_err(plot_error)?;
+    let title = format!("{} (tau {}{}) on {}, {} CPU threads", chart.scene, chart.tau, chart.time_unit, chart.device, chart.threads);
+    let (head, body) = area.split_vertically(60);
+    head.titled(&title, (FONT, 28)).map_err(plot_error)?;
+    for (panel, area) in panels.iter().zip(body.split_evenly((panels.len().div_ceil(2).max(1), 2))) {
+        let (plot, legend) = area.split_horizontally(WIDTH / 2 - LEGEND);
+        draw_legend(&legend, panel)?;
+        let (x, y) = (span(panel, |(x, _)| x), span(panel, |(_, y)| y));
+        if panel.is_y_log {
+            draw_panel(&plot, panel, log(x).log_scale(), log(y).log_scale())?;
+        } else {
+            let margin = 0.05 * (y.end - y.start).max(1.0);
+            draw_panel(&plot, panel, log(x).log_scale(), y.start - margin..y.end + margin)?;
+        }
+    }
+    area.present().map_err(plot_error)
+}
+
+/// Range of all finite values, levels included.
+fn span(panel: &Panel, of: impl Fn((f64, f64)) -> f64) -> Range<f64> {
+    let points = panel.series.iter().flat_map(|series| &series.points).map(|point| of(*point));
+    let levels = panel.levels.iter().map(|(level, _)| of((f64::NAN, *level)));
+    let finite = points.chain(levels).filter(|value| value.is_finite());
+    let (low, high) = finite.fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)));
+    if low <= high { low..high } else { 1.0..10.0 }
+}
+
+/// A range for a logarithmic axis, with a margin.
+fn log(range: Range<f64>) -> Range<f64> {
+    let high = range.end.max(1e-30);
+    // Twelve decades at most: an error of 0 must not squeeze the rest.
+    let low = range.start.max(1e-12 * high);
+    low / 1.6..high * 1.6
+}
+
+fn draw_panel<B, X, Y>(area: &DrawingArea<B, Shift>, panel: &Panel, x: X, y: Y) -> Result<(), DrawError>
+where
+    B: DrawingBackend,
+    X: AsRangedCoord<Value = f64>,
+    Y: AsRangedCoord<Value = f64>,
+    X::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
+    Y::CoordDescType: Ranged<ValueType = f64> + ValueFormatter<f64>,
+{
+    let mut plot = ChartBuilder::on(area)
+        .caption(&panel.title, (FONT, 20))
+        .margin(12)
+        .x_label_area_size(48)
+        .y_label_area_size(78)
+        .build_cartesian_2d(x, y)
+        .map_err(plot_error)?;
+    plot.configure_mesh()
+        .x_desc(&panel.x)
+        .y_desc(&panel.y)
+        .label_style((FONT, 15))
+        .axis_desc_style((FONT, 17))
+        .x_label_formatter(&power)
+        .y_label_formatter(&|y| if panel.is_y_log { power(y) } else { format!("{y:.0}") })
+        .light_line_style(WHITE)
+        .draw()
+        .map_err(plot_error)?;
+    let ([x0, x1], _) = ([plot.x_range().start, plot.x_range().end], ());
+    for (level, name) in &panel.levels {
+        let style = BLACK.mix(0.5).stroke_width(1);
+        plot.draw_series(DashedLineSeries::new([(x0, *level), (x1, *level)], 6, 4, style)).map_err(plot_error)?;
+        plot.draw_series([Text::new(name.clone(), (x0 * 1.05, *level), (FONT, 14).into_font())]).map_err(plot_error)?;
+    }
+    for (number, series) in panel.series.iter().enumerate() {
+        let colour = COLOURS[number % COLOURS.len()];
+        let finite: Vec<(f64, f64)> = series.points.iter().copied().filter(|(x, y)| x.is_finite() && y.is_finite()).collect();
+        if series.is_line {
+            plot.draw_series(LineSeries::new(finite.iter().copied(), colour.stroke_width(2))).map_err(plot_error)?;
+        }
+        if number < COLOURS.len() {
+            plot.draw_series(finite.iter().map(|&at| Circle::new(at, 5, colour.filled()))).map_err(plot_error)?;
+        } else {
+            plot.draw_series(finite.iter().map(|&at| TriangleMarker::new(at, 7, colour.filled()))).map_err(plot_error)?;
+        }
+    }
+    plot.draw_series(LineSeries::new(panel.front.iter().map(|(x, y, _)| (*x, *y)), BLACK.stroke_width(1))).map_err(plot_error)?;
+    for (x, y, label) in &panel.front {
+        let at = EmptyElement::at((*x, *y)) + Text::new(label.clone(), (8, -16), (FONT, 13).into_font());
+        plot.draw_series([at]).map_err(plot_error)?;
+    }
+    if let Some(pick) = panel.pick {
+        plot.draw_series([Circle::new(pick, 11, BLACK.stroke_width(2))]).map_err(plot_error)?;
+    }
+    Ok(())
+}
+
+/// A label of a logarithmic axis: 0.001 to 1000 in full, powers beyond.
+fn power(value: &f64) -> String {
+    if (1e-3..=1e3).contains(value) { format!("{value}") } else { format!("{value:.0e}") }
+}
+
+fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -> Result<(), DrawError> {
+    let mut row = 52;
+    let mut line = |text: &str, mark: &dyn Fn((i32, i32)) -> Result<(), DrawError>| {
+        mark((8, row + 8))?;
+        area.draw_text(text, &(FONT, 15).into_text_style(area), (22, row)).map_err(plot_error)?;
+        row += 24;
+        Ok::<_, DrawError>(())
+    };
+    for (number, series) in panel.series.iter().enumerate() {
+        let colour = COLOURS[number % COLOURS.len()];
+        line(&series.name, &|at| {
+            if number < COLOURS.len() {
+                area.draw(&Circle::new(at, 5, colour.filled())).map_err(plot_error)
+            } else {
+                area.draw(&TriangleMarker::new(at, 7, colour.filled())).map_err(plot_error)
+            }
+        })?;
+    }
+    if !panel.front.is_empty() {
+        line("Pareto front", &|(x, y)| {
+            area.draw(&PathElement::new([(x - 6, y), (x + 6, y)], BLACK.stroke_width(1))).map_err(plot_error)
+        })?;
+    }
+    if panel.pick.is_some() {
+        line("pick", &|at| area.draw(&Circle::new(at, 7, BLACK.stroke_width(2))).map_err(plot_error))?;
+    }
+    Ok(())
+}

@@ -1,0 +1,613 @@
+//! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
+
+use super::{Charting, failed};
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
+#[cfg(feature = "cuda")]
+use crate::backend::{CudaDevice, Storage, cuda::Cuda};
+use crate::flow::{
+    Composition, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer, dormand_prince_tracer,
+};
+use crate::render::rng::{philox, unit};
+use crate::run::{Plan, RunError, Settings, Setup, Slide};
+use crate::surrogate::network::{Encoding, NetworkSettings};
+use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace};
+use serde::Serialize;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+static NEVER: AtomicBool = AtomicBool::new(false);
+
+/// Most points on which errors are measured.
+const MAX_POINTS: usize = 1 << 20;
+/// Fewest of them.
+const MIN_POINTS: usize = 1 << 10;
+/// Share of the panel's time for the truth.
+const TRUTH_SHARE: f64 = 0.2;
+/// Seconds over which the speed of a method is measured.
+const TIMED: f64 = 0.25;
+/// Fewest points of a timed batch, and most on the CPU and on a GPU.
+const MIN_BATCH: usize = 1 << 12;
+const MAX_BATCH: [usize; 2] = [1 << 20, 1 << 23];
+/// Seconds for which networks are trained before each measurement.
+const TRAINED: [f64; 3] = [1.0, 3.0, 10.0];
+/// Seconds of tracing labels for networks, and most labels.
+const LABELS_SECONDS: f64 = 2.0;
+const MAX_LABELS: usize = 1 << 24;
+
+/// A method with a setting.
+#[derive(Debug, Clone, Serialize)]
+pub struct FtlePoint {
+    /// Family, as in the legend.
+    pub method: String,
+    /// Setting within the family.
+    pub setting: String,
+    /// Root mean square error of the FTLE, 1/time.
+    pub rms: f64,
+    /// 99th percentile of the absolute error, 1/time.
+    pub p99: f64,
+    /// PSNR in decibels with the largest true FTLE as peak; `None` if the error or the peak is 0.
+    pub psnr: Option<f64>,
+    /// FTLE samples per second in large batches, building not counted.
+    pub samples_per_second: f64,
+    /// Seconds to build, including the tracing of labels and training.
+    pub build_seconds: f64,
+    /// Bytes that a sample may read: the window of velocities, the table, the weights. 0 for closed forms.
+    pub bytes: u64,
+    /// Points whose FTLE is finite in the truth and not here; they are left out of the errors.
+    pub failed: usize,
+}
+
+impl FtlePoint {
+    /// Seconds of `samples` samples, building included.
+    pub fn seconds(&self, samples: f64) -> f64 {
+        self.build_seconds + samples / self.samples_per_second
+    }
+}
+
+/// Errors and costs of FTLE samples.
+#[derive(Debug, Clone, Serialize)]
+pub struct FtlePanel {
+    /// Points on which errors are measured.
+    pub points: usize,
+    /// Integrator of the truth.
+    pub truth: String,
+    /// Root mean square of the true FTLE, 1/time.
+    pub truth_rms: f64,
+    /// Error of the FTLE that the tolerance allows: `trust.tolerance` of the colour ramp, 1/time.
+    pub tolerance: f64,
+    /// Steps that the program chooses; `None` if the scene gives them.
+    pub chosen_steps: Option<usize>,
+    /// All methods and settings.
+    pub methods: Vec<FtlePoint>,
+}
+
+/// The first slide of a scene.
+pub(super) struct Opened {
+    pub(super) plan: Plan,
+    pub(super) slide: Slide,
+    pub(super) device_name: String,
+    /// Snapshot intervals in tau, or 10 for closed forms.
+    pub(super) intervals: usize,
+    /// Bytes of the window of velocities.
+    window_bytes: u64,
+}
+
+impl Opened {
+    pub(super) fn new(settings: &Settings, device: &Device) -> Result<Self, RunError> {
+        /// Intervals of a composed flow map of a closed form.
+        const CLOSED: usize = 10;
+        let Setup { plan, mut slides, .. } = Setup::new(settings.clone())?;
+        let slide = slides.next_slide(&NEVER)?.ok_or(RunError::EndedEarly)?;
+        let (intervals, window_bytes) = match &slide.velocity {
+            VelocitySource::Analytic(..) => (CLOSED, 0),
+            VelocitySource::Window(window) => {
+                let [from, to] = [slide.time, slide.time + plan.map.direction.sign() * plan.map.tau];
+                let slack = 1e-9 * plan.map.tau;
+                let within = |time: f64| time > from.min(to) + slack && time < from.max(to) - slack;
+                let inner = window.snapshots().filter(|snapshot| within(snapshot.time)).count();
+                (inner + 1, window.bytes() as u64)
+            }
+        };
+        let device_name = match device {
+            Device::Cpu { .. } => Cpu.name(),
+            #[cfg(feature = "cuda")]
+            Device::Cuda(device) => Cuda::new(device).name(),
+        };
+        Ok(Self { plan, slide, device_name, intervals, window_bytes })
+    }
+
+    /// Nodes of the grid of the velocity; `None` for closed forms.
+    pub(super) fn shape(&self) -> Option<[usize; 3]> {
+        match &self.slide.velocity {
+            VelocitySource::Window(window) => window.grid().map(|grid| grid.shape()),
+            VelocitySource::Analytic(..) => None,
+        }
+    }
+
+    /// Nodes of a table at the resolution of the data, or as the program chooses for closed forms.
+    pub(super) fn own_nodes(&self, is_gpu: bool) -> [usize; 3] {
+        let most = if is_gpu { MAX_DEVICE_NODES } else { MAX_OWN_NODES };
+        let open = SurrogateSettings { kind: Kind::Table, table_nodes: None };
+        let shaped = self.shape().map_or(open.clone(), |shape| open.at_resolution_of(shape, most));
+        shaped.nodes(&self.plan.domain).unwrap_or([64; 3])
+    }
+
+    /// Steps chosen by their error, also if the scene gives their number.
+    pub(super) fn auto_steps(&self) -> Steps {
+        match self.plan.map.steps {
+            Steps::Auto { tolerance } => Steps::Auto { tolerance },
+            Steps::Fixed(_) => Steps::Auto { tolerance: 0.01 },
+        }
+    }
+
+    /// Uniform random points in unit and in domain coordinates; in two dimensions all lie in the middle of the slab.
+    pub(super) fn random_points(&self, count: usize) -> [Vec<[f32; 3]>; 2] {
+        let Points { unit, domain } = Points::random(self, count, 5);
+        [unit, domain]
+    }
+
+    /// A tracer of the CPU.
+    pub(super) fn on_cpu(&self, map: &FlowMap) -> Result<Box<dyn Tracer>, RunError> {
+        cpu_tracer(self.slide.velocity.clone(), map, self.slide.time).map_err(RunError::Flow)
+    }
+}
+
+/// Points in unit and in domain coordinates.
+pub(super) struct Points {
+    pub(super) unit: Vec<[f32; 3]>,
+    domain: Vec<[f32; 3]>,
+}
+
+impl Points {
+    /// Uniform random points; in two dimensions all lie in the middle of the slab.
+    pub(super) fn random(opened: &Opened, count: usize, stream: u32) -> Self {
+        let (seed, domain) = (opened.plan.scene.seed, &opened.plan.domain);
+        let unit: Vec<[f32; 3]> = (0..count as u32)
+            .map(|i| {
+                let words = philox([i, stream, 0, 0], [seed as u32, (seed >> 32) as u32]);
+                std::array::from_fn(|axis| if axis < domain.dimensions { unit(words[axis]) } else { 0.5 })
+            })
+            .collect();
+        let domain = unit.iter().map(|&point| domain.from_unit(point)).collect();
+        Self { unit, domain }
+    }
+
+    fn first(&self, count: usize) -> (&[[f32; 3]], &[[f32; 3]]) {
+        let count = count.min(self.unit.len());
+        (&self.unit[..count], &self.domain[..count])
+    }
+}
+
+/// Points with their true FTLE, and what is measured on them.
+struct Bench<'a, 'b> {
+    charting: &'a mut Charting<'b>,
+    opened: &'a Opened,
+    points: Points,
+    truth: Vec<f64>,
+    timed: Points,
+    found: Vec<FtlePoint>,
+}
+
+/// What is known of a method before it is measured.
+struct Built {
+    seconds: f64,
+    bytes: u64,
+}
+
+impl Bench<'_, '_> {
+    /// Measures error and speed of a method, which writes the log-stretch at points in unit and domain coordinates.
+    fn measure(
+        &mut self,
+        method: &str,
+        setting: String,
+        built: Built,
+        mut answer: impl FnMut(&[[f32; 3]], &[[f32; 3]], &mut Vec<f64>) -> Result<(), RunError> + Send,
+    ) -> Result<(), RunError> {
+        let tau = self.opened.plan.map.tau;
+        let Self { charting, points, truth, timed, .. } = self;
+        let (values, samples_per_second) = charting.pool.install(|| {
+            let mut values = Vec::new();
+            answer(&points.unit, &points.domain, &mut values)?;
+            Ok::<_, RunError>((values, speed(timed, &mut answer)?))
+        })?;
+        let mut errors: Vec<f64> = Vec::with_capacity(truth.len());
+        let (mut failed, mut peak) = (0, 0.0_f64);
+        for (value, truth) in values.iter().zip(truth.iter()) {
+            let error = (value / tau - truth).abs();
+            if error.is_finite() {
+                errors.push(error);
+                peak = peak.max(*truth);
+            } else if truth.is_finite() {
+                failed += 1;
+            }
+        }
+        if errors.is_empty() {
+            self.charting.skip(format_args!("{method}, {setting}"), "no point has a finite value");
+            return Ok(());
+        }
+        errors.sort_unstable_by(f64::total_cmp);
+        let rms = (errors.iter().map(|error| error * error).sum::<f64>() / errors.len() as f64).sqrt();
+        self.found.push(FtlePoint {
+            method: method.to_owned(),
+            setting,
+            rms,
+            p99: errors[(errors.len() - 1) * 99 / 100],
+            psnr: (rms > 0.0 && peak > 0.0).then(|| 20.0 * (peak / rms).log10()),
+            samples_per_second,
+            build_seconds: built.seconds,
+            bytes: built.bytes,
+            failed,
+        });
+        Ok(())
+    }
+
+    /// Measures a tracer of any device.
+    fn measure_tracer(&mut self, method: &str, setting: String, tracer: &dyn Trace) -> Result<(), RunError> {
+        let built = Built { seconds: 0.0, bytes: self.opened.window_bytes };
+        let mut traced = Traced::default();
+        self.measure(method, setting, built, |_, seeds, out| {
+            tracer.trace(seeds, Extras::default(), &mut traced).map_err(failed)?;
+            out.clear();
+            if traced.log_stretch_f64.is_empty() {
+                out.extend(traced.log_stretch.iter().map(|s| f64::from(*s)));
+            } else {
+                out.extend_from_slice(&traced.log_stretch_f64);
+            }
+            Ok(())
+        })
+    }
+
+    fn measure_predictor(&mut self, method: &str, setting: String, seconds: f64, surrogate: &dyn Predict) -> Result<(), RunError> {
+        let built = Built { seconds, bytes: surrogate.bytes() as u64 };
+        let mut values = Vec::new();
+        self.measure(method, setting, built, |unit, _, out| {
+            values.resize(unit.len(), 0.0);
+            surrogate.predict(unit, &mut values).map_err(failed)?;
+            out.clear();
+            out.extend(values.iter().map(|s| f64::from(*s)));
+            Ok(())
+        })
+    }
+}
+
+/// Samples per second: the median of three batches, after batches that grow until one takes long enough to be timed.
+fn speed(
+    timed: &Points,
+    answer: &mut impl FnMut(&[[f32; 3]], &[[f32; 3]], &mut Vec<f64>) -> Result<(), RunError>,
+) -> Result<f64, RunError> {
+    let mut values = Vec::new();
+    let mut batch = MIN_BATCH;
+    let mut time = |batch: usize| {
+        let (unit, domain) = timed.first(batch);
+        let began = Instant::now();
+        answer(unit, domain, &mut values)?;
+        Ok::<_, RunError>(began.elapsed().as_secs_f64() / unit.len() as f64)
+    };
+    let mut seconds = time(batch)?;
+    while seconds * (batch as f64) < TIMED / 3.0 && batch < timed.unit.len() {
+        batch *= 2;
+        seconds = time(batch)?;
+    }
+    let mut three = [seconds, time(batch)?, time(batch)?];
+    three.sort_unstable_by(f64::total_cmp);
+    Ok(1.0 / three[1])
+}
+
+/// Makes the truth and measures everything that there is time for.
+pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<FtlePanel, RunError> {
+    (charting.tell)("the truth: Dormand-Prince in f64");
+    let truth_map = FlowMap { integrator: Integrator::DormandPrince, precision: Precision::F64, ..opened.plan.map.clone() };
+    let truth_tracer = opened.on_cpu(&truth_map)?;
+    let (points, truth) = charting.pool.install(|| truth(opened, &*truth_tracer, TRUTH_SHARE * charting.left()));
+    let known: Vec<f64> = truth.iter().copied().filter(|f| f.is_finite()).collect();
+    let truth_rms = (known.iter().map(|f| f * f).sum::<f64>() / known.len().max(1) as f64).sqrt();
+    let ramp = ramp(opened, &known);
+    let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
+    let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
+    let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
+    let mut bench = Bench { charting, opened, points, truth, timed, found: Vec::new() };
+    let steps = chosen_steps.or(match opened.plan.map.steps {
+        Steps::Fixed(steps) => Some(steps),
+        Steps::Auto { .. } => None,
+    });
+    let steps = steps.unwrap_or(100);
+    match bench.charting.device {
+        Device::Cpu { .. } => on_backend(&mut bench, &mut Cpu, steps, "")?,
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => {
+            for storage in [Storage::F32, Storage::F16] {
+                let mut backend = Cuda::new(&CudaDevice { storage, ..device.clone() });
+                let name = if storage == Storage::F16 { ", f16 storage" } else { "" };
+                if name.is_empty() { on_backend(&mut bench, &mut backend, steps, name)? } else { tracing(&mut bench, &mut backend, steps, name)? }
+            }
+        }
+    }
+    composed(&mut bench, steps)?;
+    adaptive(&mut bench)?;
+    Ok(FtlePanel {
+        points: bench.points.unit.len(),
+        truth: "Dormand-Prince 5(4), f64, tolerance 1e-10".into(),
+        truth_rms,
+        tolerance: opened.plan.scene.trust.tolerance * ramp,
+        chosen_steps,
+        methods: bench.found,
+    })
+}
+
+/// Range of the FTLE over the colour ramp: that of the scene, or as the program would choose it.
+fn ramp(opened: &Opened, ftle: &[f64]) -> f64 {
+    let values: Vec<f32> = ftle.iter().map(|f| *f as f32).collect();
+    let scaled = opened.plan.scene.transfer.clone().unwrap_or_default().scaled_to(&values);
+    scaled.high.unwrap_or(1.0) - scaled.low.unwrap_or(0.0)
+}
+
+/// Points and their true FTLE: as many as the truth integrates in `seconds`. NaN at points without a velocity.
+fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64>) {
+    let mut traced = Traced::default();
+    let probe = Points::random(opened, MIN_POINTS, 2);
+    let began = Instant::now();
+    tracer.trace(&probe.domain, Extras::default(), &mut traced);
+    let affordable = seconds * MIN_POINTS as f64 / began.elapsed().as_secs_f64();
+    let points = Points::random(opened, (affordable as usize).clamp(MIN_POINTS, MAX_POINTS), 0);
+    tracer.trace(&points.domain, Extras::default(), &mut traced);
+    let ftle = |(s, seed): (&f64, &[f32; 3])| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
+    let truth = traced.log_stretch_f64.iter().zip(&points.domain).map(ftle).collect();
+    (points, truth)
+}
+
+/// Everything that runs on the device.
+fn on_backend<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: usize, storage: &str) -> Result<(), RunError> {
+    tracing(bench, backend, steps, storage)?;
+    tables(bench, backend)?;
+    networks(bench, backend)?;
+    differences(bench, backend, steps)
+}
+
+/// A tracer of the backend. Combinations that it does not have are noted, and give `None`.
+fn tracer_of<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, what: &str, map: &FlowMap) -> Result<Option<B::Tracer>, RunError> {
+    if !bench.charting.has_time_for(what) {
+        return Ok(None);
+    }
+    let (velocity, time) = (&bench.opened.slide.velocity, bench.opened.slide.time);
+    match bench.charting.pool.install(|| backend.tracer(velocity, map, time)) {
+        Ok(tracer) => Ok(Some(tracer)),
+        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
+        Err(error) => {
+            bench.charting.skip(what, error);
+            Ok(None)
+        }
+    }
+}
+
+/// The tangent flow over numbers of steps.
+fn tracing<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: usize, storage: &str) -> Result<(), RunError> {
+    let plan = &bench.opened.plan.map;
+    let sweep = |precision: Precision, factors: &[f64]| -> Vec<FlowMap> {
+        let mut numbers: Vec<usize> = factors.iter().map(|factor| ((steps as f64 * factor).round() as usize).max(1)).collect();
+        numbers.dedup();
+        let map = |n| FlowMap { integrator: Integrator::Tangent, precision, steps: Steps::Fixed(n), ..plan.clone() };
+        numbers.into_iter().map(map).collect()
+    };
+    let mut maps = sweep(Precision::F32, &[1.0, 0.5, 2.0, 0.25, 4.0, 0.125]);
+    maps.extend(sweep(Precision::F64, &[1.0, 4.0]));
+    for map in maps {
+        let Steps::Fixed(n) = map.steps else { continue };
+        let (precision, name) = if map.precision == Precision::F32 { ("f32", "tangent RK4, f32") } else { ("f64", "tangent RK4, f64") };
+        let what = format!("tangent RK4, {precision}{storage}, {n} steps");
+        if let Some(tracer) = tracer_of(bench, backend, &what, &map)? {
+            bench.measure_tracer(&format!("{name}{storage}"), format!("{n} steps"), &tracer)?;
+        }
+    }
+    Ok(())
+}
+
+/// Central differences over gaps, the published method.
+fn differences<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: usize) -> Result<(), RunError> {
+    let plan = bench.opened.plan.map.clone();
+    let extent = bench.opened.plan.domain.extent();
+    let longest = extent[..bench.opened.plan.domain.dimensions.min(3)].iter().copied().fold(0.0, f64::max);
+    for (precision, name) in [(Precision::F32, "differences, f32"), (Precision::F64, "differences, f64")] {
+        for exponent in [-4, -3, -5, -2, -6, -8] {
+            let gap = longest * 10f64.powi(exponent);
+            let what = format!("{name}, gap 1e{exponent} of the domain");
+            let map =
+                FlowMap { integrator: Integrator::Differences, precision, difference_step: gap, steps: Steps::Fixed(steps), ..plan.clone() };
+            if let Some(tracer) = tracer_of(bench, backend, &what, &map)? {
+                bench.measure_tracer(name, format!("gap 1e{exponent}"), &tracer)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Dormand-Prince over tolerances, on the CPU.
+fn adaptive(bench: &mut Bench<'_, '_>) -> Result<(), RunError> {
+    if bench.charting.device.is_gpu() {
+        bench.charting.skip("Dormand-Prince over tolerances", "it runs on the CPU only");
+        return Ok(());
+    }
+    for tolerance in [1e-4, 1e-2, 1e-6, 1e-8] {
+        if bench.charting.has_time_for(&format!("Dormand-Prince, tolerance {tolerance:e}")) {
+            let (velocity, map, time) = (bench.opened.slide.velocity.clone(), &bench.opened.plan.map, bench.opened.slide.time);
+            let tracer = dormand_prince_tracer(velocity, map, time, tolerance).map_err(RunError::Flow)?;
+            bench.measure_tracer("Dormand-Prince, f64", format!("tolerance {tolerance:e}"), &tracer)?;
+        }
+    }
+    Ok(())
+}
+
+/// Composed flow maps, plain and joined, over resolutions, on the CPU.
+fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
+    if bench.charting.device.is_gpu() {
+        bench.charting.skip("composed flow maps", "they run on the CPU only");
+        return Ok(());
+    }
+    let own = bench.opened.own_nodes(false);
+    let intervals = bench.opened.intervals;
+    for factor in [0.5, 1.0, 2.0] {
+        let nodes = scaled(own, factor);
+        let what = format!("composed flow maps of {} nodes", shape(nodes));
+        if !fits(bench, &what, nodes.iter().product::<usize>()) {
+            continue;
+        }
+        let began = Instant::now();
+        let (velocity, map, time) = (&bench.opened.slide.velocity, &bench.opened.plan.map, bench.opened.slide.time);
+        let per_interval = steps.div_ceil(intervals);
+        let built = bench.charting.pool.install(|| Composition::trace(velocity, map, time, nodes, intervals, per_interval));
+        let Some(plain) = built.map_err(RunError::Flow)? else {
+            bench.charting.skip(what, "not on a sphere");
+            return Ok(());
+        };
+        let plain_seconds = began.elapsed().as_secs_f64();
+        let joined = bench.charting.pool.install(|| plain.joined());
+        let joined_seconds = began.elapsed().as_secs_f64();
+        for (name, composition, seconds) in
+            [("composition", &plain, plain_seconds), ("composition, hierarchical", &joined, joined_seconds)]
+        {
+            let built = Built { seconds, bytes: composition.bytes() as u64 };
+            bench.measure(name, format!("{} nodes", shape(nodes)), built, |unit, _, out| {
+                out.resize(unit.len(), 0.0);
+                composition.log_stretch(unit, out);
+                Ok(())
+            })?;
+        }
+    }
+    Ok(())
+}
+
+/// Tables over resolutions.
+fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), RunError> {
+    let map = bench.opened.plan.map.clone();
+    let Some(tracer) = tracer_of(bench, backend, "the tracer of tables", &map)? else { return Ok(()) };
+    let own = bench.opened.own_nodes(bench.charting.device.is_gpu());
+    for factor in [1.0, 0.5, 2.0, 0.25, 4.0] {
+        let nodes = scaled(own, factor);
+        let what = format!("table of {} nodes", shape(nodes));
+        if !fits(bench, &what, nodes.iter().product()) {
+            continue;
+        }
+        let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
+        let network = NetworkSettings::default();
+        let began = Instant::now();
+        if let Some(surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? {
+            let frozen = surrogate.freeze().map_err(failed)?;
+            bench.measure_predictor("table", format!("{} nodes", shape(nodes)), began.elapsed().as_secs_f64(), &frozen)?;
+        }
+    }
+    Ok(())
+}
+
+/// Networks over encodings, sizes and seconds of training, and base + residual.
+fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), RunError> {
+    let map = bench.opened.plan.map.clone();
+    let Some(tracer) = tracer_of(bench, backend, "labels for networks", &map)? else { return Ok(()) };
+    let (buffer, label_seconds) = bench.labels(&tracer)?;
+    let own = bench.opened.own_nodes(bench.charting.device.is_gpu());
+    let scene = NetworkSettings { inputs: Vec::new(), start_range: None, ..bench.opened.plan.scene.network.clone() };
+    let small = NetworkSettings { log2_table: scene.log2_table.min(15), ..scene.clone() };
+    let frequency = NetworkSettings { encoding: Encoding::Frequency, hidden_layers: 8, width: 256, learning_rate: None, ..scene.clone() };
+    let narrow = NetworkSettings { hidden_layers: 4, width: 64, ..frequency.clone() };
+    let mut variants = vec![
+        ("base + residual", Kind::Residual, scaled(own, 0.5), scene.clone()),
+        ("base + residual", Kind::Residual, scaled(own, 0.5), small.clone()),
+        ("network", Kind::Network, own, scene),
+        ("network", Kind::Network, own, small),
+        ("network", Kind::Network, own, if bench.charting.device.is_gpu() { frequency } else { narrow }),
+    ];
+    variants.retain(|(_, kind, _, network)| *kind == Kind::Network || network.encoding == Encoding::HashGrid);
+    for (name, kind, nodes, network) in variants {
+        let size = match network.encoding {
+            Encoding::HashGrid => format!("2^{} entries", network.log2_table),
+            Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
+        };
+        let what = format!("{name}, {size}");
+        if !bench.charting.has_time_for(&what) || (kind == Kind::Residual && !fits(bench, &what, nodes.iter().product())) {
+            continue;
+        }
+        let began = Instant::now();
+        let settings = SurrogateSettings { kind, table_nodes: Some(nodes) };
+        let Some(mut surrogate) = surrogate_of(bench, backend, &what, &settings, &network, &tracer)? else { continue };
+        let mut spent = label_seconds + began.elapsed().as_secs_f64();
+        let mut trained = 0.0;
+        for seconds in TRAINED {
+            if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
+                break;
+            }
+            let learned = bench.charting.pool.install(|| surrogate.learn(&buffer, seconds - trained, u64::MAX));
+            spent += learned.map_err(failed)?.seconds;
+            trained = seconds;
+            let frozen = surrogate.freeze().map_err(failed)?;
+            bench.measure_predictor(name, format!("{size}, {seconds} s"), spent, &frozen)?;
+        }
+    }
+    Ok(())
+}
+
+impl Bench<'_, '_> {
+    /// Traces uniform random labels for some seconds; returns them with the seconds.
+    fn labels(&mut self, tracer: &dyn Trace) -> Result<(ReplayBuffer, f64), RunError> {
+        let mut traced = Traced::default();
+        let time = |points: &Points, traced: &mut Traced| {
+            let began = Instant::now();
+            self.charting.pool.install(|| tracer.trace(&points.domain, Extras::default(), traced)).map_err(failed)?;
+            Ok::<_, RunError>(began.elapsed().as_secs_f64())
+        };
+        let probe = Points::random(self.opened, MIN_BATCH, 3);
+        let per_second = MIN_BATCH as f64 / time(&probe, &mut traced)?;
+        let count = ((LABELS_SECONDS * per_second) as usize).clamp(MIN_BATCH, MAX_LABELS);
+        let points = Points::random(self.opened, count, 4);
+        let seconds = time(&points, &mut traced)?;
+        let samples = Samples { points: points.unit, log_stretch: std::mem::take(&mut traced.log_stretch), ..Samples::default() };
+        Ok((ReplayBuffer::holding(&samples), seconds))
+    }
+}
+
+/// Builds a surrogate on the backend; settings that it refuses are noted.
+fn surrogate_of<B: Backend>(
+    bench: &mut Bench<'_, '_>,
+    backend: &mut B,
+    what: &str,
+    settings: &SurrogateSettings,
+    network: &NetworkSettings,
+    tracer: &B::Tracer,
+) -> Result<Option<B::Surrogate>, RunError> {
+    let plan = &bench.opened.plan;
+    let request = SurrogateRequest {
+        settings,
+        network,
+        domain: &plan.domain,
+        seed: plan.scene.seed,
+        replay_buffer: MAX_LABELS,
+        stop: &NEVER,
+    };
+    match bench.charting.pool.install(|| backend.surrogate(&request, tracer)) {
+        Ok(surrogate) => Ok(Some(surrogate)),
+        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
+        Err(error) => {
+            bench.charting.skip(what, error);
+            Ok(None)
+        }
+    }
+}
+
+fn scaled(nodes: [usize; 3], factor: f64) -> [usize; 3] {
+    nodes.map(|n| if n > 1 { ((n as f64 * factor) as usize).max(2) } else { 1 })
+}
+
+fn shape(nodes: [usize; 3]) -> String {
+    let used: Vec<String> = nodes.iter().filter(|n| **n > 1).map(ToString::to_string).collect();
+    used.join("x")
+}
+
+/// True if so many nodes can be traced in a quarter of the time that is left, at the speed of the fastest tracer so far, and fit into memory.
+fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize) -> bool {
+    const MAX_NODES: usize = 1 << 27;
+    let traced = bench.found.iter().filter(|point| point.method.starts_with("tangent")).map(|point| point.samples_per_second);
+    let seconds = nodes as f64 / traced.fold(1e4, f64::max);
+    let affordable = 0.25 * bench.charting.left();
+    if nodes > MAX_NODES || seconds > affordable {
+        bench.charting.skip(what, format_args!("it would take {seconds:.0} s to trace, of {:.0} s left", bench.charting.left()));
+        return false;
+    }
+    bench.charting.has_time_for(what)
+}

@@ -1,0 +1,311 @@
+//! Time to error of pictures: the true error of each frame against the seconds since the window was new.
+
+use super::{Charting, failed};
+use crate::backend::{Device, TracedOnce, stratified_points};
+use crate::publish::compare_films;
+use crate::render::smooth::LIT;
+use crate::render::{Film, Method, TransferSettings};
+use crate::run::{Event, Frame, RunError, RunOptions, Settings, Setup, run};
+use crate::surrogate::Kind;
+use crate::trust::Strata;
+use serde::Serialize;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// PSNR over lit pixels, in decibels, to which the time is measured.
+pub const TARGETS: [f64; 4] = [30.0, 35.0, 40.0, 45.0];
+/// Share of the panel's time for the truth.
+const TRUTH_SHARE: f64 = 0.35;
+/// PSNR beyond which a curve ends.
+const ENOUGH: f64 = 47.0;
+/// Longest curve, in seconds, on the CPU and on a GPU.
+const LONGEST: [f64; 2] = [20.0, 6.0];
+/// Samples a pixel of a frame of the truth.
+const TRUTH_SAMPLES: f64 = 16.0;
+/// Slides of a sliding window; the first one is not counted.
+const SLIDES: usize = 3;
+
+/// A frame of a curve.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct PicturePoint {
+    /// Seconds since the slide: its preparation and all frames so far, training included.
+    pub seconds: f64,
+    /// Samples a pixel so far.
+    pub samples: f64,
+    /// True PSNR of the tone-mapped picture over lit pixels, in decibels.
+    pub psnr: f64,
+    /// The same over all pixels.
+    pub psnr_all: f64,
+    /// Mean of squared error / (radiance^2 + 0.01) over lit pixels, linear.
+    pub relmse: f64,
+    /// Structural similarity of the tone-mapped luma with the mean of the truth's halves.
+    pub ssim: Option<f64>,
+    /// PSNR over lit pixels that the frame states; `None` if the method states none.
+    pub stated_psnr: Option<f64>,
+}
+
+/// The frames of a method.
+#[derive(Debug, Clone, Serialize)]
+pub struct PictureCurve {
+    /// Method.
+    pub method: String,
+    /// Kind of its surrogate; `None` for `reference`.
+    pub surrogate: Option<String>,
+    /// Bytes of the surrogate.
+    pub bytes: usize,
+    /// Frames of a still window, in order of time.
+    pub frames: Vec<PicturePoint>,
+    /// Frames per second while the window slides at every frame, preparation included; `None` if it was not measured.
+    pub sliding_frames_per_second: Option<f64>,
+}
+
+impl PictureCurve {
+    /// Method and surrogate.
+    pub fn name(&self) -> String {
+        match &self.surrogate {
+            Some(surrogate) => format!("{}, {surrogate}", self.method),
+            None => self.method.clone(),
+        }
+    }
+
+    /// Seconds from which on the PSNR over lit pixels is at least `decibels`; `None` if the last frame is below.
+    pub fn seconds_to(&self, decibels: f64) -> Option<f64> {
+        let below = self.frames.iter().rposition(|frame| frame.psnr < decibels);
+        self.frames.get(below.map_or(0, |last| last + 1)).map(|frame| frame.seconds)
+    }
+}
+
+/// Curves of all methods.
+#[derive(Debug, Clone, Serialize)]
+pub struct PicturePanel {
+    /// Width and height in pixels.
+    pub size: [usize; 2],
+    /// Samples a pixel of both halves of the truth.
+    pub truth_samples: f64,
+    /// PSNR over lit pixels between the halves. Their mean is 6 dB better.
+    pub truth_psnr: f64,
+    /// One curve per method and surrogate.
+    pub curves: Vec<PictureCurve>,
+}
+
+/// Two independent pictures of the same scene. The product of the differences to both is the squared error of a third one without their noise.
+#[derive(Debug, Clone)]
+pub struct Truth {
+    /// The halves.
+    pub halves: [Film; 2],
+    mean: Film,
+}
+
+impl Truth {
+    /// Takes two independent pictures of one size.
+    ///
+    /// # Errors
+    /// The pictures differ in size.
+    pub fn new(halves: [Film; 2]) -> Result<Self, RunError> {
+        let mut mean = halves[0].clone();
+        mean.accumulate(&halves[1])?;
+        Ok(Self { halves, mean })
+    }
+}
+
+/// Errors of a picture.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PictureErrors {
+    /// Root mean square over lit pixels, linear radiance.
+    pub rms: f64,
+    /// As in [`PicturePoint`].
+    pub psnr: f64,
+    /// As in [`PicturePoint`].
+    pub psnr_all: f64,
+    /// As in [`PicturePoint`].
+    pub relmse: f64,
+}
+
+/// Errors of a film against the truth; lit pixels have an opacity above [`LIT`] there. `tone_map` is `[contrast, brightness, gamma]`.
+pub fn picture_errors(film: &Film, truth: &Truth, [contrast, brightness, gamma]: [f64; 3]) -> PictureErrors {
+    let tone = |c: f32| ((f64::from(c) - 0.5) * contrast + brightness).clamp(0.0, 1.0).powf(1.0 / gamma);
+    let [a, b] = &truth.halves;
+    let (mut linear, mut relative, mut mapped, mut lit) = (0.0, 0.0, [0.0; 2], 0.0);
+    for i in 0..film.rgba.len() {
+        let (mut square, mut product, mut relative_square) = (0.0, 0.0, 0.0);
+        for k in 0..3 {
+            let (c, a, b) = (film.rgba[i][k], a.rgba[i][k], b.rgba[i][k]);
+            let error = f64::from(c - a) * f64::from(c - b) / 3.0;
+            product += error;
+            relative_square += error / (f64::from(a) * f64::from(b)).max(0.0).mul_add(1.0, 0.01);
+            square += (tone(c) - tone(a)) * (tone(c) - tone(b)) / 3.0;
+        }
+        mapped[1] += square;
+        if a.rgba[i][3] + b.rgba[i][3] > 2.0 * LIT {
+            (linear, relative, mapped[0], lit) = (linear + product, relative + relative_square, mapped[0] + square, lit + 1.0);
+        }
+    }
+    // Noise may leave a squared error below zero.
+    let decibels = |mean: f64| -10.0 * mean.max(1e-12).log10();
+    PictureErrors {
+        rms: (linear / lit).max(0.0).sqrt(),
+        psnr: decibels(mapped[0] / lit),
+        psnr_all: decibels(mapped[1] / film.rgba.len() as f64),
+        relmse: (relative / lit).max(0.0),
+    }
+}
+
+/// Transfer function for all pictures of a chart, scaled to the first slide's FTLE where the scene leaves it open.
+///
+/// # Errors
+/// The source cannot be opened, or the device fails.
+pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSettings, RunError> {
+    let mut setup = Setup::new(settings.clone())?;
+    let slide = setup.slides.next_slide(&AtomicBool::new(false))?.ok_or(RunError::EndedEarly)?;
+    let layers = if setup.plan.domain.dimensions == 3 { 16 } else { 1 };
+    let points = stratified_points(&Strata::even([64, 64, layers], 1), settings.seed, u64::MAX);
+    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
+    let traced = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).map_err(failed)?;
+    let TracedOnce { flow, traced, .. } = traced;
+    let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
+    Ok(settings.transfer.clone().unwrap_or_default().scaled_to(&ftle))
+}
+
+/// Runs the first slide of a scene until `seen` returns false for a frame.
+pub(super) fn still(
+    settings: Settings,
+    options: &RunOptions,
+    mut seen: impl FnMut(&Frame) -> bool + Send,
+) -> Result<usize, RunError> {
+    let mut settings = settings;
+    settings.time.slides = Some(1);
+    (settings.time.warmup_frames, settings.time.frames_per_slide) = (0, 1_000_000);
+    (settings.render.until, settings.render.budget) = (None, None);
+    let enough = AtomicBool::new(false);
+    let mut sink = |event: Event| {
+        if let Event::Frame(frame) = event
+            && !enough.load(Ordering::Relaxed)
+            && !seen(&frame)
+        {
+            enough.store(true, Ordering::Relaxed);
+        }
+    };
+    Ok(run(Setup::new(settings)?, options, &mut sink, &enough)?.surrogate_bytes)
+}
+
+/// The scene with another method, and a number of samples that the method accepts.
+pub(super) fn with_method(settings: &Settings, method: Method, kind: Kind) -> Settings {
+    let mut settings = settings.clone();
+    settings.render.method = method;
+    if !method.is_smooth() {
+        settings.render.samples = settings.render.samples.ceil().max(1.0);
+    }
+    if kind != settings.surrogate.kind {
+        (settings.surrogate.kind, settings.surrogate.table_nodes) = (kind, None);
+    }
+    if kind != Kind::Network {
+        (settings.network.inputs, settings.network.start_range) = (Vec::new(), None);
+    }
+    settings.training.resume = None;
+    settings
+}
+
+/// Renders the truth and the curves.
+pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunError> {
+    let mut settings = charting.settings.clone();
+    settings.transfer = Some(fixed_colours(&settings, charting.device)?);
+    let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
+    let size = [settings.render.width, settings.render.height];
+    let per_half = 0.5 * TRUTH_SHARE * charting.left();
+    let mut samples = 0.0;
+    let mut half = |seed: u64| {
+        (charting.tell)("the true picture: two halves of reference");
+        let mut scene = Settings { seed, ..with_method(&settings, Method::Reference, Kind::Table) };
+        scene.render.samples = TRUTH_SAMPLES;
+        let began = Instant::now();
+        let mut sum = Film::new(size[0], size[1]);
+        still(scene, &options, |frame| {
+            samples += TRUTH_SAMPLES;
+            // Both films have the size of the scene.
+            sum.accumulate(&frame.film).is_ok() && began.elapsed().as_secs_f64() < per_half && !charting.stop.load(Ordering::Relaxed)
+        })?;
+        Ok::<_, RunError>(sum)
+    };
+    // Seeds of their own: the charted pictures must not share random numbers with the truth.
+    let halves = [half(settings.seed ^ 0x5eed_0001)?, half(settings.seed ^ 0x5eed_0002)?];
+    let truth = Truth::new(halves)?;
+    let one = Truth::new([truth.halves[1].clone(), truth.halves[1].clone()])?;
+    let truth_psnr = picture_errors(&truth.halves[0], &one, settings.render.tone_map).psnr;
+    let mut curves = Vec::new();
+    let candidates = [
+        (Method::TwoLevel, Kind::Table),
+        (Method::Reference, Kind::Table),
+        (Method::Marched, Kind::Table),
+        (Method::TwoLevel, Kind::Residual),
+        (Method::Gated, Kind::Table),
+        (Method::Gated, Kind::Residual),
+        (Method::TwoLevel, Kind::Network),
+        (Method::Gated, Kind::Network),
+    ];
+    for (number, (method, kind)) in candidates.into_iter().enumerate() {
+        let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
+        let mut curve =
+            PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding_frames_per_second: None };
+        if !charting.has_time_for(&format!("pictures by {}", curve.name())) {
+            continue;
+        }
+        let longest = (charting.left() / (candidates.len() - number) as f64).min(LONGEST[usize::from(charting.device.is_gpu())]);
+        let scene = with_method(&settings, method, kind);
+        curve.bytes = measure(&scene, &options, &truth, 0.8 * longest, charting.stop, &mut curve.frames)?;
+        curve.sliding_frames_per_second = sliding(&scene, &options, 0.2 * longest)?;
+        curves.push(curve);
+    }
+    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves })
+}
+
+/// Frames of a still window for some seconds; returns the bytes of the surrogate.
+fn measure(
+    scene: &Settings,
+    options: &RunOptions,
+    truth: &Truth,
+    longest: f64,
+    stop: &AtomicBool,
+    frames: &mut Vec<PicturePoint>,
+) -> Result<usize, RunError> {
+    let mut sum = Film::new(scene.render.width, scene.render.height);
+    let mut seconds = 0.0;
+    still(scene.clone(), options, |frame| {
+        let record = &frame.record;
+        seconds += record.seconds.slide + record.seconds.total;
+        // Films of the other methods have their own samples only.
+        let accumulated = scene.render.method.is_smooth() || sum.accumulate(&frame.film).is_err();
+        let film = if accumulated { &*frame.film } else { &sum };
+        let errors = picture_errors(film, truth, frame.tone_map);
+        let own = record.samples_per_pixel * (record.frame + 1) as f64;
+        frames.push(PicturePoint {
+            seconds,
+            samples: record.picture_error.map_or(own, |stated| stated.samples_per_pixel),
+            psnr: errors.psnr,
+            psnr_all: errors.psnr_all,
+            relmse: errors.relmse,
+            ssim: compare_films(film, &truth.mean, frame.tone_map).ok().and_then(|compared| compared.ssim),
+            stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
+        });
+        errors.psnr < ENOUGH && seconds < longest && !stop.load(Ordering::Relaxed)
+    })
+}
+
+/// Frames per second of a window that slides at every frame; `None` if the source has too few slides, or a frame took too long.
+fn sliding(scene: &Settings, options: &RunOptions, longest: f64) -> Result<Option<f64>, RunError> {
+    let mut scene = scene.clone();
+    (scene.time.slides, scene.time.frames_per_slide, scene.time.warmup_frames) = (Some(SLIDES), 1, 0);
+    (scene.render.until, scene.render.budget) = (None, None);
+    let (mut seconds, mut frames) = (0.0, 0);
+    let enough = AtomicBool::new(false);
+    let mut sink = |event: Event| {
+        if let Event::Frame(Frame { record, .. }) = event
+            && record.slide > 0
+        {
+            seconds += record.seconds.slide + record.seconds.total;
+            frames += 1;
+            enough.store(seconds > longest, Ordering::Relaxed);
+        }
+    };
+    run(Setup::new(scene)?, options, &mut sink, &enough)?;
+    Ok((frames > 0).then(|| f64::from(frames) / seconds))
+}

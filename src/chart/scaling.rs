@@ -1,0 +1,161 @@
+//! Cost of a sample against the size of the task: tau, nodes of the window, threads.
+
+use super::ftle::Opened;
+use super::{Charting, failed};
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::flow::{Extras, FlowMap, Traced};
+use crate::run::RunError;
+use crate::source::SourceKind;
+use crate::surrogate::network::NetworkSettings;
+use crate::surrogate::{Kind, Predict, SurrogateSettings, Trace};
+use serde::Serialize;
+use std::sync::atomic::AtomicBool;
+use std::time::Instant;
+
+/// Points of a timed batch.
+const BATCH: [usize; 2] = [1 << 16, 1 << 21];
+
+/// Costs at one size of the task.
+#[derive(Debug, Clone, Serialize)]
+pub struct ScalingPoint {
+    /// `tau`, `nodes` or `threads`.
+    pub axis: &'static str,
+    /// Value on the axis; of `nodes` the number of all nodes.
+    pub value: f64,
+    /// Steps that meet the tolerance.
+    pub steps: usize,
+    /// Nanoseconds of a traced sample.
+    pub trace_ns: f64,
+    /// Nanoseconds of a sample from a table.
+    pub table_ns: f64,
+    /// Seconds to trace the table.
+    pub table_seconds: f64,
+    /// Samples from which on the table is cheaper, its tracing included; `None` if it never is.
+    pub table_pays_from: Option<f64>,
+}
+
+/// Costs against the size of the task.
+#[derive(Debug, Clone, Serialize)]
+pub struct ScalingPanel {
+    /// All sizes.
+    pub points: Vec<ScalingPoint>,
+}
+
+/// Measures everything that there is time for.
+pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<ScalingPanel, RunError> {
+    let mut points = Vec::new();
+    let tau = opened.plan.map.tau;
+    // A window of snapshots ends after tau.
+    let longest: &[f64] = if opened.shape().is_none() { &[0.25, 0.5, 1.0, 2.0] } else { &[0.25, 0.5, 1.0] };
+    for factor in longest {
+        let map = FlowMap { tau: tau * factor, ..opened.plan.map.clone() };
+        points.extend(point(charting, opened, &map, "tau", tau * factor)?);
+    }
+    if let (SourceKind::Turbulence, Some(nodes)) = (charting.settings.source.kind, opened.shape()) {
+        for factor in [0.5, 0.25] {
+            let mut settings = charting.settings.clone();
+            let fewer = nodes.map(|n| ((n as f64 * factor) as usize).max(4));
+            settings.source.nodes = Some(fewer);
+            let other = Opened::new(&settings, charting.device)?;
+            points.extend(point(charting, &other, &opened.plan.map, "nodes", fewer.iter().product::<usize>() as f64)?);
+        }
+        points.extend(point(charting, opened, &opened.plan.map, "nodes", nodes.iter().product::<usize>() as f64)?);
+    }
+    if !charting.device.is_gpu() {
+        let all = charting.pool.current_num_threads();
+        let mut numbers: Vec<usize> = (0..).map(|power| 1 << power).take_while(|n| *n < all).collect();
+        numbers.push(all);
+        for threads in numbers {
+            let own = std::mem::replace(&mut charting.pool, rayon::ThreadPoolBuilder::new().num_threads(threads).build()?);
+            let measured = point(charting, opened, &opened.plan.map, "threads", threads as f64);
+            charting.pool = own;
+            points.extend(measured?);
+        }
+    }
+    Ok(ScalingPanel { points })
+}
+
+fn point(
+    charting: &mut Charting<'_>,
+    opened: &Opened,
+    map: &FlowMap,
+    axis: &'static str,
+    value: f64,
+) -> Result<Option<ScalingPoint>, RunError> {
+    let what = format!("cost at {axis} {value}");
+    if !charting.has_time_for(&what) {
+        return Ok(None);
+    }
+    let measured = match charting.device {
+        Device::Cpu { .. } => charting.pool.install(|| on(&mut Cpu, opened, map, BATCH[0])),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => charting.pool.install(|| on(&mut Cuda::new(device), opened, map, BATCH[1])),
+    };
+    match measured {
+        Ok(costs) => Ok(Some(costs.at(axis, value))),
+        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
+        Err(error) => {
+            charting.skip(what, error);
+            Ok(None)
+        }
+    }
+}
+
+struct Costs {
+    steps: usize,
+    trace: f64,
+    table: f64,
+    table_seconds: f64,
+}
+
+impl Costs {
+    fn at(&self, axis: &'static str, value: f64) -> ScalingPoint {
+        let saved = self.trace - self.table;
+        ScalingPoint {
+            axis,
+            value,
+            steps: self.steps,
+            trace_ns: 1e9 * self.trace,
+            table_ns: 1e9 * self.table,
+            table_seconds: self.table_seconds,
+            table_pays_from: (saved > 0.0).then(|| self.table_seconds / saved),
+        }
+    }
+}
+
+/// Seconds of a sample, the fastest of three batches.
+fn fastest(samples: usize, mut work: impl FnMut() -> Result<(), BackendError>) -> Result<f64, BackendError> {
+    let mut best = f64::INFINITY;
+    for _ in 0..3 {
+        let began = Instant::now();
+        work()?;
+        best = best.min(began.elapsed().as_secs_f64());
+    }
+    Ok(best / samples as f64)
+}
+
+fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, batch: usize) -> Result<Costs, BackendError> {
+    static NEVER: AtomicBool = AtomicBool::new(false);
+    let chosen = FlowMap { steps: opened.auto_steps(), ..map.clone() };
+    let tracer = backend.tracer(&opened.slide.velocity, &chosen, opened.slide.time)?;
+    let [unit, seeds] = opened.random_points(batch);
+    let mut traced = Traced::default();
+    let trace = fastest(batch, || Ok(tracer.trace(&seeds, Extras::default(), &mut traced)?))?;
+    let request = SurrogateRequest {
+        settings: &SurrogateSettings { kind: Kind::Table, table_nodes: Some(opened.own_nodes(batch > BATCH[0])) },
+        network: &NetworkSettings::default(),
+        domain: &opened.plan.domain,
+        seed: opened.plan.scene.seed,
+        replay_buffer: 1 << 10,
+        stop: &NEVER,
+    };
+    let began = Instant::now();
+    let surrogate = backend.surrogate(&request, &tracer)?;
+    let table_seconds = began.elapsed().as_secs_f64();
+    let frozen = surrogate.freeze()?;
+    let mut values = vec![0.0; batch];
+    let table = fastest(batch, || Ok(frozen.predict(&unit, &mut values)?))?;
+    Ok(Costs { steps: tracer.flow().steps(), trace, table, table_seconds })
+}

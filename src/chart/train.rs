@@ -1,0 +1,197 @@
+//! Training offline on a still window: the loss on points that the network never sees, epoch by epoch, and pictures on the way.
+
+use super::ftle::{Opened, Points};
+use super::{failed, fixed_colours};
+use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::flow::Extras;
+use crate::render::{Film, Renderer, Scene};
+use crate::run::{RunError, Settings};
+use crate::surrogate::network::Target;
+use crate::surrogate::{Predict, ReplayBuffer, Samples};
+use crate::trust::Gate;
+use serde::Serialize;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Instant;
+
+/// How long a network is trained, and on what.
+#[derive(Debug, Clone, PartialEq)]
+pub struct TrainOptions {
+    /// Passes over the labels.
+    pub epochs: u64,
+    /// Traced labels.
+    pub labels: usize,
+    /// Points of the validation, traced apart.
+    pub validation: usize,
+    /// Epochs after which a picture is rendered, besides the last one.
+    pub pictures: Vec<u64>,
+}
+
+impl Default for TrainOptions {
+    fn default() -> Self {
+        Self { epochs: 100, labels: 1 << 20, validation: 1 << 15, pictures: vec![1, 100] }
+    }
+}
+
+/// An epoch.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Epoch {
+    /// Its number, from 1.
+    pub epoch: u64,
+    /// Optimizer steps so far.
+    pub steps: u64,
+    /// Seconds of training so far; labels and validation are not counted.
+    pub seconds: f64,
+    /// Mean loss of training; `None` if no step was taken.
+    pub loss: Option<f64>,
+    /// Root mean square error of the log-stretch on the validation points.
+    pub rms: f64,
+    /// PSNR in decibels on the validation points; peak: their largest traced log-stretch. `None` if the error is 0.
+    pub psnr: Option<f64>,
+    /// Roll-backs of the weights because the loss diverged.
+    pub rollbacks: u64,
+}
+
+/// Result of a training.
+#[derive(Debug, Clone, Serialize)]
+pub struct TrainReport {
+    /// All epochs.
+    pub epochs: Vec<Epoch>,
+    /// Seconds of tracing the labels.
+    pub label_seconds: f64,
+    /// Bytes of the surrogate.
+    pub bytes: usize,
+    /// The device, as in the records.
+    pub device: String,
+    /// True if a stop ended it early.
+    pub interrupted: bool,
+}
+
+/// Trains the scene's surrogate on its first slide. `epoch` is called after each epoch, with a picture of the surrogate alone where one is due.
+/// Setting `stop` ends the training after the epoch in progress.
+///
+/// # Errors
+/// The source cannot be opened, a setting is refused, or the device fails.
+pub fn train(
+    settings: &Settings,
+    options: &TrainOptions,
+    device: &Device,
+    threads: usize,
+    epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send),
+    stop: &AtomicBool,
+) -> Result<TrainReport, RunError> {
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
+    let opened = Opened::new(settings, device)?;
+    let colours = fixed_colours(settings, device)?;
+    let settings = Settings { transfer: Some(colours), ..settings.clone() };
+    let training = Training { settings: &settings, options, opened: &opened, stop };
+    pool.install(|| match device {
+        Device::Cpu { .. } => training.on(Cpu, epoch),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => training.on(Cuda::new(device), epoch),
+    })
+}
+
+struct Training<'a> {
+    settings: &'a Settings,
+    options: &'a TrainOptions,
+    opened: &'a Opened,
+    stop: &'a AtomicBool,
+}
+
+impl Training<'_> {
+    fn on<B: Backend>(
+        &self,
+        mut backend: B,
+        epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send),
+    ) -> Result<TrainReport, RunError> {
+        let Self { settings, options, opened, stop } = self;
+        let (plan, slide) = (&opened.plan, &opened.slide);
+        let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
+        let arrival = settings.network.target == Target::FlowMap;
+        let extras = Extras { arrival, jacobian: arrival && settings.network.jacobian_weight > 0.0 };
+        let began = Instant::now();
+        let labels = crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
+        let label_seconds = began.elapsed().as_secs_f64();
+        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default()).map_err(failed)?.samples;
+        let request = SurrogateRequest {
+            settings: &settings.surrogate,
+            network: &settings.network,
+            domain: &plan.domain,
+            seed: settings.seed,
+            replay_buffer: labels.len().max(1),
+            stop,
+        };
+        let mut surrogate = backend.surrogate(&request, &tracer).map_err(failed)?;
+        let buffer = ReplayBuffer::holding(&labels);
+        let steps_per_epoch = (labels.len() / settings.network.batch).max(1) as u64;
+        let mut report =
+            TrainReport { epochs: Vec::new(), label_seconds, bytes: surrogate.bytes(), device: backend.name(), interrupted: false };
+        let (mut steps, mut seconds, mut rollbacks) = (0, 0.0, 0);
+        for number in 1..=options.epochs {
+            let learned = surrogate.learn(&buffer, f64::INFINITY, steps_per_epoch).map_err(failed)?;
+            steps += learned.steps;
+            seconds += learned.seconds;
+            rollbacks += learned.rollbacks;
+            let frozen = surrogate.freeze().map_err(failed)?;
+            let (rms, psnr) = error(&frozen, &validation)?;
+            let done = Epoch { epoch: number, steps, seconds, loss: learned.loss, rms, psnr, rollbacks };
+            report.interrupted = stop.load(Ordering::Relaxed);
+            let is_last = number == options.epochs || report.interrupted;
+            let film = if is_last || options.pictures.contains(&number) { Some(self.picture(&mut backend, &tracer, &frozen)?) } else { None };
+            epoch(&done, film.as_ref());
+            report.epochs.push(done);
+            if report.interrupted {
+                break;
+            }
+        }
+        Ok(report)
+    }
+
+    /// A picture in which the surrogate answers everything.
+    fn picture<B: Backend>(
+        &self,
+        backend: &mut B,
+        tracer: &B::Tracer,
+        frozen: &crate::backend::FrozenOf<B>,
+    ) -> Result<Film, RunError> {
+        let Self { settings, opened, stop, .. } = self;
+        let domain = &opened.plan.domain;
+        let scene = Scene::assemble(
+            domain,
+            settings.camera.clone(),
+            settings.light.clone(),
+            settings.transfer.clone(),
+            settings.render.clone(),
+            settings.seed,
+        );
+        let mut renderer = Renderer::new(scene, domain, opened.plan.map.tau)?;
+        let gate = Gate::uniform(true);
+        let job = FrameJob {
+            tracer,
+            surrogate: Some(frozen),
+            routing: Routing { gate: &gate, trace_budget: None, keep: 0, extras: Extras::default() },
+            picture: 0,
+            samples: settings.render.samples.ceil().max(1.0),
+            smooth: None,
+            progress: None,
+            stop,
+        };
+        let Rendered { film, .. } = backend.render(&job, &mut renderer, &mut B::Picture::default()).map_err(failed)?;
+        Ok(film)
+    }
+}
+
+/// Root mean square error of the log-stretch, and its PSNR.
+fn error(surrogate: &dyn Predict, validation: &Samples) -> Result<(f64, Option<f64>), RunError> {
+    let mut predicted = vec![0.0; validation.len()];
+    surrogate.predict(&validation.points, &mut predicted).map_err(failed)?;
+    let (mut square, mut peak) = (0.0, 0.0_f64);
+    for (predicted, traced) in predicted.iter().zip(&validation.log_stretch) {
+        square += f64::from(predicted - traced).powi(2);
+        peak = peak.max(f64::from(*traced));
+    }
+    let rms = (square / validation.len().max(1) as f64).sqrt();
+    Ok((rms, (rms > 0.0 && peak > 0.0).then(|| 20.0 * (peak / rms).log10())))
+}

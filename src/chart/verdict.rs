@@ -1,0 +1,115 @@
+//! What a chart says, in words.
+
+use super::ftle::{FtlePanel, FtlePoint};
+use super::picture::{PicturePanel, TARGETS};
+use super::{Chart, pick};
+
+/// Numbers of samples for which building is charged.
+pub(super) const CHARGED: [f64; 3] = [1e6, 1e9, 1e11];
+
+/// Sentences about the front, the picks, and where each method wins.
+pub fn verdict(chart: &Chart) -> Vec<String> {
+    let mut said = Vec::new();
+    if let Some(panel) = &chart.ftle {
+        of_ftle(panel, &chart.time_unit, &mut said);
+    }
+    if let Some(panel) = &chart.pictures {
+        of_pictures(panel, &mut said);
+    }
+    for point in chart.scaling.iter().flat_map(|panel| &panel.points) {
+        let from = match point.table_pays_from {
+            Some(samples) => format!("the table pays from {samples:.1e} samples on"),
+            None => "the table never pays".into(),
+        };
+        said.push(format!(
+            "{} {}: {} steps, {:.0} ns a traced sample, {:.1} ns from a table that takes {:.2} s; {from}.",
+            point.axis, point.value, point.steps, point.trace_ns, point.table_ns, point.table_seconds
+        ));
+    }
+    said
+}
+
+fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
+    let per = if time_unit.is_empty() { String::new() } else { format!(" /{time_unit}") };
+    let tolerance = panel.tolerance;
+    for samples in CHARGED {
+        let points: Vec<[f64; 2]> = panel.methods.iter().map(|point| [point.seconds(samples), point.rms]).collect();
+        match pick(&points, tolerance) {
+            Some(best) => {
+                let best = &panel.methods[best];
+                said.push(format!(
+                    "{samples:.0e} FTLE samples within {tolerance:.2e}{per}: {} takes {}, building included (rms {:.1e}, {}).",
+                    name(best),
+                    duration(best.seconds(samples)),
+                    best.rms,
+                    size(best.bytes)
+                ));
+            }
+            None => said.push(format!("No method is within {tolerance:.2e}{per}.")),
+        }
+    }
+    // The classes of methods, and from how many samples on the cheapest of each within the tolerance beats tracing.
+    let within = |prefix: &str| panel.methods.iter().filter(|point| point.method.starts_with(prefix) && point.rms <= tolerance).collect::<Vec<_>>();
+    let fastest = |points: &[&FtlePoint]| points.iter().map(|point| point.samples_per_second).fold(0.0, f64::max);
+    let tracing = fastest(&within("tangent"));
+    for class in ["composition", "table", "base + residual", "network"] {
+        let points = within(class);
+        let pays = |point: &&FtlePoint| {
+            let saved = 1.0 / tracing - 1.0 / point.samples_per_second;
+            if saved > 0.0 { point.build_seconds / saved } else { f64::INFINITY }
+        };
+        let from = points.iter().map(pays).fold(f64::INFINITY, f64::min);
+        said.push(if points.is_empty() {
+            let best = panel.methods.iter().filter(|point| point.method.starts_with(class)).map(|point| point.rms).fold(f64::INFINITY, f64::min);
+            if best.is_finite() { format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.") } else { format!("{class}: not measured.") }
+        } else if from.is_finite() && tracing > 0.0 {
+            format!("{class}: cheaper than tracing from {from:.1e} samples on, at {:.1} times its speed.", fastest(&points) / tracing)
+        } else {
+            format!("{class}: within the tolerance, and never cheaper than tracing.")
+        });
+    }
+}
+
+fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
+    for target in TARGETS {
+        let reached = |curve: &super::PictureCurve| curve.seconds_to(target).map(|seconds| (seconds, curve.name()));
+        let mut times: Vec<(f64, String)> = panel.curves.iter().filter_map(reached).collect();
+        times.sort_by(|a, b| a.0.total_cmp(&b.0));
+        said.push(match times.as_slice() {
+            [] => format!("{target} dB over lit pixels: reached by no method in the time given."),
+            [(seconds, first), rest @ ..] => {
+                let others: Vec<String> = rest.iter().map(|(seconds, name)| format!("{name} {}", duration(*seconds))).collect();
+                let others = if others.is_empty() { "no other method reached it".into() } else { others.join(", ") };
+                format!("{target} dB over lit pixels: {first} after {} ({others}).", duration(*seconds))
+            }
+        });
+    }
+    let sliding = |curve: &super::PictureCurve| curve.sliding_frames_per_second.map(|rate| format!("{} {rate:.2}", curve.name()));
+    let rates: Vec<String> = panel.curves.iter().filter_map(sliding).collect();
+    if !rates.is_empty() {
+        said.push(format!("Frames/s while the window slides at every frame: {}.", rates.join(", ")));
+    }
+}
+
+fn name(point: &FtlePoint) -> String {
+    format!("{} ({})", point.method, point.setting)
+}
+
+/// Bytes in a unit that reads well.
+pub(super) fn size(bytes: u64) -> String {
+    match bytes {
+        0 => "no memory".into(),
+        1..1_000_000 => format!("{:.0} kB", bytes as f64 / 1e3),
+        _ => format!("{:.1} MB", bytes as f64 / 1e6),
+    }
+}
+
+/// Seconds in a unit that reads well.
+fn duration(seconds: f64) -> String {
+    match seconds {
+        s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
+        s if s < 600.0 => format!("{s:.2} s"),
+        s if s < 36_000.0 => format!("{:.0} min", s / 60.0),
+        s => format!("{:.0} h", s / 3600.0),
+    }
+}

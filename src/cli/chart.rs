@@ -1,0 +1,94 @@
+//! `ridgewatch chart`: speed against accuracy of a scene, and the pick.
+
+use super::common::{Common, Interrupted, Usage, device, located, print_json, print_text, scene, seconds};
+use super::messages;
+use super::signals::Stop;
+use anyhow::{Context, Result, bail};
+use ridgewatch::chart::{Chart, ChartOptions, chart, csv, verdict, write_png, write_svg};
+use ridgewatch::files::write_whole;
+use ridgewatch::run::RunError;
+use ridgewatch::source::SourceKind;
+use serde::Serialize;
+use std::path::PathBuf;
+use std::time::Duration;
+
+/// Time from a signal to the end of the process.
+const STOP_WITHIN: Duration = Duration::from_secs(60);
+
+/// Options of `chart`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), or data files and globs.
+    #[arg(required = true, value_name = "CONFIG | FILES")]
+    paths: Vec<PathBuf>,
+    /// Seconds for all measurements. What did not fit is named.
+    #[arg(long, default_value_t = 300.0, value_parser = seconds, value_name = "S")]
+    seconds: f64,
+    /// Panels: ftle (error and cost of FTLE samples), pictures (time to error), scaling (cost against tau, nodes, threads).
+    #[arg(long, value_enum, value_delimiter = ',', default_values_t = [Panel::Ftle, Panel::Pictures, Panel::Scaling], value_name = "PANELS")]
+    only: Vec<Panel>,
+    /// Folder for chart.png, chart.svg, chart.csv and chart.json. Files of these names are replaced.
+    #[arg(long, short, default_value = "out/chart")]
+    out: PathBuf,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Panel {
+    Ftle,
+    Pictures,
+    Scaling,
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    #[serde(flatten)]
+    chart: &'a Chart,
+    verdict: &'a [String],
+}
+
+/// Charts.
+pub fn run(common: &Common, options: &Options) -> Result<()> {
+    let scene = scene(common, &options.paths)?;
+    if scene.source.kind == SourceKind::Live {
+        bail!(Usage("a running simulation cannot be charted, since no moment of it comes twice; accepted: archives and closed forms".into()));
+    }
+    let device = device(common, &scene)?;
+    std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
+    let bar = messages::spinner("opening the source".into());
+    let tell = |what: &str| {
+        tracing::info!("measuring {what}");
+        bar.set_message(format!("measuring {what}"));
+    };
+    let has = |panel| options.only.contains(&panel);
+    let wanted = ChartOptions { seconds: options.seconds, ftle: has(Panel::Ftle), pictures: has(Panel::Pictures), scaling: has(Panel::Scaling) };
+    let stop = Stop::default();
+    stop.watch(Some(STOP_WITHIN), || ());
+    let chart = chart(&scene.settings(), &wanted, &device, common.threads, &tell, &stop.requested)
+        .map_err(|error| located(&scene, error, RunError::refused))?;
+    bar.finish_and_clear();
+    let said = verdict(&chart);
+    let report = Report { chart: &chart, verdict: &said };
+    let files = [
+        ("chart.csv", csv(&chart).into_bytes()),
+        ("chart.svg", write_svg(&chart)?.into_bytes()),
+        ("chart.png", write_png(&chart)?),
+        ("chart.json", serde_json::to_vec_pretty(&report)?),
+    ];
+    for (name, bytes) in files {
+        let path = options.out.join(name);
+        write_whole(&path, &bytes).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    if common.json {
+        print_json(&report)?;
+    } else {
+        said.iter().for_each(print_text);
+        for line in &chart.not_measured {
+            messages::note(format_args!("not measured: {line}"));
+        }
+        print_text(format_args!("{}: chart.png, chart.svg, chart.csv, chart.json, after {:.0} s", options.out.display(), chart.seconds));
+    }
+    match stop.status() {
+        0 => Ok(()),
+        status => bail!(Interrupted { status, done: "the chart has what was measured until then" }),
+    }
+}

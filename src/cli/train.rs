@@ -1,0 +1,105 @@
+//! `ridgewatch train`: offline training of a scene's network on a still window.
+
+use super::common::{Common, Interrupted, Usage, device, located, print_json, print_text, scene};
+use super::messages;
+use super::signals::Stop;
+use anyhow::{Context, Result, bail};
+use ridgewatch::chart::{Epoch, TrainOptions, train};
+use ridgewatch::files::write_whole;
+use ridgewatch::publish::write_png;
+use ridgewatch::render::Film;
+use ridgewatch::run::RunError;
+use ridgewatch::source::SourceKind;
+use ridgewatch::surrogate::Kind;
+use std::fmt::Write;
+use std::path::{Path, PathBuf};
+
+/// Options of `train`.
+#[derive(Debug, clap::Args)]
+pub struct Options {
+    /// A scene file (.toml), or data files and globs. The surrogate is the scene's (surrogate.kind network or residual).
+    #[arg(required = true, value_name = "CONFIG | FILES")]
+    paths: Vec<PathBuf>,
+    /// Passes over the labels.
+    #[arg(long, default_value_t = 100, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    epochs: u64,
+    /// Traced labels.
+    #[arg(long, default_value_t = 1 << 20, value_parser = clap::value_parser!(u64).range(1024..=1 << 28))]
+    labels: u64,
+    /// Epochs after which a picture of the network alone is written, besides the last one.
+    #[arg(long, value_delimiter = ',', default_values_t = [1, 100], value_name = "EPOCHS")]
+    pictures: Vec<u64>,
+    /// Folder for epochs.csv and the pictures. Files of these names are replaced.
+    #[arg(long, short, default_value = "out/train")]
+    out: PathBuf,
+}
+
+/// Trains.
+pub fn run(common: &Common, options: &Options) -> Result<()> {
+    let scene = scene(common, &options.paths)?;
+    if scene.source.kind == SourceKind::Live {
+        bail!(Usage("a running simulation has no still window to train on; accepted: archives and closed forms".into()));
+    }
+    if scene.surrogate.kind == Kind::Table {
+        bail!(Usage("a table is not trained; accepted: a scene with surrogate.kind network or residual (--set surrogate.kind=network)".into()));
+    }
+    if !scene.network.inputs.is_empty() {
+        bail!(Usage("network.inputs is given, and a still window has one start time and duration; accepted: a network over positions".into()));
+    }
+    let device = device(common, &scene)?;
+    std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
+    let wanted = TrainOptions {
+        epochs: options.epochs,
+        labels: options.labels as usize,
+        pictures: options.pictures.clone(),
+        ..TrainOptions::default()
+    };
+    let bar = messages::progress(Some(options.epochs));
+    let (tone_map, mut failed) = (scene.render.tone_map, None);
+    let mut seen = |epoch: &Epoch, film: Option<&Film>| {
+        bar.set_position(epoch.epoch);
+        bar.set_message(format!("rms {:.4}", epoch.rms));
+        if let Some(film) = film {
+            let path = options.out.join(format!("epoch_{:06}.png", epoch.epoch));
+            failed = failed.take().or(write_png(&path, film, tone_map).err());
+        }
+    };
+    let stop = Stop::default();
+    // Without a bound: an epoch may take long, and a second signal ends the process.
+    stop.watch(None, || ());
+    let trained = train(&scene.settings(), &wanted, &device, common.threads, &mut seen, &stop.requested);
+    let report = trained.map_err(|error| located(&scene, error, RunError::refused))?;
+    bar.finish_and_clear();
+    if let Some(error) = failed {
+        return Err(error.into());
+    }
+    write_epochs(&options.out.join("epochs.csv"), &report.epochs)?;
+    if common.json {
+        print_json(&report)?;
+    } else if let Some(last) = report.epochs.last() {
+        let psnr = last.psnr.map_or(String::new(), |psnr| format!(", {psnr:.1} dB"));
+        print_text(format_args!(
+            "{}: epochs.csv, epoch_*.png; after {} epochs ({} steps, {:.1} s, {:.1} MB) the log-stretch has an error of {:.4}{psnr}",
+            options.out.display(),
+            last.epoch,
+            last.steps,
+            last.seconds,
+            report.bytes as f64 / 1e6,
+            last.rms
+        ));
+    }
+    match stop.status() {
+        0 => Ok(()),
+        status => bail!(Interrupted { status, done: "the epochs until then are written" }),
+    }
+}
+
+fn write_epochs(path: &Path, epochs: &[Epoch]) -> Result<()> {
+    let mut text = String::from("epoch,steps,seconds,loss,rms,psnr,rollbacks\n");
+    let number = |value: Option<f64>| value.map_or(String::new(), |value| format!("{value:.6e}"));
+    for Epoch { epoch, steps, seconds, loss, rms, psnr, rollbacks } in epochs {
+        // Writing into a string does not fail.
+        let _ = writeln!(text, "{epoch},{steps},{seconds:.3},{},{rms:.6e},{},{rollbacks}", number(*loss), number(*psnr));
+    }
+    write_whole(path, text.as_bytes()).with_context(|| format!("cannot write {}", path.display()))
+}

@@ -1,0 +1,145 @@
+//! Charts, trials and offline training through the command line.
+
+#![allow(clippy::unwrap_used)]
+
+#[path = "../kit/mod.rs"]
+mod kit;
+
+use kit::program::{config, json, ridgewatch, run, text};
+use serde_json::Value;
+use std::path::Path;
+
+/// A small double gyre, in seconds instead of minutes.
+const SMALL: [&str; 5] = ["render.width=96", "render.height=48", "time.tau=5", "time.slides=3", "render.samples=2"];
+
+fn command(name: &str, out: &Path, more: &[&str]) -> Vec<String> {
+    let mut arguments: Vec<String> = vec![name.into(), config("double_gyre.toml"), "--device".into(), "cpu".into()];
+    arguments.extend(SMALL.iter().flat_map(|key| ["--set".into(), (*key).to_owned()]));
+    arguments.extend(["--out".into(), text(out).into()]);
+    arguments.extend(more.iter().map(|word| (*word).to_owned()));
+    arguments
+}
+
+fn number(value: &Value) -> f64 {
+    value.as_f64().unwrap_or_else(|| panic!("no number: {value}"))
+}
+
+/// Errors are those of the numerics: they fall with steps and with nodes, and the pick is the cheapest method within the tolerance.
+#[test]
+fn errors_fall_with_steps_and_nodes() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("chart");
+    run(&mut ridgewatch(command("chart", &out, &["--only", "ftle", "--seconds", "25"]))).success();
+    let chart = json(&out.join("chart.json"));
+    let methods = chart["ftle"]["methods"].as_array().unwrap();
+    let rms = |method: &str, setting: &str| {
+        let found = methods.iter().find(|point| point["method"] == method && point["setting"].as_str().unwrap().starts_with(setting));
+        number(&found.unwrap_or_else(|| panic!("{method}, {setting} is missing: {:?}", chart["not_measured"]))["rms"])
+    };
+    let steps = chart["ftle"]["chosen_steps"].as_u64().unwrap();
+    let of_steps = |n: u64| rms("tangent RK4, f64", &format!("{n} steps"));
+    // Order 4: a fourth of the step has 1/256 of the error, until that of the truth is reached.
+    assert!(of_steps(4 * steps) < of_steps(steps) / 50.0, "{} {}", of_steps(4 * steps), of_steps(steps));
+    let tables: Vec<f64> = ["64x32", "128x64", "256x128"].map(|nodes| rms("table", nodes)).to_vec();
+    assert!(tables.windows(2).all(|pair| pair[1] < 0.6 * pair[0]), "{tables:?}");
+    // The published gap of 1e-6 drowns in the rounding of f32.
+    assert!(rms("differences, f32", "gap 1e-6") > 5.0 * rms("differences, f32", "gap 1e-3"));
+    let tolerance = number(&chart["ftle"]["tolerance"]);
+    let within = methods.iter().filter(|point| number(&point["rms"]) <= tolerance);
+    let cost = |point: &Value| number(&point["build_seconds"]) + 1e6 / number(&point["samples_per_second"]);
+    let best = within.min_by(|a, b| cost(a).total_cmp(&cost(b))).unwrap();
+    let verdict = chart["verdict"][0].as_str().unwrap();
+    let name = format!("{} ({})", best["method"].as_str().unwrap(), best["setting"].as_str().unwrap());
+    assert!(verdict.starts_with("1e6 FTLE samples") && verdict.contains(&name), "{verdict}; {name}");
+    // One line per measurement below the head.
+    let csv = std::fs::read_to_string(out.join("chart.csv")).unwrap();
+    assert_eq!(csv.lines().count(), methods.len() + 1);
+    assert!(csv.lines().all(|line| columns(line) == 16), "{csv}");
+}
+
+/// Columns of a line of CSV, whose commas inside quotes count as text.
+fn columns(line: &str) -> usize {
+    line.split('"').step_by(2).map(|outside| outside.matches(',').count()).sum::<usize>() + 1
+}
+
+#[test]
+fn pictures_converge_and_the_chart_is_drawn() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("chart");
+    run(&mut ridgewatch(command("chart", &out, &["--only", "pictures,scaling", "--seconds", "40"]))).success();
+    let chart = json(&out.join("chart.json"));
+    let curves = chart["pictures"]["curves"].as_array().unwrap();
+    let frames = |method: &str| {
+        let curve = curves.iter().find(|curve| curve["method"] == method).unwrap_or_else(|| panic!("{method}: {:?}", chart["not_measured"]));
+        curve["frames"].as_array().unwrap().clone()
+    };
+    for method in ["two_level", "reference"] {
+        let frames = frames(method);
+        let (first, last) = (number(&frames[0]["psnr"]), number(&frames[frames.len() - 1]["psnr"]));
+        assert!(frames.len() > 1 && last > first + 3.0, "{method}: {first} to {last} dB in {} frames", frames.len());
+        assert!(frames.windows(2).all(|pair| number(&pair[0]["seconds"]) < number(&pair[1]["seconds"])), "time goes on");
+    }
+    let last = frames("two_level").pop().unwrap();
+    let (stated, measured) = (number(&last["stated_psnr"]), number(&last["psnr"]));
+    assert!((stated - measured).abs() < 2.5, "stated {stated} dB, measured {measured} dB");
+    let threads: Vec<f64> = chart["scaling"]["points"].as_array().unwrap().iter().filter(|p| p["axis"] == "tau").map(|p| number(&p["steps"])).collect();
+    assert!(threads.len() >= 2 && threads[0] < threads[threads.len() - 1], "a longer tau takes more steps: {threads:?}");
+    let picture = image::load_from_memory(&std::fs::read(out.join("chart.png")).unwrap()).unwrap().into_rgb8();
+    let coloured = picture.pixels().filter(|pixel| pixel.0.iter().max() != pixel.0.iter().min()).count();
+    assert!(picture.width() == 1800 && coloured > 500, "curves have colours: {coloured} pixels");
+    let svg = std::fs::read_to_string(out.join("chart.svg")).unwrap();
+    for words in ["two_level, table", "reference", "PSNR over lit pixels, dB", "Double gyre"] {
+        assert!(svg.contains(words), "{words}");
+    }
+}
+
+#[test]
+fn a_trial_is_remembered_beside_its_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    let scene = folder.path().join("scene.toml");
+    std::fs::copy(config("double_gyre.toml"), &scene).unwrap();
+    let keys: Vec<&str> = SMALL.iter().flat_map(|key| ["--set", key]).collect();
+    let picture = folder.path().join("picture.exr");
+    let render = |more: &[&str]| {
+        let given = ["render", text(&scene), "--device", "cpu", "--method", "auto", "--out", text(&picture), "--json"];
+        run(&mut ridgewatch(given.iter().chain(&keys).chain(more))).success()
+    };
+    let first = render(&[]);
+    let choice = json(&folder.path().join("scene.auto.json"));
+    let method = choice["choice"]["method"].as_str().unwrap().to_owned();
+    assert!(["two_level", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")), "{}", first.stderr);
+    assert_eq!(serde_json::from_str::<Value>(&first.stdout).unwrap()["method"], method.as_str(), "the record has what rendered");
+    // Another choice in the file shows that it is read, and another scene that it is not.
+    let other = if method == "reference" { "two_level" } else { "reference" };
+    let mut changed = choice.clone();
+    changed["choice"]["method"] = other.into();
+    std::fs::write(folder.path().join("scene.auto.json"), changed.to_string()).unwrap();
+    assert_eq!(serde_json::from_str::<Value>(&render(&[]).stdout).unwrap()["method"], other);
+    assert_eq!(serde_json::from_str::<Value>(&render(&["--set", "time.tau=5.5"]).stdout).unwrap()["method"], method.as_str());
+}
+
+#[test]
+fn training_lowers_the_error_on_points_it_never_sees() {
+    let folder = tempfile::tempdir().unwrap();
+    let out = folder.path().join("train");
+    let network = ["--set", "surrogate.kind=network", "--set", "network.log2_table=12", "--set", "network.width=16", "--set", "network.batch=4096"];
+    let given = [&network[..], &["--epochs", "12", "--labels", "65536", "--pictures", "1,3"]].concat();
+    run(&mut ridgewatch(command("train", &out, &given))).success();
+    let text = std::fs::read_to_string(out.join("epochs.csv")).unwrap();
+    let rows: Vec<Vec<f64>> = text.lines().skip(1).map(|line| line.split(',').map(|cell| cell.parse().unwrap_or(f64::NAN)).collect()).collect();
+    assert_eq!(rows.len(), 12);
+    // 65536 labels in batches of 4096 are 16 steps an epoch.
+    assert_eq!([rows[0][1], rows[11][1]], [16.0, 192.0]);
+    assert!(rows[11][4] < 0.5 * rows[0][4], "rms from {} to {}", rows[0][4], rows[11][4]);
+    for epoch in [1, 3, 12] {
+        assert!(out.join(format!("epoch_{epoch:06}.png")).exists(), "{epoch}");
+    }
+    run(&mut ridgewatch(command("train", &out, &[]))).refused(2, &["a table is not trained", "surrogate.kind"]);
+}
+
+#[test]
+fn what_cannot_be_charted_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    run(&mut ridgewatch(["chart", config("live.toml").as_str(), "--out", text(folder.path())])).refused(2, &["running simulation", "accepted"]);
+    run(&mut ridgewatch(command("chart", folder.path(), &["--only", "speed"]))).refused(2, &["speed", "ftle"]);
+}
