@@ -312,18 +312,26 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     });
     let steps = steps.unwrap_or(100);
     match bench.charting.device {
-        Device::Cpu { .. } => on_backend(&mut bench, &mut Cpu, steps, "")?,
+        Device::Cpu { .. } => {
+            tracing(&mut bench, &mut Cpu, steps, "")?;
+            tables(&mut bench, &mut Cpu)?;
+            differences(&mut bench, &mut Cpu, steps)?;
+            composed(&mut bench, steps)?;
+            adaptive(&mut bench)?;
+            networks(&mut bench, &mut Cpu)?;
+        }
         #[cfg(feature = "cuda")]
         Device::Cuda(device) => {
-            for storage in [Storage::F32, Storage::F16] {
-                let mut backend = Cuda::new(&CudaDevice { storage, ..device.clone() });
-                let name = if storage == Storage::F16 { ", f16 storage" } else { "" };
-                if name.is_empty() { on_backend(&mut bench, &mut backend, steps, name)? } else { tracing(&mut bench, &mut backend, steps, name)? }
-            }
+            let mut backend = Cuda::new(&CudaDevice { storage: Storage::F32, ..device.clone() });
+            tracing(&mut bench, &mut backend, steps, "")?;
+            let mut half = Cuda::new(&CudaDevice { storage: Storage::F16, ..device.clone() });
+            tracing(&mut bench, &mut half, steps, ", f16 storage")?;
+            tables(&mut bench, &mut backend)?;
+            differences(&mut bench, &mut backend, steps)?;
+            networks(&mut bench, &mut backend)?;
+            bench.charting.skip("composed flow maps, and Dormand-Prince over tolerances", "they run on the CPU only");
         }
     }
-    composed(&mut bench, steps)?;
-    adaptive(&mut bench)?;
     Ok(FtlePanel {
         points: bench.points.unit.len(),
         truth: "Dormand-Prince 5(4), f64, tolerance 1e-10".into(),
@@ -353,14 +361,6 @@ fn truth(opened: &Opened, tracer: &dyn Tracer, seconds: f64) -> (Points, Vec<f64
     let ftle = |(s, seed): (&f64, &[f32; 3])| if tracer.is_missing(*seed) { f64::NAN } else { s / tracer.tau() };
     let truth = traced.log_stretch_f64.iter().zip(&points.domain).map(ftle).collect();
     (points, truth)
-}
-
-/// Everything that runs on the device.
-fn on_backend<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: usize, storage: &str) -> Result<(), RunError> {
-    tracing(bench, backend, steps, storage)?;
-    tables(bench, backend)?;
-    networks(bench, backend)?;
-    differences(bench, backend, steps)
 }
 
 /// A tracer of the backend. Combinations that it does not have are noted, and give `None`.
@@ -422,10 +422,6 @@ fn differences<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: us
 
 /// Dormand-Prince over tolerances, on the CPU.
 fn adaptive(bench: &mut Bench<'_, '_>) -> Result<(), RunError> {
-    if bench.charting.device.is_gpu() {
-        bench.charting.skip("Dormand-Prince over tolerances", "it runs on the CPU only");
-        return Ok(());
-    }
     for tolerance in [1e-4, 1e-2, 1e-6, 1e-8] {
         if bench.charting.has_time_for(&format!("Dormand-Prince, tolerance {tolerance:e}")) {
             let (velocity, map, time) = (bench.opened.slide.velocity.clone(), &bench.opened.plan.map, bench.opened.slide.time);
@@ -438,10 +434,6 @@ fn adaptive(bench: &mut Bench<'_, '_>) -> Result<(), RunError> {
 
 /// Composed flow maps, plain and joined, over resolutions, on the CPU.
 fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
-    if bench.charting.device.is_gpu() {
-        bench.charting.skip("composed flow maps", "they run on the CPU only");
-        return Ok(());
-    }
     let own = bench.opened.own_nodes(false);
     let intervals = bench.opened.intervals;
     for factor in [0.5, 1.0, 2.0] {
@@ -521,7 +513,7 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
             Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
         };
         let what = format!("{name}, {size}");
-        if !bench.charting.has_time_for(&what) || (kind == Kind::Residual && !fits(bench, &what, nodes.iter().product())) {
+        if !fits(bench, &what, if kind == Kind::Residual { nodes.iter().product() } else { 0 }) {
             continue;
         }
         let began = Instant::now();
@@ -602,6 +594,9 @@ fn shape(nodes: [usize; 3]) -> String {
 /// True if so many nodes can be traced in a quarter of the time that is left, at the speed of the fastest tracer so far, and fit into memory.
 fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize) -> bool {
     const MAX_NODES: usize = 1 << 27;
+    if !bench.charting.has_time_for(what) {
+        return false;
+    }
     let traced = bench.found.iter().filter(|point| point.method.starts_with("tangent")).map(|point| point.samples_per_second);
     let seconds = nodes as f64 / traced.fold(1e4, f64::max);
     let affordable = 0.25 * bench.charting.left();
@@ -609,5 +604,5 @@ fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize) -> bool {
         bench.charting.skip(what, format_args!("it would take {seconds:.0} s to trace, of {:.0} s left", bench.charting.left()));
         return false;
     }
-    bench.charting.has_time_for(what)
+    true
 }

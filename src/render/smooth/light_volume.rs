@@ -81,7 +81,9 @@ impl LightGrid {
             return Self { nodes, shear: None, size: nodes, samples, step };
         };
         let delta: [f64; 3] = std::array::from_fn(|k| toward[k] / edges[k] * (nodes[k] - 1) as f64);
-        let major = (0..3).fold(0, |best, k| if delta[k].abs() > delta[best].abs() { k } else { best });
+        // The axis along which the light passes most nodes, so that no slope is above 1; of nearly equal ones that with the fewest planes.
+        let most = delta.iter().fold(0.0, |most: f64, passed| most.max(passed.abs()));
+        let major = (0..3).filter(|&k| delta[k].abs() >= 0.999 * most).min_by_key(|&k| nodes[k]).unwrap_or(0);
         let lateral = [usize::from(major == 0), if major == 2 { 1 } else { 2 }];
         let shear = Shear {
             major,
@@ -129,37 +131,38 @@ impl LightVolume {
 
     fn sheared(medium: &Medium<'_>, grid: &LightGrid, shear: &Shear) -> Vec<f32> {
         let cells = grid.nodes.map(|n| (n - 1) as f32);
-        let (size, planes, samples) = (grid.size, grid.size[2], grid.samples);
+        let (size, samples) = (grid.size, grid.samples);
         let (across, down) = (grid.columns(shear, 0), grid.columns(shear, 1));
-        let width = (across.end() - across.start() + 1) as usize;
-        let starts: Vec<[i32; 2]> = down.flat_map(|w| across.clone().map(move |v| [v, w])).collect();
-        let sums: Vec<f32> = starts
-            .par_iter()
-            .with_min_len(16)
-            .flat_map_iter(|start| {
-                let mut depth = 0.0;
-                (0..planes).map(move |plane| {
-                    if plane > 0 {
+        let (first, width) = ([*across.start(), *down.start()], (across.end() - across.start() + 1) as usize);
+        // Plane by plane, so that the nodes in use stay in the caches.
+        let mut sums = vec![0.0_f32; width * (down.end() - down.start() + 1) as usize];
+        let mut depth = vec![0.0; grid.values()];
+        for (plane, values) in depth.chunks_mut(size[0] * size[1]).enumerate() {
+            if plane > 0 {
+                // Columns that are outside of the box between the two planes gain nothing.
+                let inside = |side: usize| {
+                    let shifts = [plane - 1, plane].map(|plane| plane as f32 * shear.slope[side]);
+                    let low = -shifts[0].max(shifts[1]).ceil() as i32 - first[side];
+                    let high = (cells[shear.lateral[side]] - shifts[0].min(shifts[1])).ceil() as i32 - first[side];
+                    low.max(0) as usize..high.max(0) as usize + 1
+                };
+                let (across, down) = (inside(0), inside(1));
+                sums.par_chunks_mut(width).enumerate().skip(down.start).take(down.len()).for_each(|(w, row)| {
+                    for v in across.start..across.end.min(width) {
                         for m in 0..samples {
                             let x = (plane - 1) as f32 + (m as f32 + 0.5) / samples as f32;
-                            depth += Self::extinction_at(medium, shear, &cells, *start, x) * (shear.length / samples as f32);
+                            let start = [first[0] + v as i32, first[1] + w as i32];
+                            row[v] += Self::extinction_at(medium, shear, &cells, start, x) * (shear.length / samples as f32);
                         }
                     }
-                    depth
-                })
-            })
-            .collect();
-        // From one run of planes per column to the planes' own arrays.
-        let mut depth = vec![0.0; grid.values()];
-        let first = starts[0];
-        depth.par_chunks_mut(size[0]).enumerate().for_each(|(row, values)| {
-            let (plane, c) = (row / size[1], row % size[1]);
-            let w = c as i32 - MARGIN - shear.offset(1, plane) - first[1];
-            for (b, value) in values.iter_mut().enumerate() {
-                let v = b as i32 - MARGIN - shear.offset(0, plane) - first[0];
-                *value = sums[(w as usize * width + v as usize) * planes + plane];
+                });
             }
-        });
+            values.par_chunks_mut(size[0]).enumerate().for_each(|(c, values)| {
+                let w = (c as i32 - MARGIN - shear.offset(1, plane) - first[1]) as usize;
+                let v = (-MARGIN - shear.offset(0, plane) - first[0]) as usize;
+                values.copy_from_slice(&sums[w * width + v..][..size[0]]);
+            });
+        }
         depth
     }
 
