@@ -1,7 +1,8 @@
 //! Marching: the expected picture of the surrogate, by quadrature along camera rays (emission and absorption, Max 1995).
 //!
-//! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through points that follow an additive recurrence
-//! in two dimensions (Roberts 2018), the same for every pixel: the first ray goes through the pixel's centre, later ones fill the pixel evenly.
+//! The picture is the mean over the pixel's area, as it is for tracking. The rays of a pixel go through the same points in every pixel, two by two on
+//! opposite sides of its centre, so that no even number of rays shifts the picture: first the four points of Gauss's rule, then an additive recurrence
+//! in two dimensions (Roberts 2018), which fills the pixel evenly.
 
 use super::light_volume::LightVolume;
 use super::nodes::Nodes;
@@ -66,7 +67,15 @@ impl RaySum {
 fn offsets(j: u64) -> [f32; 3] {
     /// The root of x^3 = x + 1.
     const PLASTIC: f64 = 1.324_717_957_244_746;
-    let [x, y] = [1.0 / PLASTIC, 1.0 / (PLASTIC * PLASTIC)].map(|a| (0.5 + j as f64 * a).fract() as f32);
+    /// Distance of Gauss's two points from the middle of the unit interval, 1 / sqrt 12.
+    const GAUSS: f64 = 0.288_675_134_594_812_9;
+    let pair = j / 2;
+    let point = match pair {
+        0 => [0.5 - GAUSS, 0.5 - GAUSS],
+        1 => [0.5 - GAUSS, 0.5 + GAUSS],
+        _ => [1.0 / PLASTIC, 1.0 / (PLASTIC * PLASTIC)].map(|a| (0.5 + (pair - 1) as f64 * a).fract()),
+    };
+    let [x, y] = point.map(|x| (if j % 2 == 0 { x } else { 1.0 - x }) as f32);
     [x, y, 0.5]
 }
 

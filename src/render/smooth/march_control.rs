@@ -2,14 +2,20 @@
 
 use crate::rng::FrameRandom;
 
-/// Rays per pixel of the first round. Later rounds add one each.
+/// Rays per pixel of the first round. They come two by two, on opposite sides of the pixel's centre.
 pub const FIRST_RAYS: u64 = 2;
+/// Rays per pixel that a picture gets in any case, one pair a round, and the most it gets.
+const MIN_RAYS: u64 = 4;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
+/// Once the error of the pixel filter is this share of what it may be, no more rays are marched.
+const SPARE: f64 = 0.25;
+/// Audits that a picture gets in any case, one a round.
+const MIN_AUDITS: u64 = 8;
 /// Pixels per call whose rays are compared with others of the same pixel.
 const AUDITED_PIXELS: u64 = 256;
 /// Number of audited pixels whose rays are compared with a finer march as well.
@@ -30,6 +36,8 @@ pub struct MarchControl {
     audited: [f64; 2],
     quadrature: f64,
     filter: f64,
+    /// Number of audits so far.
+    audits: u64,
 }
 
 /// What to do after a round.
@@ -45,7 +53,7 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0 }
+        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
     }
 }
 
@@ -60,10 +68,17 @@ impl MarchControl {
         (FIRST_STEP / self.step).round().max(1.0) as usize
     }
 
-    /// Pixels to audit after the rays from `rays` on.
-    pub fn audit_pixels(&self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
+    /// Returns true if rays are to be marched or pixels to be audited.
+    pub fn is_due(&self) -> bool {
+        self.next_rays > 0 || self.audits < MIN_AUDITS
+    }
+
+    /// Pixels of the next audit, others in each.
+    pub fn audit_pixels(&mut self, random: &FrameRandom, pixels: usize) -> Vec<u32> {
+        let first = self.audits * AUDITED_PIXELS;
+        self.audits += 1;
         let pixel = |i: u64| {
-            let word = random.words((self.rays * AUDITED_PIXELS + i) as u32, u32::MAX, AUDIT_DIMENSION)[0];
+            let word = random.words((first + i) as u32, u32::MAX, AUDIT_DIMENSION)[0];
             ((u64::from(word) * pixels as u64) >> 32) as u32
         };
         (0..AUDITED_PIXELS).map(pixel).collect()
@@ -102,20 +117,21 @@ impl MarchControl {
 
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
+        let allowed = SHARE * others.max(0.0);
+        let wanted = self.rays < MIN_RAYS || self.filter() > SPARE * allowed;
+        self.next_rays = if wanted && self.rays < MAX_RAYS { FIRST_RAYS } else { 0 };
         if !may_go_on {
-            self.next_rays = u64::from(self.rays < MAX_RAYS);
             return Marching::Enough;
         }
-        let allowed = SHARE * others.max(0.0);
         if self.quadrature() > allowed && self.step > MIN_STEP {
-            *self = Self { step: 0.5 * self.step, next_rays: self.rays.max(FIRST_RAYS), ..Self::default() };
+            let next_rays = self.rays.max(FIRST_RAYS);
+            *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
             return Marching::Anew;
         }
         if self.filter() > allowed && self.rays < MAX_RAYS {
             self.next_rays = self.rays;
             return Marching::More;
         }
-        self.next_rays = u64::from(self.rays < MAX_RAYS);
         Marching::Enough
     }
 }

@@ -141,7 +141,7 @@ impl Picture {
 
     /// Marches more rays, and compares some pixels with a finer march. Returns the seconds that it took. `stop` ends it early.
     fn march(&mut self, medium: &Medium<'_>, round: &Refinement<'_>) -> f64 {
-        if self.march.next_rays == 0 {
+        if !self.march.is_due() {
             return 0.0;
         }
         let began = Instant::now();

@@ -171,10 +171,10 @@ impl GpuSmooth {
 
     /// Marches the rays that are due, and compares some pixels with a finer march. Returns the seconds that it took.
     fn march(&mut self, round: &SmoothRound<'_>, renderer: &Renderer, parameters: &FrameParameters) -> Result<f64, DeviceError> {
-        let due = self.control.next_rays;
-        if due == 0 {
+        if !self.control.is_due() {
             return Ok(0.0);
         }
+        let due = self.control.next_rays;
         let began = Instant::now();
         let medium = medium(&self.nodes, round, parameters)?;
         let step = renderer.node_spacing(medium.nodes.shape()) as f32 * self.control.step;
