@@ -238,8 +238,8 @@ RW_FN LightLine light_line(const LightVolume& volume, const UnitLine& line) {
     return out;
 }
 
-// Optical depth to the light at a plane coordinate and columns.
-RW_FN float light_depth(const LightVolume& volume, float plane, const float (&column)[2]) {
+// Interpolated depth of the columns at a plane coordinate.
+RW_FN float stored_depth(const LightVolume& volume, float plane, const float (&column)[2]) {
     const int planes = volume.nodes[volume.axes[0]];
     int near, first[2];
     float f[2];
@@ -267,22 +267,40 @@ RW_FN float light_depth(const LightVolume& volume, float plane, const float (&co
     return fma_(at(near + 1, near_plane + 1.0f) - nearer, plane - near_plane, nearer);
 }
 
-// Sums the depth along column (v, w) of a directional light and stores it plane by plane.
+// Plane coordinate where the light of a column came in through a side wall; 0 or less if it came in through the first plane.
+RW_FN float light_entry(const LightVolume& volume, const float (&column)[2]) {
+    float entry = 0.0f;
+    RW_UNROLL
+    for (int side = 0; side < 2; ++side) {
+        const float shift = volume.shift[side], wall = shift < 0.0f ? float(volume.nodes[volume.axes[1 + side]] - 1) : 0.0f;
+        if (shift != 0.0f) entry = max_(entry, (wall - column[side]) / shift);
+    }
+    return entry;
+}
+
+// Optical depth to the light at a plane coordinate and columns.
+RW_FN float light_depth(const LightVolume& volume, float plane, const float (&column)[2]) {
+    const float depth = stored_depth(volume, plane, column), entry = min_(light_entry(volume, column), plane);
+    return entry > 0.0f ? depth - stored_depth(volume, entry, column) : depth;
+}
+
+// Sums the depth along column (v, w) of a directional light and stores it plane by plane. The extinction is continued into the margin around the box,
+// so that neighbouring columns agree at its walls.
 RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w) {
     const LightVolume& volume = march.light;
     const int column[2] = {v, w}, planes = volume.nodes[volume.axes[0]];
     const float last = float(planes - 1), part = volume.step / float(volume.parts);
     const float per_plane = 1.0f / last, per_part = 1.0f / float(volume.parts);
     float cells_of[2], per_cell[2];
-    // Planes between which the column may be in the box, with a plane to spare for rounding.
+    // Planes between which the column may be near the box, with a plane to spare for rounding.
     float enter = 0.0f, leave = last;
     RW_UNROLL
     for (int side = 0; side < 2; ++side) {
         const float shift = volume.shift[side], cells = float(volume.nodes[volume.axes[1 + side]] - 1), begin = float(column[side]);
         cells_of[side] = cells;
         per_cell[side] = 1.0f / cells;
-        const float to_low = -begin / shift, to_high = (cells - begin) / shift;
-        if (shift == 0.0f) leave = begin < 0.0f || begin > cells ? -1.0f : leave;
+        const float margin = float(volume.margin), to_low = (-margin - begin) / shift, to_high = (cells + margin - begin) / shift;
+        if (shift == 0.0f) leave = begin < -margin || begin > cells + margin ? -1.0f : leave;
         else enter = max_(enter, min_(to_low, to_high) - 1.0f), leave = min_(leave, max_(to_low, to_high) + 1.0f);
     }
     float depth = 0.0f;
@@ -292,14 +310,14 @@ RW_FN void fill_column(const FrameScene& scene, const March& march, int v, int w
                 const float x = float(plane - 1) + (float(m) + 0.5f) * per_part;
                 const float across = (volume.reversed ? last - x : x) * per_plane;
                 float lateral[2];
-                bool inside = true;
+                bool near = true;
                 RW_UNROLL
                 for (int side = 0; side < 2; ++side) {
                     const float place = float(column[side]) + x * volume.shift[side];
-                    inside = inside && place >= 0.0f && place <= cells_of[side];
-                    lateral[side] = place * per_cell[side];
+                    near = near && place >= -float(volume.margin) && place <= cells_of[side] + float(volume.margin);
+                    lateral[side] = min_(max_(place * per_cell[side], 0.0f), 1.0f);
                 }
-                if (!inside) continue;
+                if (!near) continue;
                 float unit[3];
                 RW_UNROLL
                 for (int k = 0; k < 3; ++k) unit[k] = k == volume.axes[0] ? across : (k == volume.axes[1] ? lateral[0] : lateral[1]);
@@ -341,10 +359,19 @@ RW_FN void fill_node(const FrameScene& scene, const March& march, uint32_t index
     volume.depth[index] = depth_to_light(scene, march, point, volume.step);
 }
 
-// Offset of a ray across (axis 0) or down (1) its pixel: an additive recurrence in two dimensions (Roberts 2018).
+// Offset of a ray across (axis 0) or down (1) its pixel: pairs on opposite sides of the centre, first the four points of Gauss's rule, then an additive
+// recurrence in two dimensions (Roberts 2018).
 RW_FN float ray_offset(uint32_t ray, int axis) {
-    const double plastic = 1.324717957244746, x = 0.5 + double(ray) * (axis == 0 ? 1.0 / plastic : 1.0 / (plastic * plastic));
-    return float(x - floor_(x));
+    const double plastic = 1.324717957244746, gauss = 0.2886751345948129;
+    const uint32_t pair = ray / 2;
+    double point;
+    if (pair < 2) {
+        point = pair == 1 && axis == 1 ? 0.5 + gauss : 0.5 - gauss;
+    } else {
+        const double x = 0.5 + double(pair - 1) * (axis == 0 ? 1.0 / plastic : 1.0 / (plastic * plastic));
+        point = x - floor_(x);
+    }
+    return float(ray % 2 == 0 ? point : 1.0 - point);
 }
 
 // Colour of the light at a quadrature point, given the weight of the point times the transmittance to the light.

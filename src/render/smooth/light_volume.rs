@@ -1,8 +1,9 @@
 //! Optical depth to the light, tabulated once for a window, a light and a transfer function.
 //!
 //! For a directional light the table is sheared: its columns are light rays. The depth is summed along each column, plane by plane, away from the
-//! light, so that it is exact along the light up to quadrature, and interpolation acts across the rays only. For a point light each node of a
-//! plain grid is marched by itself.
+//! light, so that it is exact along the light up to quadrature, and interpolation acts across the rays only. Where light enters through a side wall,
+//! neighbouring columns are in the box for different lengths; so the extinction is continued outside, and what lies before the wall is subtracted.
+//! For a point light each node of a plain grid is marched by itself.
 
 use super::march::{Medium, node_spacing};
 use crate::Light;
@@ -139,14 +140,14 @@ impl LightVolume {
         let mut depth = vec![0.0; grid.values()];
         for (plane, values) in depth.chunks_mut(size[0] * size[1]).enumerate() {
             if plane > 0 {
-                // Columns that are outside of the box between the two planes gain nothing.
-                let inside = |side: usize| {
+                // Columns that are far from the box between the two planes gain nothing.
+                let near = |side: usize| {
                     let shifts = [plane - 1, plane].map(|plane| plane as f32 * shear.slope[side]);
-                    let low = -shifts[0].max(shifts[1]).ceil() as i32 - first[side];
-                    let high = (cells[shear.lateral[side]] - shifts[0].min(shifts[1])).ceil() as i32 - first[side];
+                    let low = -shifts[0].max(shifts[1]).ceil() as i32 - MARGIN - first[side];
+                    let high = (cells[shear.lateral[side]] - shifts[0].min(shifts[1])).ceil() as i32 + MARGIN - first[side];
                     low.max(0) as usize..high.max(0) as usize + 1
                 };
-                let (across, down) = (inside(0), inside(1));
+                let (across, down) = (near(0), near(1));
                 sums.par_chunks_mut(width).enumerate().skip(down.start).take(down.len()).for_each(|(w, row)| {
                     for v in across.start..across.end.min(width) {
                         for m in 0..samples {
@@ -166,18 +167,18 @@ impl LightVolume {
         depth
     }
 
-    /// Extinction on a column at plane coordinate `x`; 0 outside of the box.
+    /// Extinction on a column at plane coordinate `x`: that of the wall in the margin around the box, 0 beyond.
     fn extinction_at(medium: &Medium<'_>, shear: &Shear, cells: &[f32; 3], column: [i32; 2], x: f32) -> f32 {
         let mut place = [0.0; 3];
         place[shear.major] = if shear.from_above { cells[shear.major] - x } else { x };
         for side in 0..2 {
             let k = shear.lateral[side];
             place[k] = column[side] as f32 + x * shear.slope[side];
-            if !(0.0..=cells[k]).contains(&place[k]) {
+            if place[k] < -MARGIN as f32 || place[k] > cells[k] + MARGIN as f32 {
                 return 0.0;
             }
         }
-        medium.extinction(std::array::from_fn(|k| place[k] / cells[k]))
+        medium.extinction(std::array::from_fn(|k| (place[k] / cells[k]).clamp(0.0, 1.0)))
     }
 
     /// Optical depth from a point in unit coordinates to the light.
@@ -196,7 +197,6 @@ impl LightVolume {
         };
         let x = if shear.from_above { self.cells[shear.major] - place[shear.major] } else { place[shear.major] };
         let column: [f32; 2] = std::array::from_fn(|side| place[shear.lateral[side]] - x * shear.slope[side]);
-        let plane = lower(x, size[2]);
         let first = column.map(f32::floor);
         let f: [f32; 2] = std::array::from_fn(|side| column[side] - first[side]);
         let at = |plane: usize| {
@@ -207,6 +207,14 @@ impl LightVolume {
             let row = size[0];
             between(between(near[0], near[1], f[0]), between(near[row], near[row + 1], f[0]), f[1])
         };
-        between(at(plane), at(plane + 1), x - plane as f32)
+        let depth = |x: f32| {
+            let plane = lower(x, size[2]);
+            between(at(plane), at(plane + 1), x - plane as f32)
+        };
+        // Where the light came in, if not through the first plane.
+        let wall = |side: usize| if shear.slope[side] < 0.0 { self.cells[shear.lateral[side]] } else { 0.0 };
+        let entry = |side: usize| if shear.slope[side] == 0.0 { 0.0 } else { (wall(side) - column[side]) / shear.slope[side] };
+        let entry = entry(0).max(entry(1)).min(x);
+        if entry > 0.0 { depth(x) - depth(entry) } else { depth(x) }
     }
 }
