@@ -296,9 +296,7 @@ fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -
         })?;
     }
     if !panel.front.is_empty() {
-        line("Pareto front", &|(x, y)| {
-            area.draw(&PathElement::new([(x - 6, y), (x + 6, y)], BLACK.stroke_width(1))).map_err(plot_error)
-        })?;
+        line("Pareto front", &|(x, y)| area.draw(&PathElement::new([(x - 6, y), (x + 6, y)], BLACK.stroke_width(1))).map_err(plot_error))?;
     }
     if panel.pick.is_some() {
         line("pick", &|at| area.draw(&Circle::new(at, 7, BLACK.stroke_width(2))).map_err(plot_error))?;

@@ -6,7 +6,12 @@ pub fn front(points: &[[f64; 2]]) -> Vec<usize> {
     let mut order: Vec<usize> = (0..points.len()).filter(|&i| points[i].iter().all(|value| value.is_finite())).collect();
     order.sort_by(|&a, &b| points[a][0].total_cmp(&points[b][0]).then(points[a][1].total_cmp(&points[b][1])));
     let mut least = f64::INFINITY;
-    order.retain(|&i| points[i][1] < least && { least = points[i][1]; true });
+    order.retain(|&i| {
+        points[i][1] < least && {
+            least = points[i][1];
+            true
+        }
+    });
     order
 }
 

@@ -7,6 +7,7 @@ use crate::backend::{CudaDevice, Storage, cuda::Cuda};
 use crate::flow::{
     Composition, Extras, FlowMap, Integrator, Precision, Steps, Traced, Tracer, VelocitySource, cpu_tracer, dormand_prince_tracer,
 };
+use crate::render::Method;
 use crate::render::rng::{philox, unit};
 use crate::run::{Plan, RunError, Settings, Setup, Slide};
 use crate::surrogate::network::{Encoding, NetworkSettings};
@@ -96,7 +97,10 @@ impl Opened {
     pub(super) fn new(settings: &Settings, device: &Device) -> Result<Self, RunError> {
         /// Intervals of a composed flow map of a closed form.
         const CLOSED: usize = 10;
-        let Setup { plan, mut slides, .. } = Setup::new(settings.clone())?;
+        // The method of the scene plays no part.
+        let mut settings = settings.clone();
+        (settings.render.method, settings.render.until, settings.render.budget) = (Method::TwoLevel, None, None);
+        let Setup { plan, mut slides, .. } = Setup::new(settings)?;
         let slide = slides.next_slide(&NEVER)?.ok_or(RunError::EndedEarly)?;
         let (intervals, window_bytes) = match &slide.velocity {
             VelocitySource::Analytic(..) => (CLOSED, 0),
@@ -410,8 +414,13 @@ fn differences<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: us
         for exponent in [-4, -3, -5, -2, -6, -8] {
             let gap = longest * 10f64.powi(exponent);
             let what = format!("{name}, gap 1e{exponent} of the domain");
-            let map =
-                FlowMap { integrator: Integrator::Differences, precision, difference_step: gap, steps: Steps::Fixed(steps), ..plan.clone() };
+            let map = FlowMap {
+                integrator: Integrator::Differences,
+                precision,
+                difference_step: gap,
+                steps: Steps::Fixed(steps),
+                ..plan.clone()
+            };
             if let Some(tracer) = tracer_of(bench, backend, &what, &map)? {
                 bench.measure_tracer(name, format!("gap 1e{exponent}"), &tracer)?;
             }
@@ -453,8 +462,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
         let plain_seconds = began.elapsed().as_secs_f64();
         let joined = bench.charting.pool.install(|| plain.joined());
         let joined_seconds = began.elapsed().as_secs_f64();
-        for (name, composition, seconds) in
-            [("composition", &plain, plain_seconds), ("composition, hierarchical", &joined, joined_seconds)]
+        for (name, composition, seconds) in [("composition", &plain, plain_seconds), ("composition, hierarchical", &joined, joined_seconds)]
         {
             let built = Built { seconds, bytes: composition.bytes() as u64 };
             bench.measure(name, format!("{} nodes", shape(nodes)), built, |unit, _, out| {
@@ -564,14 +572,8 @@ fn surrogate_of<B: Backend>(
     tracer: &B::Tracer,
 ) -> Result<Option<B::Surrogate>, RunError> {
     let plan = &bench.opened.plan;
-    let request = SurrogateRequest {
-        settings,
-        network,
-        domain: &plan.domain,
-        seed: plan.scene.seed,
-        replay_buffer: MAX_LABELS,
-        stop: &NEVER,
-    };
+    let request =
+        SurrogateRequest { settings, network, domain: &plan.domain, seed: plan.scene.seed, replay_buffer: MAX_LABELS, stop: &NEVER };
     match bench.charting.pool.install(|| backend.surrogate(&request, tracer)) {
         Ok(surrogate) => Ok(Some(surrogate)),
         Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),

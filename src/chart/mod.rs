@@ -18,7 +18,7 @@ mod verdict;
 pub use draw::{DrawError, write_png, write_svg};
 pub use front::{front, pick};
 pub use ftle::{FtlePanel, FtlePoint};
-pub use picture::{PictureCurve, PicturePanel, PicturePoint, PictureErrors, TARGETS, Truth, fixed_colours, picture_errors};
+pub use picture::{PictureCurve, PictureErrors, PicturePanel, PicturePoint, TARGETS, Truth, fixed_colours, picture_errors};
 pub use scaling::{ScalingPanel, ScalingPoint};
 pub use table::csv;
 pub use train::{Epoch, TrainOptions, TrainReport, train};
@@ -154,8 +154,7 @@ pub fn chart(
     } else {
         None
     };
-    let scaling =
-        if options.scaling { Some(charting.with_share(0.15, |charting| scaling::panel(charting, &opened))?) } else { None };
+    let scaling = if options.scaling { Some(charting.with_share(0.15, |charting| scaling::panel(charting, &opened))?) } else { None };
     let pictures = if options.pictures { Some(picture::panel(&mut charting)?) } else { None };
     Ok(Chart {
         scene: settings.title.clone(),

@@ -155,7 +155,8 @@ pub fn picture_errors(film: &Film, truth: &Truth, [contrast, brightness, gamma]:
 /// # Errors
 /// The source cannot be opened, or the device fails.
 pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSettings, RunError> {
-    let mut setup = Setup::new(settings.clone())?;
+    // No method is asked for a picture here, and `auto` is not one.
+    let mut setup = Setup::new(with_method(settings, Method::Reference, Kind::Table))?;
     let slide = setup.slides.next_slide(&AtomicBool::new(false))?.ok_or(RunError::EndedEarly)?;
     let layers = if setup.plan.domain.dimensions == 3 { 16 } else { 1 };
     let points = stratified_points(&Strata::even([64, 64, layers], 1), settings.seed, u64::MAX);
@@ -167,11 +168,7 @@ pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSet
 }
 
 /// Runs the first slide of a scene until `seen` returns false for a frame.
-pub(super) fn still(
-    settings: Settings,
-    options: &RunOptions,
-    mut seen: impl FnMut(&Frame) -> bool + Send,
-) -> Result<usize, RunError> {
+pub(super) fn still(settings: Settings, options: &RunOptions, mut seen: impl FnMut(&Frame) -> bool + Send) -> Result<usize, RunError> {
     let mut settings = settings;
     settings.time.slides = Some(1);
     (settings.time.warmup_frames, settings.time.frames_per_slide) = (0, 1_000_000);

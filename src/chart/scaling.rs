@@ -2,9 +2,9 @@
 
 use super::ftle::Opened;
 use super::{Charting, failed};
-use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
 use crate::flow::{Extras, FlowMap, Traced};
 use crate::run::RunError;
 use crate::source::SourceKind;

@@ -2,9 +2,9 @@
 
 use super::ftle::{Opened, Points};
 use super::{failed, fixed_colours};
-use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
+use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};
 use crate::flow::Extras;
 use crate::render::{Film, Renderer, Scene};
 use crate::run::{RunError, Settings};
@@ -101,20 +101,19 @@ struct Training<'a> {
 }
 
 impl Training<'_> {
-    fn on<B: Backend>(
-        &self,
-        mut backend: B,
-        epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send),
-    ) -> Result<TrainReport, RunError> {
+    fn on<B: Backend>(&self, mut backend: B, epoch: &mut (dyn FnMut(&Epoch, Option<&Film>) + Send)) -> Result<TrainReport, RunError> {
         let Self { settings, options, opened, stop } = self;
         let (plan, slide) = (&opened.plan, &opened.slide);
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         let arrival = settings.network.target == Target::FlowMap;
         let extras = Extras { arrival, jacobian: arrival && settings.network.jacobian_weight > 0.0 };
         let began = Instant::now();
-        let labels = crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
+        let labels =
+            crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;
         let label_seconds = began.elapsed().as_secs_f64();
-        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default()).map_err(failed)?.samples;
+        let validation = crate::backend::audit::trace(&tracer, &Points::random(opened, options.validation, 7).unit, Extras::default())
+            .map_err(failed)?
+            .samples;
         let request = SurrogateRequest {
             settings: &settings.surrogate,
             network: &settings.network,
@@ -139,7 +138,8 @@ impl Training<'_> {
             let done = Epoch { epoch: number, steps, seconds, loss: learned.loss, rms, psnr, rollbacks };
             report.interrupted = stop.load(Ordering::Relaxed);
             let is_last = number == options.epochs || report.interrupted;
-            let film = if is_last || options.pictures.contains(&number) { Some(self.picture(&mut backend, &tracer, &frozen)?) } else { None };
+            let film =
+                if is_last || options.pictures.contains(&number) { Some(self.picture(&mut backend, &tracer, &frozen)?) } else { None };
             epoch(&done, film.as_ref());
             report.epochs.push(done);
             if report.interrupted {
@@ -150,12 +150,7 @@ impl Training<'_> {
     }
 
     /// A picture in which the surrogate answers everything.
-    fn picture<B: Backend>(
-        &self,
-        backend: &mut B,
-        tracer: &B::Tracer,
-        frozen: &crate::backend::FrozenOf<B>,
-    ) -> Result<Film, RunError> {
+    fn picture<B: Backend>(&self, backend: &mut B, tracer: &B::Tracer, frozen: &crate::backend::FrozenOf<B>) -> Result<Film, RunError> {
         let Self { settings, opened, stop, .. } = self;
         let domain = &opened.plan.domain;
         let scene = Scene::assemble(

@@ -1,7 +1,7 @@
 //! A short trial of methods on a scene: the choice of `method = "auto"`.
 
-use super::picture::{fixed_colours, picture_errors, still, with_method};
 use super::Truth;
+use super::picture::{fixed_colours, picture_errors, still, with_method};
 use crate::backend::Device;
 use crate::render::{Film, Method};
 use crate::run::{RunError, RunOptions, Settings};

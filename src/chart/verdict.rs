@@ -49,7 +49,8 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
         }
     }
     // The classes of methods, and from how many samples on the cheapest of each within the tolerance beats tracing.
-    let within = |prefix: &str| panel.methods.iter().filter(|point| point.method.starts_with(prefix) && point.rms <= tolerance).collect::<Vec<_>>();
+    let within =
+        |prefix: &str| panel.methods.iter().filter(|point| point.method.starts_with(prefix) && point.rms <= tolerance).collect::<Vec<_>>();
     let fastest = |points: &[&FtlePoint]| points.iter().map(|point| point.samples_per_second).fold(0.0, f64::max);
     let tracing = fastest(&within("tangent"));
     for class in ["composition", "table", "base + residual", "network"] {
@@ -60,8 +61,13 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
         };
         let from = points.iter().map(pays).fold(f64::INFINITY, f64::min);
         said.push(if points.is_empty() {
-            let best = panel.methods.iter().filter(|point| point.method.starts_with(class)).map(|point| point.rms).fold(f64::INFINITY, f64::min);
-            if best.is_finite() { format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.") } else { format!("{class}: not measured.") }
+            let best =
+                panel.methods.iter().filter(|point| point.method.starts_with(class)).map(|point| point.rms).fold(f64::INFINITY, f64::min);
+            if best.is_finite() {
+                format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.")
+            } else {
+                format!("{class}: not measured.")
+            }
         } else if from.is_finite() && tracing > 0.0 {
             format!("{class}: cheaper than tracing from {from:.1e} samples on, at {:.1} times its speed.", fastest(&points) / tracing)
         } else {

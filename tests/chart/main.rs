@@ -42,8 +42,9 @@ fn errors_fall_with_steps_and_nodes() {
     assert!(of_steps(4 * steps) < of_steps(steps) / 50.0, "{} {}", of_steps(4 * steps), of_steps(steps));
     let tables: Vec<f64> = ["64x32", "128x64", "256x128"].map(|nodes| rms("table", nodes)).to_vec();
     assert!(tables.windows(2).all(|pair| pair[1] < 0.6 * pair[0]), "{tables:?}");
-    // The published gap of 1e-6 drowns in the rounding of f32.
-    assert!(rms("differences, f32", "gap 1e-6") > 5.0 * rms("differences, f32", "gap 1e-3"));
+    // The published gap of 1e-6 drowns in the rounding of f32. In f64 only the error of the steps is left.
+    let published = rms("differences, f32", "gap 1e-6");
+    assert!(published > 3.0 * rms("differences, f32", "gap 1e-5") && published > 5.0 * rms("differences, f64", "gap 1e-6"), "{published}");
     let tolerance = number(&chart["ftle"]["tolerance"]);
     let within = methods.iter().filter(|point| number(&point["rms"]) <= tolerance);
     let cost = |point: &Value| number(&point["build_seconds"]) + 1e6 / number(&point["samples_per_second"]);
@@ -70,7 +71,8 @@ fn pictures_converge_and_the_chart_is_drawn() {
     let chart = json(&out.join("chart.json"));
     let curves = chart["pictures"]["curves"].as_array().unwrap();
     let frames = |method: &str| {
-        let curve = curves.iter().find(|curve| curve["method"] == method).unwrap_or_else(|| panic!("{method}: {:?}", chart["not_measured"]));
+        let curve =
+            curves.iter().find(|curve| curve["method"] == method).unwrap_or_else(|| panic!("{method}: {:?}", chart["not_measured"]));
         curve["frames"].as_array().unwrap().clone()
     };
     for method in ["two_level", "reference"] {
@@ -82,7 +84,8 @@ fn pictures_converge_and_the_chart_is_drawn() {
     let last = frames("two_level").pop().unwrap();
     let (stated, measured) = (number(&last["stated_psnr"]), number(&last["psnr"]));
     assert!((stated - measured).abs() < 2.5, "stated {stated} dB, measured {measured} dB");
-    let threads: Vec<f64> = chart["scaling"]["points"].as_array().unwrap().iter().filter(|p| p["axis"] == "tau").map(|p| number(&p["steps"])).collect();
+    let threads: Vec<f64> =
+        chart["scaling"]["points"].as_array().unwrap().iter().filter(|p| p["axis"] == "tau").map(|p| number(&p["steps"])).collect();
     assert!(threads.len() >= 2 && threads[0] < threads[threads.len() - 1], "a longer tau takes more steps: {threads:?}");
     let picture = image::load_from_memory(&std::fs::read(out.join("chart.png")).unwrap()).unwrap().into_rgb8();
     let coloured = picture.pixels().filter(|pixel| pixel.0.iter().max() != pixel.0.iter().min()).count();
@@ -107,7 +110,11 @@ fn a_trial_is_remembered_beside_its_scene() {
     let first = render(&[]);
     let choice = json(&folder.path().join("scene.auto.json"));
     let method = choice["choice"]["method"].as_str().unwrap().to_owned();
-    assert!(["two_level", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")), "{}", first.stderr);
+    assert!(
+        ["two_level", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")),
+        "{}",
+        first.stderr
+    );
     assert_eq!(serde_json::from_str::<Value>(&first.stdout).unwrap()["method"], method.as_str(), "the record has what rendered");
     // Another choice in the file shows that it is read, and another scene that it is not.
     let other = if method == "reference" { "two_level" } else { "reference" };
@@ -122,11 +129,13 @@ fn a_trial_is_remembered_beside_its_scene() {
 fn training_lowers_the_error_on_points_it_never_sees() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("train");
-    let network = ["--set", "surrogate.kind=network", "--set", "network.log2_table=12", "--set", "network.width=16", "--set", "network.batch=4096"];
+    let network =
+        ["--set", "surrogate.kind=network", "--set", "network.log2_table=12", "--set", "network.width=16", "--set", "network.batch=4096"];
     let given = [&network[..], &["--epochs", "12", "--labels", "65536", "--pictures", "1,3"]].concat();
     run(&mut ridgewatch(command("train", &out, &given))).success();
     let text = std::fs::read_to_string(out.join("epochs.csv")).unwrap();
-    let rows: Vec<Vec<f64>> = text.lines().skip(1).map(|line| line.split(',').map(|cell| cell.parse().unwrap_or(f64::NAN)).collect()).collect();
+    let rows: Vec<Vec<f64>> =
+        text.lines().skip(1).map(|line| line.split(',').map(|cell| cell.parse().unwrap_or(f64::NAN)).collect()).collect();
     assert_eq!(rows.len(), 12);
     // 65536 labels in batches of 4096 are 16 steps an epoch.
     assert_eq!([rows[0][1], rows[11][1]], [16.0, 192.0]);
@@ -140,6 +149,7 @@ fn training_lowers_the_error_on_points_it_never_sees() {
 #[test]
 fn what_cannot_be_charted_is_refused() {
     let folder = tempfile::tempdir().unwrap();
-    run(&mut ridgewatch(["chart", config("live.toml").as_str(), "--out", text(folder.path())])).refused(2, &["running simulation", "accepted"]);
+    run(&mut ridgewatch(["chart", config("live.toml").as_str(), "--out", text(folder.path())]))
+        .refused(2, &["running simulation", "accepted"]);
     run(&mut ridgewatch(command("chart", folder.path(), &["--only", "speed"]))).refused(2, &["speed", "ftle"]);
 }
