@@ -50,7 +50,9 @@ struct Report<'a> {
 pub fn run(common: &Common, options: &Options) -> Result<()> {
     let scene = scene(common, &options.paths)?;
     if scene.source.kind == SourceKind::Live {
-        bail!(Usage("a running simulation cannot be charted, since no moment of it comes twice; accepted: archives and closed forms".into()));
+        bail!(Usage(
+            "a running simulation cannot be charted, since no moment of it comes twice; accepted: archives and closed forms".into()
+        ));
     }
     let device = device(common, &scene)?;
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
@@ -60,7 +62,8 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         bar.set_message(format!("measuring {what}"));
     };
     let has = |panel| options.only.contains(&panel);
-    let wanted = ChartOptions { seconds: options.seconds, ftle: has(Panel::Ftle), pictures: has(Panel::Pictures), scaling: has(Panel::Scaling) };
+    let wanted =
+        ChartOptions { seconds: options.seconds, ftle: has(Panel::Ftle), pictures: has(Panel::Pictures), scaling: has(Panel::Scaling) };
     let stop = Stop::default();
     stop.watch(Some(STOP_WITHIN), || ());
     let chart = chart(&scene.settings(), &wanted, &device, common.threads, &tell, &stop.requested)

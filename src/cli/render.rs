@@ -75,12 +75,7 @@ pub fn run(common: &Common, options: Options) -> Result<()> {
     settle_method(common, &mut scene, &options.paths, &device)?;
     check_learns(&scene, "--resume", options.resume.as_deref())?;
     scene.training.resume = options.resume.clone().or(scene.training.resume);
-    let run_options = RunOptions {
-        verify_points: options.verify as usize,
-        threads: common.threads,
-        device,
-        ..RunOptions::default()
-    };
+    let run_options = RunOptions { verify_points: options.verify as usize, threads: common.threads, device, ..RunOptions::default() };
     let scene_text = scene.to_toml()?;
     let setup = open(&scene)?;
     let bar = messages::progress(Some(100));

@@ -41,10 +41,14 @@ pub fn run(common: &Common, options: &Options) -> Result<()> {
         bail!(Usage("a running simulation has no still window to train on; accepted: archives and closed forms".into()));
     }
     if scene.surrogate.kind == Kind::Table {
-        bail!(Usage("a table is not trained; accepted: a scene with surrogate.kind network or residual (--set surrogate.kind=network)".into()));
+        bail!(Usage(
+            "a table is not trained; accepted: a scene with surrogate.kind network or residual (--set surrogate.kind=network)".into()
+        ));
     }
     if !scene.network.inputs.is_empty() {
-        bail!(Usage("network.inputs is given, and a still window has one start time and duration; accepted: a network over positions".into()));
+        bail!(Usage(
+            "network.inputs is given, and a still window has one start time and duration; accepted: a network over positions".into()
+        ));
     }
     let device = device(common, &scene)?;
     std::fs::create_dir_all(&options.out).with_context(|| format!("cannot make the folder {}", options.out.display()))?;
