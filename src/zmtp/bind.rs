@@ -1,16 +1,22 @@
 //! Endpoints: `tcp://HOST:PORT`, `ipc://PATH`, and the place that only this user reaches.
 
 use rustix::fs::{FlockOperation, flock};
+use rustix::io::Errno;
 use std::fs::{DirBuilder, File, Permissions};
 use std::io::{self, ErrorKind};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 use thiserror::Error;
 
 /// Maximum length of the path of a Unix socket, in bytes.
 const MAX_PATH: usize = 107;
+/// Longest wait for the lock of a socket's folder. Programs like this one hold it for a moment; whoever may read the folder can hold it for ever.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause between two attempts to take it.
+const PAUSE: Duration = Duration::from_millis(10);
 
 /// Whose connections are accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -37,6 +43,15 @@ pub enum BindError {
         path: PathBuf,
         /// What was found.
         found: String,
+    },
+    /// Another process keeps the folder of a socket locked.
+    #[error(
+        "{path} has been locked by another process for {LOCK_TIMEOUT:?}; accepted: a folder that only this user may read",
+        path = path.display()
+    )]
+    Locked {
+        /// The folder.
+        path: PathBuf,
     },
     /// An error of the system.
     #[error(transparent)]
@@ -119,9 +134,8 @@ fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
             "the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"
         )));
     }
-    let folder = File::open(path.parent().unwrap_or(path))?;
     // Two programs must not take each other's new socket for a left one.
-    flock(&folder, FlockOperation::LockExclusive).map_err(io::Error::from)?;
+    let _lock = lock_folder(path.parent().unwrap_or(path))?;
     let listener = match UnixListener::bind(path) {
         Err(error) if error.kind() == ErrorKind::AddrInUse => {
             remove_left(path)?;
@@ -131,6 +145,19 @@ fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
     };
     let about = std::fs::symlink_metadata(path)?;
     Ok((listener, SocketFile { path: path.to_owned(), identity: (about.dev(), about.ino()) }))
+}
+
+/// Locks a folder until the value is dropped.
+fn lock_folder(path: &Path) -> Result<File, BindError> {
+    let (folder, begin) = (File::open(path)?, Instant::now());
+    loop {
+        match flock(&folder, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Ok(folder),
+            Err(Errno::WOULDBLOCK) if begin.elapsed() < LOCK_TIMEOUT => std::thread::sleep(PAUSE),
+            Err(Errno::WOULDBLOCK) => return Err(BindError::Locked { path: path.to_owned() }),
+            Err(error) => return Err(io::Error::from(error).into()),
+        }
+    }
 }
 
 /// Removes a socket of this user that an ended program left.
@@ -259,5 +286,25 @@ mod tests {
         std::os::unix::fs::symlink(folder.path(), folder.path().join("link")).unwrap();
         assert!(private_in(&folder.path().join("link"), "frames").unwrap_err().to_string().contains("no folder"));
         assert!(private_in(&folder.path().join("missing/own"), "frames").is_err());
+    }
+
+    #[test]
+    fn a_folder_that_somebody_keeps_locked_is_refused_in_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let endpoint = format!("ipc://{}/frames", folder.path().display());
+        let theirs = File::open(folder.path()).unwrap();
+        flock(&theirs, FlockOperation::LockExclusive).unwrap();
+        let (send, receive) = std::sync::mpsc::channel();
+        let (binding, path) = (endpoint.clone(), folder.path().display().to_string());
+        std::thread::spawn(move || send.send(Bound::open(&binding).map(drop)));
+        let error = receive.recv_timeout(10 * LOCK_TIMEOUT).unwrap().unwrap_err().to_string();
+        assert!(error.contains(&path) && error.contains("locked by another process"), "{error}");
+        // A lock that is held for a moment is waited for.
+        let late = std::thread::spawn(move || {
+            std::thread::sleep(5 * PAUSE);
+            drop(theirs);
+        });
+        Bound::open(&endpoint).unwrap();
+        late.join().unwrap();
     }
 }
