@@ -1,10 +1,11 @@
 //! Endpoints: `tcp://HOST:PORT`, `ipc://PATH`, and the place that only this user reaches.
 
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{CWD, FlockOperation, Mode, OFlags, flock, openat};
 use rustix::io::Errno;
 use std::fs::{DirBuilder, File, Permissions};
 use std::io::{self, ErrorKind};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
@@ -72,6 +73,19 @@ pub(crate) struct SocketFile {
     identity: (u64, u64),
 }
 
+impl SocketFile {
+    /// Changes the mode of the socket, and of nothing else that has its name by now.
+    fn set_mode(&self, mode: u32) -> io::Result<()> {
+        let file: File = openat(CWD, &self.path, OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC, Mode::empty())?.into();
+        let about = file.metadata()?;
+        if (about.dev(), about.ino()) != self.identity {
+            return Err(io::Error::other(format!("{} was replaced", self.path.display())));
+        }
+        // `fchmod` refuses descriptors of O_PATH, and no other can be opened for a socket. This link leads to the open file, whatever its name.
+        std::fs::set_permissions(format!("/proc/self/fd/{}", file.as_raw_fd()), Permissions::from_mode(mode))
+    }
+}
+
 impl Drop for SocketFile {
     fn drop(&mut self) {
         let about = std::fs::symlink_metadata(&self.path);
@@ -116,9 +130,7 @@ impl Bound {
     pub fn open_to(&self, peers: Peers) -> io::Result<()> {
         match self {
             Self::Tcp(_) => Ok(()),
-            Self::Unix(_, file) => {
-                std::fs::set_permissions(&file.path, Permissions::from_mode(if peers == Peers::User { 0o600 } else { 0o666 }))
-            }
+            Self::Unix(_, file) => file.set_mode(if peers == Peers::User { 0o600 } else { 0o666 }),
         }
     }
 }
@@ -306,5 +318,21 @@ mod tests {
         });
         Bound::open(&endpoint).unwrap();
         late.join().unwrap();
+    }
+
+    #[test]
+    fn the_mode_of_nothing_but_the_socket_is_changed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, victim) = (folder.path().join("frames"), folder.path().join("victim"));
+        std::fs::write(&victim, "").unwrap();
+        std::fs::set_permissions(&victim, Permissions::from_mode(0o640)).unwrap();
+        let (bound, _) = Bound::open(&format!("ipc://{}", path.display())).unwrap();
+        std::fs::rename(&path, folder.path().join("old")).unwrap();
+        std::os::unix::fs::symlink(&victim, &path).unwrap();
+        assert!(bound.open_to(Peers::Any).unwrap_err().to_string().contains("was replaced"));
+        std::fs::remove_file(&path).unwrap();
+        std::fs::hard_link(&victim, &path).unwrap();
+        assert!(bound.open_to(Peers::Any).is_err());
+        assert_eq!(victim.metadata().unwrap().mode() & 0o777, 0o640);
     }
 }
