@@ -45,6 +45,19 @@ pub enum BindError {
         /// What was found.
         found: String,
     },
+    /// The folder of the private socket cannot be used, because another user has made it for instance.
+    #[error(
+        "{path} {found}; accepted: a folder of user {user} with mode 0700 (set XDG_RUNTIME_DIR to such a folder, or name a socket in one: ipc://PATH)",
+        path = path.display()
+    )]
+    NotPrivate {
+        /// The folder.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+        /// User of this process.
+        user: u32,
+    },
     /// Another process keeps the folder of a socket locked.
     #[error(
         "{path} has been locked by another process for {LOCK_TIMEOUT:?}; accepted: a folder that only this user may read",
@@ -193,43 +206,43 @@ fn user() -> u32 {
 }
 
 /// Endpoint of a Unix socket in a folder that only this user enters: `$XDG_RUNTIME_DIR/ridgewatch` if the system has made that variable's folder
-/// for this user, else `/dev/shm/ridgewatch-$USER`. Creates the folder.
+/// for this user, else `/dev/shm/ridgewatch-UID`. Creates the folder.
 ///
 /// # Errors
 /// The folder cannot be created, or others have rights to it.
 pub fn private_endpoint(name: &str) -> Result<String, BindError> {
-    let runtime =
-        std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute() && check_private(folder).is_ok());
-    let folder = match runtime {
+    private_in(&private_folder(std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from)), name)
+}
+
+/// By the number of the user: names of users in the environment may be those of others, after `su` for instance.
+fn private_folder(runtime: Option<PathBuf>) -> PathBuf {
+    match runtime.filter(|folder| folder.is_absolute() && check_private(folder).is_ok()) {
         Some(folder) => folder.join("ridgewatch"),
-        None => {
-            let name = std::env::var("USER").ok().filter(|name| !name.is_empty() && !name.contains('/'));
-            PathBuf::from(format!("/dev/shm/ridgewatch-{}", name.unwrap_or_else(|| user().to_string())))
-        }
-    };
-    private_in(&folder, name)
+        None => PathBuf::from(format!("/dev/shm/ridgewatch-{}", user())),
+    }
 }
 
 fn private_in(folder: &Path, name: &str) -> Result<String, BindError> {
-    match DirBuilder::new().mode(0o700).create(folder) {
-        Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error.into()),
-        _ => check_private(folder)?,
-    }
+    let checked = match DirBuilder::new().mode(0o700).create(folder) {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists => Err(format!("cannot be created: {error}")),
+        _ => check_private(folder),
+    };
+    checked.map_err(|found| BindError::NotPrivate { path: folder.to_owned(), found, user: user() })?;
     Ok(format!("ipc://{}", folder.join(name).display()))
 }
 
-fn check_private(folder: &Path) -> Result<(), BindError> {
-    let about = std::fs::symlink_metadata(folder)?;
-    let found = if !about.is_dir() {
-        "is no folder".to_owned()
+/// Checks that a folder is this user's alone. The error is what was found.
+fn check_private(folder: &Path) -> Result<(), String> {
+    let about = std::fs::symlink_metadata(folder).map_err(|error| format!("cannot be examined: {error}"))?;
+    if !about.is_dir() {
+        Err("is no folder".to_owned())
     } else if about.uid() != user() {
-        format!("belongs to user {}", about.uid())
+        Err(format!("belongs to user {}", about.uid()))
     } else if about.mode() & 0o077 != 0 {
-        format!("has mode {:04o}", about.mode() & 0o7777)
+        Err(format!("has mode {:04o}", about.mode() & 0o7777))
     } else {
-        return Ok(());
-    };
-    Err(BindError::Foreign { path: folder.to_owned(), found })
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -297,7 +310,32 @@ mod tests {
         assert!(error.contains("mode 0755"), "{error}");
         std::os::unix::fs::symlink(folder.path(), folder.path().join("link")).unwrap();
         assert!(private_in(&folder.path().join("link"), "frames").unwrap_err().to_string().contains("no folder"));
-        assert!(private_in(&folder.path().join("missing/own"), "frames").is_err());
+        assert!(
+            private_in(&folder.path().join("missing/own"), "frames").unwrap_err().to_string().contains("missing/own cannot be created")
+        );
+    }
+
+    #[test]
+    fn a_private_folder_that_another_user_made_first_is_refused_with_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let taken = folder.path().join("taken");
+        std::fs::write(&taken, "").unwrap();
+        // Only root can make a folder of another user; a file in the way is refused likewise.
+        if user() == 0 {
+            std::fs::remove_file(&taken).unwrap();
+            std::fs::create_dir(&taken).unwrap();
+            std::os::unix::fs::chown(&taken, Some(4711), None).unwrap();
+        }
+        let error = private_in(&taken, "frames").unwrap_err().to_string();
+        let found = if user() == 0 { "belongs to user 4711" } else { "is no folder" };
+        for part in [taken.to_str().unwrap(), found, "with mode 0700", "XDG_RUNTIME_DIR", "ipc://PATH"] {
+            assert!(error.contains(part), "{error}");
+        }
+        // The same folder in every environment of this user.
+        let shared = PathBuf::from(format!("/dev/shm/ridgewatch-{}", user()));
+        assert_eq!([None, Some(taken), Some("run".into())].map(private_folder), [(); 3].map(|()| shared.clone()));
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o700)).unwrap();
+        assert_eq!(private_folder(Some(folder.path().to_owned())), folder.path().join("ridgewatch"));
     }
 
     #[test]
