@@ -29,7 +29,7 @@ const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
 /// Locked by the run that writes, and by nobody once its process has ended. It stays.
-const LOCK: &str = ".lock";
+const LOCK: &str = ".ridgewatch.lock";
 /// Attempts to take the lock, and the pause between them: another process holds it for a moment while it looks for a vacant folder.
 const ATTEMPTS: usize = 5;
 const PAUSE: Duration = Duration::from_millis(20);
@@ -481,6 +481,17 @@ mod tests {
         assert_eq!(RunFolder::vacant(&path).unwrap(), folder.path().join("run-2"), "it has no frame yet");
         drop(run);
         RunFolder::create(&RunFolder::vacant(&path).unwrap(), false).unwrap();
+    }
+
+    #[test]
+    fn a_lock_of_another_program_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join(".lock"), "theirs").unwrap();
+        let other = Folder::open(folder.path()).unwrap();
+        let _held = other.lock(".lock").unwrap();
+        fs::write(folder.path().join(".lock"), "theirs").unwrap();
+        drop(RunFolder::create(folder.path(), false).unwrap());
+        assert_eq!(fs::read(folder.path().join(".lock")).unwrap(), b"theirs");
     }
 
     #[test]
