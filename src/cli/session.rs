@@ -5,7 +5,7 @@ use super::common::{
 };
 use super::signals::Stop;
 use super::{messages, notify};
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
 use ridgewatch::render::Method;
@@ -137,7 +137,7 @@ impl Session<'_> {
         let mut folder = folder?;
         let out = folder.path().to_owned();
         if let Err(error) = folder.write_scene(if follows { "attach" } else { "replay" }, &text) {
-            folder.restore_previous().with_context(|| format!("{}: the previous run cannot be restored", out.display()))?;
+            folder.give_up();
             return Err(error.into());
         }
         output.write_to(folder, &publish)?;

@@ -182,14 +182,20 @@ impl RunFolder {
         })
     }
 
-    /// Moves the files of the previous run back and gives up this run. Returns whether there was a previous run.
-    ///
-    /// # Errors
-    /// Errors of the system; files that could not be moved stay in `.previous`.
-    pub fn restore_previous(&mut self) -> io::Result<bool> {
+    /// Moves the files of the previous run back. Returns whether there was a previous run. After an error, files that could not be moved stay in
+    /// `.previous`.
+    fn restore_previous(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
         restore(&self.folder, &self.frames, &previous)?;
         Ok(true)
+    }
+
+    /// Moves the files of the previous run back, for a run that ends without a frame. Errors are warnings. Returns whether there was one.
+    pub fn give_up(&mut self) -> bool {
+        self.restore_previous().unwrap_or_else(|error| {
+            tracing::warn!("{}: the previous run cannot be restored: {error}", self.path().display());
+            false
+        })
     }
 
     /// The folder.
