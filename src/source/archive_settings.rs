@@ -181,6 +181,14 @@ pub struct ArchiveSettings {
     /// decided by their standard names.
     pub grid_relative: Option<bool>,
     /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
+    /// Mask of land: a variable (0 is land unless its attributes say otherwise; `!NAME`: 0 is water), `"zero"` (nodes whose velocity is 0 at
+    /// all sampled times) or `"none"`; by default found by convention.
+    pub mask: Option<String>,
+    /// Entry, counted from 0, of a dimension that is neither time nor an axis, such as the member of an ensemble; of time, the only time that
+    /// is read.
+    pub select: Option<BTreeMap<String, usize>>,
+    /// Units of `u`, `v`, `w`, `x`, `y`, `z` or `time` where those of the files are missing or wrong.
+    pub units: Option<BTreeMap<String, String>>,
     pub external: bool,
     /// Most memory that reading may need, in GiB; by default nine tenths of what is free.
     pub memory_gib: Option<f64>,

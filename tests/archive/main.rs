@@ -6,6 +6,7 @@ mod hdf5;
 mod hemispheres;
 #[path = "../kit/mod.rs"]
 mod kit;
+mod land;
 mod netcdf;
 mod real;
 mod refused;

@@ -72,6 +72,9 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         }
     }
     let repeats = |text: &str| if hdf5 { !text.is_empty() && text.bytes().all(|b| b"xyzXYZ".contains(&b)) } else { text == "none" };
+        ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("mask", s.mask.is_some(), !staggered, "left out with WRF output, whose winds blow over land too"),
     match s.periodic.as_deref().filter(|text| !repeats(text)) {
         None => Ok(()),
         Some(text) => {

@@ -326,7 +326,17 @@ impl Planner<'_> {
         let factor = if self.settings.velocity_unit == VelocityUnit::Cells { 1.0 } else { unit.map_or(1.0, |u| u.factor) };
         let why = part.map_or_else(|| why.to_owned(), |part| format!("component {part} of {why}"));
         let roles = shape.order.iter().map(role).collect();
-        Ok(ComponentPlan { name: v.name.clone(), shape: found, roles, packing: self.packing(variable)?, factor, why })
+        Ok(ComponentPlan {
+            name: v.name.clone(),
+            shape: found,
+            dimensions: self.dimensions_of(variable),
+            roles,
+            packing: self.packing(variable)?,
+            factor,
+            why,
+            of_water: false,
+            mask: None,
+        })
     }
 
     /// Times of all frames: by a dataset or attribute that holds them, or by the numbers in names. `along_axis` is the length of the

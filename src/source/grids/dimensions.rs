@@ -59,6 +59,16 @@ impl Planner<'_> {
         let mut extents = Vec::new();
         let mut squeezed = Vec::new();
         for &dimension in &self.variable(u).dimensions {
+        for (name, &entry) in s.select.iter().flatten() {
+            let found = self.variable(u).dimensions.iter().map(|&d| &self.listing().dimensions[d]).find(|d| d.name == *name);
+            if found.is_none_or(|d| entry >= d.len) {
+                let accepted = match found {
+                    Some(d) => format!("entries of `{name}` are counted from 0 to {}", d.len.saturating_sub(1)),
+                    None => format!("dimensions of `{}` are {}", self.variable(u).name, self.dimensions_of(u).join(", ")),
+                };
+                return Err(SourceError::setting("select", format!("{{ {name} = {entry} }}"), accepted));
+            }
+        }
             let known = overrides.iter().find(|o| o.dimension == dimension);
             let extent = known.copied().unwrap_or_else(|| self.measured(dimension));
             let found = &self.listing().dimensions[dimension];

@@ -3,6 +3,7 @@
 use super::axes::{AxisPlan, Quantity};
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
+use super::mask::is_of_water;
 use super::poles::Poles;
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
@@ -37,6 +38,27 @@ impl<'a> Planner<'a> {
 
     pub fn shape(&self, index: usize) -> Vec<usize> {
         self.listing().shape(self.variable(index))
+    }
+
+    /// Entry that is read of a dimension that is no axis.
+    pub fn entry_of(&self, dimension: usize) -> usize {
+        self.settings.entry(&self.listing().dimensions[dimension].name).unwrap_or(0)
+    }
+
+    /// Unit of a coordinate along an axis: the one that the settings state, else the file's.
+    pub fn axis_units(&self, kind: Kind, index: usize) -> Option<&'a str> {
+        let stated = match kind {
+            Kind::Longitude | Kind::X => self.settings.unit("x"),
+            Kind::Latitude | Kind::Y => self.settings.unit("y"),
+            Kind::Level => self.settings.unit("z"),
+            _ => None,
+        };
+        stated.or_else(|| self.variable(index).units())
+    }
+
+    /// Names of the dimensions of a variable.
+    pub fn dimensions_of(&self, index: usize) -> Vec<String> {
+        self.variable(index).dimensions.iter().map(|&d| self.listing().dimensions[d].name.clone()).collect()
     }
 
     pub fn path(&self) -> &'a Path {
@@ -159,6 +181,9 @@ impl<'a> Planner<'a> {
         let component = candidate.component.name();
         let text = variable.units().unwrap_or_default();
         let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
+            dimensions: self.dimensions_of(candidate.variable),
+            of_water: is_of_water(self.listing(), variable),
+            mask: None,
         match Unit::parse(text) {
             Some(u) if u.is_dimensionless() => {
                 self.note(format!("{component}: `{}` has no unit: taken as SI", variable.name));

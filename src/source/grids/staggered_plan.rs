@@ -48,7 +48,8 @@ impl Planner<'_> {
             _ => Role::Fixed(0),
         };
         let (roles, packing) = ((0..rank).map(role).collect(), self.packing(variable)?);
-        Ok(ComponentPlan { name: v.name.clone(), shape: self.shape(variable), roles, packing, factor, why: why.into() })
+        let (shape, dimensions) = (self.shape(variable), self.dimensions_of(variable));
+        Ok(ComponentPlan { name: v.name.clone(), shape, dimensions, roles, packing, factor, why: why.into(), of_water: false, mask: None })
     }
 
     /// Plans WRF output. All files of an archive share the domain and the heights of the first.
@@ -131,7 +132,7 @@ impl Planner<'_> {
             staggered.heights.len(),
             staggered.heights.first().copied().unwrap_or(0.0),
             staggered.heights.last().copied().unwrap_or(0.0),
-            if s.heights.is_some() { "as set" } else { "the mean heights of its full and half levels; others with `heights`" }
+            if s.heights.is_some() { "as set" } else { "the mean heights of its full and half levels; others with archive.heights" }
         );
         self.note(staggered.what.clone());
         self.note(match staggered.scale {
