@@ -4,6 +4,7 @@ use crate::error::SourceError;
 use crate::formats::Limits;
 use ridgewatch_base::memory::gib;
 use serde::{Deserialize, Deserializer, Serialize};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Conversion of coordinates to lengths.
@@ -198,7 +199,25 @@ pub struct ArchiveSettings {
     pub slab: Option<[f64; 2]>,
 }
 
+/// Quantities whose unit can be stated.
+pub const WITH_UNITS: [&str; 7] = ["u", "v", "w", "x", "y", "z", "time"];
+
 impl ArchiveSettings {
+    /// Unit that is stated for one of [`WITH_UNITS`].
+    pub(super) fn unit(&self, of: &str) -> Option<&str> {
+        self.units.as_ref()?.get(of).map(String::as_str)
+    }
+
+    /// Units that are stated for u, v and w.
+    pub(super) fn velocity_units(&self) -> [Option<&str>; 3] {
+        ["u", "v", "w"].map(|of| self.unit(of))
+    }
+
+    /// Entry that is picked of a dimension.
+    pub(super) fn entry(&self, dimension: &str) -> Option<usize> {
+        self.select.as_ref()?.get(dimension).copied()
+    }
+
     /// Compares the bytes of a window with the memory that reading may need.
     ///
     /// # Errors

@@ -8,6 +8,7 @@ mod hemispheres;
 mod kit;
 mod land;
 mod netcdf;
+mod odd;
 mod real;
 mod refused;
 mod resampled;

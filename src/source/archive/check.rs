@@ -1,6 +1,6 @@
 //! Checks of the archive settings: by themselves, and against the files.
 
-use crate::archive_settings::{ArchiveSettings, Metric, Staggering};
+use crate::archive_settings::{ArchiveSettings, Metric, Staggering, WITH_UNITS};
 use crate::error::SourceError;
 use crate::formats::Format;
 use crate::grids::{Layout, Resampling};
@@ -30,6 +30,13 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
         && !(gib.is_finite() && gib > 0.0)
     {
         return fault("memory_gib", gib.to_string(), "a number above 0");
+    }
+    if let Some(odd) = settings.units.iter().flatten().find(|(of, _)| !WITH_UNITS.contains(&of.as_str())) {
+        return fault(
+            "units",
+            format!("{{ {} = {:?} }}", odd.0, odd.1),
+            "units of u, v, w, x, y, z and time: --set archive.units.u=\"m s-1\"",
+        );
     }
     if settings.level.is_some_and(|l| !l.is_finite()) {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");

@@ -159,7 +159,7 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
         file,
         files: files.len(),
         format: first.listing.format.name().into(),
-        variables: variables(&first.listing),
+        variables: variables(&first.listing, settings),
         problem: None,
         refused: None,
         source: None,
@@ -197,7 +197,7 @@ impl AxisReport {
     }
 }
 
-fn variables(listing: &Listing) -> Vec<VariableReport> {
+fn variables(listing: &Listing, settings: &ArchiveSettings) -> Vec<VariableReport> {
     let report = |i: usize| {
         let variable = &listing.variables[i];
         VariableReport {
@@ -206,7 +206,7 @@ fn variables(listing: &Listing) -> Vec<VariableReport> {
             dimensions: variable.dimensions.iter().map(|&d| (listing.dimensions[d].name.clone(), listing.dimensions[d].len)).collect(),
             units: variable.units().map(str::to_owned),
             role: None,
-            why: match velocity::judge(listing, i) {
+            why: match velocity::judge(listing, i, settings.velocity_units()) {
                 Ok(candidate) => format!("may be {}, but another was chosen: {}", candidate.component.name(), candidate.why),
                 Err(lacks) => lacks,
             },

@@ -77,7 +77,7 @@ pub fn classify_name(name: &str) -> Kind {
         "y" | "yc" | "ny" | "northing" | "south_north" | "yu_ocean" | "yt_ocean" | "ycoor" | "y_coordinate" => Kind::Y,
         "z" | "zc" | "nz" | "lev" | "level" | "levels" | "plev" | "pressure" | "pressure_level" | "isobaric" | "depth" | "deptht"
         | "depthu" | "depthv" | "depthw" | "height" | "altitude" | "bottom_top" | "st_ocean" | "s_rho" | "sigma" | "zcoor" => Kind::Level,
-        "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" => Kind::Time,
+        "time" | "times" | "t" | "nt" | "ocean_time" | "valid_time" | "xtime" | "time_counter" | "month" | "months" => Kind::Time,
         _ => Kind::Unknown,
     }
 }

@@ -240,7 +240,7 @@ impl Planner<'_> {
         }
         let letters = if interleaved { "x, y, c (component)" } else { "x and y" };
         let what = format!(
-            "it has {rank} axes{}; give `order = \"...\"`, one letter for each axis, slowest first: {letters}, and z, t (time) or `-` (one entry) for the others",
+            "it has {rank} axes{}; give --set archive.order=LETTERS, one letter for each axis, slowest first: {letters}, and z, t (time) or `-` (one entry) for the others",
             if text.is_empty() { String::new() } else { format!(", which `{text}` does not describe") }
         );
         Err(self.misfit(variable, what))

@@ -2,6 +2,7 @@
 
 use super::planner::Planner;
 use crate::cf::coordinate::{Kind, classify, classify_name};
+use crate::cf::units::Unit;
 use crate::error::SourceError;
 use crate::formats::NumberType;
 
@@ -74,6 +75,13 @@ impl Planner<'_> {
             let found = &self.listing().dimensions[dimension];
             if found.len == 1 && !extent.kind.is_horizontal() && extent.kind != Kind::Time {
                 squeezed.push(found.name.as_str());
+            if let (Some(entry), false) = (s.entry(&found.name), extent.kind == Kind::Time) {
+                let value = extent.coordinate.map(|c| self.coordinate_values(c)).transpose()?.and_then(|values| values.get(entry).copied());
+                let value = value.map_or_else(String::new, |value| format!(" ({value})"));
+                self.note(format!("entry {entry}{value} of `{}`, as set", found.name));
+                continue;
+            }
+            extent.kind = self.stated_kind(extent);
             } else {
                 extents.push(extent);
             }
@@ -86,6 +94,20 @@ impl Planner<'_> {
 
     /// A dimension with its coordinate variable and what it measures, regardless of the settings.
     pub fn measured(&self, dimension: usize) -> Extent {
+    /// What a dimension measures if the settings state its unit: degrees make a longitude or latitude, metres do not.
+    fn stated_kind(&self, extent: Extent) -> Kind {
+        let Some(unit) = extent.coordinate.and_then(|c| self.axis_units(extent.kind, c)) else { return extent.kind };
+        let angle = unit.to_ascii_lowercase().starts_with("degree") || unit.to_ascii_lowercase().starts_with("radian");
+        let length = Unit::parse(unit).is_some_and(|u| u.is_length());
+        match extent.kind {
+            Kind::X if angle => Kind::Longitude,
+            Kind::Y if angle => Kind::Latitude,
+            Kind::Longitude if length => Kind::X,
+            Kind::Latitude if length => Kind::Y,
+            other => other,
+        }
+    }
+
         let name = &self.listing().dimensions[dimension].name;
         let candidates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
         let first = |fits: &dyn Fn(usize) -> bool| candidates.iter().copied().find(|&i| fits(i));
@@ -112,8 +134,9 @@ impl Planner<'_> {
                 (Kind::Level, "z")
             } else {
                 let what = format!(
-                    "dimension `{}` has {} entries, but is neither time nor x, y or level; name the axes with `x`, `y`, `z`, `time`",
-                    dimension.name, dimension.len
+                    "dimension `{}` has {} entries, but is neither time nor x, y or level; pick one entry with --set archive.select.{}=0, or \
+                     name the axes with --set archive.x=NAME, archive.y, archive.z, archive.time",
+                    dimension.name, dimension.len, dimension.name
                 );
                 return Err(self.misfit(u, what));
             };

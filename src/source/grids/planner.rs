@@ -97,13 +97,20 @@ impl<'a> Planner<'a> {
         let listing = self.listing();
         let line = |i: usize| {
             let variable = self.variable(i);
-            let verdict = match judge(listing, i) {
+            let verdict = match judge(listing, i, self.settings.velocity_units()) {
                 Ok(candidate) => format!("may be {} ({})", candidate.component.name(), candidate.why),
                 Err(lacks) => lacks,
             };
             format!("  {} ({}): {verdict}", variable.name, listing.dimension_names(variable))
         };
-        let candidates = (0..listing.variables.len()).map(line).collect::<Vec<_>>().join("\n");
+        let mut shown: Vec<usize> = listing.matching(|v| v.dimensions.len() > 1).collect();
+        let rank = |i: usize| (judge(listing, i, self.settings.velocity_units()).is_err(), !may_be_named(self.variable(i)));
+        shown.sort_by_key(|&i| rank(i));
+        let mut candidates: Vec<String> = shown.iter().map(|&i| line(i)).collect();
+        match listing.variables.len() - shown.len() {
+            0 => {}
+            others => candidates.push(format!("  and {others} variables of fewer than two dimensions")),
+        }
         self.fault(format!(
             "no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
              Variables in the file:\n{candidates}"
@@ -161,7 +168,8 @@ impl<'a> Planner<'a> {
         axis: Option<&AxisPlan>,
     ) -> Result<ComponentPlan, SourceError> {
         let variable = self.variable(candidate.variable);
-        let role = |d: &usize| roles.iter().find(|r| r.0 == *d).map_or(Role::Fixed(0), |r| r.1);
+        let roles =
+            variable.dimensions.iter().map(|&d| roles.iter().find(|r| r.0 == d).map_or(Role::Fixed(self.entry_of(d)), |r| r.1)).collect();
         Ok(ComponentPlan {
             factor: self.velocity_factor(candidate, axis)?,
             name: variable.name.clone(),
@@ -179,7 +187,7 @@ impl<'a> Planner<'a> {
         }
         let variable = self.variable(candidate.variable);
         let component = candidate.component.name();
-        let text = variable.units().unwrap_or_default();
+        let text = self.settings.unit(component).or(variable.units()).unwrap_or_default();
         let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
             dimensions: self.dimensions_of(candidate.variable),
             of_water: is_of_water(self.listing(), variable),
@@ -195,11 +203,15 @@ impl<'a> Planner<'a> {
                 let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
                 let hint = if component == "w" { ", or ignore vertical motion with `w = \"none\"`" } else { "" };
                 let what = format!(
-                    "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with `{component} = \"...\"`{hint}"
+                    "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with --set archive.{component}=NAME{hint}"
                 );
                 Err(self.misfit(candidate.variable, what))
             }
-            _ => Err(self.fault(format!("variable `{}` has unit `{text}`; accepted are {VELOCITY_UNITS}", variable.name))),
+            _ => Err(self.fault(format!(
+                "variable `{}` has unit `{text}`; accepted are {VELOCITY_UNITS}. If the file is wrong, state it with --set \
+                 archive.units.{component}=\"m s-1\"",
+                variable.name
+            ))),
         }
     }
 

@@ -21,7 +21,7 @@ impl Planner<'_> {
         let ignore_w = s.w.as_deref() == Some("none");
         let w = if ignore_w { None } else { self.named("w", &s.w)? };
         let fixed = [self.named("u", &s.u)?, self.named("v", &s.v)?, w];
-        let found = velocity::choose(self.listing(), fixed, ignore_w).map_err(|lacking| self.no_velocity(&lacking))?;
+        let found = velocity::choose(self.listing(), fixed, ignore_w, s.velocity_units()).map_err(|lacking| self.no_velocity(&lacking))?;
         let mut names: Vec<String> = found.others.iter().map(|o| format!("`{}`", self.variable(o.variable).name)).collect();
         if !names.is_empty() {
             names.dedup();
@@ -90,7 +90,7 @@ impl Planner<'_> {
         let has = |kind| extents.iter().any(|e| e.kind == kind);
         let sphere = has(Kind::Longitude) && has(Kind::Latitude);
         let level = extents.iter().find(|e| e.kind == Kind::Level).and_then(|e| e.coordinate);
-        let unit = level.and_then(|c| Unit::parse(self.variable(c).units().unwrap_or_default()));
+        let unit = level.and_then(|c| Unit::parse(self.axis_units(Kind::Level, c).unwrap_or_default()));
         let measured = unit.is_some_and(|u| u.is_length() || u.is_pressure());
         let fault = |found: &str, accepted: &str| Err(SourceError::setting("metric", found, accepted));
         match (self.settings.metric, self.settings.velocity_unit) {
@@ -132,7 +132,9 @@ impl Planner<'_> {
             return Ok(AxisPlan { notes, ..AxisPlan::made(extent.kind, axis, Quantity::None) });
         };
         let values = self.coordinate_values(coordinate)?;
-        Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values).plan(range, self.wants_periodic())
+        let units = self.axis_units(extent.kind, coordinate);
+        let coordinates = Coordinates { units, ..Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values) };
+        coordinates.plan(range, self.wants_periodic())
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {
