@@ -43,11 +43,13 @@ impl Planner<'_> {
     pub fn extents(&mut self, u: usize) -> Result<Vec<Extent>, SourceError> {
         let s = self.settings;
         let mut overrides = Vec::new();
+        let is_pair = self.named_pair()?.is_some();
         for (key, name, kind) in [("x", &s.x, Kind::X), ("y", &s.y, Kind::Y), ("z", &s.z, Kind::Level), ("time", &s.time, Kind::Time)] {
             // A scalar time variable is found later.
             let variable = name.as_ref().and_then(|n| self.listing().find(n));
             let scalar = key == "time" && variable.is_some_and(|v| self.variable(v).dimensions.is_empty());
-            if let Some((dimension, coordinate)) = if scalar { None } else { self.named_axis(key, name)? } {
+            let aside = scalar || (is_pair && matches!(key, "x" | "y"));
+            if let Some((dimension, coordinate)) = if aside { None } else { self.named_axis(key, name)? } {
                 // The setting says which axis it is, the file whether it is an angle.
                 let kind = match (kind, coordinate.map(|c| classify(self.variable(c)))) {
                     (Kind::X, Some(Kind::Longitude)) => Kind::Longitude,
