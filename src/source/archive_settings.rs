@@ -181,7 +181,6 @@ pub struct ArchiveSettings {
     /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
     /// decided by their standard names.
     pub grid_relative: Option<bool>,
-    /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
     /// Mask of land: a variable (0 is land unless its attributes say otherwise; `!NAME`: 0 is water), `"zero"` (nodes whose velocity is 0 at
     /// all sampled times) or `"none"`; by default found by convention.
     pub mask: Option<String>,
@@ -190,6 +189,7 @@ pub struct ArchiveSettings {
     pub select: Option<BTreeMap<String, usize>>,
     /// Units of `u`, `v`, `w`, `x`, `y`, `z` or `time` where those of the files are missing or wrong.
     pub units: Option<BTreeMap<String, String>>,
+    /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
     pub external: bool,
     /// Most memory that reading may need, in GiB; by default nine tenths of what is free.
     pub memory_gib: Option<f64>,

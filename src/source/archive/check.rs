@@ -60,7 +60,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
     };
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
-        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; `u`, `v` and `w` name variables of NetCDF"),
+        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
         ("order", s.order.is_some(), hdf5, "with HDF5 only"),
         ("spacing", s.spacing.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
         ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),

@@ -262,6 +262,29 @@ impl Inspection {
     }
 }
 
+impl Inspection {
+    /// The table of variables: of a refused file without those that are no fields.
+    fn variables(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "\nvariables")?;
+        let width = self.variables.iter().map(|v| v.name.chars().count()).max().unwrap_or(0);
+        let (used, mut unused): (Vec<_>, Vec<_>) = self.variables.iter().partition(|v| v.role.is_some());
+        let all = unused.len();
+        if self.problem.is_some() {
+            unused.retain(|v| v.dimensions.len() > 1);
+        }
+        let left_out = all - unused.len();
+        for v in used.into_iter().chain(unused) {
+            let dims: Vec<String> = v.dimensions.iter().map(|(n, l)| format!("{n} {l}")).collect();
+            let role = v.role.as_deref().unwrap_or("-");
+            writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
+        }
+        if left_out > 0 {
+            writeln!(f, "  and {left_out} variables of fewer than two dimensions")?;
+        }
+        Ok(())
+    }
+}
+
 fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
@@ -293,13 +316,13 @@ impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let more = if self.files > 1 { format!(" and {} more", self.files - 1) } else { String::new() };
         writeln!(f, "{}{more} ({})", self.file.display(), self.format)?;
-        writeln!(f, "\nvariables")?;
-        let width = self.variables.iter().map(|v| v.name.chars().count()).max().unwrap_or(0);
-        let (used, unused): (Vec<_>, Vec<_>) = self.variables.iter().partition(|v| v.role.is_some());
-        for v in used.into_iter().chain(unused) {
-            let dims: Vec<String> = v.dimensions.iter().map(|(n, l)| format!("{n} {l}")).collect();
-            let role = v.role.as_deref().unwrap_or("-");
-            writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
+        if let Some(problem) = &self.problem {
+            writeln!(f, "\ncannot be read as an archive:\n{problem}")?;
+        }
+        // Candidates are a part of the reason.
+        let lists = self.problem.as_ref().is_some_and(|problem| problem.contains('\n'));
+        if !lists {
+            self.variables(f)?;
         }
         if let Some(source) = &self.source {
             writeln!(f, "\nmetric {}", word(source.metric))?;
@@ -323,8 +346,8 @@ impl fmt::Display for Inspection {
                 None => writeln!(f, "{period}; made, ascending")?,
             }
         }
-        if let Some(problem) = &self.problem {
-            return writeln!(f, "\ncannot be read as an archive:\n{problem}");
+        if self.problem.is_some() {
+            return Ok(());
         }
         if let Some(t) = &self.time {
             if t.snapshots == 1 {

@@ -138,6 +138,11 @@ pub fn judge(listing: &Listing, index: usize, stated: [Option<&str>; 3]) -> Resu
     }
 }
 
+/// True if a name of the variable is that of a component, whatever its unit.
+pub fn may_be_named(variable: &Variable) -> bool {
+    by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable)).is_some()
+}
+
 type Named = (Component, usize, usize, String);
 
 fn by_standard_name(variable: &Variable) -> Option<Named> {

@@ -231,7 +231,7 @@ impl Planner<'_> {
             None if says(standard) => (false, format!("standard_name `{standard}`")),
             None if standard.is_empty() && says(&long) => (false, format!("long_name `{long}`")),
             None if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
-            None => (true, "no name says eastward; `grid_relative = false` otherwise".into()),
+            None => (true, "no name says eastward; --set archive.grid_relative=false otherwise".into()),
         }
     }
 

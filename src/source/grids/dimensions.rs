@@ -59,9 +59,6 @@ impl Planner<'_> {
                 overrides.push(Extent { dimension, kind, coordinate });
             }
         }
-        let mut extents = Vec::new();
-        let mut squeezed = Vec::new();
-        for &dimension in &self.variable(u).dimensions {
         for (name, &entry) in s.select.iter().flatten() {
             let found = self.variable(u).dimensions.iter().map(|&d| &self.listing().dimensions[d]).find(|d| d.name == *name);
             if found.is_none_or(|d| entry >= d.len) {
@@ -72,11 +69,12 @@ impl Planner<'_> {
                 return Err(SourceError::setting("select", format!("{{ {name} = {entry} }}"), accepted));
             }
         }
+        let mut extents = Vec::new();
+        let mut squeezed = Vec::new();
+        for &dimension in &self.variable(u).dimensions {
             let known = overrides.iter().find(|o| o.dimension == dimension);
-            let extent = known.copied().unwrap_or_else(|| self.measured(dimension));
+            let mut extent = known.copied().unwrap_or_else(|| self.measured(dimension));
             let found = &self.listing().dimensions[dimension];
-            if found.len == 1 && !extent.kind.is_horizontal() && extent.kind != Kind::Time {
-                squeezed.push(found.name.as_str());
             if let (Some(entry), false) = (s.entry(&found.name), extent.kind == Kind::Time) {
                 let value = extent.coordinate.map(|c| self.coordinate_values(c)).transpose()?.and_then(|values| values.get(entry).copied());
                 let value = value.map_or_else(String::new, |value| format!(" ({value})"));
@@ -84,6 +82,8 @@ impl Planner<'_> {
                 continue;
             }
             extent.kind = self.stated_kind(extent);
+            if found.len == 1 && !extent.kind.is_horizontal() && extent.kind != Kind::Time {
+                squeezed.push(found.name.as_str());
             } else {
                 extents.push(extent);
             }
@@ -94,8 +94,6 @@ impl Planner<'_> {
         Ok(extents)
     }
 
-    /// A dimension with its coordinate variable and what it measures, regardless of the settings.
-    pub fn measured(&self, dimension: usize) -> Extent {
     /// What a dimension measures if the settings state its unit: degrees make a longitude or latitude, metres do not.
     fn stated_kind(&self, extent: Extent) -> Kind {
         let Some(unit) = extent.coordinate.and_then(|c| self.axis_units(extent.kind, c)) else { return extent.kind };
@@ -110,6 +108,8 @@ impl Planner<'_> {
         }
     }
 
+    /// A dimension with its coordinate variable and what it measures, regardless of the settings.
+    pub fn measured(&self, dimension: usize) -> Extent {
         let name = &self.listing().dimensions[dimension].name;
         let candidates: Vec<usize> = self.listing().matching(|v| v.dimensions == [dimension] && v.number.is_number()).collect();
         let first = |fits: &dyn Fn(usize) -> bool| candidates.iter().copied().find(|&i| fits(i));
@@ -154,7 +154,9 @@ impl Planner<'_> {
             if found.len() > 1 || (found.is_empty() && !optional) {
                 let dims = self.listing().dimension_names(self.variable(u));
                 let which = if found.is_empty() { "no dimension".into() } else { found.join(" and ") };
-                return Err(self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with `{what} = \"...\"`")));
+                return Err(
+                    self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with --set archive.{what}=NAME"))
+                );
             }
         }
         Ok(())
@@ -166,10 +168,10 @@ impl Planner<'_> {
         let file = self.path().display();
         let fault = |found: String, accepted: String| SourceError::setting("level", format!("{wanted} ({found})"), accepted);
         let Some(extent) = extents.iter().find(|e| e.kind == Kind::Level) else {
-            return Err(fault(format!("{file} has no level axis"), "leave `level` out".into()));
+            return Err(fault(format!("{file} has no level axis"), "left out".into()));
         };
         let Some(coordinate) = extent.coordinate else {
-            return Err(fault("the level axis has no coordinates".into(), "name them with `z`".into()));
+            return Err(fault("the level axis has no coordinates".into(), "the axis named with --set archive.z=NAME".into()));
         };
         let values = self.coordinate_values(coordinate)?;
         let variable = self.variable(coordinate);

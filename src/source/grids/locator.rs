@@ -236,7 +236,7 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
             continue;
         }
         if across.saturating_mul(up) > 1 << 28 {
-            return Err(format!("{across} x {up} nodes are too many; give a coarser `resolution`"));
+            return Err(format!("{across} x {up} nodes are too many; give a coarser --set archive.resolution=[DLON,DLAT]"));
         }
         let step = [width / across as f64, (north - south) / up as f64];
         let nodes = [if round { across } else { across + 1 }, up + 1];

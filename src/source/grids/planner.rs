@@ -9,7 +9,7 @@ use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::packing::Packing;
 use crate::cf::units::{Unit, VELOCITY_UNITS};
-use crate::cf::velocity::{Candidate, judge};
+use crate::cf::velocity::{Candidate, judge, may_be_named};
 use crate::error::SourceError;
 use crate::formats::{DataFile, Listing, Variable};
 use std::fmt::Display;
@@ -112,8 +112,10 @@ impl<'a> Planner<'a> {
             others => candidates.push(format!("  and {others} variables of fewer than two dimensions")),
         }
         self.fault(format!(
-            "no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
-             Variables in the file:\n{candidates}"
+            "no velocity found ({lacking}). Name its variables with --set archive.u=NAME --set archive.v=NAME or, if another file holds \
+             the other component, name that file too.\n\
+             Variables in the file:\n{}",
+            candidates.join("\n")
         ))
     }
 
@@ -141,7 +143,9 @@ impl<'a> Planner<'a> {
         {
             let lowest = level.axis.first();
             if level.quantity == Quantity::Pressure && lowest <= 0.0 {
-                let what = format!("a pressure of {lowest} Pa has no height; use `metric = \"index\"`, or another axis with `z`");
+                let what = format!(
+                    "a pressure of {lowest} Pa has no height; use --set archive.metric=index, or another axis with --set archive.z=NAME"
+                );
                 return Err(SourceError::variable(self.path(), level.axis.name(), what));
             }
             let scale = self.settings.vertical_scale.unwrap_or(1.0);
@@ -174,7 +178,7 @@ impl<'a> Planner<'a> {
             factor: self.velocity_factor(candidate, axis)?,
             name: variable.name.clone(),
             shape: self.shape(candidate.variable),
-            roles: variable.dimensions.iter().map(role).collect(),
+            roles,
             packing: self.packing(candidate.variable)?,
             why: candidate.why.clone(),
         })
@@ -201,7 +205,7 @@ impl<'a> Planner<'a> {
             Some(u) if u.is_pressure_tendency() && along_pressure => Ok(u.factor),
             Some(u) if u.is_velocity() || u.is_pressure_tendency() => {
                 let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
-                let hint = if component == "w" { ", or ignore vertical motion with `w = \"none\"`" } else { "" };
+                let hint = if component == "w" { ", or ignore vertical motion with --set archive.w=none" } else { "" };
                 let what = format!(
                     "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with --set archive.{component}=NAME{hint}"
                 );

@@ -77,7 +77,8 @@ impl Planner<'_> {
         let [a, b] = [found.u.variable, other].map(|i| self.variable(i));
         Err(self.fault(format!(
             "`{}` lies on ({}) but `{}` on ({}): staggered components are read only if they are WRF's (dimensions `..._stag`, with PH and \
-             PHB) or have longitudes and latitudes of their own",
+             PHB) or have longitudes and latitudes of two dimensions, their own or of the points between which they lie; those are named with \
+             --set archive.x=NAME --set archive.y=NAME",
             a.name,
             listing.dimension_names(a),
             b.name,
@@ -97,17 +98,18 @@ impl Planner<'_> {
             (Some(Metric::Sphere), _) if !sphere => {
                 fault("sphere", "the axes are not longitude and latitude; accepted are index and cartesian")
             }
-            (Some(Metric::Sphere), _) if three && !measured => {
-                fault("sphere", "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`")
-            }
+            (Some(Metric::Sphere), _) if three && !measured => fault(
+                "sphere",
+                "the levels are neither pressures nor lengths; pick one with --set archive.level=VALUE, or --set archive.metric=index",
+            ),
             (Some(metric), VelocityUnit::Cells) if metric != Metric::Index => {
-                fault(&word(metric), "velocities in cells need `metric = \"index\"`")
+                fault(&word(metric), "velocities in cells need --set archive.metric=index")
             }
             (Some(metric), _) => Ok(metric),
             (None, VelocityUnit::Cells) => Ok(Metric::Index),
             (None, VelocityUnit::Si) if sphere && three && !measured => {
                 self.note(
-                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere",
+                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); --set archive.level=VALUE gives the sphere",
                 );
                 Ok(Metric::Index)
             }
@@ -149,7 +151,7 @@ impl Planner<'_> {
             format!("has only coordinates of two dimensions ({}), of which no longitude and latitude are a pair", wide.join(", "))
         };
         format!(
-            "dimension `{name}` {why}. Name a coordinate variable with `x`, `y` or `z`, or set `velocity_unit = \"cells\"` if its values are cells per snapshot interval"
+            "dimension `{name}` {why}. Name coordinates with --set archive.x=NAME (archive.y, archive.z), or set --set archive.velocity_unit=cells if the velocities are cells per snapshot interval"
         )
     }
 }

@@ -56,12 +56,12 @@ impl Planner<'_> {
     pub fn plan_staggered(mut self, velocity: &Velocity, first: Option<&Layout>) -> Result<Layout, SourceError> {
         let s = self.settings;
         if s.metric.is_some_and(|m| m != Metric::Cartesian) || s.velocity_unit == VelocityUnit::Cells {
-            let accepted = "WRF output is read in metres: `metric = \"cartesian\"` and velocities in SI";
+            let accepted = "WRF output is read in metres: --set archive.metric=cartesian and velocities in SI";
             return Err(SourceError::setting("metric", "not cartesian", accepted));
         }
         if s.level.is_some() || s.region.is_some() {
             let key = if s.level.is_some() { "level" } else { "region" };
-            let accepted = "WRF output is read whole and in three dimensions; choose heights with `heights`";
+            let accepted = "WRF output is read whole and in three dimensions; choose heights with --set archive.heights=[...]";
             return Err(SourceError::setting(key, "given", accepted));
         }
         let components = self.staggered_components(velocity)?;
