@@ -9,6 +9,7 @@ mod kit;
 mod land;
 mod netcdf;
 mod odd;
+mod parts;
 mod real;
 mod refused;
 mod resampled;

@@ -2,6 +2,7 @@
 
 use super::check::{check, check_fit};
 use super::files::expand;
+use super::group::{Group, grouped, open_group};
 use super::synthetic::{declared, synthesized};
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::calendar::Calendar;
@@ -22,9 +23,11 @@ use std::sync::Arc;
 /// Names of the components, in order.
 const COMPONENTS: [&str; 3] = ["u", "v", "w"];
 
-/// A file of the archive; closed until it is read.
+/// A file of the archive, or several that are read as one; closed until it is read.
 struct ArchiveFile {
     path: PathBuf,
+    /// With files of other components, meshes and masks.
+    group: Group,
     frames: Vec<Vec<ComponentPlan>>,
 }
 
@@ -88,31 +91,44 @@ impl Archive {
     /// Opens a list of files. See [`Archive::open`].
     pub(super) fn open_files(paths: Vec<PathBuf>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         check(settings)?;
+        match Self::open_groups(paths.iter().map(|path| vec![path.clone()]).collect(), settings) {
+            Err(error) if paths.len() > 1 => match grouped(&paths, settings)? {
+                Some(groups) => Self::open_groups(groups, settings),
+                None => Err(error),
+            },
+            result => result,
+        }
+    }
+
+    /// Opens groups of files.
+    fn open_groups(groups: Vec<Group>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         let limits = limits(settings);
         let mut first: Option<Layout> = None;
         let mut format = Format::Hdf5;
         let mut entries: Vec<(f64, Place)> = Vec::new();
-        let mut files: Vec<ArchiveFile> = Vec::with_capacity(paths.len());
+        let mut files: Vec<ArchiveFile> = Vec::with_capacity(groups.len());
+        let together = groups.iter().find(|group| group.len() > 1).map(|group| in_words(group));
         let mut open = None;
         let mut expected: Option<Listing> = None;
         let mut synthetic = None;
-        let mut masks: Vec<PathBuf> = Vec::new();
-        for path in paths {
-            let (file, layout) = match open_next(&path, settings, first.as_ref(), expected.as_ref(), limits) {
+        let mut masks: Vec<Group> = Vec::new();
+        for group in groups {
+            let Some(path) = group.first().cloned() else { continue };
+            let (file, layout) = match open_next(&group, settings, first.as_ref(), expected.as_ref(), limits) {
                 Ok(both) => both,
                 Err(_) if is_mask_alone(&path, settings, limits) => {
-                    masks.push(path);
+                    masks.push(group);
                     continue;
                 }
                 Err(error) => return Err(error),
             };
-            if expected.is_none() && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
+            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
             let index = files.len();
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
             entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
-            files.push(ArchiveFile { path: path.clone(), frames: layout.frames.clone() });
+            files.push(ArchiveFile { path: path.clone(), group: group.clone(), frames: layout.frames.clone() });
             match &mut first {
                 Some(reference) => {
                     reference.widen(&layout).map_err(|fault| SourceError::file(&path, fault))?;
@@ -123,7 +139,7 @@ impl Archive {
                 None => {
                     synthetic = declared(&file.listing).map(str::to_owned);
                     if holds_mask(&file.listing, settings) {
-                        masks.insert(0, path.clone());
+                        masks.insert(0, group);
                     }
                     format = file.listing.format;
                     first = Some(layout);
@@ -133,7 +149,7 @@ impl Archive {
         }
         let Some(layout) = first else {
             let what = "it holds a mask of land, but no velocity: name the files of the velocity beside it";
-            return Err(masks.first().map_or(SourceError::NoFiles, |path| SourceError::file(path, what)));
+            return Err(masks.first().and_then(|group| group.first()).map_or(SourceError::NoFiles, |path| SourceError::file(path, what)));
         };
         entries.sort_by(|a, b| a.0.total_cmp(&b.0));
         let calendar = layout.time.calendar;
@@ -160,10 +176,11 @@ impl Archive {
             return Err(SourceError::setting("mask", format!("\"{named}\", which no file holds"), accepted));
         }
         let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
-        if !staggered && !masks.is_empty() {
+        let unused = matches!(settings.mask.as_deref(), Some(NO_MASK | ZERO));
+        if !staggered && !unused && !masks.is_empty() {
             open = None;
-            for path in &masks {
-                land.add(&DataFile::open(path, None, limits)?, &layout.frames[0], settings)?;
+            for group in &masks {
+                land.add(&open_group(group, limits)?, &layout.frames[0], settings)?;
             }
             files.iter_mut().flat_map(|file| &mut file.frames).for_each(|frame| land.apply(frame));
         }
@@ -192,6 +209,7 @@ impl Archive {
         if let Some(what) = synthetic {
             archive.declare_synthetic(what);
         }
+        archive.description.notes.extend(together.map(|names| format!("read as one, and others alike: {names}")));
         archive.description.notes.extend(land.notes);
         match settings.mask.as_deref() {
             Some(ZERO) => archive.mask_zeros()?,
@@ -288,6 +306,11 @@ impl Archive {
         self.files.iter().map(|f| f.path.as_path())
     }
 
+    /// The files that are read as one for the first of [`Self::files`].
+    pub(super) fn first_group(&self) -> Option<&Group> {
+        self.files.first().map(|file| &file.group)
+    }
+
     /// Seconds of each snapshot since 1970-01-01 in the archive's calendar (or since the simulation's start), ascending. Equal to
     /// [`SnapshotSource::times`] except in the index metric.
     pub fn seconds(&self) -> &[f64] {
@@ -354,8 +377,11 @@ impl Archive {
             other => {
                 // Closed before the next file opens.
                 drop(other);
-                let ArchiveFile { path, frames } = &self.files[place.file];
-                let file = DataFile::open(path, self.expected.as_ref(), self.limits)?;
+                let ArchiveFile { path, group, frames } = &self.files[place.file];
+                let file = match group.len() {
+                    1 => DataFile::open(path, self.expected.as_ref(), self.limits)?,
+                    _ => open_group(group, self.limits)?,
+                };
                 for component in frames.iter().flatten() {
                     let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
                     if shape.ok().as_ref() != Some(&component.shape) {
@@ -494,14 +520,25 @@ fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), Sou
     what.map_err(|what| SourceError::file(path, what))
 }
 
-/// Opens and plans the next file of an archive whose first file has the layout `first`.
+/// Names of the files of a group.
+fn in_words(group: &[PathBuf]) -> String {
+    let names = group.iter().map(|path| path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned()));
+    names.collect::<Vec<_>>().join(", ")
+}
+
+/// Opens and plans the next group of an archive whose first file has the layout `first`.
 fn open_next(
-    path: &Path,
+    group: &[PathBuf],
     settings: &ArchiveSettings,
     first: Option<&Layout>,
     expected: Option<&Listing>,
     limits: Limits,
 ) -> Result<(DataFile, Layout), SourceError> {
+    let [path] = group else {
+        let file = open_group(group, limits)?;
+        let layout = plan(&file, settings, first)?;
+        return Ok((file, layout));
+    };
     let mut file = DataFile::open(path, expected, limits)?;
     let mut planned = plan(&file, settings, first);
     let fits = planned.as_ref().is_ok_and(|layout| first.is_none_or(|first| difference(first, layout).is_none()));

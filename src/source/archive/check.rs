@@ -72,6 +72,9 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
         ("grid_relative", s.grid_relative.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("mask", s.mask.is_some(), !staggered, "left out with WRF output, whose winds blow over land too"),
         ("vertical_scale", s.vertical_scale.is_some(), heights, "with levels, in the sphere and cartesian metrics"),
     ] {
         if given && !fits {
@@ -79,9 +82,6 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         }
     }
     let repeats = |text: &str| if hdf5 { !text.is_empty() && text.bytes().all(|b| b"xyzXYZ".contains(&b)) } else { text == "none" };
-        ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
-        ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
-        ("mask", s.mask.is_some(), !staggered, "left out with WRF output, whose winds blow over land too"),
     match s.periodic.as_deref().filter(|text| !repeats(text)) {
         None => Ok(()),
         Some(text) => {

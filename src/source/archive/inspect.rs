@@ -2,6 +2,7 @@
 
 use super::archive::{Archive, Displacement, files_of, limits};
 use super::check::check;
+use super::group::open_group;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::velocity;
 use crate::error::SourceError;
@@ -170,7 +171,12 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
         resolution: None,
     };
     match Archive::open_files(files, settings) {
-        Ok(archive) => inspection.fill(archive, settings.steady, tau)?,
+        Ok(archive) => {
+            if let Some(group) = archive.first_group().filter(|group| **group != [inspection.file.clone()]) {
+                inspection.variables = variables(&open_group(group, limits(settings))?.listing, settings);
+            }
+            inspection.fill(archive, settings.steady, tau)?;
+        }
         Err(error) => {
             (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused());
             inspection.axes = readable_axes(&first, settings).iter().map(|(role, plan)| AxisReport::of(plan, role)).collect();

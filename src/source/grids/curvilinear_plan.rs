@@ -45,7 +45,7 @@ impl Planner<'_> {
         if named.is_none() && (s.x.is_some() || s.y.is_some()) {
             return Ok(None);
         }
-        let Some(u) = self.points(velocity.u.variable, named)? else { return Ok(None) };
+        let Some(u) = self.points(velocity.u.variable, "u", named)? else { return Ok(None) };
         let own = |&dimension: &usize| {
             self.measured(dimension).coordinate.map(|c| self.variable(c)).is_some_and(|variable| {
                 let length = Unit::parse(variable.units().unwrap_or_default()).is_some_and(|u| u.is_length());
@@ -56,8 +56,9 @@ impl Planner<'_> {
             return Ok(None);
         }
         let mut points = vec![u];
-        for other in [Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten() {
-            match self.points(other.variable, named)? {
+        // Vertical velocities lie above tracers.
+        for (other, letter) in [Some((&velocity.v, "v")), velocity.w.as_ref().map(|w| (w, "t"))].into_iter().flatten() {
+            match self.points(other.variable, letter, named)? {
                 Some(found) => points.push(found),
                 None => return Ok(None),
             }
@@ -101,9 +102,9 @@ impl Planner<'_> {
         [dims[dims.len() - 1], dims[dims.len() - 2]]
     }
 
-    /// Points of a variable: a pair of longitudes and latitudes on its dimensions, of which those that its `coordinates` attribute names go
+    /// Points of a variable, those of `letter` on a staggered grid: a pair of longitudes and latitudes on its dimensions, of which those that its `coordinates` attribute names go
     /// first; else a pair with one point more along x or y, between whose points it lies. Pairs without values are passed over.
-    fn points(&self, variable: usize, named: Option<Pair>) -> Result<Option<Points>, SourceError> {
+    fn points(&self, variable: usize, letter: &str, named: Option<Pair>) -> Result<Option<Points>, SourceError> {
         let (listing, of) = (self.listing(), self.variable(variable));
         let wide: Vec<usize> = of.dimensions.iter().rev().copied().filter(|&d| listing.dimensions[d].len > 1).collect();
         let [x, y, ..] = wide[..] else { return Ok(None) };
@@ -111,14 +112,18 @@ impl Planner<'_> {
         let find = |kind: Kind| {
             let fits = |v: &Variable| v.dimensions.len() >= 2 && v.number.is_number() && classify(v) == kind;
             let mut found: Vec<usize> = listing.matching(fits).collect();
-            found.sort_by_key(|&i| !first.contains(&self.variable(i).name.as_str()));
+            // In files that were joined, each component has coordinates of its own file, or of its points in a mesh.
+            found.sort_by_key(|&i| {
+                let ((part, name), of_part) = (self.file.origin(i), self.file.origin(variable).0);
+                (part != of_part, !first.contains(&name), !name.to_ascii_lowercase().ends_with(letter))
+            });
             found
         };
         let latitudes = find(Kind::Latitude);
         let pairs: Vec<Pair> = match named {
             Some(pair) => vec![pair],
             None => {
-                let partner = |lon: usize| latitudes.iter().find(|&&lat| self.plane_of(lat) == self.plane_of(lon)).map(|&lat| [lon, lat]);
+                let partner = |lon: usize| latitudes.iter().find(|&&lat| self.are_partners(lon, lat)).map(|&lat| [lon, lat]);
                 find(Kind::Longitude).into_iter().filter_map(partner).collect()
             }
         };
@@ -144,6 +149,11 @@ impl Planner<'_> {
             }
         }
         Ok(None)
+    }
+
+    /// True if longitudes and latitudes are of the same points.
+    fn are_partners(&self, longitude: usize, latitude: usize) -> bool {
+        self.plane_of(longitude) == self.plane_of(latitude) && self.file.origin(longitude).0 == self.file.origin(latitude).0
     }
 
     /// False if the longitudes or the latitudes are all 0 or missing, as in files from which other points were cut.

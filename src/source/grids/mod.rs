@@ -9,6 +9,7 @@
 
 mod axes;
 mod component;
+mod content;
 mod curvilinear;
 mod curvilinear_plan;
 mod datasets;
@@ -29,6 +30,7 @@ mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
 pub use component::{ComponentPlan, Orders, read_component};
+pub use content::{Content, content};
 pub use layout::{Layout, Resampling, difference};
 pub use levels::to_heights;
 pub use mask::{Mask, Masks, NO_MASK, ZERO, holds_mask};

@@ -181,6 +181,9 @@ impl<'a> Planner<'a> {
             roles,
             packing: self.packing(candidate.variable)?,
             why: candidate.why.clone(),
+            dimensions: self.dimensions_of(candidate.variable),
+            of_water: is_of_water(self.listing(), variable),
+            mask: None,
         })
     }
 
@@ -193,9 +196,6 @@ impl<'a> Planner<'a> {
         let component = candidate.component.name();
         let text = self.settings.unit(component).or(variable.units()).unwrap_or_default();
         let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
-            dimensions: self.dimensions_of(candidate.variable),
-            of_water: is_of_water(self.listing(), variable),
-            mask: None,
         match Unit::parse(text) {
             Some(u) if u.is_dimensionless() => {
                 self.note(format!("{component}: `{}` has no unit: taken as SI", variable.name));
