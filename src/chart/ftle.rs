@@ -139,8 +139,8 @@ impl Opened {
     /// Steps chosen by their error, also if the scene gives their number.
     pub(super) fn auto_steps(&self) -> Steps {
         match self.plan.map.steps {
-            Steps::Auto { tolerance } => Steps::Auto { tolerance },
             Steps::Fixed(_) => Steps::Auto { tolerance: 0.01 },
+            auto => auto,
         }
     }
 
@@ -312,7 +312,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let mut bench = Bench { charting, opened, points, truth, timed, found: Vec::new() };
     let steps = chosen_steps.or(match opened.plan.map.steps {
         Steps::Fixed(steps) => Some(steps),
-        Steps::Auto { .. } => None,
+        Steps::Auto { .. } | Steps::AutoByShare { .. } => None,
     });
     let steps = steps.unwrap_or(100);
     match bench.charting.device {

@@ -126,7 +126,8 @@ fn check_parent(ring: &Path) -> Result<(), WireError> {
     let about = metadata(parent, std::fs::metadata(parent))?;
     // Nobody may rename folders of others in a sticky folder, except its owner.
     let sticky = about.mode() & 0o1000 != 0;
-    let found = if ![0, system::user()].contains(&about.uid()) && !(sticky && about.uid() == NOBODY) {
+    let trusted = [0, system::user()].contains(&about.uid()) || (sticky && about.uid() == NOBODY);
+    let found = if !trusted {
         format!("is a folder of user {}, who may replace {}", about.uid(), ring.display())
     } else if !sticky && about.mode() & 0o002 != 0 {
         format!("is a folder that all users may write into (mode {:04o})", about.mode() & 0o7777)
