@@ -1,7 +1,7 @@
-//! Files, folders and patterns as a list of files.
+//! Files, folders and patterns as a list of files. A Zarr store is a folder that counts as one file.
 
 use crate::error::SourceError;
-use crate::formats::FormatFault;
+use crate::formats::{FormatFault, is_store};
 use std::path::{Path, PathBuf};
 
 /// Extensions of the files that are taken from a folder.
@@ -18,7 +18,9 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     let mut files: Vec<PathBuf> = Vec::new();
     for path in paths {
         let text = path.to_string_lossy();
-        if path.is_dir() {
+        if is_store(path) {
+            files.push(path.clone());
+        } else if path.is_dir() {
             files.extend(folder(path)?);
         } else if !path.exists() && text.contains(['*', '?', '[']) {
             files.extend(pattern(&text)?);
@@ -42,12 +44,14 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
         let file = entry.map_err(failed)?.path();
         let extension = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
         let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-        if file.is_file() && (EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_")) {
+        let named =
+            EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_") || name.ends_with(".zarr.zip");
+        if (file.is_file() && named) || is_store(&file) {
             files.push(file);
         }
     }
     if files.is_empty() {
-        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5").display().to_string() });
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5, *.zarr").display().to_string() });
     }
     files.sort();
     Ok(files)
@@ -58,7 +62,7 @@ fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
     let mut files = Vec::new();
     for file in found {
         let file = file.map_err(|e| unreadable(e.path(), e.error()))?;
-        if file.is_file() {
+        if file.is_file() || is_store(&file) {
             files.push(file);
         }
     }
