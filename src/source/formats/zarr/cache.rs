@@ -6,12 +6,15 @@ use std::sync::Arc;
 /// The variable, its place in the array, and whether it is the index of a shard.
 pub type Key = (usize, Vec<usize>, bool);
 
-/// Chunks within a bound of bytes. What the latest request for a variable reached is kept; all else goes first.
+/// Requests for a variable that a chunk stays without being reached: a snapshot may take several, for its sides of the seam.
+const IDLE: u32 = 16;
+
+/// Chunks within a bound of bytes. What the latest request for a variable reached is kept; all else goes first, and soon.
 pub struct Cache {
     most: u64,
     bytes: u64,
     held: HashMap<Key, Held>,
-    /// Whether something may be given up.
+    /// Whether there may be something that the latest requests did not reach.
     spare: bool,
 }
 
@@ -20,7 +23,8 @@ struct Held {
     data: Option<Arc<Vec<u8>>>,
     bytes: u64,
     extents: Vec<usize>,
-    wanted: bool,
+    /// Requests for the variable since one reached it.
+    idle: u32,
 }
 
 /// Bytes of an entry beside its data.
@@ -33,11 +37,19 @@ impl Cache {
 
     /// Begins a request for a block of a variable.
     pub fn begin(&mut self, variable: usize, start: &[usize], count: &[usize]) {
-        for ((of, origin, _), held) in self.held.iter_mut().filter(|(key, _)| key.0 == variable) {
-            debug_assert_eq!(*of, variable);
-            held.wanted = (0..origin.len()).all(|k| origin[k] < start[k] + count[k] && start[k] < origin[k] + held.extents[k]);
-            self.spare |= !held.wanted;
+        let reached = |origin: &[usize], extents: &[usize]| {
+            (0..origin.len()).all(|k| origin[k] < start[k] + count[k] && start[k] < origin[k] + extents[k])
+        };
+        for ((_, origin, _), held) in self.held.iter_mut().filter(|(key, _)| key.0 == variable) {
+            held.idle = if reached(origin, &held.extents) { 0 } else { held.idle + 1 };
         }
+        self.spare = true;
+        self.keep_if(|held| held.idle <= IDLE);
+    }
+
+    fn keep_if(&mut self, keep: impl Fn(&Held) -> bool) {
+        self.held.retain(|_, held| keep(held));
+        self.bytes = self.held.values().map(|held| held.bytes).sum();
     }
 
     pub fn get(&self, key: &Key) -> Option<Option<Arc<Vec<u8>>>> {
@@ -48,12 +60,11 @@ impl Cache {
     pub fn keep(&mut self, key: Key, extents: &[usize], data: &Option<Arc<Vec<u8>>>) {
         let bytes = data.as_ref().map_or(0, |data| data.len() as u64) + ENTRY_BYTES;
         if self.bytes + bytes > self.most && self.spare {
-            self.held.retain(|_, held| held.wanted);
-            self.bytes = self.held.values().map(|held| held.bytes).sum();
+            self.keep_if(|held| held.idle == 0);
             self.spare = false;
         }
         if self.bytes + bytes <= self.most
-            && self.held.insert(key, Held { data: data.clone(), bytes, extents: extents.to_vec(), wanted: true }).is_none()
+            && self.held.insert(key, Held { data: data.clone(), bytes, extents: extents.to_vec(), idle: 0 }).is_none()
         {
             self.bytes += bytes;
         }
@@ -96,5 +107,15 @@ mod tests {
         let half = unpacked(5 * one, 24, 6, 5);
         assert!(half > 3.0 && half < 4.5, "{half}");
         assert_eq!(unpacked(0, 24, 6, 5), 6.0);
+    }
+
+    #[test]
+    fn what_is_not_reached_any_more_is_given_up() {
+        let mut cache = Cache::new(u64::MAX);
+        for time in 0..100 {
+            cache.begin(0, &[time, 0], &[1, 1]);
+            cache.keep((0, vec![time, 0], false), &[1, 2], &Some(Arc::new(vec![0; 1000])));
+        }
+        assert_eq!(cache.held.len(), IDLE as usize + 1);
     }
 }
