@@ -398,11 +398,13 @@ impl Reader<'_> {
 
     /// Folders in a folder, which are counted.
     fn listed(&mut self, folder: &str, depth: usize) -> Result<Vec<String>, FormatFault> {
-        let inner = self.parts.folders(folder).map_err(|what| FormatFault::Refused(format!("`{folder}`: {what}")))?;
+        let mut inner = self.parts.folders(folder).map_err(|what| FormatFault::Refused(format!("`{folder}`: {what}")))?;
         if depth > MAX_DEPTH && !inner.is_empty() {
             return Err(FormatFault::Refused(format!("its groups are nested more than {MAX_DEPTH} deep, or in a circle")));
         }
         inner.iter().try_for_each(|_| self.count())?;
+        // Folders come in any order: the first error must always be the same.
+        inner.sort();
         Ok(inner)
     }
 
