@@ -94,6 +94,25 @@ fn velocities_are_those_of_netcdf() {
 }
 
 #[test]
+fn components_in_stores_of_their_own_are_read_as_one() {
+    let dir = tempdir().unwrap();
+    let path = |name: &str| dir.path().join(name);
+    let without = |name: &str| {
+        let mut fixture = currents();
+        fixture.variables.retain(|variable| variable.name != name);
+        fixture
+    };
+    let whole = currents().write(&path("whole.nc"));
+    let u = write(&without("vo"), &Layout { pack: Pack::Zstd, chunks: CUT, ..V3 }, &path("u.zarr"));
+    let v = write(&without("uo"), &Layout { chunks: CUT, ..V2 }, &path("v.zarr"));
+    let file = without("uo").write(&path("v.nc"));
+    for files in [[&u, &v], [&v, &u], [&u, &file], [&file, &u]] {
+        same(&mut open(&files), &mut open(&[&whole]), &format!("{files:?}"));
+    }
+    refused(&[&u], "", &["u.zarr"]);
+}
+
+#[test]
 fn zip_files_are_stores() {
     let dir = tempdir().unwrap();
     let file = currents().write(&dir.path().join("a.nc"));
