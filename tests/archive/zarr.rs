@@ -157,6 +157,16 @@ fn stores_are_found_by_what_they_hold() {
     let none = dir.path().join("none.zarr");
     std::fs::create_dir(&none).unwrap();
     refused(&[&none], "", &["none.zarr", "*.zarr"]);
+    // A copy that was interrupted.
+    for files in [dir.path().to_owned(), dir.path().join("*.zarr")] {
+        refused(&[files], "", &["none.zarr", "holds no `zarr.json`"]);
+    }
+    std::fs::remove_dir(&none).unwrap();
+    #[cfg(unix)]
+    {
+        std::os::unix::fs::symlink(dir.path().join("gone"), &none).unwrap();
+        refused(&[dir.path()], "", &["none.zarr", "which does not exist"]);
+    }
 }
 
 #[test]

@@ -50,6 +50,11 @@ fn refuse_dangling(path: &Path) -> Result<(), SourceError> {
     }
 }
 
+/// Whether a folder is a store, or is called one: a copy without its metadata would be left out without a word.
+fn is_called_store(path: &Path) -> bool {
+    is_store(path) || (path.is_dir() && path.extension().is_some_and(|extension| extension == "zarr"))
+}
+
 fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let failed = |cause| unreadable(path, cause);
     let mut files = Vec::new();
@@ -64,7 +69,7 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
         if named {
             refuse_dangling(&file)?;
         }
-        if (file.is_file() && named) || is_store(&file) {
+        if (file.is_file() && named) || is_called_store(&file) {
             files.push(file);
         }
     }
@@ -81,7 +86,7 @@ fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
     for file in found {
         let file = file.map_err(|e| unreadable(e.path(), e.error()))?;
         refuse_dangling(&file)?;
-        if file.is_file() || is_store(&file) {
+        if file.is_file() || is_called_store(&file) {
             files.push(file);
         }
     }
