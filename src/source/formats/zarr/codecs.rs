@@ -17,6 +17,8 @@ pub enum Step {
     Shuffle(usize),
 }
 
+/// The latest format of Blosc 1, in the first byte.
+const BLOSC_1: u8 = 2;
 /// Names of the codecs, for messages.
 pub const ACCEPTED: &str = "gzip, zlib, zstd, blosc, lz4, crc32c, shuffle, bitround, bytes, transpose and sharding_indexed";
 
@@ -32,7 +34,7 @@ pub fn most_stored(bytes: u64) -> u64 {
 /// Damaged data, or another length than `expected` at the end.
 pub fn unpack(steps: &[Step], mut data: Vec<u8>, expected: u64) -> Result<Vec<u8>, String> {
     for step in steps {
-        data = step.undo(data, most_stored(expected))?;
+        data = step.undo(data, expected)?;
     }
     if data.len() as u64 == expected {
         return Ok(data);
@@ -41,15 +43,20 @@ pub fn unpack(steps: &[Step], mut data: Vec<u8>, expected: u64) -> Result<Vec<u8
 }
 
 impl Step {
-    fn undo(self, mut data: Vec<u8>, most: u64) -> Result<Vec<u8>, String> {
+    fn undo(self, mut data: Vec<u8>, expected: u64) -> Result<Vec<u8>, String> {
+        let most = most_stored(expected);
         match self {
-            Self::Gzip => inflate(flate2::read::MultiGzDecoder::new(&data[..]), most),
-            Self::Zlib => inflate(flate2::read::ZlibDecoder::new(&data[..]), most),
+            Self::Gzip => inflate(flate2::read::MultiGzDecoder::new(&data[..]), expected),
+            Self::Zlib => inflate(flate2::read::ZlibDecoder::new(&data[..]), expected),
             Self::Zstd => {
                 let mut out = Vec::new();
                 let unpacked = zrip::DecompressContext::new().decompress_into_with_limit(&data, &mut out, most as usize);
                 unpacked.map_err(|e| format!("zstd: {e}"))?;
                 Ok(out)
+            }
+            // Filters of Blosc 2 that the crate does not know would give wrong values.
+            Self::Blosc if data.first().is_some_and(|&version| version > BLOSC_1) => {
+                Err(format!("blosc: its format has version {}; accepted are those of Blosc 1, up to {BLOSC_1}", data[0]))
             }
             Self::Blosc => {
                 let bytes = blusc::blosc1_cbuffer_validate(&data, data.len()).map_err(|()| "blosc: its header is damaged")?;
@@ -90,8 +97,11 @@ fn within(bytes: u64, most: u64) -> Result<(), String> {
     if bytes <= most { Ok(()) } else { Err(format!("it unpacks to {bytes} bytes, more than its metadata say")) }
 }
 
-fn inflate(input: impl Read, most: u64) -> Result<Vec<u8>, String> {
+fn inflate(input: impl Read, expected: u64) -> Result<Vec<u8>, String> {
+    let most = most_stored(expected);
+    // Growing by doubling would take up to twice the memory. The length was checked against the limit.
     let mut out = Vec::new();
+    out.try_reserve_exact(expected as usize).map_err(|_| format!("out of memory for {expected} bytes"))?;
     input.take(most + 1).read_to_end(&mut out).map_err(|e| e.to_string())?;
     within(out.len() as u64, most)?;
     Ok(out)
@@ -163,6 +173,15 @@ mod tests {
             assert!(unpack(steps, data.clone(), 1 << 10).is_err(), "{steps:?}");
             assert!(unpack(steps, data, 1 << 24).is_ok_and(|out| out == zeros), "{steps:?}");
         }
+    }
+
+    #[test]
+    fn blosc_2_is_refused() {
+        let mut packed = vec![0; 1024];
+        let length = blusc::blosc2_compress(5, 1, 4, &what(), &mut packed);
+        packed.truncate(length as usize);
+        let said = unpack(&[Step::Blosc], packed, 384).unwrap_err();
+        assert!(said.contains("accepted are those of Blosc 1"), "{said}");
     }
 
     #[rustfmt::skip]
