@@ -58,7 +58,7 @@ impl Cache {
 
     /// Keeps a chunk if there is room.
     pub fn keep(&mut self, key: Key, extents: &[usize], data: &Option<Arc<Vec<u8>>>) {
-        let bytes = data.as_ref().map_or(0, |data| data.len() as u64) + ENTRY_BYTES;
+        let bytes = data.as_ref().map_or(0, |data| data.capacity() as u64) + ENTRY_BYTES;
         if self.bytes + bytes > self.most && self.spare {
             self.keep_if(|held| held.idle == 0);
             self.spare = false;
