@@ -355,6 +355,23 @@ fn very_many_parts_are_refused() {
     let large = write(&plane(CLASSIC, &[0.0], DAYS), &V3, &dir.path().join("large.zarr"));
     std::fs::write(large.join("zarr.json"), vec![b' '; (16 << 20) + 1]).unwrap();
     refused(&[&large], "", &["large.zarr", "`zarr.json`", "more than the 16777216"]);
+    // The same in a zip file, where a name of 64 KiB would lead through 32,000 folders.
+    let deep = dir.path().join("deep.zip");
+    let mut field = parts(&plane(CLASSIC, &[0.0], DAYS), &V2);
+    field.push(("g/".repeat(32_000) + ".zarray", b"{}".to_vec()));
+    std::fs::write(&deep, zipped(&field, "", false)).unwrap();
+    refused(&[&deep], "", &["deep.zip", "nested more than 64 deep"]);
+    // Lists of objects take most memory for their length.
+    let objects = "{\"\":0},".repeat(100_000);
+    let list = format!("{{\"zarr_format\": 3, \"node_type\": \"group\", \"attributes\": {{\"a\": [{objects}0]}}}}");
+    let store = write(&plane(CLASSIC, &[0.0], DAYS), &V3, &dir.path().join("objects.zarr"));
+    std::fs::write(store.join("zarr.json"), &list).unwrap();
+    refused(&[&store], "memory_gib = 0.05", &["objects.zarr", "the metadata up to `zarr.json` need 0.08 GiB"]);
+    assert_eq!(open(&[&store]).times().len(), 1);
+    // Names, dimensions and what is quoted of metadata have bounds.
+    let long = write(&plane(CLASSIC, &[0.0], DAYS), &Layout { consolidated: true, ..V2 }, &dir.path().join("long.zarr"));
+    change(&long, ".zmetadata", "\"v/", &format!("\"{}/v/", "n".repeat(5000)));
+    refused(&[&long], "", &["long.zarr", "the name of a variable has 5002 bytes; accepted are 4096"]);
     let fine = write(&plane(CLASSIC, &[0.0], DAYS), &Layout { chunks: &[("x", 1), ("y", 1)], ..V2 }, &dir.path().join("fine.zarr"));
     change(&fine, "time/.zarray", "1\n  ]", "9000000\n  ]");
     refused(&[&fine], "", &["fine.zarr"]);

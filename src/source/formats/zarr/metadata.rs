@@ -154,7 +154,7 @@ impl Array {
         };
         let codecs = match regular {
             true => codecs(&array["codecs"], &chunk),
-            false => Err(format!("its grid of chunks is {:.80}; accepted is `regular`", grid["name"].to_string())),
+            false => Err(format!("its grid of chunks is {}; accepted is `regular`", brief(&grid["name"]))),
         };
         let dimensions = array["dimension_names"].as_array().into_iter().flatten().map(|d| text(d).map(str::to_owned)).collect();
         let mut attributes = collect(&array["attributes"]);
@@ -232,11 +232,18 @@ fn volume(extents: &[usize]) -> u64 {
     extents.iter().fold(1, |n, &k| n.saturating_mul(k as u64))
 }
 
+/// The start of what was found, for a message: metadata may hold megabytes of it.
+fn brief(found: impl ToString) -> String {
+    format!("{:.80}", found.to_string())
+}
+
 /// Whole numbers from `least` on.
 fn lengths(of: &Value, key: &str, least: u64) -> Result<Vec<usize>, String> {
     let list = of[key].as_array().ok_or_else(|| format!("its metadata have no list `{key}`"))?;
     let length = |v: &Value| v.as_u64().filter(|&n| n >= least).and_then(|n| usize::try_from(n).ok());
-    list.iter().map(|v| length(v).ok_or_else(|| format!("`{key}` holds {v}; accepted are whole numbers from {least} on"))).collect()
+    list.iter()
+        .map(|v| length(v).ok_or_else(|| format!("`{key}` holds {}; accepted are whole numbers from {least} on", brief(v))))
+        .collect()
 }
 
 /// A type of elements.
@@ -357,14 +364,22 @@ fn codecs(list: &Value, chunk: &[usize]) -> Result<Codecs, String> {
                 let mut sorted = order.clone();
                 sorted.sort_unstable();
                 if !sorted.into_iter().eq(0..chunk.len()) {
-                    return Err(format!("its codec `transpose` has the order {order:?} for {} dimensions", chunk.len()));
+                    return Err(format!(
+                        "its codec `transpose` has the order {} for {} dimensions",
+                        brief(&settings["order"]),
+                        chunk.len()
+                    ));
                 }
                 codecs.order = order.iter().map(|&k| codecs.order[k]).collect();
             }
             "sharding_indexed" => {
                 let inner = lengths(settings, "chunk_shape", 1)?;
                 if inner.len() != chunk.len() || inner.iter().zip(chunk).any(|(inner, outer)| outer % inner != 0) {
-                    return Err(format!("its chunks of {inner:?} do not divide its shards of {chunk:?}"));
+                    return Err(format!(
+                        "its chunks of {} do not divide its shards of {}",
+                        brief(&settings["chunk_shape"]),
+                        brief(format!("{chunk:?}"))
+                    ));
                 }
                 let index = self::codecs(&settings["index_codecs"], &[])?;
                 let within = self::codecs(&settings["codecs"], &inner)?;

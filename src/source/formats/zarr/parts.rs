@@ -1,6 +1,6 @@
 //! Where the parts of a store lie: files of a folder, or entries of a zip file.
 
-use super::super::limits::{Limits, MAX_OBJECTS};
+use super::super::limits::{Limits, MAX_DEPTH, MAX_OBJECTS};
 use super::super::messages::FormatFault;
 use rawzip::{CompressionMethod, FileReader, RECOMMENDED_BUFFER_SIZE, ReaderAt, ZipArchive, ZipArchiveEntryWayfinder};
 use std::collections::{BTreeSet, HashMap};
@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 /// Names of the files that describe a group or an array.
 pub const METADATA: [&str; 5] = ["zarr.json", ".zmetadata", ".zgroup", ".zarray", ".zattrs"];
 /// Bytes that an entry of a zip file takes in memory, beside its name.
-const ENTRY_BYTES: u64 = 128;
+const ENTRY_BYTES: u64 = 256;
 
 /// Which bytes of a part are wanted.
 #[derive(Debug, Clone, Copy)]
@@ -161,7 +161,14 @@ impl ZipParts {
         while let Some(entry) = found.next_entry().map_err(damaged)? {
             // Names that are not UTF-8 name no part of a store.
             let Ok(name) = std::str::from_utf8(entry.file_path().as_bytes()) else { continue };
-            bytes += 2 * name.len() as u64 + ENTRY_BYTES;
+            let (pieces, described) = (name.split('/').count(), METADATA.contains(&name.rsplit('/').next().unwrap_or_default()));
+            // The array, its file and the folder of the store come on top of the groups.
+            if described && pieces > MAX_DEPTH + 3 {
+                return Err(FormatFault::Refused(format!("its groups are nested more than {MAX_DEPTH} deep")));
+            }
+            // Each folder that leads to metadata is held by its whole name.
+            let names = if described { 2 + pieces as u64 } else { 2 };
+            bytes += names * name.len() as u64 + ENTRY_BYTES;
             limits.check(bytes, "the names in its directory").map_err(FormatFault::Refused)?;
             let method = entry.compression_method();
             if checked(name).is_ok() && (method == CompressionMethod::STORE || method == CompressionMethod::DEFLATE) {
