@@ -78,6 +78,13 @@ fn mutated_stores_are_answered() {
             if zip { std::fs::remove_file(&path).unwrap() } else { std::fs::remove_dir_all(&path).unwrap() }
         }
     }
+    // Metadata that take most memory for their length, almost as many as are accepted.
+    let list = format!("{{\"zarr_format\": 3, \"node_type\": \"group\", \"attributes\": {{\"a\": [{}0]}}}}", "{\"\":0},".repeat(70_000));
+    let store = write_parts(&parts(&levels(), &V3), &dir.path().join("objects.zarr"));
+    std::fs::write(store.join("zarr.json"), list).unwrap();
+    let mutants = peak() - before;
+    assert_eq!(answered(&store, &settings), Some(true));
+    println!("{} MB more for mutants, {} MB for metadata", mutants >> 20, (peak() - before) >> 20);
     let grown = (peak() - before) >> 20;
     println!("{longest:.1?} at most, {grown} MB more at most than before");
     assert!(grown < MEMORY + 14, "{grown}");
