@@ -53,7 +53,7 @@ fn mutated_stores_are_answered() {
             let (mut read, mut failed, mut refused) = (0, 0, 0);
             for _ in 0..share {
                 // Half of the mutants have damaged metadata, the others chunks.
-                let metadata = random(&mut state) % 2 == 0;
+                let metadata = random(&mut state).is_multiple_of(2);
                 let chosen: Vec<usize> = (0..whole.len()).filter(|&i| whole[i].0.contains("z") == metadata).collect();
                 let (part, data) = &whole[chosen[random(&mut state) as usize % chosen.len()]];
                 let place = if zip { path.clone() } else { path.join(part) };

@@ -3,7 +3,7 @@
 use crate::kit::grids::{Ocean, Wrf, packed_levels};
 use crate::kit::netcdf::*;
 use crate::kit::program::{self, project};
-use crate::kit::zarr::{Layout, Pack, V2, V3, parts, write, write_parts, zipped};
+use crate::kit::zarr::{Layout, Pack, V2, V3, parts, write, zipped};
 use crate::{DAYS, inspected, open, open_with, refused};
 use ridgewatch::source::{Archive, SnapshotSource};
 use std::path::{Path, PathBuf};

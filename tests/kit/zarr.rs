@@ -102,7 +102,7 @@ pub fn zipped(parts: &Parts, top: &str, deflated: bool) -> Vec<u8> {
     let mut archive = rawzip::ZipArchiveWriter::new(&mut out);
     for (name, data) in parts {
         let method = if deflated { rawzip::CompressionMethod::DEFLATE } else { rawzip::CompressionMethod::STORE };
-        let (mut entry, config) = archive.new_file(&format!("{top}{name}")).compression_method(method).start().unwrap();
+        let (mut entry, config) = archive.new_file(format!("{top}{name}")).compression_method(method).start().unwrap();
         let descriptor = if deflated {
             let mut writer = config.wrap(flate2::write::DeflateEncoder::new(&mut entry, flate2::Compression::default()));
             writer.write_all(data).unwrap();
