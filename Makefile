@@ -135,9 +135,9 @@ $(CARGO_DENY)/bin/cargo-deny:
 deny: $(CARGO_DENY)/bin/cargo-deny
 	$(CARGO_DENY)/bin/cargo-deny --locked check bans licenses sources
 
-.venv/installed: | python-packages
+.venv/installed: Makefile | python-packages
 	$(PYTHON) -m venv .venv
-	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq
+	.venv/bin/pip install --quiet numpy scipy netCDF4 pyzmq xarray zarr
 	touch $@
 
 $(NVRTC)/done: | python-packages

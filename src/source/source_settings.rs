@@ -20,7 +20,7 @@ pub enum SourceKind {
     Shear,
     /// The standard synthetic turbulence, sampled on a grid.
     Turbulence,
-    /// NetCDF and HDF5 files (`[archive]`).
+    /// NetCDF and HDF5 files, and Zarr stores (`[archive]`).
     Archive,
     /// A running simulation (`[live]`), with `ridgewatch attach`.
     Live,

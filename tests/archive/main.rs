@@ -14,6 +14,7 @@ mod real;
 mod refused;
 mod resampled;
 mod round_trip;
+mod zarr;
 
 use ridgewatch::source::{Archive, ArchiveSettings, Inspection, SnapshotSource, SourceError, inspect};
 use std::path::{Path, PathBuf};

@@ -10,3 +10,4 @@ pub mod program;
 pub mod publishing;
 pub mod ring;
 pub mod scene;
+pub mod zarr;

@@ -27,19 +27,19 @@ unsafe impl NcTypeDescriptor for Character {
 }
 
 pub struct Variable {
-    name: String,
-    dimensions: Vec<String>,
-    data: Data,
-    attributes: Vec<(String, AttributeValue)>,
+    pub name: String,
+    pub dimensions: Vec<String>,
+    pub data: Data,
+    pub attributes: Vec<(String, AttributeValue)>,
     deflated: bool,
 }
 
 /// A file to be written.
 pub struct Fixture {
     format: Format,
-    dimensions: Vec<(String, usize)>,
+    pub dimensions: Vec<(String, usize)>,
     pub variables: Vec<Variable>,
-    attributes: Vec<(String, AttributeValue)>,
+    pub attributes: Vec<(String, AttributeValue)>,
 }
 
 #[derive(Clone, Copy, PartialEq)]

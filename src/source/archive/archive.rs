@@ -42,8 +42,8 @@ struct Place {
     entry: usize,
 }
 
-/// Velocity in NetCDF files with CF conventions, in WRF output, on curvilinear grids, or in HDF5 files. Opening reads headers,
-/// coordinates and times; velocities are read one snapshot at a time. One file is open at any moment.
+/// Velocity in NetCDF files and Zarr stores with CF conventions, in WRF output, on curvilinear grids, or in HDF5 files. Opening reads
+/// headers, coordinates and times; velocities are read one snapshot at a time. One file is open at any moment.
 pub struct Archive {
     files: Vec<ArchiveFile>,
     /// In time order.

@@ -50,7 +50,7 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
 /// The setting at fault.
 pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) -> Result<(), SourceError> {
     let s = settings;
-    let hdf5 = format == Format::Hdf5;
+    let hdf5 = !format.names_dimensions();
     let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
     let curvilinear = matches!(layout.resampling, Some(Resampling::Curvilinear(_)));
     let what = match () {

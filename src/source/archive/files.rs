@@ -1,7 +1,7 @@
-//! Files, folders and patterns as a list of files.
+//! Files, folders and patterns as a list of files. A Zarr store is a folder that counts as one file.
 
 use crate::error::SourceError;
-use crate::formats::FormatFault;
+use crate::formats::{FormatFault, is_store};
 use std::path::{Path, PathBuf};
 
 /// Extensions of the files that are taken from a folder.
@@ -19,7 +19,9 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     for path in paths {
         let text = path.to_string_lossy();
         refuse_dangling(path)?;
-        if path.is_dir() {
+        if is_store(path) {
+            files.push(path.clone());
+        } else if path.is_dir() {
             files.extend(folder(path)?);
         } else if !path.exists() && text.contains(['*', '?', '[']) {
             files.extend(pattern(&text)?);
@@ -48,6 +50,11 @@ fn refuse_dangling(path: &Path) -> Result<(), SourceError> {
     }
 }
 
+/// Whether a folder is a store, or is called one: a copy without its metadata would be left out without a word.
+fn is_called_store(path: &Path) -> bool {
+    is_store(path) || (path.is_dir() && path.extension().is_some_and(|extension| extension == "zarr"))
+}
+
 fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let failed = |cause| unreadable(path, cause);
     let mut files = Vec::new();
@@ -55,15 +62,19 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
         let file = entry.map_err(failed)?.path();
         let extension = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
         let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-        if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_") {
+        // A store may have any name; a link to one that is gone shows by its ending alone.
+        let named = EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension))
+            || name.starts_with("wrfout_")
+            || [".zarr", ".zarr.zip"].iter().any(|ending| name.ends_with(ending));
+        if named {
             refuse_dangling(&file)?;
-            if file.is_file() {
-                files.push(file);
-            }
+        }
+        if (file.is_file() && named) || is_called_store(&file) {
+            files.push(file);
         }
     }
     if files.is_empty() {
-        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5").display().to_string() });
+        return Err(SourceError::NoMatch { pattern: path.join("*.nc, *.h5, *.zarr").display().to_string() });
     }
     files.sort();
     Ok(files)
@@ -75,7 +86,7 @@ fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
     for file in found {
         let file = file.map_err(|e| unreadable(e.path(), e.error()))?;
         refuse_dangling(&file)?;
-        if file.is_file() {
+        if file.is_file() || is_called_store(&file) {
             files.push(file);
         }
     }

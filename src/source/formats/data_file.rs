@@ -50,7 +50,7 @@ impl DataFile {
             self.listing.variables.push(joined);
             self.joined.push((self.others.len(), variable.name.clone()));
         }
-        self.listing.bytes += other.listing.bytes;
+        self.listing.bytes = self.listing.bytes.saturating_add(other.listing.bytes);
         self.others.push(other);
         self
     }

@@ -141,6 +141,8 @@ pub enum Format {
     NetCdf4,
     /// HDF5 without the structure of NetCDF.
     Hdf5,
+    /// Zarr of this version, and whether its arrays name their dimensions.
+    Zarr { version: u8, named: bool },
 }
 
 impl Format {
@@ -151,12 +153,14 @@ impl Format {
             Self::Classic(_) => "NetCDF 64-bit data",
             Self::NetCdf4 => "NetCDF-4",
             Self::Hdf5 => "HDF5",
+            Self::Zarr { version: 2, .. } => "Zarr 2",
+            Self::Zarr { .. } => "Zarr 3",
         }
     }
 
     /// True if files of this format name their dimensions, so that coordinates can be found by name.
     pub fn names_dimensions(self) -> bool {
-        self != Self::Hdf5
+        !matches!(self, Self::Hdf5 | Self::Zarr { named: false, .. })
     }
 }
 
@@ -165,7 +169,7 @@ impl Format {
 pub struct Listing {
     pub path: PathBuf,
     pub format: Format,
-    /// Length of the file.
+    /// Length of the file; `u64::MAX` if it does not bound what the file holds.
     pub bytes: u64,
     pub dimensions: Vec<Dimension>,
     pub variables: Vec<Variable>,
@@ -269,7 +273,9 @@ pub enum FormatFault {
     )]
     Locked(String, String),
     /// Another format, perhaps this one.
-    #[error("neither NetCDF nor HDF5 ({0}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4 and HDF5")]
+    #[error(
+        "neither NetCDF, HDF5 nor Zarr ({0}); accepted are NetCDF classic, 64-bit offset, 64-bit data, NetCDF-4, HDF5 and Zarr 2 and 3"
+    )]
     Unknown(String),
     /// The file is shorter than its header says.
     #[error("truncated: {found} bytes, but its header needs {expected}")]

@@ -1,4 +1,4 @@
-//! File formats: NetCDF classic, NetCDF-4 and HDF5, as variables, attributes and numbers.
+//! File formats: NetCDF classic, NetCDF-4, HDF5 and Zarr, as variables, attributes and numbers.
 //!
 //! In: one of three [`messages::Request`]s (list a file, describe a variable, read a hyperslab). Out: plain data ([`Listing`],
 //! [`messages::Description`], values as `f64`, [`FormatError`]). No library handle leaves this room, so that it can move to a child
@@ -19,6 +19,7 @@ mod scan;
 mod server;
 mod store;
 mod write;
+mod zarr;
 
 pub use data_file::DataFile;
 pub use guard::report_crashes;
@@ -26,3 +27,4 @@ pub use libraries::{hdf5_version, netcdf_version};
 pub use limits::Limits;
 pub use messages::{Attribute, Format, FormatError, FormatFault, Listing, NumberType, Variable};
 pub use write::{NewVariable, Values, write_hdf5, write_netcdf};
+pub use zarr::is_store;

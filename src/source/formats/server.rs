@@ -7,6 +7,7 @@ use super::messages::{Description, Format, FormatError, FormatFault, Listing, Nu
 use super::netcdf4::NetCdf4Store;
 use super::scan::{Chunks, scan};
 use super::store::Store;
+use super::zarr::ZarrStore;
 use std::fs::File;
 use std::io::{Read, Seek, SeekFrom};
 use std::path::Path;
@@ -68,8 +69,15 @@ impl OpenFile {
     /// takes milliseconds and many small reads; a file that resembles `expected` is opened through libhdf5 instead.
     fn open(path: &Path, expected: Option<&Listing>, limits: &Limits) -> Result<Self, FormatError> {
         let failed = |cause: std::io::Error| FormatFault::Open(cause.to_string()).of(path);
+        let zarr = |(listing, store, chunks)| Self { listing, store: Box::new(store) as Box<dyn Store>, chunks };
+        if path.is_dir() {
+            return ZarrStore::open_folder(path, limits).map(zarr);
+        }
         let mut file = ridgewatch_base::files::open(path).map_err(failed)?;
         let bytes = file.metadata().map_err(failed)?.len();
+        if is_zip(&mut file, bytes).map_err(failed)? {
+            return ZarrStore::open_zip(path, file, limits).map(zarr);
+        }
         let format = recognise(&mut file, bytes).map_err(failed)?.map_err(|found| FormatFault::Unknown(found).of(path))?;
         let empty = |format| Listing { path: path.into(), format, bytes, dimensions: vec![], variables: vec![], attributes: vec![] };
         if let Format::Classic(version) = format {
@@ -114,6 +122,15 @@ impl OpenFile {
     }
 }
 
+fn is_zip(file: &mut File, length: u64) -> std::io::Result<bool> {
+    let mut head = [0u8; 4];
+    if length >= 4 {
+        file.read_exact(&mut head)?;
+        file.seek(SeekFrom::Start(0))?;
+    }
+    Ok(head == *b"PK\x03\x04")
+}
+
 /// Recognises the format by the first bytes. The inner error names the format that they suggest instead.
 fn recognise(file: &mut File, length: u64) -> std::io::Result<Result<Format, String>> {
     const HDF5: [u8; 8] = *b"\x89HDF\r\n\x1a\n";
@@ -141,7 +158,6 @@ fn recognise(file: &mut File, length: u64) -> std::io::Result<Result<Format, Str
         _ if got == 0 => "it is empty".into(),
         [b'G', b'R', b'I', b'B', ..] => "it is GRIB: convert it, for example with `cdo -f nc copy`".into(),
         [0x1f, 0x8b, ..] => "it is compressed with gzip: unpack it first".into(),
-        [b'P', b'K', 3, 4, ..] => "it is a zip archive: unpack it first".into(),
         [b'C', b'D', b'F', version, ..] => format!("its version {version} is unknown"),
         _ => format!("it starts with {:?}", String::from_utf8_lossy(&head[..got])),
     }))
