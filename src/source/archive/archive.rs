@@ -213,7 +213,7 @@ impl Archive {
         archive.description.notes.extend(land.notes);
         match settings.mask.as_deref() {
             Some(ZERO) => archive.mask_zeros()?,
-            None if land.found.iter().all(Option::is_none) && !staggered => archive.tell_zeros()?,
+            None if land.found.iter().all(Option::is_none) && !staggered => archive.tell_zeros(),
             _ => {}
         }
         if let Some([error, size]) = archive.resampling_error()? {
@@ -225,10 +225,10 @@ impl Archive {
         Ok(archive)
     }
 
-    /// For each component, the points whose velocity is 0 at all of a few times, by their places in the file: those of one entry along the
-    /// levels, or all. Stops as soon as there are none.
-    fn zeros(&mut self, level: Option<usize>) -> Result<Zeros, SourceError> {
-        let found = self.zeros_of_open(level);
+    /// For each component, the points whose velocity is 0 at all of a few times: the given ones, or all in the order of the file. Stops as soon
+    /// as there are none.
+    fn zeros(&mut self, points: Option<&Orders>) -> Result<Zeros, SourceError> {
+        let found = self.zeros_of_open(points);
         if self.files.len() > 1 {
             // A file that changes from here on is noticed.
             self.open = None;
@@ -236,14 +236,13 @@ impl Archive {
         found
     }
 
-    fn zeros_of_open(&mut self, level: Option<usize>) -> Result<Zeros, SourceError> {
+    fn zeros_of_open(&mut self, points: Option<&Orders>) -> Result<Zeros, SourceError> {
         let mut zeros = Zeros::new();
         for index in sampled(self.times.len()) {
             let place = self.open_at(index)?;
             let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
             for (which, plan) in self.files[place.file].frames[place.frame].iter().enumerate().take(2) {
-                let [x, y, z] = plan.file_order();
-                let orders = [x, y, level.map_or(z, |level| vec![level])];
+                let orders = points.cloned().unwrap_or_else(|| plan.file_order());
                 let values = read_component(file, plan, &orders, place.entry)?;
                 match zeros.get_mut(which) {
                     Some((_, zero)) => zero.iter_mut().zip(values).for_each(|(zero, v)| *zero &= v == 0.0),
@@ -281,10 +280,17 @@ impl Archive {
     }
 
     /// Tells of cells whose corners are 0 at all sampled times, in the middle one of the levels: probably land.
-    fn tell_zeros(&mut self) -> Result<(), SourceError> {
+    fn tell_zeros(&mut self) {
         let level = self.axes.get(2).map_or(0, |axis| axis.order[axis.order.len() / 2]);
-        let zeros = self.zeros(Some(level))?;
-        let Some(([nx, ny, _], zero)) = zeros.first() else { return Ok(()) };
+        // Nodes of a resampled mesh are no entries of the file.
+        let along = |k: usize| match &self.resampling {
+            None => self.axes[k].order.clone(),
+            Some(_) => (0..self.files[0].frames[0][0].along(k)).collect(),
+        };
+        let points = [along(0), along(1), vec![level]];
+        // What cannot be read is reported when it is needed.
+        let Ok(zeros) = self.zeros(Some(&points)) else { return };
+        let Some(([nx, ny, _], zero)) = zeros.first() else { return };
         let corners = |cell: usize| [0, 1, *nx, nx + 1].map(|corner| cell / (nx - 1) * nx + cell % (nx - 1) + corner);
         let cells = nx.saturating_sub(1) * ny.saturating_sub(1);
         let dead = (0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count();
@@ -298,7 +304,6 @@ impl Archive {
                 sampled(self.times.len()).len()
             ));
         }
-        Ok(())
     }
 
     /// The files, in the order of their names in the arguments.
