@@ -242,8 +242,8 @@ fn only_the_chunks_in_question_are_read() {
     let layout = Layout { chunks: &[("time", 1), ("level", 1), ("latitude", 2), ("longitude", 2)], ..V2 };
     let fixture = packed_levels(CLASSIC, &[850.0, 500.0, 700.0], 0.0);
     let store = write(&fixture, &layout, &dir.path().join("a.zarr"));
-    // Level 500, latitudes 60 and 30, longitudes 0 and 90. Without a mask, opening looks for land in the velocity.
-    let settings = "level = 500\nregion = [-5, 95, 29, 61]\nw = \"none\"\nmask = \"none\"";
+    // Level 500, latitudes 60 and 30, longitudes 0 and 90.
+    let settings = "level = 500\nregion = [-5, 95, 29, 61]\nw = \"none\"";
     let expected = open_with(&[&store], settings).read(1).unwrap().nodes.clone();
     for name in ["u", "v", "w"] {
         for entry in std::fs::read_dir(store.join(name)).unwrap() {
@@ -272,12 +272,13 @@ fn what_unpacks_to_more_than_declared_is_refused() {
         let large = Fixture::on(CLASSIC, &[("x", "", &vec![0.0; 1 << 24])]);
         let bomb = parts(&large, &Layout { pack, ..V2 }).into_iter().find(|(name, _)| name == "x/0").unwrap().1;
         std::fs::write(store.join("u/0.0.0"), bomb).unwrap();
-        let message = refused(&[&store], "", &["`u/0.0.0`"]).to_string();
-        assert!(!message.contains("codecs failed"), "{pack:?}: {message}");
+        let message = open(&[&store]).read(0).unwrap_err().to_string();
+        assert!(message.contains("`u/0.0.0`") && !message.contains("codecs failed"), "{pack:?}: {message}");
     }
     let stored = write(&field, &V2, &dir.path().join("stored.zarr"));
     std::fs::write(stored.join("u/0.0.0"), vec![0; 1 << 20]).unwrap();
-    refused(&[&stored], "", &["stored.zarr", "holds 1048576 bytes"]);
+    let message = open(&[&stored]).read(0).unwrap_err().to_string();
+    assert!(message.contains("holds 1048576 bytes"), "{message}");
 }
 
 #[test]
@@ -297,13 +298,16 @@ fn extents_are_checked_before_memory_is_taken() {
     };
     let small = "memory_gib = 0.01";
     let chunks = changed("chunks.zarr", "\"chunks\":[2,3,4]", "\"chunks\":[2,3000,4000]");
-    refused(&[&chunks], small, &["chunks.zarr", "its chunks of 96000000 bytes", "archive.memory_gib"]);
+    let mut archive = open_with(&[&chunks], small);
+    let message = archive.read(0).unwrap_err().to_string();
+    assert!(message.contains("its chunks of 96000000 bytes") && message.contains("archive.memory_gib"), "{message}");
     let shape = changed("shape.zarr", "\"shape\":[2,3,4]", "\"shape\":[2,3,40000000]");
     refused(&[&shape], small, &["shape.zarr", "variable `u`", "40000000 nodes along a dimension"]);
     refused(&[&changed("wide.zarr", "\"shape\":[2,3,4]", "\"shape\":[2,9223372036854775807,4]")], "", &["wide.zarr", "overflow"]);
     refused(&[&changed("zero.zarr", "\"chunks\":[2,3,4]", "\"chunks\":[2,0,4]")], "", &["zero.zarr", "`u/.zarray`", "`chunks` holds 0"]);
     let unknown = changed("codec.zarr", "\"compressor\":null", "\"compressor\":{\"id\":\"jpeg2k\"}");
-    refused(&[&unknown], "", &["codec.zarr", "codec `jpeg2k`", "accepted are gzip, zlib, zstd, blosc"]);
+    let message = open(&[&unknown]).read(0).unwrap_err().to_string();
+    assert!(message.contains("codec `jpeg2k`") && message.contains("accepted are gzip, zlib, zstd, blosc"), "{message}");
 }
 
 #[test]
@@ -321,7 +325,7 @@ fn links_and_names_do_not_lead_out_of_a_store() {
     std::fs::copy(store.join("u/0.0.0"), &elsewhere).unwrap();
     std::fs::remove_file(&chunk).unwrap();
     std::os::unix::fs::symlink(&elsewhere, &chunk).unwrap();
-    let message = open_with(&[&store], "mask = \"none\"").read(1).unwrap_err().to_string();
+    let message = open(&[&store]).read(1).unwrap_err().to_string();
     assert!(message.contains("`u/1.0.0`: it is a link out of the store") && message.contains("archive.external = true"), "{message}");
     assert_eq!(us(&open_with(&[&store], "external = true").read(1).unwrap())[..2], [0.0, 1.0]);
     // A folder that leads out, with metadata or chunks in it.
@@ -332,12 +336,14 @@ fn links_and_names_do_not_lead_out_of_a_store() {
     // Names in consolidated metadata.
     let store = write(&field, &Layout { consolidated: true, ..V2 }, &dir.path().join("c.zarr"));
     change(&store, ".zmetadata", "\"v/", "\"../b.zarr/v/");
-    refused(&[&store], "v = \"../b.zarr/v\"", &["c.zarr", "names of parts hold no `..`"]);
+    let message = open_with(&[&store], "v = \"../b.zarr/v\"").read(0).unwrap_err().to_string();
+    assert!(message.contains("names of parts hold no `..`"), "{message}");
     // A pipe would wait for a writer.
     let pipe = write(&field, &V2, &dir.path().join("d.zarr")).join("u/0.0.0");
     std::fs::remove_file(&pipe).unwrap();
     assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
-    refused(&[dir.path().join("d.zarr")], "", &["d.zarr", "accepted: a regular file"]);
+    let message = open(&[dir.path().join("d.zarr")]).read(0).unwrap_err().to_string();
+    assert!(message.contains("accepted: a regular file"), "{message}");
 }
 
 #[test]
