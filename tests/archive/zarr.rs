@@ -421,8 +421,7 @@ fn a_window_beside_xarray() {
         let arguments: Vec<String> = region.iter().map(f64::to_string).collect();
         let theirs = program::run(Command::new(&python).arg(&script).arg(&path).args(&arguments)).success().stdout;
         let (begin, before) = (std::time::Instant::now(), read());
-        let mut archive =
-            open_with(&[&path], &format!("region = {region:?}\nmetric = \"index\"\nvelocity_unit = \"cells\"\nmask = \"none\""));
+        let mut archive = open_with(&[&path], &format!("region = {region:?}\nmetric = \"index\"\nvelocity_unit = \"cells\""));
         let mut total = 0.0;
         for index in 0..archive.times().len() {
             let snapshot = archive.read(index).unwrap();
