@@ -172,9 +172,21 @@ fn a_stop_of_several_signals_is_one() {
     }
 }
 
+/// Sets what a command does when its terminal closes.
+fn on_hangup(command: &mut Command, handler: libc::sighandler_t) {
+    // SAFETY: between fork and exec, only `signal` is called, which is safe there.
+    unsafe {
+        command.pre_exec(move || {
+            libc::signal(libc::SIGHUP, handler);
+            Ok(())
+        })
+    };
+}
+
 #[test]
 fn a_terminal_that_closes_ends_in_order() {
-    let mut run = Run::start(&gyre(), &["training.steps_per_frame=100000000"], None);
+    // These tests may run under `nohup`, whose choice would be inherited.
+    let mut run = Run::start_with(&gyre(), &["training.steps_per_frame=100000000"], None, |command| on_hangup(command, libc::SIG_DFL));
     std::thread::sleep(Duration::from_millis(1500));
     run.process().signal(libc::SIGHUP);
     run.ended_in_order(129);
@@ -183,15 +195,7 @@ fn a_terminal_that_closes_ends_in_order() {
 
 #[test]
 fn a_run_under_nohup_outlives_its_terminal() {
-    let mut run = Run::start_with(&gyre(), &["training.steps_per_frame=100000000"], None, |command| {
-        // SAFETY: between fork and exec, only `signal` is called, which is safe there.
-        unsafe {
-            command.pre_exec(|| {
-                libc::signal(libc::SIGHUP, libc::SIG_IGN);
-                Ok(())
-            })
-        };
-    });
+    let mut run = Run::start_with(&gyre(), &["training.steps_per_frame=100000000"], None, |command| on_hangup(command, libc::SIG_IGN));
     run.process().signal(libc::SIGHUP);
     std::thread::sleep(Duration::from_millis(1500));
     assert!(!run.process().has_ended() && !run.process().stderr().contains("finishing"), "the signal is ignored");

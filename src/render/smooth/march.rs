@@ -75,7 +75,7 @@ fn offsets(j: u64) -> [f32; 3] {
         1 => [0.5 - GAUSS, 0.5 + GAUSS],
         _ => [1.0 / PLASTIC, 1.0 / (PLASTIC * PLASTIC)].map(|a| (0.5 + (pair - 1) as f64 * a).fract()),
     };
-    let [x, y] = point.map(|x| (if j % 2 == 0 { x } else { 1.0 - x }) as f32);
+    let [x, y] = point.map(|x| (if j.is_multiple_of(2) { x } else { 1.0 - x }) as f32);
     [x, y, 0.5]
 }
 

@@ -159,10 +159,10 @@ fn fit(listing: &Listing, mask: &Variable, plan: &ComponentPlan) -> Option<Vec<A
                 _ => return None,
             }
         };
-        if let Along::Axis(k) = along {
-            if std::mem::replace(&mut taken[k], true) {
-                return None;
-            }
+        if let Along::Axis(k) = along
+            && std::mem::replace(&mut taken[k], true)
+        {
+            return None;
         }
         found.push(along);
     }

@@ -103,7 +103,8 @@ impl Planner<'_> {
         let name = format!("{} {}", variable.name, variable.text("long_name").unwrap_or_default()).to_ascii_lowercase();
         let bare = Unit::parse(units).is_some_and(|unit| unit.is_dimensionless());
         let months = |word: &str| word.starts_with("month");
-        if !counted(&first) && !(bare && name.split(|c: char| !c.is_alphabetic()).any(months)) {
+        let numbers = bare && name.split(|c: char| !c.is_alphabetic()).any(months);
+        if !counted(&first) && !numbers {
             return Ok(());
         }
         let found = if units.is_empty() { "has no unit".into() } else { format!("is in `{units}`") };
