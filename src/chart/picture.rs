@@ -14,8 +14,8 @@ use std::time::Instant;
 
 /// PSNR over lit pixels, in decibels, to which the time is measured.
 pub const TARGETS: [f64; 4] = [30.0, 35.0, 40.0, 45.0];
-/// Share of the panel's time for the truth.
-const TRUTH_SHARE: f64 = 0.35;
+/// Shares of the panel's time for the truth: of the first window, and of the last one that slides.
+const TRUTH_SHARES: [f64; 2] = [0.25, 0.1];
 /// PSNR beyond which a curve ends.
 const ENOUGH: f64 = 47.0;
 /// Longest curve, in seconds, on the CPU and on a GPU.
@@ -55,8 +55,17 @@ pub struct PictureCurve {
     pub bytes: usize,
     /// Frames of a still window, in order of time.
     pub frames: Vec<PicturePoint>,
-    /// Frames per second while the window slides at every frame, preparation included; `None` if it was not measured.
-    pub sliding_frames_per_second: Option<f64>,
+    /// Frames of a window that slides at every frame; `None` if it was not measured.
+    pub sliding: Option<Sliding>,
+}
+
+/// A window that slides at every frame.
+#[derive(Debug, Clone, Copy, Serialize)]
+pub struct Sliding {
+    /// Frames per second, preparation included.
+    pub frames_per_second: f64,
+    /// True PSNR over lit pixels of the last frame, in decibels; `None` if the runs ended before it, or the source before its truth.
+    pub psnr: Option<f64>,
 }
 
 impl PictureCurve {
@@ -80,7 +89,7 @@ impl PictureCurve {
 pub struct PicturePanel {
     /// Width and height in pixels.
     pub size: [usize; 2],
-    /// Samples a pixel of both halves of the truth.
+    /// Samples a pixel of both halves of the first window's truth.
     pub truth_samples: f64,
     /// PSNR over lit pixels between the halves. Their mean is 6 dB better.
     pub truth_psnr: f64,
@@ -167,10 +176,16 @@ pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSet
     Ok(settings.transfer.clone().unwrap_or_default().scaled_to(&ftle))
 }
 
-/// Runs the first slide of a scene until `seen` returns false for a frame.
-pub(super) fn still(settings: Settings, options: &RunOptions, mut seen: impl FnMut(&Frame) -> bool + Send) -> Result<usize, RunError> {
+/// Runs slide `slide` of a scene, counted from 0, until `seen` returns false for a frame. Returns the bytes of the surrogate; `None` if the source ends
+/// before.
+pub(super) fn still(
+    settings: Settings,
+    options: &RunOptions,
+    slide: usize,
+    mut seen: impl FnMut(&Frame) -> bool + Send,
+) -> Result<Option<usize>, RunError> {
     let mut settings = settings;
-    settings.time.slides = Some(1);
+    settings.time.slides = Some(slide + 1);
     (settings.time.warmup_frames, settings.time.frames_per_slide) = (0, 1_000_000);
     (settings.render.until, settings.render.budget) = (None, None);
     let enough = AtomicBool::new(false);
@@ -182,7 +197,13 @@ pub(super) fn still(settings: Settings, options: &RunOptions, mut seen: impl FnM
             enough.store(true, Ordering::Relaxed);
         }
     };
-    Ok(run(Setup::new(settings)?, options, &mut sink, &enough)?.surrogate_bytes)
+    let mut setup = Setup::new(settings)?;
+    for _ in 0..slide {
+        if setup.slides.next_slide(&enough)?.is_none() {
+            return Ok(None);
+        }
+    }
+    Ok(Some(run(setup, options, &mut sink, &enough)?.surrogate_bytes))
 }
 
 /// The scene with another method, and a number of samples that the method accepts.
@@ -208,24 +229,31 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
     settings.transfer = Some(fixed_colours(&settings, charting.device)?);
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
     let size = [settings.render.width, settings.render.height];
-    let per_half = 0.5 * TRUTH_SHARE * charting.left();
-    let mut samples = 0.0;
-    let mut half = |seed: u64| {
+    let left = charting.left();
+    let truth = |slide: usize, share: f64| {
         (charting.tell)("the true picture: two halves of reference");
-        let mut scene = Settings { seed, ..with_method(&settings, Method::Reference, Kind::Table) };
-        scene.render.samples = TRUTH_SAMPLES;
-        let began = Instant::now();
-        let mut sum = Film::new(size[0], size[1]);
-        still(scene, &options, |frame| {
-            samples += TRUTH_SAMPLES;
-            // Both films have the size of the scene.
-            sum.accumulate(&frame.film).is_ok() && began.elapsed().as_secs_f64() < per_half && !charting.stop.load(Ordering::Relaxed)
-        })?;
-        Ok::<_, RunError>(sum)
+        let mut samples = 0.0;
+        // Seeds of their own: the charted pictures must not share random numbers with the truth.
+        let mut half = |seed: u64| {
+            let mut scene = Settings { seed, ..with_method(&settings, Method::Reference, Kind::Table) };
+            scene.render.samples = TRUTH_SAMPLES;
+            let began = Instant::now();
+            let mut sum = Film::new(size[0], size[1]);
+            let bytes = still(scene, &options, slide, |frame| {
+                samples += TRUTH_SAMPLES;
+                // Both films have the size of the scene.
+                let whole = sum.accumulate(&frame.film).is_ok();
+                whole && began.elapsed().as_secs_f64() < 0.5 * share * left && !charting.stop.load(Ordering::Relaxed)
+            })?;
+            Ok::<_, RunError>(bytes.map(|_| sum))
+        };
+        let halves = [half(settings.seed ^ 0x5eed_0001)?, half(settings.seed ^ 0x5eed_0002)?];
+        let [Some(a), Some(b)] = halves else { return Ok::<_, RunError>(None) };
+        Ok(Some((Truth::new([a, b])?, samples)))
     };
-    // Seeds of their own: the charted pictures must not share random numbers with the truth.
-    let halves = [half(settings.seed ^ 0x5eed_0001)?, half(settings.seed ^ 0x5eed_0002)?];
-    let truth = Truth::new(halves)?;
+    let (first_truth, samples) = truth(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
+    let last_truth = truth(SLIDES - 1, TRUTH_SHARES[1])?.map(|(truth, _)| truth);
+    let truth = first_truth;
     let one = Truth::new([truth.halves[1].clone(), truth.halves[1].clone()])?;
     let truth_psnr = picture_errors(&truth.halves[0], &one, settings.render.tone_map).psnr;
     let mut curves = Vec::new();
@@ -241,15 +269,14 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
     ];
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
         let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
-        let mut curve =
-            PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding_frames_per_second: None };
+        let mut curve = PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None };
         if !charting.has_time_for(&format!("pictures by {}", curve.name())) {
             continue;
         }
         let longest = (charting.left() / (candidates.len() - number) as f64).min(LONGEST[usize::from(charting.device.is_gpu())]);
         let scene = with_method(&settings, method, kind);
         curve.bytes = measure(&scene, &options, &truth, 0.8 * longest, charting.stop, &mut curve.frames)?;
-        curve.sliding_frames_per_second = sliding(&scene, &options, 0.2 * longest)?;
+        curve.sliding = sliding(&scene, &options, last_truth.as_ref(), 0.2 * longest)?;
         curves.push(curve);
     }
     Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves })
@@ -266,7 +293,7 @@ fn measure(
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
     let mut seconds = 0.0;
-    still(scene.clone(), options, |frame| {
+    let bytes = still(scene.clone(), options, 0, |frame| {
         let record = &frame.record;
         seconds += record.seconds.slide + record.seconds.total;
         // Films of the other methods have their own samples only.
@@ -284,25 +311,29 @@ fn measure(
             stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
         });
         errors.psnr < ENOUGH && seconds < longest && !stop.load(Ordering::Relaxed)
-    })
+    })?;
+    Ok(bytes.unwrap_or(0))
 }
 
-/// Frames per second of a window that slides at every frame; `None` if the source has too few slides, or a frame took too long.
-fn sliding(scene: &Settings, options: &RunOptions, longest: f64) -> Result<Option<f64>, RunError> {
+/// A window that slides at every frame; `None` if the source has too few slides, or a frame took too long.
+fn sliding(scene: &Settings, options: &RunOptions, truth: Option<&Truth>, longest: f64) -> Result<Option<Sliding>, RunError> {
     let mut scene = scene.clone();
     (scene.time.slides, scene.time.frames_per_slide, scene.time.warmup_frames) = (Some(SLIDES), 1, 0);
     (scene.render.until, scene.render.budget) = (None, None);
-    let (mut seconds, mut frames) = (0.0, 0);
+    let (mut seconds, mut frames, mut psnr) = (0.0, 0, None);
     let enough = AtomicBool::new(false);
     let mut sink = |event: Event| {
-        if let Event::Frame(Frame { record, .. }) = event
+        if let Event::Frame(Frame { record, film, tone_map, .. }) = event
             && record.slide > 0
         {
             seconds += record.seconds.slide + record.seconds.total;
             frames += 1;
+            if record.slide + 1 == SLIDES as u64 {
+                psnr = truth.map(|truth| picture_errors(&film, truth, tone_map).psnr);
+            }
             enough.store(seconds > longest, Ordering::Relaxed);
         }
     };
     run(Setup::new(scene)?, options, &mut sink, &enough)?;
-    Ok((frames > 0).then(|| f64::from(frames) / seconds))
+    Ok((frames > 0).then(|| Sliding { frames_per_second: f64::from(frames) / seconds, psnr }))
 }

@@ -41,8 +41,9 @@ pub fn csv(chart: &Chart) -> String {
                 frame.samples
             );
         }
-        if let Some(rate) = curve.sliding_frames_per_second {
-            let _ = writeln!(out, "picture,{},sliding,{:.6e},,,{},,,,,,,,,", text(&curve.name()), 1.0 / rate, curve.bytes);
+        if let Some(sliding) = curve.sliding {
+            let (seconds, psnr) = (1.0 / sliding.frames_per_second, number(sliding.psnr));
+            let _ = writeln!(out, "picture,{},sliding,{seconds:.6e},,,{},,,{psnr},,,,,,", text(&curve.name()), curve.bytes);
         }
     }
     for point in chart.scaling.iter().flat_map(|panel| &panel.points) {

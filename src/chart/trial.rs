@@ -52,7 +52,7 @@ pub fn choose(settings: &Settings, device: &Device, threads: usize, stop: &Atomi
         let scene = with_method(&settings, method, Kind::Table);
         let longest = TRIAL_SECONDS / METHODS.len() as f64;
         let (mut since, mut spent, mut reached) = (0.0, 0.0, Reached::default());
-        still(scene, &options, |frame| {
+        still(scene, &options, 0, |frame| {
             let record = &frame.record;
             (since, spent) = (since + record.seconds.slide + record.seconds.total, spent + record.seconds.total);
             name.clone_from(&record.device);

@@ -90,10 +90,15 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
             }
         });
     }
-    let sliding = |curve: &super::PictureCurve| curve.sliding_frames_per_second.map(|rate| format!("{} {rate:.2}", curve.name()));
+    let sliding = |curve: &super::PictureCurve| {
+        curve.sliding.map(|found| {
+            let psnr = found.psnr.map_or(String::new(), |psnr| format!(" at {psnr:.1} dB"));
+            format!("{} {:.2}/s{psnr}", curve.name(), found.frames_per_second)
+        })
+    };
     let rates: Vec<String> = panel.curves.iter().filter_map(sliding).collect();
     if !rates.is_empty() {
-        said.push(format!("Frames/s while the window slides at every frame: {}.", rates.join(", ")));
+        said.push(format!("Frames of a window that slides at every frame: {}.", rates.join(", ")));
     }
 }
 
