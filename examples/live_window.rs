@@ -1,7 +1,7 @@
 //! Follows a simulation and writes the window of each slide: all nodes of its snapshots, 4 f32 each (u, v, w, and NaN where missing), oldest first.
 //!
 //! ```text
-//! cargo run --release --example live_window -- /dev/shm/ridgewatch-$USER/run 6 windows
+//! cargo run --release --example live_window -- /dev/shm/ridgewatch-$(id -u)/run 6 windows
 //! ```
 //! It takes every step, and ends with the simulation.
 #![allow(clippy::print_stdout)]

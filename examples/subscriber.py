@@ -6,9 +6,11 @@
 """
 
 import argparse
+import contextlib
 import json
 import os
 import pathlib
+import stat
 import sys
 import time
 
@@ -17,20 +19,30 @@ import zmq
 SUFFIX = {"jpeg": "jpg", "png": "png", "exr": "exr", "raw": "f32"}
 
 
+def is_private(folder):
+    """Whether a folder exists and is this user's alone. Frames in a folder of another user would be theirs."""
+    try:
+        about = os.lstat(folder)
+    except OSError:
+        return False
+    return stat.S_ISDIR(about.st_mode) and about.st_uid == os.geteuid() and about.st_mode & 0o077 == 0
+
+
 def private_endpoint():
     """The endpoint of `--publish`, in a folder that only this user enters."""
-    folder = os.environ.get("XDG_RUNTIME_DIR", "")
-    if os.path.isabs(folder) and os.path.isdir(folder) and not os.path.islink(folder):
-        about = os.stat(folder)
-        if about.st_uid == os.geteuid() and about.st_mode & 0o077 == 0:
-            return f"ipc://{folder}/ridgewatch/frames"
-    name = os.environ.get("USER", "")
-    return f"ipc:///dev/shm/ridgewatch-{name if name and '/' not in name else os.geteuid()}/frames"
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    folder = f"{runtime}/ridgewatch" if os.path.isabs(runtime) and is_private(runtime) else f"/dev/shm/ridgewatch-{os.geteuid()}"
+    # Made now, so that no other user makes it before ridgewatch starts.
+    with contextlib.suppress(OSError):
+        os.mkdir(folder, 0o700)
+    if not is_private(folder):
+        sys.exit(f"{folder} is not a folder of this user with mode 0700: set XDG_RUNTIME_DIR to such a folder, or name an endpoint")
+    return f"ipc://{folder}/frames"
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("endpoint", nargs="?", default=private_endpoint(), help="by default that of `--publish`")
+    parser.add_argument("endpoint", nargs="?", help="by default that of `--publish`")
     parser.add_argument("--save", type=pathlib.Path, help="folder for the pictures")
     parser.add_argument("--frames", type=int, default=0, help="stop after so many frames")
     parser.add_argument("--records", action="store_true", help="print the record messages too")
@@ -42,7 +54,7 @@ def main():
     # Two waiting messages are enough: old frames are useless.
     socket.setsockopt(zmq.RCVHWM, 2)
     # Reconnecting is libzmq's default (every 100 ms): after a disconnect the frames continue.
-    socket.connect(options.endpoint)
+    socket.connect(options.endpoint or private_endpoint())
     socket.subscribe(b"frame")
     if options.records:
         socket.subscribe(b"record")

@@ -10,7 +10,7 @@ use anyhow::{Context, bail};
 use serde_json::Value;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
-use zeromq::{Socket, SocketRecv, SubSocket, ZmqMessage};
+use zeromq::{Socket, SocketOptions, SocketRecv, SubSocket, ZmqError, ZmqMessage, ZmqResult};
 
 #[tokio::main]
 async fn main() -> anyhow::Result<()> {
@@ -21,9 +21,7 @@ async fn main() -> anyhow::Result<()> {
         std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
     }
 
-    let mut socket = SubSocket::new();
-    // Waits for the publisher if it is not there yet, and reconnects by itself after a disconnect.
-    socket.connect(&endpoint).await.with_context(|| endpoint.clone())?;
+    let mut socket = connect(&endpoint).await.with_context(|| endpoint.clone())?;
     socket.subscribe("frame").await?;
 
     let mut last: Option<Instant> = None;
@@ -45,6 +43,20 @@ async fn main() -> anyhow::Result<()> {
         match show(&message, gap, save.as_deref()) {
             Ok(line) => println!("{line}"),
             Err(error) => eprintln!("not understood: {error:#}"),
+        }
+    }
+}
+
+/// Connects as soon as the publisher is there. After a disconnect the socket connects again by itself.
+async fn connect(endpoint: &str) -> ZmqResult<SubSocket> {
+    loop {
+        let mut options = SocketOptions::default();
+        // Otherwise the pauses between attempts grow to half a minute, and after half a minute it is an error.
+        options.connect_timeout(Duration::from_secs(1));
+        let mut socket = SubSocket::with_options(options);
+        match socket.connect(endpoint).await {
+            Err(ZmqError::ConnectTimeout(_)) => {}
+            connected => return connected.map(|()| socket),
         }
     }
 }

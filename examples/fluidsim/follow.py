@@ -1,8 +1,8 @@
 """fluidsim, followed live: 2-D turbulence or the 3-D Taylor-Green vortex.
 
     pip install fluidsim fluidfft pyfftw WHEEL_OF_RIDGEWATCH_ADAPTER
-    RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/fluidsim python follow.py 2d
-    ridgewatch attach examples/fluidsim/live.toml /dev/shm/ridgewatch-$USER/fluidsim
+    RIDGEWATCH_RING=/dev/shm/ridgewatch-$(id -u)/fluidsim python follow.py 2d
+    ridgewatch attach examples/fluidsim/live.toml /dev/shm/ridgewatch-$(id -u)/fluidsim
 
 Only the lines between the marks are ours: a solver publishes by calling one function after each step. A ring that cannot be had is a warning, and the
 simulation goes on without.

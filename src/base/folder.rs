@@ -10,6 +10,9 @@ use std::os::fd::OwnedFd;
 use std::os::unix::ffi::OsStringExt;
 use std::path::{Path, PathBuf};
 
+/// Attempts to open a file that others rename at the same time.
+const ATTEMPTS: usize = 100;
+
 /// A folder that is held open.
 #[derive(Debug)]
 pub struct Folder {
@@ -112,6 +115,46 @@ impl Folder {
         written
     }
 
+    /// Opens a file that is written beside its place and then renamed: empty, and locked until it is closed, so that one process writes it at a
+    /// time. What a killed process left of it is used again. Where the file system has no locks, nothing is locked.
+    ///
+    /// # Errors
+    /// Errors of the system; `WouldBlock` if another process writes it.
+    pub fn open_part(&self, part: &OsStr) -> io::Result<File> {
+        let flags = OFlags::RDWR | OFlags::CREATE | OFlags::NOFOLLOW | OFlags::NONBLOCK | OFlags::CLOEXEC;
+        for _ in 0..ATTEMPTS {
+            let file: File = match rustix::fs::openat(&self.handle, part, flags, Mode::from_raw_mode(0o666)) {
+                // A link.
+                Err(Errno::LOOP) => {
+                    self.remove(part)?;
+                    continue;
+                }
+                file => file?.into(),
+            };
+            match rustix::fs::flock(&file, FlockOperation::NonBlockingLockExclusive) {
+                Ok(()) | Err(Errno::NOLCK | Errno::NOSYS | Errno::OPNOTSUPP) => {}
+                Err(Errno::WOULDBLOCK) => {
+                    let path = self.path.join(part);
+                    return Err(io::Error::new(ErrorKind::WouldBlock, format!("another process writes {}", path.display())));
+                }
+                Err(error) => return Err(error.into()),
+            }
+            let (about, named) = (rustix::fs::fstat(&file)?, rustix::fs::statat(&self.handle, part, AtFlags::SYMLINK_NOFOLLOW));
+            if !named.is_ok_and(|named| (named.st_dev, named.st_ino) == (about.st_dev, about.st_ino)) {
+                // Its process has renamed it before it was locked here: what it has become must stay.
+                continue;
+            }
+            let regular = FileType::from_raw_mode(about.st_mode) == FileType::RegularFile;
+            if regular && about.st_nlink == 1 && about.st_uid == rustix::process::geteuid().as_raw() {
+                file.set_len(0)?;
+                return Ok(file);
+            }
+            // A pipe, or a file that has another name too.
+            self.remove(part)?;
+        }
+        Err(io::Error::other(format!("{} was replaced {ATTEMPTS} times while it was opened", self.path.join(part).display())))
+    }
+
     /// Moves a file into a folder of the same file system, which may be this one.
     ///
     /// # Errors
@@ -134,6 +177,14 @@ impl Folder {
     /// Errors of the system.
     pub fn remove_folder(&self, name: &str) -> io::Result<()> {
         Ok(rustix::fs::unlinkat(&self.handle, name, AtFlags::REMOVEDIR)?)
+    }
+
+    /// Brings names that were changed in it to the disk.
+    ///
+    /// # Errors
+    /// Errors of the system.
+    pub fn sync(&self) -> io::Result<()> {
+        Ok(rustix::fs::fsync(&self.handle)?)
     }
 
     /// Names of everything in the folder.
@@ -250,6 +301,38 @@ mod tests {
         folder.write_whole("summary", b"ours").unwrap();
         pipe("lock");
         assert!(folder.lock("lock").unwrap_err().to_string().contains("no regular file"));
+    }
+
+    #[test]
+    fn what_a_killed_writer_left_is_used_again_and_nothing_else() {
+        let (temporary, folder) = opened();
+        let (path, name) = (temporary.path().join(".weights.part"), OsStr::new(".weights.part"));
+        std::fs::write(&path, "half").unwrap();
+        let mut part = folder.open_part(name).unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"");
+        let refused = folder.open_part(name).unwrap_err();
+        assert!(refused.kind() == ErrorKind::WouldBlock && refused.to_string().contains(".weights.part"), "{refused}");
+        part.write_all(b"whole").unwrap();
+        // What it has become stays, also while it is open.
+        folder.rename(name, &folder, "weights").unwrap();
+        let next = folder.open_part(name).unwrap();
+        assert_eq!(std::fs::read(temporary.path().join("weights")).unwrap(), b"whole");
+        drop((part, next));
+        // Other names of a file, and what is no file, are replaced.
+        let victim = temporary.path().join("victim");
+        std::fs::write(&victim, "precious").unwrap();
+        let fifo = |path: &Path| assert!(std::process::Command::new("mkfifo").arg(path).status().unwrap().success());
+        for odd in
+            [&|| symlink(&victim, &path).unwrap(), &|| std::fs::hard_link(&victim, &path).unwrap(), &|| fifo(&path)] as [&dyn Fn(); 3]
+        {
+            folder.remove(name).unwrap();
+            odd();
+            folder.open_part(name).unwrap().write_all(b"ours").unwrap();
+            assert_eq!((std::fs::read(&path).unwrap(), std::fs::read(&victim).unwrap()), (b"ours".to_vec(), b"precious".to_vec()));
+        }
+        std::fs::remove_file(&path).unwrap();
+        std::fs::create_dir(&path).unwrap();
+        assert!(folder.open_part(name).is_err());
     }
 
     #[test]

@@ -5,7 +5,7 @@ use super::common::{
 };
 use super::signals::Stop;
 use super::{messages, notify};
-use anyhow::{Context, Result, anyhow, bail};
+use anyhow::{Result, anyhow, bail};
 use ridgewatch::config::SceneFile;
 use ridgewatch::publish::{DEFAULT_ENDPOINT, FileStatistics, Output, PublishError, RunFolder, Summary};
 use ridgewatch::render::Method;
@@ -99,8 +99,12 @@ impl Session<'_> {
     /// Runs. `open` may wait for its source until the flag is set, and then returns `None`.
     pub fn run(self, open: impl FnOnce(&SceneFile, &AtomicBool) -> Result<Option<Setup>>) -> Result<()> {
         let Self { common, options, scene, text, follows: following } = self;
-        // Before any wait or work. `RunFolder::create` checks again, in case another run takes the folder meanwhile.
-        RunFolder::refuse_occupied(&options.out, options.overwrite)?;
+        let wanted = following.as_ref().filter(|_| !options.overwrite).map(|following| following.wanted.as_path());
+        // Before any wait or work. The folder is checked again when it is created, in case another run takes it meanwhile.
+        match RunFolder::refuse_occupied(&options.out, options.overwrite) {
+            Err(PublishError::InUse { .. } | PublishError::Occupied { .. }) if wanted.is_some() => {}
+            free => free?,
+        }
         let stop = Stop::default();
         let within = options.stop_within.map(Duration::try_from_secs_f64).transpose().unwrap_or_default();
         let watch = || stop.watch(within, || ());
@@ -125,19 +129,13 @@ impl Session<'_> {
         // The socket first: a port in use must not cost the previous run in the folder.
         let publish = scene.publish_settings();
         let mut output = Output::start(&publish, None).map_err(|error| located(&scene, error, PublishError::refused))?;
-        let mut folder = RunFolder::create(&options.out, options.overwrite);
-        if let (Some(Follows { wanted, .. }), false, Err(PublishError::InUse { .. } | PublishError::Occupied { .. })) =
-            (&following, options.overwrite, &folder)
-        {
-            // Another run took it while this one waited for its simulation.
-            let out = RunFolder::vacant(wanted)?;
-            messages::note(format_args!("{} is taken by now: this run is written to {}", options.out.display(), out.display()));
-            folder = RunFolder::create(&out, false);
-        }
-        let mut folder = folder?;
+        let mut folder = wanted.map_or_else(|| RunFolder::create(&options.out, options.overwrite), RunFolder::create_vacant)?;
         let out = folder.path().to_owned();
+        if out != options.out {
+            messages::note(format_args!("this run is written to {}, not to {}", out.display(), options.out.display()));
+        }
         if let Err(error) = folder.write_scene(if follows { "attach" } else { "replay" }, &text) {
-            folder.restore_previous().with_context(|| format!("{}: the previous run cannot be restored", out.display()))?;
+            folder.give_up();
             return Err(error.into());
         }
         output.write_to(folder, &publish)?;

@@ -60,7 +60,7 @@ impl<'a> TracerBuilder<'a> {
     fn new(source: VelocitySource, map: &'a FlowMap, t0: f64, order: Order) -> Result<Self, FlowError> {
         positive("tau", map.tau)?;
         match map.steps {
-            Steps::Auto { tolerance } => positive("steps.tolerance", tolerance)?,
+            Steps::Auto { tolerance } | Steps::AutoByShare { tolerance, .. } => positive("steps.tolerance", tolerance)?,
             Steps::Fixed(0) => return Err(FlowError::OutOfRange { key: "steps", found: 0.0, accepted: "1 or more" }),
             Steps::Fixed(_) => {}
         }
@@ -172,7 +172,8 @@ impl<'a> TracerBuilder<'a> {
         }
         let (count, chosen) = match self.map.steps {
             Steps::Fixed(steps) => (steps, None),
-            Steps::Auto { tolerance } => {
+            Steps::Auto { tolerance } | Steps::AutoByShare { tolerance, .. } => {
+                let share = if let Steps::AutoByShare { share, .. } = self.map.steps { share } else { f64::INFINITY };
                 // Steps are chosen in double precision, so that rounding does not affect the choice.
                 let mut tracer = self.tracer::<_, _, D, N, C>(double()?, TangentKernel(Stages::empty()));
                 let intervals = intervals(Coordinates::break_times(&tracer.field), from, to);
@@ -184,7 +185,7 @@ impl<'a> TracerBuilder<'a> {
                 };
                 let chosen = steps::choose_steps(
                     tolerance,
-                    steps::GridConstraints { intervals, min_steps: cells },
+                    steps::GridConstraints { intervals, min_steps: cells, share },
                     &self.domain,
                     |steps, points, out| {
                         tracer.kernel = TangentKernel(Stages::new::<V64, D, N, C>(&tracer.field, from, to, steps));

@@ -136,6 +136,14 @@ pub enum Steps {
         /// Root mean square difference of the log-stretch, no unit.
         tolerance: f64,
     },
+    /// As `Auto`, and at most this share of the root mean square log-stretch. The gradient of a linear interpolant jumps at the faces of
+    /// cells, so that errors fall only with the first power of the step, and short integrations have little stretch.
+    AutoByShare {
+        /// As for `Auto`.
+        tolerance: f64,
+        /// Share of the log-stretch, above 0.
+        share: f64,
+    },
     /// A given number.
     Fixed(usize),
 }

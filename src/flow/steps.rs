@@ -11,6 +11,10 @@ const MAX_STEPS: usize = 16_384;
 const MIN_STEPS_PER_INTERVAL: usize = 2;
 /// Most steps per snapshot interval, unless particles cross more cells.
 const MAX_STEPS_PER_INTERVAL: usize = 32;
+/// Most steps over those that the crossed cells require.
+const MAX_OVER_CROSSED: usize = 8;
+/// Smallest bound by a share of the log-stretch, as a part of the tolerance: a flow without stretch needs no steps for it.
+const MIN_BOUND: f64 = 0.01;
 /// Limit of the steps per snapshot interval for the cells that particles cross: velocities of input data are unbounded.
 const MAX_STEPS_PER_INTERVAL_FOR_CELLS: usize = 256;
 /// Share of the points with the largest differences that is left out on grids. If more points have no finite log-stretch, the difference is
@@ -54,12 +58,21 @@ fn trimmed_difference(a: &Traced, b: &Traced, trimmed: f64) -> (f64, usize) {
     ((squares.iter().sum::<f64>() / squares.len() as f64).sqrt(), failed)
 }
 
-/// Bounds on the number of steps that follow from the grid.
+/// Root mean square log-stretch over the paths that span the whole time; infinite if there are none.
+fn rms_of_whole(traced: &Traced) -> f64 {
+    let whole = traced.log_stretch.iter().zip(&traced.lifetime_share).filter(|(s, share)| **share >= 1.0 && s.is_finite());
+    let (sum, count) = whole.fold((0.0, 0usize), |(sum, count), (s, _)| (sum + f64::from(*s).powi(2), count + 1));
+    if count < MIN_COMPLETE_PATHS { f64::INFINITY } else { (sum / count as f64).sqrt() }
+}
+
+/// Bounds on the number of steps.
 pub struct GridConstraints {
     /// Snapshot intervals in tau; 0 for a closed form.
     pub intervals: usize,
     /// Steps that the cells crossed in tau require.
     pub min_steps: f64,
+    /// Largest difference as a share of the log-stretch; infinite if there is none.
+    pub share: f64,
 }
 
 /// Returns the first number of steps, each about 1.5 times the one before, whose log-stretch differs from that of twice as many steps by at
@@ -68,14 +81,14 @@ pub struct GridConstraints {
 /// On grids the numbers begin at `grid.min_steps`: fewer steps may agree with one another and be wrong. The gradient of the interpolant
 /// jumps at cell faces, so that a few paths along a separatrix turn one way with n steps and the other way with 2n, for every n. Therefore
 /// the [`TRIMMED_SHARE`] of the points that differ most is left out. The numbers end at [`MAX_STEPS_PER_INTERVAL`] steps per snapshot
-/// interval, beyond which the resolution of the data limits the accuracy.
+/// interval or [`MAX_OVER_CROSSED`] times the first number, beyond which the resolution of the data limits the accuracy.
 ///
 /// # Errors
 /// [`FlowError::StepsNotFound`] if no number of steps meets the tolerance on a closed form. On grids the last choice is returned instead,
 /// with [`StepChoice::within_tolerance`] false.
 pub fn choose_steps(
     tolerance: f64,
-    GridConstraints { intervals, min_steps }: GridConstraints,
+    GridConstraints { intervals, min_steps, share }: GridConstraints,
     domain: &Domain,
     mut trace: impl FnMut(usize, &[[f32; 3]], &mut Traced),
 ) -> Result<StepChoice, FlowError> {
@@ -87,13 +100,18 @@ pub fn choose_steps(
         .clamp(MIN_STEPS_PER_INTERVAL * intervals, MAX_STEPS_PER_INTERVAL_FOR_CELLS * intervals)
         .next_multiple_of(intervals.max(1));
     let mut steps = if gridded { first } else { MIN_STEPS };
-    let max_steps = if gridded { first.max(MAX_STEPS_PER_INTERVAL * intervals) } else { MAX_STEPS };
+    let max_steps = if gridded {
+        (MAX_OVER_CROSSED * first).min(MAX_STEPS_PER_INTERVAL_FOR_CELLS * intervals).max(MAX_STEPS_PER_INTERVAL * intervals)
+    } else {
+        MAX_STEPS
+    };
     let mut last = StepChoice { steps, difference: f64::INFINITY, within_tolerance: false, not_finite: 0 };
     while steps <= max_steps {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
         let (difference, not_finite) = trimmed_difference(&once, &twice, trimmed);
-        last = StepChoice { steps, difference, within_tolerance: difference <= tolerance, not_finite };
+        let within_tolerance = difference <= tolerance.min((share * rms_of_whole(&twice)).max(MIN_BOUND * tolerance));
+        last = StepChoice { steps, difference, within_tolerance, not_finite };
         if last.within_tolerance {
             return Ok(last);
         }

@@ -6,8 +6,9 @@ use super::settings::{ExrFrames, PublishSettings, WhenDiskSlow};
 use super::summary::FileStatistics;
 use crate::run::{Frame, FrameRecord};
 use std::collections::VecDeque;
+use std::sync::mpsc::channel;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::thread::JoinHandle;
+use std::thread::{Builder, JoinHandle};
 use std::time::{Duration, Instant};
 
 /// Maximum number of queued frames with pictures.
@@ -22,7 +23,7 @@ const DISK_LIMIT: Duration = Duration::from_secs(60);
 pub(super) struct FileWriter {
     shared: Arc<Shared>,
     /// `None` once finished.
-    thread: Option<JoinHandle<RunFolder>>,
+    thread: Option<JoinHandle<Option<RunFolder>>>,
     when_disk_slow: WhenDiskSlow,
     limit: Duration,
 }
@@ -66,19 +67,29 @@ impl Shared {
 }
 
 impl FileWriter {
+    /// Starts the thread. If it cannot be started, the folder has its previous run again.
     pub(super) fn start(folder: RunFolder, settings: PublishSettings) -> Result<Self, PublishError> {
-        Self::start_with_limit(folder, settings, DISK_LIMIT)
+        Self::start_in(Builder::new(), folder, settings, DISK_LIMIT)
     }
 
-    fn start_with_limit(folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
+    fn start_in(thread: Builder, mut folder: RunFolder, settings: PublishSettings, limit: Duration) -> Result<Self, PublishError> {
         let shared = Arc::new(Shared::default());
         let (theirs, when_disk_slow) = (Arc::clone(&shared), settings.when_disk_slow.unwrap_or(WhenDiskSlow::Wait));
         let name = "ridgewatch-files";
-        let thread = std::thread::Builder::new()
-            .name(name.to_owned())
-            .spawn(move || write_all(&theirs, folder, &settings))
-            .map_err(|source| PublishError::Thread { name, source })?;
-        Ok(Self { shared, thread: Some(thread), when_disk_slow, limit })
+        // Sent once the thread exists: one that is refused would take the folder with it.
+        let (send, receive) = channel();
+        let work = move || receive.recv().ok().map(|folder| write_all(&theirs, folder, &settings));
+        match thread.name(name.to_owned()).spawn(work) {
+            Ok(thread) => {
+                // It waits for the folder.
+                let _ = send.send(folder);
+                Ok(Self { shared, thread: Some(thread), when_disk_slow, limit })
+            }
+            Err(source) => {
+                folder.give_up();
+                Err(PublishError::Thread { name, source })
+            }
+        }
     }
 
     /// Queues a frame. With [`WhenDiskSlow::Wait`] it waits for a place in the queue, a minute at most.
@@ -118,7 +129,7 @@ impl FileWriter {
             state = self.shared.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
         }
         drop(state);
-        let folder = self.thread.take().and_then(|thread| thread.join().ok());
+        let folder = self.thread.take().and_then(|thread| thread.join().ok().flatten());
         let mut statistics = self.shared.lock().statistics.clone();
         statistics.bytes_kept = folder.as_ref().map_or(0, RunFolder::kept_bytes);
         (folder, statistics)
@@ -258,6 +269,19 @@ mod tests {
     }
 
     #[test]
+    fn a_thread_that_is_refused_does_not_cost_the_earlier_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let create = |overwrite| RunFolder::create(folder.path(), overwrite).unwrap();
+        create(false).append_record(&frame(7, 1).record, None).unwrap();
+        // No system has memory for this stack.
+        let refusing = Builder::new().stack_size(1 << 60);
+        let refused = FileWriter::start_in(refusing, create(true), PublishSettings::default(), DISK_LIMIT).unwrap_err().to_string();
+        assert!(refused.contains("cannot start the thread ridgewatch-files"), "{refused}");
+        assert_eq!(recorded(folder.path()), [7]);
+        assert!(!folder.path().join(".previous").exists());
+    }
+
+    #[test]
     fn records_beyond_their_cap_are_counted() {
         let folder = tempfile::tempdir().unwrap();
         // A few lines a file.
@@ -314,7 +338,7 @@ mod tests {
         let (_reader, mut pipe) = std::io::pipe().unwrap();
         std::io::Write::write_all(&mut pipe, &[0; 1 << 16]).unwrap();
         run.hang(std::fs::File::from(std::os::fd::OwnedFd::from(pipe)));
-        let writer = FileWriter::start_with_limit(run, PublishSettings::default(), limit).unwrap();
+        let writer = FileWriter::start_in(Builder::new(), run, PublishSettings::default(), limit).unwrap();
         for n in 0..2 {
             writer.frame(frame(n, 8));
         }

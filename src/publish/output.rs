@@ -78,11 +78,7 @@ impl Output {
         };
         if let Some(mut folder) = folder.flatten() {
             // A run without a frame does not replace the previous one.
-            let restored = self.frames == 0
-                && folder.restore_previous().unwrap_or_else(|error| {
-                    tracing::warn!("{}: the previous run cannot be restored: {error}", folder.path().display());
-                    false
-                });
+            let restored = self.frames == 0 && folder.give_up();
             if !restored && let Err(error) = folder.write_summary(&summary) {
                 tracing::warn!("{error}");
             }

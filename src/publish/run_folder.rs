@@ -29,10 +29,12 @@ const SCENE: &str = "scene.toml";
 /// Written at the end.
 const SUMMARY: &str = "summary.json";
 /// Locked by the run that writes, and by nobody once its process has ended. It stays.
-const LOCK: &str = ".lock";
+const LOCK: &str = ".ridgewatch.lock";
 /// Attempts to take the lock, and the pause between them: another process holds it for a moment while it looks for a vacant folder.
 const ATTEMPTS: usize = 5;
 const PAUSE: Duration = Duration::from_millis(20);
+/// Attempts to create the first vacant folder. Each fails because another run takes it at that moment.
+const VACANT_ATTEMPTS: usize = 100;
 
 /// A folder that only this run writes to. It is held open, so that its files are written into the folder that was checked.
 #[derive(Debug)]
@@ -96,6 +98,24 @@ impl RunFolder {
             }
         }
         unreachable!("a folder holds fewer than 2^32 others")
+    }
+
+    /// Creates the first of `path`, `path-2`, `path-3` and so on that holds no run, also if several runs do so at the same time.
+    ///
+    /// # Errors
+    /// As [`RunFolder::create`]; `InUse` if other runs take each folder first, a hundred times.
+    pub fn create_vacant(path: &Path) -> Result<Self, PublishError> {
+        Self::create_first(path, &mut |place| Self::create(place, false))
+    }
+
+    fn create_first(path: &Path, create: &mut dyn FnMut(&Path) -> Result<Self, PublishError>) -> Result<Self, PublishError> {
+        for _ in 1..VACANT_ATTEMPTS {
+            match create(&Self::vacant(path)?) {
+                Err(PublishError::InUse { .. } | PublishError::Occupied { .. }) => {}
+                created => return created,
+            }
+        }
+        create(&Self::vacant(path)?)
     }
 
     /// Checks that a run may be written to `path`; changes nothing.
@@ -182,14 +202,20 @@ impl RunFolder {
         })
     }
 
-    /// Moves the files of the previous run back and gives up this run. Returns whether there was a previous run.
-    ///
-    /// # Errors
-    /// Errors of the system; files that could not be moved stay in `.previous`.
-    pub fn restore_previous(&mut self) -> io::Result<bool> {
+    /// Moves the files of the previous run back. Returns whether there was a previous run. After an error, files that could not be moved stay in
+    /// `.previous`.
+    fn restore_previous(&mut self) -> io::Result<bool> {
         let Some(previous) = self.previous.take() else { return Ok(false) };
         restore(&self.folder, &self.frames, &previous)?;
         Ok(true)
+    }
+
+    /// Moves the files of the previous run back, for a run that ends without a frame. Errors are warnings. Returns whether there was one.
+    pub fn give_up(&mut self) -> bool {
+        self.restore_previous().unwrap_or_else(|error| {
+            tracing::warn!("{}: the previous run cannot be restored: {error}", self.path().display());
+            false
+        })
     }
 
     /// The folder.
@@ -481,6 +507,42 @@ mod tests {
         assert_eq!(RunFolder::vacant(&path).unwrap(), folder.path().join("run-2"), "it has no frame yet");
         drop(run);
         RunFolder::create(&RunFolder::vacant(&path).unwrap(), false).unwrap();
+    }
+
+    /// As several `attach` that waited for one simulation.
+    #[test]
+    fn runs_that_begin_together_have_a_folder_each() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("run");
+        // Others take what was vacant a moment ago, three times.
+        let mut others = Vec::new();
+        let mut create = |place: &Path| {
+            if others.len() < 3 {
+                others.push(RunFolder::create(place, false).unwrap());
+            }
+            RunFolder::create(place, false)
+        };
+        let run = RunFolder::create_first(&path, &mut create).unwrap();
+        assert_eq!(run.path(), folder.path().join("run-4"));
+        assert_eq!(RunFolder::create_vacant(&path).unwrap().path(), folder.path().join("run-5"));
+        // One that always comes second ends.
+        let mut taken = Vec::new();
+        let refused = RunFolder::create_first(&path, &mut |place| {
+            taken.push(place.to_owned());
+            Err(PublishError::InUse { path: place.to_owned(), holder: "another process".into() })
+        });
+        assert!(matches!(refused, Err(PublishError::InUse { .. })) && taken.len() == VACANT_ATTEMPTS);
+    }
+
+    #[test]
+    fn a_lock_of_another_program_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        fs::write(folder.path().join(".lock"), "theirs").unwrap();
+        let other = Folder::open(folder.path()).unwrap();
+        let _held = other.lock(".lock").unwrap();
+        fs::write(folder.path().join(".lock"), "theirs").unwrap();
+        drop(RunFolder::create(folder.path(), false).unwrap());
+        assert_eq!(fs::read(folder.path().join(".lock")).unwrap(), b"theirs");
     }
 
     #[test]

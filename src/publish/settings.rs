@@ -3,7 +3,7 @@
 use crate::setting::{Refused, count, require};
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// Word for the default endpoint, which only this user reaches: a Unix socket in `$XDG_RUNTIME_DIR/ridgewatch` or `/dev/shm/ridgewatch-$USER`.
+/// Word for the default endpoint, which only this user reaches: a Unix socket in `$XDG_RUNTIME_DIR/ridgewatch` or `/dev/shm/ridgewatch-UID`.
 pub const DEFAULT_ENDPOINT: &str = "private";
 
 /// Whose subscribers are served.

@@ -120,19 +120,24 @@ impl Setup {
             SourceKind::Turbulence => Boundary::Clamp,
             _ => Boundary::Unbounded,
         });
+        let interpolation = scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear });
         let map = FlowMap {
             tau,
             direction,
             integrator: scene.flow.integrator,
             precision: scene.flow.precision,
             steps: match scene.flow.steps {
-                StepsSetting::Auto => Steps::Auto { tolerance: scene.flow.tolerance.unwrap_or(if archive { 0.1 } else { 0.01 }) },
+                StepsSetting::Auto => match scene.flow.tolerance {
+                    Some(tolerance) => Steps::Auto { tolerance },
+                    None if archive && interpolation == Interpolation::Linear => Steps::AutoByShare { tolerance: 0.1, share: 0.015 },
+                    None => Steps::Auto { tolerance: if archive { 0.1 } else { 0.01 } },
+                },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
             difference_step: scene.flow.difference_step,
             boundary,
             normalisation: scene.flow.normalisation,
-            interpolation: scene.flow.interpolation.unwrap_or(if archive && flat { Interpolation::Cubic } else { Interpolation::Linear }),
+            interpolation,
         };
         let domain = match (&closed, &scene.domain, &grid) {
             (Some(flow), Some(given), _) => Domain { dimensions: flow.dimensions(), ..Domain::cuboid(given.min, given.max) },

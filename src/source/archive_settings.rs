@@ -4,6 +4,7 @@ use crate::error::SourceError;
 use crate::formats::Limits;
 use ridgewatch_base::memory::gib;
 use serde::{Deserialize, Deserializer, Serialize};
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 /// Conversion of coordinates to lengths.
@@ -180,6 +181,14 @@ pub struct ArchiveSettings {
     /// Curvilinear longitudes and latitudes: whether velocities run along the grid's own directions, not east and north; by default
     /// decided by their standard names.
     pub grid_relative: Option<bool>,
+    /// Mask of land: a variable (0 is land unless its attributes say otherwise; `!NAME`: 0 is water), `"zero"` (nodes whose velocity is 0 at
+    /// all sampled times) or `"none"`; by default found by convention.
+    pub mask: Option<String>,
+    /// Entry, counted from 0, of a dimension that is neither time nor an axis, such as the member of an ensemble; of time, the only time that
+    /// is read.
+    pub select: Option<BTreeMap<String, usize>>,
+    /// Units of `u`, `v`, `w`, `x`, `y`, `z` or `time` where those of the files are missing or wrong.
+    pub units: Option<BTreeMap<String, String>>,
     /// Reads values that the files keep in other files: external storage, virtual datasets and links of HDF5.
     pub external: bool,
     /// Most memory that reading may need, in GiB; by default nine tenths of what is free.
@@ -190,7 +199,25 @@ pub struct ArchiveSettings {
     pub slab: Option<[f64; 2]>,
 }
 
+/// Quantities whose unit can be stated.
+pub const WITH_UNITS: [&str; 7] = ["u", "v", "w", "x", "y", "z", "time"];
+
 impl ArchiveSettings {
+    /// Unit that is stated for one of [`WITH_UNITS`].
+    pub(super) fn unit(&self, of: &str) -> Option<&str> {
+        self.units.as_ref()?.get(of).map(String::as_str)
+    }
+
+    /// Units that are stated for u, v and w.
+    pub(super) fn velocity_units(&self) -> [Option<&str>; 3] {
+        ["u", "v", "w"].map(|of| self.unit(of))
+    }
+
+    /// Entry that is picked of a dimension.
+    pub(super) fn entry(&self, dimension: &str) -> Option<usize> {
+        self.select.as_ref()?.get(dimension).copied()
+    }
+
     /// Compares the bytes of a window with the memory that reading may need.
     ///
     /// # Errors

@@ -76,7 +76,7 @@ pub enum SourceError {
     /// Only one time, and no setting that takes the flow as steady.
     #[error(
         "{source_name} holds one time ({time}): the FTLE needs velocities over a duration. Add files of other times or, to take the flow as \
-         steady, set `archive.steady = true` and `time.tau`"
+         steady, use --set archive.steady=true --set time.tau=DURATION"
     )]
     OneTime {
         /// The archive.
@@ -86,7 +86,7 @@ pub enum SourceError {
     },
     /// The archive is shorter than tau.
     #[error(
-        "tau = {tau} needs {needed} snapshots {interval} apart, but {source_name} has {found}, which span {span}: shorten tau or add files"
+        "tau = {tau} needs {needed} snapshots {interval} apart, but {source_name} has {found}, which span {span}: add files, or shorten it with --set time.tau=DURATION"
     )]
     TooShort {
         /// The archive.

@@ -1,17 +1,19 @@
 //! Checkpoints in the safetensors format: an 8-byte little-endian header length, a JSON header, then raw little-endian f32. Any
 //! safetensors reader opens them; other values (shape, step count, rate) are text under `__metadata__`.
 //!
-//! A checkpoint is written to a temporary file beside the target, brought to the disk and then renamed, so that readers never see a partial file.
+//! A checkpoint is written to `.NAME.part` beside the target, brought to the disk and then renamed, so that readers never see a partial file. A
+//! writer that is killed leaves at most that file, which the next one uses again.
 //! On reading, the header is checked first, then the size of the file, and only a file of the expected size is read. All of it is checked before
 //! any state changes.
 
 use super::CheckpointError;
+use ridgewatch_base::folder::Folder;
 use serde_json::{Map, Value, json};
 use std::borrow::Cow;
+use std::ffi::{OsStr, OsString};
 use std::fs::File;
-use std::io::{Read, Write};
+use std::io::{BufWriter, ErrorKind, Read, Write};
 use std::ops::Range;
-use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
@@ -90,11 +92,13 @@ impl<'a> Checkpoint<'a> {
         // The format requires tensors to start at a multiple of 8 bytes, with spaces as padding.
         header.extend(std::iter::repeat_n(' ', header.len().next_multiple_of(8) - header.len()));
         let io = |source| CheckpointError::Io { path: path.into(), source };
+        let Some(name) = path.file_name() else { return Err(io(ErrorKind::InvalidInput.into())) };
+        let part = [OsStr::new("."), name, OsStr::new(".part")].into_iter().collect::<OsString>();
         let folder = path.parent().filter(|folder| !folder.as_os_str().is_empty()).unwrap_or(Path::new("."));
-        // Permissions follow the umask; temporary files are otherwise readable by their owner only.
-        let mut file = tempfile::Builder::new().permissions(std::fs::Permissions::from_mode(0o666)).tempfile_in(folder).map_err(io)?;
-        let mut out = std::io::BufWriter::new(file.as_file_mut());
+        let folder = Folder::open(folder).map_err(io)?;
+        let mut file = folder.open_part(&part).map_err(io)?;
         let mut write = || -> std::io::Result<()> {
+            let mut out = BufWriter::new(&mut file);
             out.write_all(&(header.len() as u64).to_le_bytes())?;
             out.write_all(header.as_bytes())?;
             for entry in &self.entries {
@@ -103,13 +107,16 @@ impl<'a> Checkpoint<'a> {
                 }
             }
             out.flush()?;
-            out.get_ref().sync_all()
+            out.get_ref().sync_all()?;
+            folder.rename(&part, &folder, name)
         };
-        write().map_err(io)?;
-        drop(out);
-        file.persist(path).map_err(|fault| io(fault.error))?;
+        write().map_err(|error| {
+            // `error` is the one that matters.
+            let _ = folder.remove(&part);
+            io(error)
+        })?;
         // The new name, too, outlives a loss of power, where the file system can bring a folder to the disk; the file is whole in any case.
-        let _ = File::open(folder).and_then(|folder| folder.sync_all());
+        let _ = folder.sync();
         Ok((8 + header.len() + offset) as u64)
     }
 

@@ -1,16 +1,23 @@
 //! Endpoints: `tcp://HOST:PORT`, `ipc://PATH`, and the place that only this user reaches.
 
-use rustix::fs::{FlockOperation, flock};
+use rustix::fs::{CWD, FlockOperation, Mode, OFlags, flock, openat};
+use rustix::io::Errno;
 use std::fs::{DirBuilder, File, Permissions};
 use std::io::{self, ErrorKind};
 use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::{DirBuilderExt, FileTypeExt, MetadataExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 use thiserror::Error;
 
 /// Maximum length of the path of a Unix socket, in bytes.
 const MAX_PATH: usize = 107;
+/// Longest wait for the lock of a socket's folder. Programs like this one hold it for a moment; whoever may read the folder can hold it for ever.
+const LOCK_TIMEOUT: Duration = Duration::from_secs(2);
+/// Pause between two attempts to take it.
+const PAUSE: Duration = Duration::from_millis(10);
 
 /// Whose connections are accepted.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -38,6 +45,28 @@ pub enum BindError {
         /// What was found.
         found: String,
     },
+    /// The folder of the private socket cannot be used, because another user has made it for instance.
+    #[error(
+        "{path} {found}; accepted: a folder of user {user} with mode 0700 (set XDG_RUNTIME_DIR to such a folder, or name a socket in one: ipc://PATH)",
+        path = path.display()
+    )]
+    NotPrivate {
+        /// The folder.
+        path: PathBuf,
+        /// What was found.
+        found: String,
+        /// User of this process.
+        user: u32,
+    },
+    /// Another process keeps the folder of a socket locked.
+    #[error(
+        "{path} has been locked by another process for {LOCK_TIMEOUT:?}; accepted: a folder that only this user may read",
+        path = path.display()
+    )]
+    Locked {
+        /// The folder.
+        path: PathBuf,
+    },
     /// An error of the system.
     #[error(transparent)]
     System(#[from] io::Error),
@@ -55,6 +84,19 @@ pub(crate) enum Bound {
 pub(crate) struct SocketFile {
     path: PathBuf,
     identity: (u64, u64),
+}
+
+impl SocketFile {
+    /// Changes the mode of the socket, and of nothing else that has its name by now.
+    fn set_mode(&self, mode: u32) -> io::Result<()> {
+        let file: File = openat(CWD, &self.path, OFlags::PATH | OFlags::NOFOLLOW | OFlags::CLOEXEC, Mode::empty())?.into();
+        let about = file.metadata()?;
+        if (about.dev(), about.ino()) != self.identity {
+            return Err(io::Error::other(format!("{} was replaced", self.path.display())));
+        }
+        // `fchmod` refuses descriptors of O_PATH, and no other can be opened for a socket. This link leads to the open file, whatever its name.
+        std::fs::set_permissions(format!("/proc/self/fd/{}", file.as_raw_fd()), Permissions::from_mode(mode))
+    }
 }
 
 impl Drop for SocketFile {
@@ -101,9 +143,7 @@ impl Bound {
     pub fn open_to(&self, peers: Peers) -> io::Result<()> {
         match self {
             Self::Tcp(_) => Ok(()),
-            Self::Unix(_, file) => {
-                std::fs::set_permissions(&file.path, Permissions::from_mode(if peers == Peers::User { 0o600 } else { 0o666 }))
-            }
+            Self::Unix(_, file) => file.set_mode(if peers == Peers::User { 0o600 } else { 0o666 }),
         }
     }
 }
@@ -119,9 +159,8 @@ fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
             "the path has {bytes} bytes; accepted is a path from the root of at most {MAX_PATH} bytes"
         )));
     }
-    let folder = File::open(path.parent().unwrap_or(path))?;
     // Two programs must not take each other's new socket for a left one.
-    flock(&folder, FlockOperation::LockExclusive).map_err(io::Error::from)?;
+    let _lock = lock_folder(path.parent().unwrap_or(path))?;
     let listener = match UnixListener::bind(path) {
         Err(error) if error.kind() == ErrorKind::AddrInUse => {
             remove_left(path)?;
@@ -131,6 +170,19 @@ fn unix(path: &Path) -> Result<(UnixListener, SocketFile), BindError> {
     };
     let about = std::fs::symlink_metadata(path)?;
     Ok((listener, SocketFile { path: path.to_owned(), identity: (about.dev(), about.ino()) }))
+}
+
+/// Locks a folder until the value is dropped.
+fn lock_folder(path: &Path) -> Result<File, BindError> {
+    let (folder, begin) = (File::open(path)?, Instant::now());
+    loop {
+        match flock(&folder, FlockOperation::NonBlockingLockExclusive) {
+            Ok(()) => return Ok(folder),
+            Err(Errno::WOULDBLOCK) if begin.elapsed() < LOCK_TIMEOUT => std::thread::sleep(PAUSE),
+            Err(Errno::WOULDBLOCK) => return Err(BindError::Locked { path: path.to_owned() }),
+            Err(error) => return Err(io::Error::from(error).into()),
+        }
+    }
 }
 
 /// Removes a socket of this user that an ended program left.
@@ -154,43 +206,43 @@ fn user() -> u32 {
 }
 
 /// Endpoint of a Unix socket in a folder that only this user enters: `$XDG_RUNTIME_DIR/ridgewatch` if the system has made that variable's folder
-/// for this user, else `/dev/shm/ridgewatch-$USER`. Creates the folder.
+/// for this user, else `/dev/shm/ridgewatch-UID`. Creates the folder.
 ///
 /// # Errors
 /// The folder cannot be created, or others have rights to it.
 pub fn private_endpoint(name: &str) -> Result<String, BindError> {
-    let runtime =
-        std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute() && check_private(folder).is_ok());
-    let folder = match runtime {
+    private_in(&private_folder(std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from)), name)
+}
+
+/// By the number of the user: names of users in the environment may be those of others, after `su` for instance.
+fn private_folder(runtime: Option<PathBuf>) -> PathBuf {
+    match runtime.filter(|folder| folder.is_absolute() && check_private(folder).is_ok()) {
         Some(folder) => folder.join("ridgewatch"),
-        None => {
-            let name = std::env::var("USER").ok().filter(|name| !name.is_empty() && !name.contains('/'));
-            PathBuf::from(format!("/dev/shm/ridgewatch-{}", name.unwrap_or_else(|| user().to_string())))
-        }
-    };
-    private_in(&folder, name)
+        None => PathBuf::from(format!("/dev/shm/ridgewatch-{}", user())),
+    }
 }
 
 fn private_in(folder: &Path, name: &str) -> Result<String, BindError> {
-    match DirBuilder::new().mode(0o700).create(folder) {
-        Err(error) if error.kind() != ErrorKind::AlreadyExists => return Err(error.into()),
-        _ => check_private(folder)?,
-    }
+    let checked = match DirBuilder::new().mode(0o700).create(folder) {
+        Err(error) if error.kind() != ErrorKind::AlreadyExists => Err(format!("cannot be created: {error}")),
+        _ => check_private(folder),
+    };
+    checked.map_err(|found| BindError::NotPrivate { path: folder.to_owned(), found, user: user() })?;
     Ok(format!("ipc://{}", folder.join(name).display()))
 }
 
-fn check_private(folder: &Path) -> Result<(), BindError> {
-    let about = std::fs::symlink_metadata(folder)?;
-    let found = if !about.is_dir() {
-        "is no folder".to_owned()
+/// Checks that a folder is this user's alone. The error is what was found.
+fn check_private(folder: &Path) -> Result<(), String> {
+    let about = std::fs::symlink_metadata(folder).map_err(|error| format!("cannot be examined: {error}"))?;
+    if !about.is_dir() {
+        Err("is no folder".to_owned())
     } else if about.uid() != user() {
-        format!("belongs to user {}", about.uid())
+        Err(format!("belongs to user {}", about.uid()))
     } else if about.mode() & 0o077 != 0 {
-        format!("has mode {:04o}", about.mode() & 0o7777)
+        Err(format!("has mode {:04o}", about.mode() & 0o7777))
     } else {
-        return Ok(());
-    };
-    Err(BindError::Foreign { path: folder.to_owned(), found })
+        Ok(())
+    }
 }
 
 #[cfg(test)]
@@ -258,6 +310,67 @@ mod tests {
         assert!(error.contains("mode 0755"), "{error}");
         std::os::unix::fs::symlink(folder.path(), folder.path().join("link")).unwrap();
         assert!(private_in(&folder.path().join("link"), "frames").unwrap_err().to_string().contains("no folder"));
-        assert!(private_in(&folder.path().join("missing/own"), "frames").is_err());
+        assert!(
+            private_in(&folder.path().join("missing/own"), "frames").unwrap_err().to_string().contains("missing/own cannot be created")
+        );
+    }
+
+    #[test]
+    fn a_private_folder_that_another_user_made_first_is_refused_with_what_to_do() {
+        let folder = tempfile::tempdir().unwrap();
+        let taken = folder.path().join("taken");
+        std::fs::write(&taken, "").unwrap();
+        // Only root can make a folder of another user; a file in the way is refused likewise.
+        if user() == 0 {
+            std::fs::remove_file(&taken).unwrap();
+            std::fs::create_dir(&taken).unwrap();
+            std::os::unix::fs::chown(&taken, Some(4711), None).unwrap();
+        }
+        let error = private_in(&taken, "frames").unwrap_err().to_string();
+        let found = if user() == 0 { "belongs to user 4711" } else { "is no folder" };
+        for part in [taken.to_str().unwrap(), found, "with mode 0700", "XDG_RUNTIME_DIR", "ipc://PATH"] {
+            assert!(error.contains(part), "{error}");
+        }
+        // The same folder in every environment of this user.
+        let shared = PathBuf::from(format!("/dev/shm/ridgewatch-{}", user()));
+        assert_eq!([None, Some(taken), Some("run".into())].map(private_folder), [(); 3].map(|()| shared.clone()));
+        std::fs::set_permissions(folder.path(), Permissions::from_mode(0o700)).unwrap();
+        assert_eq!(private_folder(Some(folder.path().to_owned())), folder.path().join("ridgewatch"));
+    }
+
+    #[test]
+    fn a_folder_that_somebody_keeps_locked_is_refused_in_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let endpoint = format!("ipc://{}/frames", folder.path().display());
+        let theirs = File::open(folder.path()).unwrap();
+        flock(&theirs, FlockOperation::LockExclusive).unwrap();
+        let (send, receive) = std::sync::mpsc::channel();
+        let (binding, path) = (endpoint.clone(), folder.path().display().to_string());
+        std::thread::spawn(move || send.send(Bound::open(&binding).map(drop)));
+        let error = receive.recv_timeout(10 * LOCK_TIMEOUT).unwrap().unwrap_err().to_string();
+        assert!(error.contains(&path) && error.contains("locked by another process"), "{error}");
+        // A lock that is held for a moment is waited for.
+        let late = std::thread::spawn(move || {
+            std::thread::sleep(5 * PAUSE);
+            drop(theirs);
+        });
+        Bound::open(&endpoint).unwrap();
+        late.join().unwrap();
+    }
+
+    #[test]
+    fn the_mode_of_nothing_but_the_socket_is_changed() {
+        let folder = tempfile::tempdir().unwrap();
+        let (path, victim) = (folder.path().join("frames"), folder.path().join("victim"));
+        std::fs::write(&victim, "").unwrap();
+        std::fs::set_permissions(&victim, Permissions::from_mode(0o640)).unwrap();
+        let (bound, _) = Bound::open(&format!("ipc://{}", path.display())).unwrap();
+        std::fs::rename(&path, folder.path().join("old")).unwrap();
+        std::os::unix::fs::symlink(&victim, &path).unwrap();
+        assert!(bound.open_to(Peers::Any).unwrap_err().to_string().contains("was replaced"));
+        std::fs::remove_file(&path).unwrap();
+        std::fs::hard_link(&victim, &path).unwrap();
+        assert!(bound.open_to(Peers::Any).is_err());
+        assert_eq!(victim.metadata().unwrap().mode() & 0o777, 0o640);
     }
 }

@@ -8,21 +8,27 @@ use std::time::Instant;
 
 /// State ESTABLISHED in the system's tables. In others the user may be missing, which reads as 0.
 const ESTABLISHED: &str = "01";
+/// Bits of an IPv6 address that name its network.
+const NETWORK: u128 = !(u64::MAX as u128);
 
 /// Owner of a connection, for the shares of connections.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(crate) enum Owner {
     /// A user of this machine, whatever the address: a user may take any address of 127.0.0.0/8.
     User(u32),
-    /// Another machine. Unknown users of this machine share one address.
+    /// Another machine, or the machines of an IPv6 network of 64 bits: whoever has one address of it can usually take all. Unknown users of this
+    /// machine share one address.
     Address(IpAddr),
 }
 
 impl Owner {
     pub fn of(peer: IpAddr, user: Option<u32>) -> Self {
-        let address = peer.to_canonical();
-        let unknown = Self::Address(if address.is_loopback() { IpAddr::V4(Ipv4Addr::LOCALHOST) } else { address });
-        user.map_or(unknown, Self::User)
+        let address = match peer.to_canonical() {
+            address if address.is_loopback() => Ipv4Addr::LOCALHOST.into(),
+            IpAddr::V6(address) => Ipv6Addr::from_bits(address.to_bits() & NETWORK).into(),
+            address => address,
+        };
+        user.map_or(Self::Address(address), Self::User)
     }
 }
 
@@ -129,6 +135,18 @@ mod tests {
         // A user is one owner at every address; another machine is another owner.
         assert_eq!(Owner::of("192.0.2.1".parse().unwrap(), Some(1000)), subscriber);
         assert_ne!(Owner::of("192.0.2.1".parse().unwrap(), None), Owner::of(loopback(1), None));
+    }
+
+    #[test]
+    fn many_addresses_of_an_ipv6_network_displace_no_other_owner() {
+        let of = |address: &str| Owner::of(address.parse().unwrap(), None);
+        let (subscriber, begin) = (of("2001:db8:1:2::1"), Instant::now());
+        let theirs = (1..255).map(|n| of(&format!("2001:db8:1:3:{n:x}:{n:x}::{n:x}")));
+        let connections: Vec<_> = [subscriber].into_iter().chain(theirs).map(|owner| (owner, true, begin)).collect();
+        assert_eq!(displaced(&connections), Some(1));
+        // IPv4 addresses are counted one by one, in both forms.
+        assert_eq!(of("::ffff:192.0.2.1"), of("192.0.2.1"));
+        assert_ne!(of("::ffff:192.0.2.1"), of("::ffff:192.0.2.2"));
     }
 
     /// For every address of this machine.

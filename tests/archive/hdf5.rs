@@ -83,7 +83,7 @@ fn both_layouts_of_the_turbulence_database() {
         file.new_dataset_builder().with_data(&[3i32]).create("_contents").unwrap();
         paths.push(path);
     }
-    refused(&paths[..1], "", &["no dataset holds the 5 coordinates along x", "spacing = [dx, dy, dz]"]);
+    refused(&paths[..1], "", &["no dataset holds the 5 coordinates along x", "--set archive.spacing=[DX,DY,DZ]"]);
     check(&paths, "spacing = [0.1, 0.1, 0.1]\norigin = [1.0, 2.0, 3.0]\ntime_step = 0.01", &[0.1, 0.2]);
     let archive = check(&paths, "velocity_unit = \"cells\"", &[0.0, 1.0]);
     assert_eq!(archive.metric(), Metric::Index);
@@ -157,7 +157,7 @@ fn what_does_not_fit_is_said() {
     drop(file);
     refused(&[&path], "", &["no velocity found"]);
     refused(&[&path], "velocity = \"velocities\"", &["`velocity = \"velocities\"`", "is `velocity` meant?"]);
-    refused(&[&path], "velocity = \"velocity\"", &["time = \"...\""]);
+    refused(&[&path], "velocity = \"velocity\"", &["--set archive.time=NAME"]);
     refused(&[&path], "velocity = \"velocity\"\norder = \"zyx\"", &["`zyx` does not describe", "one letter for each axis"]);
     refused(&[&path], "velocity = \"velocity\"\norder = \"zcyx\"", &["odd.h5", "component axis holds 4 entries"]);
     refused(&[&path], "velocity = \"velocity\"\nmetric = \"sphere\"", &["sphere", "cartesian"]);

@@ -6,7 +6,10 @@ mod hdf5;
 mod hemispheres;
 #[path = "../kit/mod.rs"]
 mod kit;
+mod land;
 mod netcdf;
+mod odd;
+mod parts;
 mod real;
 mod refused;
 mod resampled;

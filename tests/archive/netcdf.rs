@@ -276,7 +276,7 @@ fn the_index_metric_of_levels() {
     // Levels without a unit have no height.
     let bare = levels("level", &[1.0, 2.0, 3.0]).write(&dir.path().join("bare.nc"));
     assert_eq!(open_with(&[&bare], "w = \"none\"").metric(), Metric::Index);
-    refused(&[bare], "w = \"none\"\nmetric = \"sphere\"", &["level = ..."]);
+    refused(&[bare], "w = \"none\"\nmetric = \"sphere\"", &["--set archive.level=VALUE"]);
 }
 
 #[test]

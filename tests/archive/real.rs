@@ -5,7 +5,7 @@ use crate::kit::flow::{quasi_random, trace, window};
 use crate::kit::program::{self, project, records, set, text};
 use crate::{inspected, open, refused};
 use ridgewatch::field::Geometry;
-use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, VelocitySource, cpu_tracer};
+use ridgewatch::flow::{Boundary, Direction, Extras, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
 use ridgewatch::publish::read_exr;
 use ridgewatch::render::Film;
 use ridgewatch::source::{Metric, SnapshotSource};
@@ -192,6 +192,39 @@ fn report(name: &str, tau: f64, (ours, theirs): &(Vec<f64>, Vec<f64>)) -> (f64, 
         size / tau
     );
     (rms / size, correlation)
+}
+
+#[test]
+#[ignore = "needs real archives: make test-data"]
+fn automatic_steps_see_the_kinks_of_linear_interpolation() {
+    let mut archive = open(&[data("globcurrent").join("*.nc")]);
+    let (begin, source) = (archive.times()[59], VelocitySource::Window(window(&mut archive)));
+    for (days, limit) in [(5.0, 0.03), (10.0, 0.04)] {
+        let with = |steps| FlowMap {
+            direction: Direction::Backward,
+            precision: Precision::F64,
+            boundary: Boundary::Stop,
+            steps,
+            ..FlowMap::tangent(days * 86_400.0, 1)
+        };
+        // As scenes of archives with linear interpolation have it.
+        let automatic = with(Steps::AutoByShare { tolerance: 0.1, share: 0.015 });
+        let tracer = cpu_tracer(source.clone(), &automatic, begin).unwrap();
+        let seeds: Vec<[f32; 3]> = (0..8000).map(|i| tracer.domain().from_unit(quasi_random(i).map(|c| c as f32))).collect();
+        let of = |steps| trace(&source, &with(Steps::Fixed(steps)), begin, &seeds, Extras::default());
+        let (coarse, fine) = (of(tracer.steps()), of(16 * tracer.steps()));
+        let whole = |i: &usize| coarse.lifetime_share[*i] == 1.0 && fine.lifetime_share[*i] == 1.0 && !tracer.is_missing(seeds[*i]);
+        let chosen: Vec<usize> = (0..seeds.len()).filter(whole).collect();
+        let sum = |f: &dyn Fn(usize) -> f64| chosen.iter().map(|&i| f(i).powi(2)).sum::<f64>();
+        let error = (sum(&|i| coarse.log_stretch_f64[i] - fine.log_stretch_f64[i]) / sum(&|i| fine.log_stretch_f64[i])).sqrt();
+        println!(
+            "GlobCurrent, linear, {days} days: {} steps, {:.2} % of the FTLE at {} seeds",
+            tracer.steps(),
+            100.0 * error,
+            chosen.len()
+        );
+        assert!(error < limit, "{error}");
+    }
 }
 
 /// FTLE, per second, of log-stretches.

@@ -400,6 +400,30 @@ fn steps_are_chosen_by_error() {
 }
 
 #[test]
+fn steps_on_kinks_are_chosen_by_a_share_of_the_stretch() {
+    // Waves shorter than four cells: the gradient of the linear interpolant jumps at every face. Little stretch in a short time.
+    let source = VelocitySource::Window(turbulence([24, 12, 12], 4));
+    let VelocitySource::Window(window) = &source else { unreachable!() };
+    let seeds = lattice(&window.grid().unwrap().domain(), [24, 12, 12]);
+    let with = |steps| FlowMap { boundary: Boundary::Clamp, steps, ..map(3.0, 1, Precision::F64) };
+    let error = |steps| {
+        let chosen = cpu_tracer(source.clone(), &with(steps), 0.0).unwrap().steps();
+        let of = |steps| stretches(&run(&source, &with(Steps::Fixed(steps)), 0.0, &seeds));
+        let fine = of(16 * chosen);
+        let size = (fine.iter().map(|s| s * s).sum::<f64>() / fine.len() as f64).sqrt();
+        (chosen, rms_and_max(&of(chosen), &fine).0 / size)
+    };
+    let (plain, by_share) = (error(Steps::Auto { tolerance: 0.1 }), error(Steps::AutoByShare { tolerance: 0.1, share: 0.015 }));
+    println!("kinks, tau 3: {plain:?} by the tolerance alone, {by_share:?} by a share of the stretch");
+    assert!(plain.1 > 0.03 && by_share.1 < 0.03, "{plain:?} {by_share:?}");
+    // A flow without stretch takes no steps for it.
+    let grid = plane(even("x", 0.0, 100.0, 101), even("y", 0.0, 100.0, 101));
+    let still = steady(&grid, &[0.0, 1.0, 2.0, 3.0], &vec![0.1; grid.nodes()], &vec![0.0; grid.nodes()]);
+    let still = cpu_tracer(still, &with(Steps::AutoByShare { tolerance: 0.1, share: 0.015 }), 0.0).unwrap();
+    assert_eq!(still.steps(), 6);
+}
+
+#[test]
 fn time_resolution_is_measured() {
     let gridded = FlowMap { boundary: Boundary::Clamp, ..map(11.0, 22, Precision::F32) };
     let found = time_resolution(&turbulence([48, 24, 24], 12), &gridded, 0.0).unwrap();

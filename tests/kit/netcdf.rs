@@ -63,6 +63,11 @@ impl Fixture {
         axes.iter().rev().fold(Self::new(format, &dimensions), |file, (name, units, values)| file.axis(name, units, values))
     }
 
+    pub fn dimension(mut self, name: &str, len: usize) -> Self {
+        self.dimensions.push((name.into(), len));
+        self
+    }
+
     /// Adds an attribute to the file.
     pub fn attribute(mut self, name: &str, value: impl Into<AttributeValue>) -> Self {
         self.attributes.push((name.into(), value.into()));

@@ -1,7 +1,7 @@
 /* A decomposed solver: each MPI rank publishes its block of a 3-D field, and strides exclude the ghost cells.
  *
  *     mpicc mpi_solver.c $(pkg-config --cflags --libs ridgewatch) -lm -o mpi_solver
- *     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/mpi mpirun -n 4 ./mpi_solver 200
+ *     RIDGEWATCH_RING=/dev/shm/ridgewatch-$(id -u)/mpi mpirun -n 4 ./mpi_solver 200
  *
  * The field is the ABC flow with a drifting phase, so that every rank computes its values alone. The ghost exchange of a real solver does
  * not affect publishing. Arguments: steps (100), nodes along each axis (48), milliseconds per step (20), wait limit in ms (0). */

@@ -1,7 +1,7 @@
 /* A small solver that publishes: a decaying, drifting 2-D vortex lattice, in closed form on a periodic box.
  *
  *     cc solver.c $(pkg-config --cflags --libs ridgewatch) -lm -o solver
- *     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/demo ./solver 200
+ *     RIDGEWATCH_RING=/dev/shm/ridgewatch-$(id -u)/demo ./solver 200
  *
  * Arguments: steps (100), nodes along each axis (64), milliseconds per step (20), wait limit in milliseconds (0). */
 #include <math.h>

@@ -106,7 +106,7 @@ impl Failure {
             Failure::Wire(error) => match error {
                 WireError::InUse { .. } => Status::RwInUse,
                 WireError::NoSpace { .. } | WireError::FileSize { .. } => Status::RwNoSpace,
-                WireError::Foreign { .. } => Status::RwForeign,
+                WireError::Foreign { .. } | WireError::ForeignFolder { .. } => Status::RwForeign,
                 WireError::Forked { .. } => Status::RwForked,
                 WireError::Removed => Status::RwRemoved,
                 WireError::Io { .. } | WireError::NoMemory { .. } | WireError::NotInMemory { .. } => Status::RwSystem,

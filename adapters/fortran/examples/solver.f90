@@ -2,7 +2,7 @@
 !> equations on a periodic box.
 !>
 !>     gfortran solver.f90 -I PREFIX/include -L PREFIX/lib -lridgewatch_fortran -lridgewatch_adapter -o solver
-!>     RIDGEWATCH_RING=/dev/shm/ridgewatch-$USER/demo ./solver 200
+!>     RIDGEWATCH_RING=/dev/shm/ridgewatch-$(id -u)/demo ./solver 200
 !>
 !> Arguments: steps (100), nodes along each axis (64), milliseconds per step (20).
 program solver

@@ -1,5 +1,6 @@
 //! Errors of rings, messages and descriptions.
 
+use crate::RING_VARIABLE;
 use std::path::PathBuf;
 
 /// Error of a ring, a message or a description. Nothing was changed, unless stated otherwise.
@@ -53,6 +54,19 @@ pub enum WireError {
     #[error("{}: {found}; accepted: a regular file of user {user} that nobody else may open (mode 0600)", path.display())]
     Foreign {
         /// The file.
+        path: PathBuf,
+        /// The problem.
+        found: String,
+        /// User of this process.
+        user: u32,
+    },
+    /// The ring's folder belongs to another user, or others may write into it or replace it.
+    #[error(
+        "{}: {found}; accepted: a folder of user {user} that nobody else may write into or replace. Another one can be named, by {RING_VARIABLE} for instance",
+        path.display()
+    )]
+    ForeignFolder {
+        /// The folder.
         path: PathBuf,
         /// The problem.
         found: String,

@@ -8,6 +8,9 @@ use std::io;
 use std::os::unix::fs::{DirBuilderExt, MetadataExt, OpenOptionsExt};
 use std::path::Path;
 
+/// The system's root, as user namespaces (containers) show it: the owner of their /dev/shm.
+const NOBODY: u32 = 65534;
+
 /// Creates a file with mode 0600, or opens it if it exists and `exclusive` is false.
 pub(crate) fn create_private(path: &Path, exclusive: bool) -> io::Result<File> {
     let mut options = OpenOptions::new();
@@ -68,15 +71,13 @@ pub(crate) fn check_private(path: &Path, about: &Metadata) -> Result<(), WireErr
     if !about.is_file() {
         return Err(foreign(path, "is no regular file".into()));
     }
-    check_owner(path, about)?;
+    if about.uid() != system::user() {
+        return Err(foreign(path, format!("belongs to user {}", about.uid())));
+    }
     if about.mode() & 0o077 != 0 {
         return Err(foreign(path, format!("has mode {:04o}", about.mode() & 0o7777)));
     }
     Ok(())
-}
-
-fn check_owner(path: &Path, about: &Metadata) -> Result<(), WireError> {
-    if about.uid() == system::user() { Ok(()) } else { Err(foreign(path, format!("belongs to user {}", about.uid()))) }
 }
 
 fn foreign(path: &Path, found: String) -> WireError {
@@ -86,37 +87,51 @@ fn foreign(path: &Path, found: String) -> WireError {
 /// Creates the ring's folder if it does not exist.
 ///
 /// # Errors
-/// `Foreign`: others may write into the folder, or may replace it.
+/// `ForeignFolder`: others may write into the folder, or may replace it.
 pub(crate) fn make_folder(ring: &Path) -> Result<(), WireError> {
-    let made = DirBuilder::new().mode(0o700).recursive(true).create(ring);
-    made.map_err(|e| WireError::io(ring, "cannot be created", e))?;
+    if let Err(error) = DirBuilder::new().mode(0o700).recursive(true).create(ring) {
+        // The cause may be another user, who has made the folder's parent first and lets nobody in.
+        return match check_parent(ring) {
+            Err(foreign @ WireError::ForeignFolder { .. }) => Err(foreign),
+            _ => Err(WireError::io(ring, "cannot be created", error)),
+        };
+    }
     check_folder(ring)
 }
 
 /// Checks that a ring's folder is one, and that nobody else may write into it or replace it.
 ///
 /// # Errors
-/// `Foreign`: others may. The folder cannot be examined, for instance because it does not exist.
+/// `ForeignFolder`: others may. The folder cannot be examined, for instance because it does not exist.
 pub(crate) fn check_folder(ring: &Path) -> Result<(), WireError> {
-    let parent = ring.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent });
-    if let Some(parent) = parent {
-        let about = metadata(parent, std::fs::metadata(parent))?;
-        // In a sticky folder nobody may rename files of others.
-        let sticky = about.mode() & 0o1000 != 0;
-        if !sticky && ![0, system::user()].contains(&about.uid()) {
-            return Err(foreign(parent, format!("is a folder of user {}, who may replace {}", about.uid(), ring.display())));
-        }
-        if !sticky && about.mode() & 0o002 != 0 {
-            return Err(foreign(parent, format!("is a folder that all users may write into (mode {:04o})", about.mode() & 0o7777)));
-        }
-    }
+    check_parent(ring)?;
     let about = metadata(ring, std::fs::symlink_metadata(ring))?;
-    if !about.is_dir() {
-        return Err(foreign(ring, "is no folder".into()));
-    }
-    check_owner(ring, &about)?;
-    if about.mode() & 0o022 != 0 {
-        return Err(foreign(ring, format!("is a folder that others may write into (mode {:04o})", about.mode() & 0o7777)));
-    }
-    Ok(())
+    let found = if !about.is_dir() {
+        "is no folder".to_owned()
+    } else if about.uid() != system::user() {
+        format!("belongs to user {}", about.uid())
+    } else if about.mode() & 0o022 != 0 {
+        format!("is a folder that others may write into (mode {:04o})", about.mode() & 0o7777)
+    } else {
+        return Ok(());
+    };
+    Err(WireError::ForeignFolder { path: ring.to_owned(), found, user: system::user() })
+}
+
+/// Checks that nobody else may replace a ring's folder.
+fn check_parent(ring: &Path) -> Result<(), WireError> {
+    let Some(parent) = ring.parent().map(|parent| if parent.as_os_str().is_empty() { Path::new(".") } else { parent }) else {
+        return Ok(());
+    };
+    let about = metadata(parent, std::fs::metadata(parent))?;
+    // Nobody may rename folders of others in a sticky folder, except its owner.
+    let sticky = about.mode() & 0o1000 != 0;
+    let found = if ![0, system::user()].contains(&about.uid()) && !(sticky && about.uid() == NOBODY) {
+        format!("is a folder of user {}, who may replace {}", about.uid(), ring.display())
+    } else if !sticky && about.mode() & 0o002 != 0 {
+        format!("is a folder that all users may write into (mode {:04o})", about.mode() & 0o7777)
+    } else {
+        return Ok(());
+    };
+    Err(WireError::ForeignFolder { path: parent.to_owned(), found, user: system::user() })
 }

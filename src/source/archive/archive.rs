@@ -2,13 +2,19 @@
 
 use super::check::{check, check_fit};
 use super::files::expand;
+use super::group::{Group, grouped, open_group};
 use super::synthetic::{declared, synthesized};
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::calendar::Calendar;
 use crate::cf::coordinate::Kind;
+use crate::cf::velocity::judge;
 use crate::error::SourceError;
 use crate::formats::{DataFile, Format, Limits, Listing};
-use crate::grids::{AxisPlan, ComponentPlan, Layout, Orders, Poles, Resampling, VelocityScale, difference, plan, read_component, slab_of};
+use crate::grids::read_component;
+use crate::grids::{
+    AxisPlan, ComponentPlan, Layout, Mask, Masks, NO_MASK, Orders, Poles, Resampling, VelocityScale, ZERO, difference, holds_mask, plan,
+    slab_of,
+};
 use crate::snapshots::{SnapshotSource, SourceDescription, TimeGap, time_gaps};
 use ridgewatch_field::{Axis, EARTH_RADIUS, Geometry, Grid, Snapshot};
 use std::path::{Path, PathBuf};
@@ -17,11 +23,16 @@ use std::sync::Arc;
 /// Names of the components, in order.
 const COMPONENTS: [&str; 3] = ["u", "v", "w"];
 
-/// A file of the archive; closed until it is read.
+/// A file of the archive, or several that are read as one; closed until it is read.
 struct ArchiveFile {
     path: PathBuf,
+    /// With files of other components, meshes and masks.
+    group: Group,
     frames: Vec<Vec<ComponentPlan>>,
 }
+
+/// Shape of each component and, for each of its points, whether the velocity is always 0.
+type Zeros = Vec<([usize; 3], Vec<bool>)>;
 
 /// Place of a snapshot in the files.
 #[derive(Debug, Clone, Copy)]
@@ -80,23 +91,44 @@ impl Archive {
     /// Opens a list of files. See [`Archive::open`].
     pub(super) fn open_files(paths: Vec<PathBuf>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         check(settings)?;
+        match Self::open_groups(paths.iter().map(|path| vec![path.clone()]).collect(), settings) {
+            Err(error) if paths.len() > 1 => match grouped(&paths, settings)? {
+                Some(groups) => Self::open_groups(groups, settings),
+                None => Err(error),
+            },
+            result => result,
+        }
+    }
+
+    /// Opens groups of files.
+    fn open_groups(groups: Vec<Group>, settings: &ArchiveSettings) -> Result<Self, SourceError> {
         let limits = limits(settings);
         let mut first: Option<Layout> = None;
         let mut format = Format::Hdf5;
         let mut entries: Vec<(f64, Place)> = Vec::new();
-        let mut files: Vec<ArchiveFile> = Vec::with_capacity(paths.len());
+        let mut files: Vec<ArchiveFile> = Vec::with_capacity(groups.len());
+        let together = groups.iter().find(|group| group.len() > 1).map(|group| in_words(group));
         let mut open = None;
         let mut expected: Option<Listing> = None;
         let mut synthetic = None;
-        for path in paths {
-            let (file, layout) = open_next(&path, settings, first.as_ref(), expected.as_ref(), limits)?;
-            if expected.is_none() && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
+        let mut masks: Vec<Group> = Vec::new();
+        for group in groups {
+            let Some(path) = group.first().cloned() else { continue };
+            let (file, layout) = match open_next(&group, settings, first.as_ref(), expected.as_ref(), limits) {
+                Ok(both) => both,
+                Err(_) if is_mask_alone(&path, settings, limits) => {
+                    masks.push(group);
+                    continue;
+                }
+                Err(error) => return Err(error),
+            };
+            if expected.is_none() && group.len() == 1 && layout.resampling.is_none() && file.listing.format == Format::NetCdf4 {
                 expected = Some(file.listing.part(&layout.used(&file.listing)));
             }
             let index = files.len();
             let place = |&(frame, entry): &(usize, usize)| Place { file: index, frame, entry };
             entries.extend(layout.time.seconds.iter().copied().zip(layout.time.places.iter().map(place)));
-            files.push(ArchiveFile { path: path.clone(), frames: layout.frames.clone() });
+            files.push(ArchiveFile { path: path.clone(), group: group.clone(), frames: layout.frames.clone() });
             match &mut first {
                 Some(reference) => {
                     reference.widen(&layout).map_err(|fault| SourceError::file(&path, fault))?;
@@ -106,13 +138,19 @@ impl Archive {
                 }
                 None => {
                     synthetic = declared(&file.listing).map(str::to_owned);
+                    if holds_mask(&file.listing, settings) {
+                        masks.insert(0, group);
+                    }
                     format = file.listing.format;
                     first = Some(layout);
                 }
             }
             open = Some((index, file));
         }
-        let Some(layout) = first else { return Err(SourceError::NoFiles) };
+        let Some(layout) = first else {
+            let what = "it holds a mask of land, but no velocity: name the files of the velocity beside it";
+            return Err(masks.first().and_then(|group| group.first()).map_or(SourceError::NoFiles, |path| SourceError::file(path, what)));
+        };
         entries.sort_by(|a, b| a.0.total_cmp(&b.0));
         let calendar = layout.time.calendar;
         check_duplicates(&entries, &files, calendar)?;
@@ -129,6 +167,23 @@ impl Archive {
             _ => None,
         };
         check_memory(&files[0].path, &layout, &limits)?;
+        let mut land = Masks::default();
+        let named = settings.mask.as_deref().filter(|mask| ![NO_MASK, ZERO].contains(mask));
+        if let (Some(named), true) = (named, masks.is_empty()) {
+            let accepted = format!(
+                "a variable of the files (`!NAME` where 0 is water), \"{ZERO}\" or \"{NO_MASK}\"; name its file too, if it is in another"
+            );
+            return Err(SourceError::setting("mask", format!("\"{named}\", which no file holds"), accepted));
+        }
+        let staggered = matches!(layout.resampling, Some(Resampling::Staggered(_)));
+        let unused = matches!(settings.mask.as_deref(), Some(NO_MASK | ZERO));
+        if !staggered && !unused && !masks.is_empty() {
+            open = None;
+            for group in &masks {
+                land.add(&open_group(group, limits)?, &layout.frames[0], settings)?;
+            }
+            files.iter_mut().flat_map(|file| &mut file.frames).for_each(|frame| land.apply(frame));
+        }
         let grid = Arc::new(build_grid(&files[0].path, &layout, settings)?);
         let description = describe(&layout, format, files.len(), &seconds);
         let names: Vec<String> = layout.frames.iter().flatten().map(|c| c.name.clone()).collect();
@@ -154,6 +209,13 @@ impl Archive {
         if let Some(what) = synthetic {
             archive.declare_synthetic(what);
         }
+        archive.description.notes.extend(together.map(|names| format!("read as one, and others alike: {names}")));
+        archive.description.notes.extend(land.notes);
+        match settings.mask.as_deref() {
+            Some(ZERO) => archive.mask_zeros()?,
+            None if land.found.iter().all(Option::is_none) && !staggered => archive.tell_zeros()?,
+            _ => {}
+        }
         if let Some([error, size]) = archive.resampling_error()? {
             archive.description.notes.push(format!(
                 "resampling error, measured on the first snapshot at the file's own points: {error:.3} m/s of {size:.3} m/s ({:.1} %), root mean square",
@@ -163,9 +225,90 @@ impl Archive {
         Ok(archive)
     }
 
+    /// For each component, the points whose velocity is 0 at all of a few times, by their places in the file: those of one entry along the
+    /// levels, or all. Stops as soon as there are none.
+    fn zeros(&mut self, level: Option<usize>) -> Result<Zeros, SourceError> {
+        let found = self.zeros_of_open(level);
+        if self.files.len() > 1 {
+            // A file that changes from here on is noticed.
+            self.open = None;
+        }
+        found
+    }
+
+    fn zeros_of_open(&mut self, level: Option<usize>) -> Result<Zeros, SourceError> {
+        let mut zeros = Zeros::new();
+        for index in sampled(self.times.len()) {
+            let place = self.open_at(index)?;
+            let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
+            for (which, plan) in self.files[place.file].frames[place.frame].iter().enumerate().take(2) {
+                let [x, y, z] = plan.file_order();
+                let orders = [x, y, level.map_or(z, |level| vec![level])];
+                let values = read_component(file, plan, &orders, place.entry)?;
+                match zeros.get_mut(which) {
+                    Some((_, zero)) => zero.iter_mut().zip(values).for_each(|(zero, v)| *zero &= v == 0.0),
+                    None => zeros.push((orders.map(|order| order.len()), values.into_iter().map(|v| v == 0.0).collect())),
+                }
+            }
+            if let [(a, u), (b, v)] = &mut zeros[..]
+                && a == b
+            {
+                u.iter_mut().zip(&mut *v).for_each(|(u, v)| (*u, *v) = (*u && *v, *u && *v));
+            }
+            if zeros.iter().all(|(_, zero)| !zero.contains(&true)) {
+                return Ok(Vec::new());
+            }
+        }
+        Ok(zeros)
+    }
+
+    /// Takes points as land whose velocity is 0 at all sampled times.
+    fn mask_zeros(&mut self) -> Result<(), SourceError> {
+        let mut masks: Vec<Arc<Mask>> = self.zeros(None)?.into_iter().map(|(shape, land)| Arc::new(Mask::new(ZERO, shape, land))).collect();
+        // w has a mask only on the points of u.
+        masks.extend(masks.first().cloned());
+        for plan in self.files.iter_mut().flat_map(|file| &mut file.frames).flat_map(|frame| frame.iter_mut().zip(&masks)) {
+            let (plan, mask) = plan;
+            if mask.fits([0, 1, 2].map(|k| plan.along(k))) {
+                plan.mask = Some(mask.clone());
+            }
+        }
+        self.description.notes.push(match masks.first() {
+            Some(mask) => format!("{:.1} % of the points are 0 at all sampled times: taken as missing, as set", 100.0 * mask.share()),
+            None => "no point is 0 at all sampled times: `archive.mask = \"zero\"` finds no land".into(),
+        });
+        Ok(())
+    }
+
+    /// Tells of cells whose corners are 0 at all sampled times, in the middle one of the levels: probably land.
+    fn tell_zeros(&mut self) -> Result<(), SourceError> {
+        let level = self.axes.get(2).map_or(0, |axis| axis.order[axis.order.len() / 2]);
+        let zeros = self.zeros(Some(level))?;
+        let Some(([nx, ny, _], zero)) = zeros.first() else { return Ok(()) };
+        let corners = |cell: usize| [0, 1, *nx, nx + 1].map(|corner| cell / (nx - 1) * nx + cell % (nx - 1) + corner);
+        let cells = nx.saturating_sub(1) * ny.saturating_sub(1);
+        let dead = (0..cells).filter(|&cell| corners(cell).iter().all(|&i| zero[i])).count();
+        if dead > 0 {
+            let share = 100.0 * dead as f64 / cells as f64;
+            self.description.notes.push(format!(
+                "the velocity is exactly 0 at all corners of {share:.1} % of the cells{}, at all of {} times: is this land? Particles rest \
+                 there; --set archive.mask=zero takes such nodes as missing, --set archive.mask=NAME names a mask, in these files or in one \
+                 that is named beside them, --set archive.mask=none keeps them",
+                if self.axes.len() > 2 { " of one level" } else { "" },
+                sampled(self.times.len()).len()
+            ));
+        }
+        Ok(())
+    }
+
     /// The files, in the order of their names in the arguments.
     pub fn files(&self) -> impl ExactSizeIterator<Item = &Path> {
         self.files.iter().map(|f| f.path.as_path())
+    }
+
+    /// The files that are read as one for the first of [`Self::files`].
+    pub(super) fn first_group(&self) -> Option<&Group> {
+        self.files.first().map(|file| &file.group)
     }
 
     /// Seconds of each snapshot since 1970-01-01 in the archive's calendar (or since the simulation's start), ascending. Equal to
@@ -234,8 +377,11 @@ impl Archive {
             other => {
                 // Closed before the next file opens.
                 drop(other);
-                let ArchiveFile { path, frames } = &self.files[place.file];
-                let file = DataFile::open(path, self.expected.as_ref(), self.limits)?;
+                let ArchiveFile { path, group, frames } = &self.files[place.file];
+                let file = match group.len() {
+                    1 => DataFile::open(path, self.expected.as_ref(), self.limits)?,
+                    _ => open_group(group, self.limits)?,
+                };
                 for component in frames.iter().flatten() {
                     let shape = file.describe(&component.name).map(|d| d.dimensions.iter().map(|d| d.len).collect::<Vec<_>>());
                     if shape.ok().as_ref() != Some(&component.shape) {
@@ -374,14 +520,25 @@ fn check_memory(path: &Path, layout: &Layout, limits: &Limits) -> Result<(), Sou
     what.map_err(|what| SourceError::file(path, what))
 }
 
-/// Opens and plans the next file of an archive whose first file has the layout `first`.
+/// Names of the files of a group.
+fn in_words(group: &[PathBuf]) -> String {
+    let names = group.iter().map(|path| path.file_name().map_or_else(|| path.display().to_string(), |n| n.to_string_lossy().into_owned()));
+    names.collect::<Vec<_>>().join(", ")
+}
+
+/// Opens and plans the next group of an archive whose first file has the layout `first`.
 fn open_next(
-    path: &Path,
+    group: &[PathBuf],
     settings: &ArchiveSettings,
     first: Option<&Layout>,
     expected: Option<&Listing>,
     limits: Limits,
 ) -> Result<(DataFile, Layout), SourceError> {
+    let [path] = group else {
+        let file = open_group(group, limits)?;
+        let layout = plan(&file, settings, first)?;
+        return Ok((file, layout));
+    };
     let mut file = DataFile::open(path, expected, limits)?;
     let mut planned = plan(&file, settings, first);
     let fits = planned.as_ref().is_ok_and(|layout| first.is_none_or(|first| difference(first, layout).is_none()));
@@ -391,6 +548,24 @@ fn open_next(
         planned = plan(&file, settings, first);
     }
     Ok((file, planned?))
+}
+
+/// Snapshots that are looked at to find nodes without motion.
+const SAMPLED: usize = 3;
+
+/// A few snapshots of `count`, evenly spread, ends included.
+fn sampled(count: usize) -> Vec<usize> {
+    let few = count.min(SAMPLED);
+    (0..few).map(|k| if few > 1 { k * (count - 1) / (few - 1) } else { 0 }).collect()
+}
+
+/// True for a file without velocities that holds a mask of land.
+fn is_mask_alone(path: &Path, settings: &ArchiveSettings, limits: Limits) -> bool {
+    DataFile::open(path, None, limits).is_ok_and(|file| {
+        let listing = &file.listing;
+        let moves = |i: usize| judge(listing, i, settings.velocity_units()).is_ok();
+        holds_mask(listing, settings) && !(0..listing.variables.len()).any(moves)
+    })
 }
 
 fn check_duplicates(entries: &[(f64, Place)], files: &[ArchiveFile], calendar: Option<Calendar>) -> Result<(), SourceError> {

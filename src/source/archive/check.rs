@@ -1,6 +1,6 @@
 //! Checks of the archive settings: by themselves, and against the files.
 
-use crate::archive_settings::{ArchiveSettings, Metric, Staggering};
+use crate::archive_settings::{ArchiveSettings, Metric, Staggering, WITH_UNITS};
 use crate::error::SourceError;
 use crate::formats::Format;
 use crate::grids::{Layout, Resampling};
@@ -31,6 +31,13 @@ pub fn check(settings: &ArchiveSettings) -> Result<(), SourceError> {
     {
         return fault("memory_gib", gib.to_string(), "a number above 0");
     }
+    if let Some(odd) = settings.units.iter().flatten().find(|(of, _)| !WITH_UNITS.contains(&of.as_str())) {
+        return fault(
+            "units",
+            format!("{{ {} = {:?} }}", odd.0, odd.1),
+            "units of u, v, w, x, y, z and time: --set archive.units.u=\"m s-1\"",
+        );
+    }
     if settings.level.is_some_and(|l| !l.is_finite()) {
         return fault("level", format!("{:?}", settings.level), "a coordinate of the level axis");
     }
@@ -53,7 +60,7 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
     };
     let heights = layout.axes.len() > 2 && layout.metric != Metric::Index;
     for (key, given, fits, accepted) in [
-        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; `u`, `v` and `w` name variables of NetCDF"),
+        ("velocity", s.velocity.is_some(), hdf5, "with HDF5 only; --set archive.u=NAME, archive.v and archive.w name variables of NetCDF"),
         ("order", s.order.is_some(), hdf5, "with HDF5 only"),
         ("spacing", s.spacing.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
         ("origin", s.origin.is_some(), hdf5, "with HDF5 only; the coordinates of NetCDF are in the file"),
@@ -65,6 +72,9 @@ pub fn check_fit(settings: &ArchiveSettings, layout: &Layout, format: Format) ->
         ("z", s.z.is_some(), !staggered, "left out with WRF output, whose axes are known"),
         ("resolution", s.resolution.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
         ("grid_relative", s.grid_relative.is_some(), curvilinear, "with longitudes and latitudes of two dimensions only"),
+        ("select", s.select.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("units", s.units.is_some(), !hdf5 && !staggered, "left out with HDF5 and WRF output"),
+        ("mask", s.mask.is_some(), !staggered, "left out with WRF output, whose winds blow over land too"),
         ("vertical_scale", s.vertical_scale.is_some(), heights, "with levels, in the sphere and cartesian metrics"),
     ] {
         if given && !fits {

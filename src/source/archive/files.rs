@@ -18,6 +18,7 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     let mut files: Vec<PathBuf> = Vec::new();
     for path in paths {
         let text = path.to_string_lossy();
+        refuse_dangling(path)?;
         if path.is_dir() {
             files.extend(folder(path)?);
         } else if !path.exists() && text.contains(['*', '?', '[']) {
@@ -35,6 +36,18 @@ fn unreadable(path: &Path, cause: impl ToString) -> SourceError {
     FormatFault::Open(cause.to_string()).of(path).into()
 }
 
+/// Refuses a link whose target does not exist: a time would be missing without a word.
+fn refuse_dangling(path: &Path) -> Result<(), SourceError> {
+    match std::fs::read_link(path) {
+        Ok(target) if !path.exists() => {
+            let what =
+                format!("it is a link to {}, which does not exist: fetch or restore that file, or remove the link", target.display());
+            Err(SourceError::file(path, what))
+        }
+        _ => Ok(()),
+    }
+}
+
 fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
     let failed = |cause| unreadable(path, cause);
     let mut files = Vec::new();
@@ -42,8 +55,11 @@ fn folder(path: &Path) -> Result<Vec<PathBuf>, SourceError> {
         let file = entry.map_err(failed)?.path();
         let extension = file.extension().and_then(|e| e.to_str()).unwrap_or_default();
         let name = file.file_name().and_then(|n| n.to_str()).unwrap_or_default();
-        if file.is_file() && (EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_")) {
-            files.push(file);
+        if EXTENSIONS.iter().any(|e| e.eq_ignore_ascii_case(extension)) || name.starts_with("wrfout_") {
+            refuse_dangling(&file)?;
+            if file.is_file() {
+                files.push(file);
+            }
         }
     }
     if files.is_empty() {
@@ -58,6 +74,7 @@ fn pattern(text: &str) -> Result<Vec<PathBuf>, SourceError> {
     let mut files = Vec::new();
     for file in found {
         let file = file.map_err(|e| unreadable(e.path(), e.error()))?;
+        refuse_dangling(&file)?;
         if file.is_file() {
             files.push(file);
         }

@@ -2,6 +2,7 @@
 
 use super::archive::{Archive, Displacement, files_of, limits};
 use super::check::check;
+use super::group::open_group;
 use crate::archive_settings::ArchiveSettings;
 use crate::cf::velocity;
 use crate::error::SourceError;
@@ -159,7 +160,7 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
         file,
         files: files.len(),
         format: first.listing.format.name().into(),
-        variables: variables(&first.listing),
+        variables: variables(&first.listing, settings),
         problem: None,
         refused: None,
         source: None,
@@ -170,7 +171,12 @@ pub fn inspect(paths: &[PathBuf], settings: &ArchiveSettings, tau: Option<f64>) 
         resolution: None,
     };
     match Archive::open_files(files, settings) {
-        Ok(archive) => inspection.fill(archive, settings.steady, tau)?,
+        Ok(archive) => {
+            if let Some(group) = archive.first_group().filter(|group| **group != [inspection.file.clone()]) {
+                inspection.variables = variables(&open_group(group, limits(settings))?.listing, settings);
+            }
+            inspection.fill(archive, settings.steady, tau)?;
+        }
         Err(error) => {
             (inspection.problem, inspection.refused) = (Some(error.to_string()), error.refused());
             inspection.axes = readable_axes(&first, settings).iter().map(|(role, plan)| AxisReport::of(plan, role)).collect();
@@ -197,7 +203,7 @@ impl AxisReport {
     }
 }
 
-fn variables(listing: &Listing) -> Vec<VariableReport> {
+fn variables(listing: &Listing, settings: &ArchiveSettings) -> Vec<VariableReport> {
     let report = |i: usize| {
         let variable = &listing.variables[i];
         VariableReport {
@@ -206,7 +212,7 @@ fn variables(listing: &Listing) -> Vec<VariableReport> {
             dimensions: variable.dimensions.iter().map(|&d| (listing.dimensions[d].name.clone(), listing.dimensions[d].len)).collect(),
             units: variable.units().map(str::to_owned),
             role: None,
-            why: match velocity::judge(listing, i) {
+            why: match velocity::judge(listing, i, settings.velocity_units()) {
                 Ok(candidate) => format!("may be {}, but another was chosen: {}", candidate.component.name(), candidate.why),
                 Err(lacks) => lacks,
             },
@@ -262,6 +268,29 @@ impl Inspection {
     }
 }
 
+impl Inspection {
+    /// The table of variables: of a refused file without those that are no fields.
+    fn variables(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        writeln!(f, "\nvariables")?;
+        let width = self.variables.iter().map(|v| v.name.chars().count()).max().unwrap_or(0);
+        let (used, mut unused): (Vec<_>, Vec<_>) = self.variables.iter().partition(|v| v.role.is_some());
+        let all = unused.len();
+        if self.problem.is_some() {
+            unused.retain(|v| v.dimensions.len() > 1);
+        }
+        let left_out = all - unused.len();
+        for v in used.into_iter().chain(unused) {
+            let dims: Vec<String> = v.dimensions.iter().map(|(n, l)| format!("{n} {l}")).collect();
+            let role = v.role.as_deref().unwrap_or("-");
+            writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
+        }
+        if left_out > 0 {
+            writeln!(f, "  and {left_out} variables of fewer than two dimensions")?;
+        }
+        Ok(())
+    }
+}
+
 fn times(archive: &Archive, description: &SourceDescription, steady: bool, tau: Option<f64>) -> TimeReport {
     let times = archive.times();
     let show = |t: f64| archive.date(t).unwrap_or_else(|| format!("{t} {}", description.time_unit));
@@ -293,13 +322,13 @@ impl fmt::Display for Inspection {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let more = if self.files > 1 { format!(" and {} more", self.files - 1) } else { String::new() };
         writeln!(f, "{}{more} ({})", self.file.display(), self.format)?;
-        writeln!(f, "\nvariables")?;
-        let width = self.variables.iter().map(|v| v.name.chars().count()).max().unwrap_or(0);
-        let (used, unused): (Vec<_>, Vec<_>) = self.variables.iter().partition(|v| v.role.is_some());
-        for v in used.into_iter().chain(unused) {
-            let dims: Vec<String> = v.dimensions.iter().map(|(n, l)| format!("{n} {l}")).collect();
-            let role = v.role.as_deref().unwrap_or("-");
-            writeln!(f, "  {role:<4} {:width$}  {} ({}): {}", v.name, v.number, dims.join(", "), v.why)?;
+        if let Some(problem) = &self.problem {
+            writeln!(f, "\ncannot be read as an archive:\n{problem}")?;
+        }
+        // Candidates are a part of the reason.
+        let lists = self.problem.as_ref().is_some_and(|problem| problem.contains('\n'));
+        if !lists {
+            self.variables(f)?;
         }
         if let Some(source) = &self.source {
             writeln!(f, "\nmetric {}", word(source.metric))?;
@@ -323,8 +352,8 @@ impl fmt::Display for Inspection {
                 None => writeln!(f, "{period}; made, ascending")?,
             }
         }
-        if let Some(problem) = &self.problem {
-            return writeln!(f, "\ncannot be read as an archive:\n{problem}");
+        if self.problem.is_some() {
+            return Ok(());
         }
         if let Some(t) = &self.time {
             if t.snapshots == 1 {

@@ -7,6 +7,7 @@
 mod archive;
 mod check;
 mod files;
+mod group;
 mod inspect;
 mod memory;
 mod read_ahead;

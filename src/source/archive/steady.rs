@@ -18,7 +18,12 @@ impl Steady {
     /// The source has more than one time.
     pub fn new(source: Box<dyn SnapshotSource>, tau: f64) -> Result<Self, SourceError> {
         let &[time] = source.times() else {
-            let accepted = format!("only an archive of one time is taken as steady; {} holds {}", source.name(), source.times().len());
+            let accepted = format!(
+                "only an archive of one time is taken as steady; {} holds {}: name one file, and pick one of its times with --set \
+                 archive.select.DIMENSION=ENTRY (from 0, of the dimension of the times)",
+                source.name(),
+                source.times().len()
+            );
             return Err(SourceError::setting("steady", true, accepted));
         };
         Ok(Self { times: [time.min(time + tau), time.max(time + tau)], source })

@@ -97,11 +97,11 @@ pub struct Velocity {
     pub others: Vec<Candidate>,
 }
 
-/// Judges whether a variable may be a component.
+/// Judges whether a variable may be a component. `stated` are units of u, v and w that outweigh those of the file.
 ///
 /// # Errors
 /// It may not; the error says what it lacks.
-pub fn judge(listing: &Listing, index: usize) -> Result<Candidate, String> {
+pub fn judge(listing: &Listing, index: usize, stated: [Option<&str>; 3]) -> Result<Candidate, String> {
     let variable = &listing.variables[index];
     if !variable.number.is_number() {
         return Err("holds no numbers".into());
@@ -110,7 +110,7 @@ pub fn judge(listing: &Listing, index: usize) -> Result<Candidate, String> {
         return Err(format!("has {} dimension(s); a velocity has two or more", variable.dimensions.len()));
     }
     let named = by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable));
-    let unit = variable.units();
+    let unit = named.as_ref().and_then(|(component, ..)| stated[*component as usize]).or(variable.units());
     let parsed = unit.map(Unit::parse);
     // A standard name is a promise: an unknown unit is reported where the unit is needed.
     let fits = match (&named, parsed) {
@@ -125,13 +125,22 @@ pub fn judge(listing: &Listing, index: usize) -> Result<Candidate, String> {
             let unit = unit.map_or_else(|| "no unit, taken as SI".into(), |u| format!("unit `{u}`"));
             Ok(Candidate { variable: index, component, tier, family, why: format!("{why}, {unit}") })
         }
-        Some((.., why)) => Err(format!("{why}, but its unit `{}` is no velocity", unit.unwrap_or_default())),
+        Some((component, .., why)) => Err(format!(
+            "{why}, but its unit `{}` is no velocity; if it is one, state it with --set archive.units.{}=\"m s-1\"",
+            unit.unwrap_or_default(),
+            component.name()
+        )),
         None if unit.is_none() => Err("neither unit, standard_name nor name is that of a velocity component".into()),
         None if fits => {
             Err(format!("unit `{}`, but neither standard_name, name nor long_name says which component", unit.unwrap_or_default()))
         }
         None => Err(format!("unit `{}` is no velocity", unit.unwrap_or_default())),
     }
+}
+
+/// True if a name of the variable is that of a component, whatever its unit.
+pub fn may_be_named(variable: &Variable) -> bool {
+    by_standard_name(variable).or_else(|| by_name(variable)).or_else(|| by_long_name(variable)).is_some()
 }
 
 type Named = (Component, usize, usize, String);
@@ -183,12 +192,13 @@ fn look_up<const N: usize>(table: &[[&str; 3]; N], name: &str) -> Option<(Compon
     })
 }
 
-/// Chooses the components. `fixed` are variables that the settings name; `ignore_w` leaves out the vertical component.
+/// Chooses the components. `fixed` are variables that the settings name; `ignore_w` leaves out the vertical component; `stated` as for
+/// [`judge`].
 ///
 /// # Errors
 /// A horizontal component is lacking; the error says which.
-pub fn choose(listing: &Listing, fixed: [Option<usize>; 3], ignore_w: bool) -> Result<Velocity, String> {
-    let judged: Vec<Candidate> = (0..listing.variables.len()).filter_map(|i| judge(listing, i).ok()).collect();
+pub fn choose(listing: &Listing, fixed: [Option<usize>; 3], ignore_w: bool, stated: [Option<&str>; 3]) -> Result<Velocity, String> {
+    let judged: Vec<Candidate> = (0..listing.variables.len()).filter_map(|i| judge(listing, i, stated).ok()).collect();
     let of = |component: Component| -> Vec<Candidate> {
         match fixed[component as usize] {
             Some(variable) => {

@@ -215,7 +215,15 @@ impl<'a> Coordinates<'a> {
     }
 
     fn unknown_unit(&self, unit: &str) -> SourceError {
-        SourceError::file(self.path, format!("variable `{}` has unit `{unit}`; accepted are {AXIS_UNITS}", self.name))
+        let (key, usual) = match self.kind {
+            Kind::Longitude => ("x", "degrees_east"),
+            Kind::Latitude => ("y", "degrees_north"),
+            Kind::X => ("x", "m"),
+            Kind::Y => ("y", "m"),
+            _ => ("z", "m"),
+        };
+        let how = format!("if the file is wrong, state it with --set archive.units.{key}={usual}");
+        SourceError::file(self.path, format!("variable `{}` has unit `{unit}`; accepted are {AXIS_UNITS}; {how}", self.name))
     }
 
     /// Period of longitudes that close the circle. Drops a last node that repeats the first, if `once` is set.

@@ -1,9 +1,11 @@
 //! One component of the velocity in a file, and its values at one time.
 
 use super::axes::runs;
+use super::mask::Mask;
 use crate::cf::packing::Packing;
 use crate::error::SourceError;
 use crate::formats::DataFile;
+use std::sync::Arc;
 
 /// Meaning of a dimension of a variable.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,12 +22,18 @@ pub enum Role {
 pub struct ComponentPlan {
     pub name: String,
     pub shape: Vec<usize>,
+    /// Names of its dimensions.
+    pub dimensions: Vec<String>,
     pub roles: Vec<Role>,
     pub packing: Packing,
     /// Factor to SI.
     pub factor: f64,
     /// Why it was chosen.
     pub why: String,
+    /// True if its names say that it is a velocity of water.
+    pub of_water: bool,
+    /// Its points on land.
+    pub mask: Option<Arc<Mask>>,
 }
 
 impl ComponentPlan {
@@ -89,6 +97,13 @@ pub fn read_component(file: &DataFile, component: &ComponentPlan, orders: &Order
                         }
                     }
                 }
+            }
+        }
+    }
+    if let Some(mask) = &component.mask {
+        for (i, value) in values.iter_mut().enumerate() {
+            if mask.is_land([orders[0][i % nx], orders[1][i / nx % ny], orders[2][i / (nx * ny)]]) {
+                *value = f32::NAN;
             }
         }
     }

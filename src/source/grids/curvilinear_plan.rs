@@ -15,31 +15,85 @@ use crate::formats::Variable;
 use ridgewatch_field::Axis;
 use std::sync::Arc;
 
-/// Longitude and latitude variables of a component.
+/// Longitude and latitude variables.
 type Pair = [usize; 2];
+
+/// Where the points of a component lie.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Points {
+    pair: Pair,
+    /// Dimensions of the component along x and y.
+    plane: [usize; 2],
+    /// True along axes on which they lie between the points of the pair.
+    between: [bool; 2],
+}
 
 /// Bytes of a point of a mesh: coordinates, directions, and up to four nodes with their places, bases and velocities.
 const POINT_BYTES: u64 = 500;
 
 impl Planner<'_> {
-    /// Coordinate arrays of each component. `None` if the horizontal dimensions have coordinates of their own.
-    pub fn curvilinear_coordinates(&self, velocity: &Velocity) -> Option<Vec<Pair>> {
+    /// Points of each component. `None` if the horizontal dimensions have coordinates of their own.
+    ///
+    /// # Errors
+    /// Coordinates that the settings name and that are no pair; values that cannot be read.
+    pub fn curvilinear_points(&mut self, velocity: &Velocity) -> Result<Option<Vec<Points>>, SourceError> {
         let s = self.settings;
-        if s.metric.is_some_and(|m| m != Metric::Sphere) || s.velocity_unit != VelocityUnit::Si || s.x.is_some() || s.y.is_some() {
-            return None;
+        if s.metric.is_some_and(|m| m != Metric::Sphere) || s.velocity_unit != VelocityUnit::Si {
+            return Ok(None);
         }
-        let u = self.coordinate_arrays(velocity.u.variable)?;
+        let named = self.named_pair()?;
+        if named.is_none() && (s.x.is_some() || s.y.is_some()) {
+            return Ok(None);
+        }
+        let Some(u) = self.points(velocity.u.variable, "u", named)? else { return Ok(None) };
         let own = |&dimension: &usize| {
             self.measured(dimension).coordinate.map(|c| self.variable(c)).is_some_and(|variable| {
                 let length = Unit::parse(variable.units().unwrap_or_default()).is_some_and(|u| u.is_length());
                 length || matches!(classify(variable), Kind::Longitude | Kind::Latitude)
             })
         };
-        if self.plane_of(u[0]).iter().any(own) {
-            return None;
+        if named.is_none() && u.plane.iter().any(own) {
+            return Ok(None);
         }
-        let others = [Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten();
-        [Some(u)].into_iter().chain(others.map(|other| self.coordinate_arrays(other.variable))).collect()
+        let mut points = vec![u];
+        // Vertical velocities lie above tracers.
+        for (other, letter) in [Some((&velocity.v, "v")), velocity.w.as_ref().map(|w| (w, "t"))].into_iter().flatten() {
+            match self.points(other.variable, letter, named)? {
+                Some(found) => points.push(found),
+                None => return Ok(None),
+            }
+        }
+        for (candidate, points) in [Some(&velocity.u), Some(&velocity.v), velocity.w.as_ref()].into_iter().flatten().zip(&points) {
+            if points.between != [false; 2] {
+                let [name, longitude, latitude] = [candidate.variable, points.pair[0], points.pair[1]].map(|i| &self.variable(i).name);
+                self.note(format!(
+                    "`{name}` has no coordinates of its own: its points lie between those of `{longitude}` and `{latitude}`"
+                ));
+            }
+        }
+        Ok(Some(points))
+    }
+
+    /// Coordinates of two dimensions that the settings name.
+    pub fn named_pair(&self) -> Result<Option<Pair>, SourceError> {
+        let s = self.settings;
+        let wide = |name: &Option<String>| {
+            let index = name.as_ref().and_then(|name| self.listing().find(name));
+            index.filter(|&i| {
+                let variable = self.variable(i);
+                let angle = matches!(classify(variable), Kind::Longitude | Kind::Latitude);
+                variable.number.is_number() && (variable.dimensions.len() == 2 || (variable.dimensions.len() > 2 && angle))
+            })
+        };
+        match (wide(&s.x), wide(&s.y)) {
+            (Some(longitude), Some(latitude)) if self.plane_of(longitude) == self.plane_of(latitude) => Ok(Some([longitude, latitude])),
+            (None, None) => Ok(None),
+            (Some(odd), _) | (None, Some(odd)) => {
+                let what = "a coordinate of two dimensions is one of a pair on the same points: name both, with --set \
+                            archive.x=LONGITUDES --set archive.y=LATITUDES";
+                Err(self.misfit(odd, what))
+            }
+        }
     }
 
     /// The last two dimensions of a variable: x and y.
@@ -48,37 +102,93 @@ impl Planner<'_> {
         [dims[dims.len() - 1], dims[dims.len() - 2]]
     }
 
-    /// Longitude and latitude arrays on the dimensions of a variable. Arrays that its `coordinates` attribute names go first.
-    fn coordinate_arrays(&self, variable: usize) -> Option<Pair> {
+    /// Points of a variable, those of `letter` on a staggered grid: a pair of longitudes and latitudes on its dimensions, of which those that its `coordinates` attribute names go
+    /// first; else a pair with one point more along x or y, between whose points it lies. Pairs without values are passed over.
+    fn points(&self, variable: usize, letter: &str, named: Option<Pair>) -> Result<Option<Points>, SourceError> {
         let (listing, of) = (self.listing(), self.variable(variable));
-        let fits = |v: &Variable| {
-            let n = v.dimensions.len();
-            let on = |d: &usize| of.dimensions.contains(d) && listing.dimensions[*d].len > 1;
-            n >= 2 && v.number.is_number() && v.dimensions[n - 2..].iter().all(on)
-        };
-        let named: Vec<&str> = of.text("coordinates").map(|t| t.split_whitespace().collect()).unwrap_or_default();
+        let wide: Vec<usize> = of.dimensions.iter().rev().copied().filter(|&d| listing.dimensions[d].len > 1).collect();
+        let [x, y, ..] = wide[..] else { return Ok(None) };
+        let first: Vec<&str> = of.text("coordinates").map(|t| t.split_whitespace().collect()).unwrap_or_default();
         let find = |kind: Kind| {
-            let mut found: Vec<usize> = listing.matching(|v| fits(v) && classify(v) == kind).collect();
-            found.sort_by_key(|&i| !named.contains(&self.variable(i).name.as_str()));
+            let fits = |v: &Variable| v.dimensions.len() >= 2 && v.number.is_number() && classify(v) == kind;
+            let mut found: Vec<usize> = listing.matching(fits).collect();
+            // In files that were joined, each component has coordinates of its own file, or of its points in a mesh.
+            found.sort_by_key(|&i| {
+                let ((part, name), of_part) = (self.file.origin(i), self.file.origin(variable).0);
+                (part != of_part, !first.contains(&name), !name.to_ascii_lowercase().ends_with(letter))
+            });
             found
         };
         let latitudes = find(Kind::Latitude);
-        let partner = |lon: usize| latitudes.iter().find(|&&lat| self.plane_of(lat) == self.plane_of(lon)).map(|&lat| [lon, lat]);
-        find(Kind::Longitude).into_iter().find_map(partner)
+        let pairs: Vec<Pair> = match named {
+            Some(pair) => vec![pair],
+            None => {
+                let partner = |lon: usize| latitudes.iter().find(|&&lat| self.are_partners(lon, lat)).map(|&lat| [lon, lat]);
+                find(Kind::Longitude).into_iter().filter_map(partner).collect()
+            }
+        };
+        let length = |d: usize| listing.dimensions[d].len;
+        let on = |&[lon, _]: &Pair| {
+            let plane = self.plane_of(lon);
+            let own = plane.iter().all(|d| wide.contains(d));
+            own.then_some(Points { pair: [0; 2], plane, between: [false; 2] })
+        };
+        let beside = |&[lon, _]: &Pair| {
+            let more = [0, 1].map(|k| length(self.plane_of(lon)[k]) as i64 - length([x, y][k]) as i64);
+            let between = more.map(|more| more == 1);
+            (more.iter().all(|more| (0..=1).contains(more))).then_some(Points { pair: [0; 2], plane: [x, y], between })
+        };
+        let choices: [&dyn Fn(&Pair) -> Option<Points>; 2] = [&on, &beside];
+        for points_of in choices {
+            for &pair in &pairs {
+                if let Some(points) = points_of(&pair)
+                    && self.has_values(pair)?
+                {
+                    return Ok(Some(Points { pair, ..points }));
+                }
+            }
+        }
+        Ok(None)
     }
 
-    /// Points of a pair of coordinate arrays, at the first entry along all dimensions but the last two.
-    fn mesh(&self, [longitude, latitude]: Pair) -> Result<Mesh, SourceError> {
+    /// True if longitudes and latitudes are of the same points.
+    fn are_partners(&self, longitude: usize, latitude: usize) -> bool {
+        self.plane_of(longitude) == self.plane_of(latitude) && self.file.origin(longitude).0 == self.file.origin(latitude).0
+    }
+
+    /// False if the longitudes or the latitudes are all 0 or missing, as in files from which other points were cut.
+    fn has_values(&self, pair: Pair) -> Result<bool, SourceError> {
+        for index in pair {
+            let rows = self.listing().dimensions[self.plane_of(index)[1]].len;
+            let known = |values: Vec<f64>| values.iter().any(|v| v.is_finite() && *v != 0.0);
+            self.check_mesh(index)?;
+            if !known(self.degrees(index, Some(rows / 2))?) && !known(self.degrees(index, None)?) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Refuses coordinates that the file cannot hold, or that need too much memory.
+    fn check_mesh(&self, longitude: usize) -> Result<(), SourceError> {
         let shape = self.plane_of(longitude).map(|d| self.listing().dimensions[d].len);
         let points = shape[0].saturating_mul(shape[1]);
         self.listing().check_count(self.variable(longitude), &shape)?;
         let needed = (points as u64).saturating_mul(POINT_BYTES);
-        self.file.limits.check(needed, &format!("{points} points of a mesh")).map_err(|what| self.misfit(longitude, what))?;
-        let mesh = Mesh { shape, longitude: self.degrees(longitude, None)?, latitude: self.degrees(latitude, None)? };
-        match mesh.latitude.iter().find(|l| l.abs() > 90.001) {
-            Some(odd) => Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90"))),
-            None => Ok(mesh),
+        self.file.limits.check(needed, &format!("{points} points of a mesh")).map_err(|what| self.misfit(longitude, what))
+    }
+
+    /// Points of a component, at the first entry along all dimensions but the last two.
+    fn mesh(&self, points: &Points) -> Result<Mesh, SourceError> {
+        let [longitude, latitude] = points.pair;
+        let shape = self.plane_of(longitude).map(|d| self.listing().dimensions[d].len);
+        self.check_mesh(longitude)?;
+        let mut mesh = Mesh { shape, longitude: self.degrees(longitude, None)?, latitude: self.degrees(latitude, None)? };
+        if let Some(odd) = mesh.latitude.iter().find(|l| l.abs() > 90.001) {
+            return Err(self.misfit(latitude, format!("a latitude is {odd} degrees; accepted are -90 to 90, and missing values")));
         }
+        mesh.leave_out_zeros();
+        Ok(mesh.between(points.between))
     }
 
     /// Degrees at all points of a two-dimensional coordinate, or at those of one row.
@@ -99,13 +209,18 @@ impl Planner<'_> {
 
     /// Refuses a later file whose points differ from those of the first. Compares the first and the last row, which cost little to
     /// read.
-    fn check_points(&self, pairs: &[Pair], first: &Curvilinear) -> Result<(), SourceError> {
-        for (pair, mesh) in pairs.iter().zip(&first.meshes) {
-            for (&index, known) in pair.iter().zip([&mesh.longitude, &mesh.latitude]) {
+    fn check_points(&self, points: &[Points], first: &Curvilinear) -> Result<(), SourceError> {
+        for (points, mesh) in points.iter().zip(&first.meshes) {
+            let whole = if points.between == [false; 2] { None } else { Some(self.mesh(points)?) };
+            let whole = [whole.as_ref().map(|mesh| &mesh.longitude), whole.as_ref().map(|mesh| &mesh.latitude)];
+            for ((&index, known), whole) in points.pair.iter().zip([&mesh.longitude, &mesh.latitude]).zip(whole) {
                 for row in [0, mesh.shape[1] - 1] {
-                    let here = self.degrees(index, Some(row))?;
-                    let there = &known[row * mesh.shape[0]..][..mesh.shape[0]];
-                    if let Some((a, b)) = here.iter().zip(there).find(|(a, b)| a != b && !(a.is_nan() && b.is_nan())) {
+                    let in_row = |values: &[f64]| values[row * mesh.shape[0]..][..mesh.shape[0]].to_vec();
+                    let here = whole.map_or_else(|| self.degrees(index, Some(row)), |values| Ok(in_row(values)))?;
+                    let there = in_row(known);
+                    // Points at 0 were left out.
+                    let same = |a: f64, b: f64| a == b || (b.is_nan() && (a.is_nan() || a == 0.0));
+                    if let Some((a, b)) = here.iter().zip(&there).find(|(a, b)| !same(**a, **b)) {
                         let what = format!("it is {a} where the first file has {b} (row {row}); the files of an archive lie on one grid");
                         return Err(self.misfit(index, what));
                     }
@@ -126,17 +241,17 @@ impl Planner<'_> {
             None if says(standard) => (false, format!("standard_name `{standard}`")),
             None if standard.is_empty() && says(&long) => (false, format!("long_name `{long}`")),
             None if !standard.is_empty() => (true, format!("standard_name `{standard}`")),
-            None => (true, "no name says eastward; `grid_relative = false` otherwise".into()),
+            None => (true, "no name says eastward; --set archive.grid_relative=false otherwise".into()),
         }
     }
 
-    /// Plans a file whose components have the coordinate arrays `pairs`.
-    pub fn plan_curvilinear(mut self, velocity: &Velocity, pairs: Vec<Pair>, first: Option<&Layout>) -> Result<Layout, SourceError> {
+    /// Plans a file whose components lie on `points`.
+    pub fn plan_curvilinear(mut self, velocity: &Velocity, points: Vec<Points>, first: Option<&Layout>) -> Result<Layout, SourceError> {
         if self.settings.region.is_some() {
-            return Err(SourceError::setting("region", "given", "longitudes and latitudes of two dimensions are read whole"));
+            return Err(SourceError::setting("region", "given", "left out: longitudes and latitudes of two dimensions are read whole"));
         }
         let u = velocity.u.variable;
-        let planes: Vec<[usize; 2]> = pairs.iter().map(|pair| self.plane_of(pair[0])).collect();
+        let planes: Vec<[usize; 2]> = points.iter().map(|points| points.plane).collect();
         let mut extents = self.extents(u)?;
         for extent in &mut extents {
             if let Some(k) = planes[0].iter().position(|&d| d == extent.dimension) {
@@ -150,7 +265,8 @@ impl Planner<'_> {
         let three = level_extent.is_some();
         let metric = self.metric(&extents, three)?;
         if metric != Metric::Sphere {
-            let what = "its levels are neither pressures nor lengths, which the sphere needs: pick one with `level = ...`";
+            let what = "its levels are neither pressures nor lengths, which the sphere needs: pick one by its coordinate with --set \
+                        archive.level=VALUE, or by its entry with --set archive.select.DIMENSION=0";
             return Err(self.misfit(u, what));
         }
         let level_axis = level_extent.map(|e| self.axis(u, e, 2)).transpose()?;
@@ -161,7 +277,7 @@ impl Planner<'_> {
             (None, _) => match self.measured(d).kind {
                 Kind::Time => Role::Time,
                 Kind::Level if three && self.listing().dimensions[d].len > 1 => Role::Axis(2),
-                _ => Role::Fixed(0),
+                _ => Role::Fixed(self.entry_of(d)),
             },
         };
         let roles = |variable: usize, plane: &[usize; 2]| -> Vec<(usize, Role)> {
@@ -181,15 +297,15 @@ impl Planner<'_> {
             None => {}
         }
 
-        let pairs = &pairs[..components.len()];
+        let points = &points[..components.len()];
         let same_shapes = |l: &&Layout| l.frames[0].iter().map(|c| &c.shape).eq(components.iter().map(|c| &c.shape));
         let known = first.filter(same_shapes).and_then(|l| Some((l.resampling.clone()?, l.axes[..2].to_vec())));
         if let Some((Resampling::Curvilinear(known), _)) = &known {
-            self.check_points(pairs, known)?;
+            self.check_points(points, known)?;
         }
         let (resampling, mut axes) = match known {
             Some(known) => known,
-            None => self.resample(pairs, u)?,
+            None => self.resample(points, u)?,
         };
         axes.extend(level_axis);
         let (vertical, poles) = self.finish_axes(&mut axes, metric)?;
@@ -197,21 +313,21 @@ impl Planner<'_> {
     }
 
     /// Makes the grid and locates its nodes among the points of each component.
-    fn resample(&mut self, pairs: &[Pair], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
+    fn resample(&mut self, points: &[Points], u: usize) -> Result<(Resampling, Vec<AxisPlan>), SourceError> {
         let mut meshes: Vec<Arc<Mesh>> = Vec::new();
         // The first component with the same coordinates.
-        let twins: Vec<usize> = (0..pairs.len()).map(|k| pairs[..k].iter().position(|p| *p == pairs[k]).unwrap_or(k)).collect();
+        let twins: Vec<usize> = (0..points.len()).map(|k| points[..k].iter().position(|p| *p == points[k]).unwrap_or(k)).collect();
         for (k, &twin) in twins.iter().enumerate() {
-            meshes.push(if twin < k { meshes[twin].clone() } else { Arc::new(self.mesh(pairs[k])?) });
+            meshes.push(if twin < k { meshes[twin].clone() } else { Arc::new(self.mesh(&points[k])?) });
         }
-        let target = target(&meshes[0], self.settings.resolution).map_err(|what| self.misfit(pairs[0][0], what))?;
+        let target = target(&meshes[0], self.settings.resolution).map_err(|what| self.misfit(points[0].pair[0], what))?;
         let mut locators: Vec<Arc<Locator>> = Vec::new();
         for (k, &twin) in twins.iter().enumerate() {
             locators.push(if twin < k { locators[twin].clone() } else { Arc::new(Locator::new(&meshes[k], &target)) });
         }
         let (along, why) = self.runs_along_grid(u);
         let directions = std::array::from_fn(|k| meshes[k].directions(along).into_iter().map(|both| both[k]).collect());
-        let names = pairs[0].map(|i| self.variable(i).name.clone());
+        let names = points[0].pair.map(|i| self.variable(i).name.clone());
         let what = format!(
             "`{}` and `{}` have two dimensions: resampled bilinearly from {} x {} points to {} x {} nodes, every {:.4} x {:.4} degrees",
             names[0], names[1], meshes[0].shape[0], meshes[0].shape[1], target.nodes[0], target.nodes[1], target.step[0], target.step[1]

@@ -92,7 +92,7 @@ impl Planner<'_> {
         let shape = Shape { order: self.order(first, part.is_some())?, lengths: self.shape(first) };
         if s.level.is_some() || s.region.is_some() {
             let key = if s.level.is_some() { "level" } else { "region" };
-            return Err(SourceError::setting(key, "given", "HDF5 archives are read whole"));
+            return Err(SourceError::setting(key, "given", "left out: HDF5 archives are read whole"));
         }
         let metric = match (s.metric, s.velocity_unit) {
             (Some(Metric::Sphere), _) => {
@@ -100,7 +100,7 @@ impl Planner<'_> {
             }
             (None | Some(Metric::Index), VelocityUnit::Cells) => Metric::Index,
             (Some(Metric::Cartesian), VelocityUnit::Cells) => {
-                return Err(SourceError::setting("metric", "cartesian", "velocities in cells need `metric = \"index\"`"));
+                return Err(SourceError::setting("metric", "cartesian", "velocities in cells need --set archive.metric=index"));
             }
             (metric, VelocityUnit::Si) => metric.unwrap_or(Metric::Cartesian),
         };
@@ -170,7 +170,7 @@ impl Planner<'_> {
                 return Ok((interleaved(found, 3), why));
             }
         }
-        match velocity::choose(listing, [None, None, None], s.w.as_deref() == Some("none")) {
+        match velocity::choose(listing, [None; 3], s.w.as_deref() == Some("none"), [None; 3]) {
             Ok(found) => {
                 let mut components = vec![(found.u.variable, None), (found.v.variable, None)];
                 components.extend(found.w.map(|w| (w.variable, None)));
@@ -240,7 +240,7 @@ impl Planner<'_> {
         }
         let letters = if interleaved { "x, y, c (component)" } else { "x and y" };
         let what = format!(
-            "it has {rank} axes{}; give `order = \"...\"`, one letter for each axis, slowest first: {letters}, and z, t (time) or `-` (one entry) for the others",
+            "it has {rank} axes{}; give --set archive.order=LETTERS, one letter for each axis, slowest first: {letters}, and z, t (time) or `-` (one entry) for the others",
             if text.is_empty() { String::new() } else { format!(", which `{text}` does not describe") }
         );
         Err(self.misfit(variable, what))
@@ -284,8 +284,8 @@ impl Planner<'_> {
             (None, None) if s.velocity_unit == VelocityUnit::Cells => (letter, None, (0..nodes).map(|i| i as f64).collect()),
             (None, None) => {
                 let what = format!(
-                    "no dataset holds the {nodes} coordinates along {letter}; name it with `{letter}`, or give `spacing = [dx, dy, dz]` in the \
-                     velocity's unit of length, or set `velocity_unit = \"cells\"`"
+                    "no dataset holds the {nodes} coordinates along {letter}; name it with --set archive.{letter}=NAME, or give --set \
+                     archive.spacing=[DX,DY,DZ] in the velocity's unit of length, or --set archive.velocity_unit=cells"
                 );
                 return Err(self.misfit(velocity, what));
             }
@@ -326,7 +326,17 @@ impl Planner<'_> {
         let factor = if self.settings.velocity_unit == VelocityUnit::Cells { 1.0 } else { unit.map_or(1.0, |u| u.factor) };
         let why = part.map_or_else(|| why.to_owned(), |part| format!("component {part} of {why}"));
         let roles = shape.order.iter().map(role).collect();
-        Ok(ComponentPlan { name: v.name.clone(), shape: found, roles, packing: self.packing(variable)?, factor, why })
+        Ok(ComponentPlan {
+            name: v.name.clone(),
+            shape: found,
+            dimensions: self.dimensions_of(variable),
+            roles,
+            packing: self.packing(variable)?,
+            factor,
+            why,
+            of_water: false,
+            mask: None,
+        })
     }
 
     /// Times of all frames: by a dataset or attribute that holds them, or by the numbers in names. `along_axis` is the length of the
@@ -363,7 +373,9 @@ impl Planner<'_> {
             (name, units) = (variable.name.clone(), variable.units().unwrap_or_default().to_owned());
             self.file.read_all(index)?.iter().map(|v| v * factor).collect()
         } else if along_axis.is_some() {
-            return Err(self.time_fault(format!("no dataset holds the {expected} times along the time axis; name it with `time`")));
+            return Err(
+                self.time_fault(format!("no dataset holds the {expected} times along the time axis; name it with --set archive.time=NAME"))
+            );
         } else if let Some(owned) = owned {
             name = owned[0].0.clone();
             self.note(format!("times are attributes `{name}` of the datasets"));
@@ -375,15 +387,15 @@ impl Planner<'_> {
         } else if let Some(name) = &s.time {
             return Err(self.time_fault(format!("neither a dataset of {expected} numbers nor an attribute is called `{name}`")));
         } else if let Some(numbers) = numbers {
-            self.note(format!("times are the numbers in dataset names, times {step}; another step with `time_step`"));
+            self.note(format!("times are the numbers in dataset names, times {step}; another step with archive.time_step"));
             numbers.iter().map(|n| n * step).collect()
         } else {
             let stem = self.path().file_stem().and_then(|n| n.to_str()).unwrap_or_default();
             let Some(number) = last_number(stem).filter(|_| frames.len() == 1) else {
                 let what = "neither a dataset, an attribute, a dataset's name nor the file's name tells the time";
-                return Err(self.time_fault(format!("{what}; name it with `time = \"...\"`")));
+                return Err(self.time_fault(format!("{what}; name it with --set archive.time=NAME")));
             };
-            self.note(format!("the time is the last number in the file's name, times {step}; another step with `time_step`"));
+            self.note(format!("the time is the last number in the file's name, times {step}; another step with archive.time_step"));
             vec![number * step]
         };
         if let Some(i) = seconds.iter().position(|t| !t.is_finite()) {

@@ -2,6 +2,7 @@
 
 use super::planner::Planner;
 use crate::cf::coordinate::{Kind, classify, classify_name};
+use crate::cf::units::Unit;
 use crate::error::SourceError;
 use crate::formats::NumberType;
 
@@ -42,11 +43,13 @@ impl Planner<'_> {
     pub fn extents(&mut self, u: usize) -> Result<Vec<Extent>, SourceError> {
         let s = self.settings;
         let mut overrides = Vec::new();
+        let is_pair = self.named_pair()?.is_some();
         for (key, name, kind) in [("x", &s.x, Kind::X), ("y", &s.y, Kind::Y), ("z", &s.z, Kind::Level), ("time", &s.time, Kind::Time)] {
             // A scalar time variable is found later.
             let variable = name.as_ref().and_then(|n| self.listing().find(n));
             let scalar = key == "time" && variable.is_some_and(|v| self.variable(v).dimensions.is_empty());
-            if let Some((dimension, coordinate)) = if scalar { None } else { self.named_axis(key, name)? } {
+            let aside = scalar || (is_pair && matches!(key, "x" | "y"));
+            if let Some((dimension, coordinate)) = if aside { None } else { self.named_axis(key, name)? } {
                 // The setting says which axis it is, the file whether it is an angle.
                 let kind = match (kind, coordinate.map(|c| classify(self.variable(c)))) {
                     (Kind::X, Some(Kind::Longitude)) => Kind::Longitude,
@@ -56,12 +59,29 @@ impl Planner<'_> {
                 overrides.push(Extent { dimension, kind, coordinate });
             }
         }
+        for (name, &entry) in s.select.iter().flatten() {
+            let found = self.variable(u).dimensions.iter().map(|&d| &self.listing().dimensions[d]).find(|d| d.name == *name);
+            if found.is_none_or(|d| entry >= d.len) {
+                let accepted = match found {
+                    Some(d) => format!("entries of `{name}` are counted from 0 to {}", d.len.saturating_sub(1)),
+                    None => format!("dimensions of `{}` are {}", self.variable(u).name, self.dimensions_of(u).join(", ")),
+                };
+                return Err(SourceError::setting("select", format!("{{ {name} = {entry} }}"), accepted));
+            }
+        }
         let mut extents = Vec::new();
         let mut squeezed = Vec::new();
         for &dimension in &self.variable(u).dimensions {
             let known = overrides.iter().find(|o| o.dimension == dimension);
-            let extent = known.copied().unwrap_or_else(|| self.measured(dimension));
+            let mut extent = known.copied().unwrap_or_else(|| self.measured(dimension));
             let found = &self.listing().dimensions[dimension];
+            if let (Some(entry), false) = (s.entry(&found.name), extent.kind == Kind::Time) {
+                let value = extent.coordinate.map(|c| self.coordinate_values(c)).transpose()?.and_then(|values| values.get(entry).copied());
+                let value = value.map_or_else(String::new, |value| format!(" ({value})"));
+                self.note(format!("entry {entry}{value} of `{}`, as set", found.name));
+                continue;
+            }
+            extent.kind = self.stated_kind(extent);
             if found.len == 1 && !extent.kind.is_horizontal() && extent.kind != Kind::Time {
                 squeezed.push(found.name.as_str());
             } else {
@@ -72,6 +92,20 @@ impl Planner<'_> {
             self.note(format!("dimensions of one entry left out: {}", squeezed.join(", ")));
         }
         Ok(extents)
+    }
+
+    /// What a dimension measures if the settings state its unit: degrees make a longitude or latitude, metres do not.
+    fn stated_kind(&self, extent: Extent) -> Kind {
+        let Some(unit) = extent.coordinate.and_then(|c| self.axis_units(extent.kind, c)) else { return extent.kind };
+        let angle = unit.to_ascii_lowercase().starts_with("degree") || unit.to_ascii_lowercase().starts_with("radian");
+        let length = Unit::parse(unit).is_some_and(|u| u.is_length());
+        match extent.kind {
+            Kind::X if angle => Kind::Longitude,
+            Kind::Y if angle => Kind::Latitude,
+            Kind::Longitude if length => Kind::X,
+            Kind::Latitude if length => Kind::Y,
+            other => other,
+        }
     }
 
     /// A dimension with its coordinate variable and what it measures, regardless of the settings.
@@ -102,8 +136,9 @@ impl Planner<'_> {
                 (Kind::Level, "z")
             } else {
                 let what = format!(
-                    "dimension `{}` has {} entries, but is neither time nor x, y or level; name the axes with `x`, `y`, `z`, `time`",
-                    dimension.name, dimension.len
+                    "dimension `{}` has {} entries, but is neither time nor x, y or level; pick one entry with --set archive.select.{}=0, or \
+                     name the axes with --set archive.x=NAME, archive.y, archive.z, archive.time",
+                    dimension.name, dimension.len, dimension.name
                 );
                 return Err(self.misfit(u, what));
             };
@@ -119,7 +154,9 @@ impl Planner<'_> {
             if found.len() > 1 || (found.is_empty() && !optional) {
                 let dims = self.listing().dimension_names(self.variable(u));
                 let which = if found.is_empty() { "no dimension".into() } else { found.join(" and ") };
-                return Err(self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with `{what} = \"...\"`")));
+                return Err(
+                    self.misfit(u, format!("of its dimensions ({dims}), {which} would be {what}; name it with --set archive.{what}=NAME"))
+                );
             }
         }
         Ok(())
@@ -131,10 +168,10 @@ impl Planner<'_> {
         let file = self.path().display();
         let fault = |found: String, accepted: String| SourceError::setting("level", format!("{wanted} ({found})"), accepted);
         let Some(extent) = extents.iter().find(|e| e.kind == Kind::Level) else {
-            return Err(fault(format!("{file} has no level axis"), "leave `level` out".into()));
+            return Err(fault(format!("{file} has no level axis"), "left out".into()));
         };
         let Some(coordinate) = extent.coordinate else {
-            return Err(fault("the level axis has no coordinates".into(), "name them with `z`".into()));
+            return Err(fault("the level axis has no coordinates".into(), "the axis named with --set archive.z=NAME".into()));
         };
         let values = self.coordinate_values(coordinate)?;
         let variable = self.variable(coordinate);

@@ -71,6 +71,39 @@ fn turn(degrees: f64) -> f64 {
 }
 
 impl Mesh {
+    /// Takes points at longitude 0 and latitude 0 as missing if there are several: models write them where nothing was computed.
+    pub fn leave_out_zeros(&mut self) {
+        let nowhere: Vec<usize> = (0..self.longitude.len()).filter(|&n| self.longitude[n] == 0.0 && self.latitude[n] == 0.0).collect();
+        if nowhere.len() > 1 {
+            for n in nowhere {
+                (self.longitude[n], self.latitude[n]) = (f64::NAN, f64::NAN);
+            }
+        }
+    }
+
+    /// The middles between neighbours along the axes that `between` names.
+    pub fn between(self, between: [bool; 2]) -> Self {
+        let reach = between.map(usize::from);
+        if reach == [0; 2] {
+            return self;
+        }
+        let shape = [self.shape[0] - reach[0], self.shape[1] - reach[1]];
+        let (mut longitude, mut latitude) = (Vec::new(), Vec::new());
+        for j in 0..shape[1] {
+            for i in 0..shape[0] {
+                let mut sum = [0.0; 3];
+                for (di, dj) in (0..=reach[0]).flat_map(|di| (0..=reach[1]).map(move |dj| (di, dj))) {
+                    let n = (j + dj) * self.shape[0] + i + di;
+                    let own = vector(self.longitude[n], self.latitude[n]);
+                    sum = std::array::from_fn(|k| sum[k] + own[k]);
+                }
+                longitude.push(sum[1].atan2(sum[0]).to_degrees());
+                latitude.push(sum[2].atan2(sum[0].hypot(sum[1])).to_degrees());
+            }
+        }
+        Self { shape, longitude, latitude }
+    }
+
     fn point(&self, i: usize, j: usize) -> Option<[f64; 2]> {
         let n = j * self.shape[0] + i;
         (self.longitude[n].is_finite() && self.latitude[n].is_finite()).then(|| [self.longitude[n], self.latitude[n]])
@@ -203,7 +236,7 @@ pub fn target(mesh: &Mesh, resolution: Option<[f64; 2]>) -> Result<Target, Strin
             continue;
         }
         if across.saturating_mul(up) > 1 << 28 {
-            return Err(format!("{across} x {up} nodes are too many; give a coarser `resolution`"));
+            return Err(format!("{across} x {up} nodes are too many; give a coarser --set archive.resolution=[DLON,DLAT]"));
         }
         let step = [width / across as f64, (north - south) / up as f64];
         let nodes = [if round { across } else { across + 1 }, up + 1];

@@ -9,6 +9,7 @@
 
 mod axes;
 mod component;
+mod content;
 mod curvilinear;
 mod curvilinear_plan;
 mod datasets;
@@ -16,6 +17,7 @@ mod dimensions;
 mod layout;
 mod levels;
 mod locator;
+mod mask;
 mod nest;
 mod plan;
 mod planner;
@@ -28,8 +30,10 @@ mod velocity_units;
 
 pub use axes::{AxisPlan, FileOrder, InFile, Quantity, slab_of};
 pub use component::{ComponentPlan, Orders, read_component};
+pub use content::{Content, content};
 pub use layout::{Layout, Resampling, difference};
 pub use levels::to_heights;
+pub use mask::{Mask, Masks, NO_MASK, ZERO, holds_mask};
 pub use plan::{plan, readable_axes};
 pub use poles::Poles;
 pub use velocity_units::VelocityScale;

@@ -22,8 +22,8 @@ pub fn plan(file: &DataFile, settings: &ArchiveSettings, first: Option<&Layout>)
     components.into_iter().flatten().try_for_each(|c| planner.check_extents(c.variable))?;
     if planner.is_staggered(&velocity) {
         planner.plan_staggered(&velocity, first)
-    } else if let Some(coordinates) = planner.curvilinear_coordinates(&velocity) {
-        planner.plan_curvilinear(&velocity, coordinates, first)
+    } else if let Some(points) = planner.curvilinear_points(&velocity)? {
+        planner.plan_curvilinear(&velocity, points, first)
     } else {
         planner.plan_rectilinear(&velocity)
     }

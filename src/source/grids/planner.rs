@@ -3,12 +3,13 @@
 use super::axes::{AxisPlan, Quantity};
 use super::component::{ComponentPlan, Role};
 use super::levels::to_heights;
+use super::mask::is_of_water;
 use super::poles::Poles;
 use crate::archive_settings::{ArchiveSettings, Metric, VelocityUnit};
 use crate::cf::coordinate::Kind;
 use crate::cf::packing::Packing;
 use crate::cf::units::{Unit, VELOCITY_UNITS};
-use crate::cf::velocity::{Candidate, judge};
+use crate::cf::velocity::{Candidate, judge, may_be_named};
 use crate::error::SourceError;
 use crate::formats::{DataFile, Listing, Variable};
 use std::fmt::Display;
@@ -37,6 +38,27 @@ impl<'a> Planner<'a> {
 
     pub fn shape(&self, index: usize) -> Vec<usize> {
         self.listing().shape(self.variable(index))
+    }
+
+    /// Entry that is read of a dimension that is no axis.
+    pub fn entry_of(&self, dimension: usize) -> usize {
+        self.settings.entry(&self.listing().dimensions[dimension].name).unwrap_or(0)
+    }
+
+    /// Unit of a coordinate along an axis: the one that the settings state, else the file's.
+    pub fn axis_units(&self, kind: Kind, index: usize) -> Option<&'a str> {
+        let stated = match kind {
+            Kind::Longitude | Kind::X => self.settings.unit("x"),
+            Kind::Latitude | Kind::Y => self.settings.unit("y"),
+            Kind::Level => self.settings.unit("z"),
+            _ => None,
+        };
+        stated.or_else(|| self.variable(index).units())
+    }
+
+    /// Names of the dimensions of a variable.
+    pub fn dimensions_of(&self, index: usize) -> Vec<String> {
+        self.variable(index).dimensions.iter().map(|&d| self.listing().dimensions[d].name.clone()).collect()
     }
 
     pub fn path(&self) -> &'a Path {
@@ -75,16 +97,25 @@ impl<'a> Planner<'a> {
         let listing = self.listing();
         let line = |i: usize| {
             let variable = self.variable(i);
-            let verdict = match judge(listing, i) {
+            let verdict = match judge(listing, i, self.settings.velocity_units()) {
                 Ok(candidate) => format!("may be {} ({})", candidate.component.name(), candidate.why),
                 Err(lacks) => lacks,
             };
             format!("  {} ({}): {verdict}", variable.name, listing.dimension_names(variable))
         };
-        let candidates = (0..listing.variables.len()).map(line).collect::<Vec<_>>().join("\n");
+        let mut shown: Vec<usize> = listing.matching(|v| v.dimensions.len() > 1).collect();
+        let rank = |i: usize| (judge(listing, i, self.settings.velocity_units()).is_err(), !may_be_named(self.variable(i)));
+        shown.sort_by_key(|&i| rank(i));
+        let mut candidates: Vec<String> = shown.iter().map(|&i| line(i)).collect();
+        match listing.variables.len() - shown.len() {
+            0 => {}
+            others => candidates.push(format!("  and {others} variables of fewer than two dimensions")),
+        }
         self.fault(format!(
-            "no velocity found ({lacking}). Name the variables with `u = \"...\"` and `v = \"...\"` under [archive].\n\
-             Variables in the file:\n{candidates}"
+            "no velocity found ({lacking}). Name its variables with --set archive.u=NAME --set archive.v=NAME or, if another file holds \
+             the other component, name that file too.\n\
+             Variables in the file:\n{}",
+            candidates.join("\n")
         ))
     }
 
@@ -112,7 +143,9 @@ impl<'a> Planner<'a> {
         {
             let lowest = level.axis.first();
             if level.quantity == Quantity::Pressure && lowest <= 0.0 {
-                let what = format!("a pressure of {lowest} Pa has no height; use `metric = \"index\"`, or another axis with `z`");
+                let what = format!(
+                    "a pressure of {lowest} Pa has no height; use --set archive.metric=index, or another axis with --set archive.z=NAME"
+                );
                 return Err(SourceError::variable(self.path(), level.axis.name(), what));
             }
             let scale = self.settings.vertical_scale.unwrap_or(1.0);
@@ -139,14 +172,18 @@ impl<'a> Planner<'a> {
         axis: Option<&AxisPlan>,
     ) -> Result<ComponentPlan, SourceError> {
         let variable = self.variable(candidate.variable);
-        let role = |d: &usize| roles.iter().find(|r| r.0 == *d).map_or(Role::Fixed(0), |r| r.1);
+        let roles =
+            variable.dimensions.iter().map(|&d| roles.iter().find(|r| r.0 == d).map_or(Role::Fixed(self.entry_of(d)), |r| r.1)).collect();
         Ok(ComponentPlan {
             factor: self.velocity_factor(candidate, axis)?,
             name: variable.name.clone(),
             shape: self.shape(candidate.variable),
-            roles: variable.dimensions.iter().map(role).collect(),
+            roles,
             packing: self.packing(candidate.variable)?,
             why: candidate.why.clone(),
+            dimensions: self.dimensions_of(candidate.variable),
+            of_water: is_of_water(self.listing(), variable),
+            mask: None,
         })
     }
 
@@ -157,7 +194,7 @@ impl<'a> Planner<'a> {
         }
         let variable = self.variable(candidate.variable);
         let component = candidate.component.name();
-        let text = variable.units().unwrap_or_default();
+        let text = self.settings.unit(component).or(variable.units()).unwrap_or_default();
         let along_pressure = axis.is_some_and(|a| a.quantity == Quantity::Pressure);
         match Unit::parse(text) {
             Some(u) if u.is_dimensionless() => {
@@ -168,13 +205,17 @@ impl<'a> Planner<'a> {
             Some(u) if u.is_pressure_tendency() && along_pressure => Ok(u.factor),
             Some(u) if u.is_velocity() || u.is_pressure_tendency() => {
                 let (axis, axis_units) = axis.map_or(("", ""), |a| (a.axis.name(), a.axis.units()));
-                let hint = if component == "w" { ", or ignore vertical motion with `w = \"none\"`" } else { "" };
+                let hint = if component == "w" { ", or ignore vertical motion with --set archive.w=none" } else { "" };
                 let what = format!(
-                    "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with `{component} = \"...\"`{hint}"
+                    "its unit `{text}` does not fit the axis `{axis}` in `{axis_units}`; name another with --set archive.{component}=NAME{hint}"
                 );
                 Err(self.misfit(candidate.variable, what))
             }
-            _ => Err(self.fault(format!("variable `{}` has unit `{text}`; accepted are {VELOCITY_UNITS}", variable.name))),
+            _ => Err(self.fault(format!(
+                "variable `{}` has unit `{text}`; accepted are {VELOCITY_UNITS}. If the file is wrong, state it with --set \
+                 archive.units.{component}=\"m s-1\"",
+                variable.name
+            ))),
         }
     }
 

@@ -21,7 +21,7 @@ impl Planner<'_> {
         let ignore_w = s.w.as_deref() == Some("none");
         let w = if ignore_w { None } else { self.named("w", &s.w)? };
         let fixed = [self.named("u", &s.u)?, self.named("v", &s.v)?, w];
-        let found = velocity::choose(self.listing(), fixed, ignore_w).map_err(|lacking| self.no_velocity(&lacking))?;
+        let found = velocity::choose(self.listing(), fixed, ignore_w, s.velocity_units()).map_err(|lacking| self.no_velocity(&lacking))?;
         let mut names: Vec<String> = found.others.iter().map(|o| format!("`{}`", self.variable(o.variable).name)).collect();
         if !names.is_empty() {
             names.dedup();
@@ -77,7 +77,8 @@ impl Planner<'_> {
         let [a, b] = [found.u.variable, other].map(|i| self.variable(i));
         Err(self.fault(format!(
             "`{}` lies on ({}) but `{}` on ({}): staggered components are read only if they are WRF's (dimensions `..._stag`, with PH and \
-             PHB) or have longitudes and latitudes of their own",
+             PHB) or have longitudes and latitudes of two dimensions, their own or of the points between which they lie; those are named with \
+             --set archive.x=NAME --set archive.y=NAME",
             a.name,
             listing.dimension_names(a),
             b.name,
@@ -90,24 +91,25 @@ impl Planner<'_> {
         let has = |kind| extents.iter().any(|e| e.kind == kind);
         let sphere = has(Kind::Longitude) && has(Kind::Latitude);
         let level = extents.iter().find(|e| e.kind == Kind::Level).and_then(|e| e.coordinate);
-        let unit = level.and_then(|c| Unit::parse(self.variable(c).units().unwrap_or_default()));
+        let unit = level.and_then(|c| Unit::parse(self.axis_units(Kind::Level, c).unwrap_or_default()));
         let measured = unit.is_some_and(|u| u.is_length() || u.is_pressure());
         let fault = |found: &str, accepted: &str| Err(SourceError::setting("metric", found, accepted));
         match (self.settings.metric, self.settings.velocity_unit) {
             (Some(Metric::Sphere), _) if !sphere => {
                 fault("sphere", "the axes are not longitude and latitude; accepted are index and cartesian")
             }
-            (Some(Metric::Sphere), _) if three && !measured => {
-                fault("sphere", "the levels are neither pressures nor lengths; pick one with `level = ...` or set `metric = \"index\"`")
-            }
+            (Some(Metric::Sphere), _) if three && !measured => fault(
+                "sphere",
+                "the levels are neither pressures nor lengths; pick one with --set archive.level=VALUE, or --set archive.metric=index",
+            ),
             (Some(metric), VelocityUnit::Cells) if metric != Metric::Index => {
-                fault(&word(metric), "velocities in cells need `metric = \"index\"`")
+                fault(&word(metric), "velocities in cells need --set archive.metric=index")
             }
             (Some(metric), _) => Ok(metric),
             (None, VelocityUnit::Cells) => Ok(Metric::Index),
             (None, VelocityUnit::Si) if sphere && three && !measured => {
                 self.note(
-                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); `level = ...` gives the sphere",
+                    "the levels are neither pressures nor lengths: metric index (cells and snapshots); --set archive.level=VALUE gives the sphere",
                 );
                 Ok(Metric::Index)
             }
@@ -132,7 +134,9 @@ impl Planner<'_> {
             return Ok(AxisPlan { notes, ..AxisPlan::made(extent.kind, axis, Quantity::None) });
         };
         let values = self.coordinate_values(coordinate)?;
-        Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values).plan(range, self.wants_periodic())
+        let units = self.axis_units(extent.kind, coordinate);
+        let coordinates = Coordinates { units, ..Coordinates::of(self.path(), self.variable(coordinate), extent.kind, values) };
+        coordinates.plan(range, self.wants_periodic())
     }
 
     fn without_coordinates(&self, dimension: usize) -> String {
@@ -147,7 +151,7 @@ impl Planner<'_> {
             format!("has only coordinates of two dimensions ({}), of which no longitude and latitude are a pair", wide.join(", "))
         };
         format!(
-            "dimension `{name}` {why}. Name a coordinate variable with `x`, `y` or `z`, or set `velocity_unit = \"cells\"` if its values are cells per snapshot interval"
+            "dimension `{name}` {why}. Name coordinates with --set archive.x=NAME (archive.y, archive.z), or set --set archive.velocity_unit=cells if the velocities are cells per snapshot interval"
         )
     }
 }

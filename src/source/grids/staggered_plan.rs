@@ -48,19 +48,20 @@ impl Planner<'_> {
             _ => Role::Fixed(0),
         };
         let (roles, packing) = ((0..rank).map(role).collect(), self.packing(variable)?);
-        Ok(ComponentPlan { name: v.name.clone(), shape: self.shape(variable), roles, packing, factor, why: why.into() })
+        let (shape, dimensions) = (self.shape(variable), self.dimensions_of(variable));
+        Ok(ComponentPlan { name: v.name.clone(), shape, dimensions, roles, packing, factor, why: why.into(), of_water: false, mask: None })
     }
 
     /// Plans WRF output. All files of an archive share the domain and the heights of the first.
     pub fn plan_staggered(mut self, velocity: &Velocity, first: Option<&Layout>) -> Result<Layout, SourceError> {
         let s = self.settings;
         if s.metric.is_some_and(|m| m != Metric::Cartesian) || s.velocity_unit == VelocityUnit::Cells {
-            let accepted = "WRF output is read in metres: `metric = \"cartesian\"` and velocities in SI";
+            let accepted = "WRF output is read in metres: --set archive.metric=cartesian and velocities in SI";
             return Err(SourceError::setting("metric", "not cartesian", accepted));
         }
         if s.level.is_some() || s.region.is_some() {
             let key = if s.level.is_some() { "level" } else { "region" };
-            let accepted = "WRF output is read whole and in three dimensions; choose heights with `heights`";
+            let accepted = "WRF output is read whole and in three dimensions; choose heights with --set archive.heights=[...]";
             return Err(SourceError::setting(key, "given", accepted));
         }
         let components = self.staggered_components(velocity)?;
@@ -131,7 +132,7 @@ impl Planner<'_> {
             staggered.heights.len(),
             staggered.heights.first().copied().unwrap_or(0.0),
             staggered.heights.last().copied().unwrap_or(0.0),
-            if s.heights.is_some() { "as set" } else { "the mean heights of its full and half levels; others with `heights`" }
+            if s.heights.is_some() { "as set" } else { "the mean heights of its full and half levels; others with archive.heights" }
         );
         self.note(staggered.what.clone());
         self.note(match staggered.scale {

@@ -5,8 +5,9 @@ use super::planner::Planner;
 use crate::cf::calendar::{CALENDARS, Calendar};
 use crate::cf::coordinate::{Kind, classify};
 use crate::cf::time::{TIME_UNITS, TimeUnit};
+use crate::cf::units::Unit;
 use crate::error::SourceError;
-use crate::formats::NumberType;
+use crate::formats::{NumberType, Variable};
 
 /// Times of one file.
 #[derive(Debug, Clone, PartialEq)]
@@ -18,6 +19,11 @@ pub struct TimePlan {
     /// Frame (see [`super::layout::Layout::frames`]) and entry along its time dimension of each time.
     pub places: Vec<(usize, usize)>,
     pub calendar: Option<Calendar>,
+}
+
+/// All entries along the time dimension of the only frame.
+fn places_of(seconds: &[f64]) -> Vec<(usize, usize)> {
+    (0..seconds.len()).map(|entry| (0, entry)).collect()
 }
 
 impl Planner<'_> {
@@ -41,33 +47,71 @@ impl Planner<'_> {
             (_, None) => listing.matching(|v| listing.shape(v).iter().product::<usize>() == 1 && classify(v) == Kind::Time).next(),
         };
         let Some(index) = variable else {
+            if self.settings.steady && expected == 1 {
+                let (variable, units) = (String::new(), String::new());
+                return Ok(TimePlan { variable, units, seconds: vec![0.0], places: vec![(0, 0)], calendar: None });
+            }
             let times: Vec<&str> = listing.variables.iter().filter(|v| classify(v) == Kind::Time).map(|v| v.name.as_str()).collect();
             let found =
                 if times.is_empty() { "no time variable".into() } else { format!("no numeric time variable, only {}", times.join(", ")) };
-            return Err(self.time_fault(format!("{found}; name one with `time = \"...\"`, in {TIME_UNITS}")));
+            let steady =
+                if expected == 1 { ", or take the flow as steady with --set archive.steady=true and --set time.tau=DURATION" } else { "" };
+            return Err(self.time_fault(format!("{found}; name one with --set archive.time=NAME, in {TIME_UNITS}{steady}")));
         };
         let variable = self.variable(index);
         if variable.number == NumberType::Text {
-            return self.characters(index, expected);
+            return Ok(self.selected_time(self.characters(index, expected)?, dimension));
         }
         let name = variable.name.clone();
         // WRF before version 3.8 puts the reference into the description only.
         let description = variable.text("description").filter(|d| TimeUnit::has_reference(d));
-        let units = variable.units().filter(|u| TimeUnit::has_reference(u)).or(description).or(variable.units()).unwrap_or_default();
+        let units = variable.units().filter(|u| TimeUnit::has_reference(u)).or(description).or(variable.units());
+        let units = self.settings.unit("time").or(units).unwrap_or_default();
+        self.check_months(variable, units)?;
         let calendar_name = variable.text("calendar").unwrap_or_default();
         let Some(calendar) = Calendar::parse(calendar_name) else {
             return Err(self.time_fault(format!("calendar `{calendar_name}` of `{name}` is unknown; accepted are {CALENDARS}")));
         };
         let Some(unit) = TimeUnit::parse(units, calendar) else {
             let calendar = calendar.name();
-            let what = format!("unit `{units}` of `{name}` (calendar {calendar}) is not understood; accepted are {TIME_UNITS}");
+            let what = format!(
+                "unit `{units}` of `{name}` (calendar {calendar}) is not understood; accepted are {TIME_UNITS}; if the file is wrong, state it \
+                 with --set archive.units.time=\"hours since 2000-01-01\""
+            );
             return Err(self.time_fault(what));
         };
         let seconds: Vec<f64> = self.coordinate_values(index)?.into_iter().map(|v| unit.seconds(v)).collect();
         let show = |i: usize| unit.calendar.and_then(|c| c.iso(seconds[i])).unwrap_or_else(|| seconds[i].to_string());
         self.check_times(&name, &seconds, expected, show)?;
-        let places = (0..seconds.len()).map(|entry| (0, entry)).collect();
-        Ok(TimePlan { variable: name, units: units.to_owned(), seconds, places, calendar: unit.calendar })
+        let (variable, units, calendar) = (name, units.to_owned(), unit.calendar);
+        Ok(self.selected_time(TimePlan { variable, units, places: places_of(&seconds), seconds, calendar }, dimension))
+    }
+
+    /// The time that the settings pick, or all.
+    fn selected_time(&self, mut plan: TimePlan, dimension: Option<&Extent>) -> TimePlan {
+        let entry = dimension.and_then(|extent| self.settings.entry(&self.listing().dimensions[extent.dimension].name));
+        if let Some((entry, &seconds)) = entry.and_then(|entry| Some((entry, plan.seconds.get(entry)?))) {
+            (plan.seconds, plan.places) = (vec![seconds], vec![(0, entry)]);
+        }
+        plan
+    }
+
+    /// Refuses months, whose lengths differ, and numbers of months, which are no time.
+    fn check_months(&self, variable: &Variable, units: &str) -> Result<(), SourceError> {
+        let first = units.split_whitespace().next().unwrap_or_default().to_ascii_lowercase();
+        let counted = |word: &str| word.starts_with("month") || word.starts_with("year");
+        let name = format!("{} {}", variable.name, variable.text("long_name").unwrap_or_default()).to_ascii_lowercase();
+        let bare = Unit::parse(units).is_some_and(|unit| unit.is_dimensionless());
+        let months = |word: &str| word.starts_with("month");
+        if !counted(&first) && !(bare && name.split(|c: char| !c.is_alphabetic()).any(months)) {
+            return Ok(());
+        }
+        let found = if units.is_empty() { "has no unit".into() } else { format!("is in `{units}`") };
+        Err(self.time_fault(format!(
+            "`{}` counts months or years, which have no fixed length, and {found}: state the length of 1 with --set \
+             archive.units.time=\"30.4375 days\" (a mean month) or, with a date for 0, \"30.4375 days since 2000-01-01\"",
+            variable.name
+        )))
     }
 
     /// Times as dates in rows of characters: `2005-08-28_12:00:00`.
@@ -82,8 +126,7 @@ impl Planner<'_> {
         };
         let seconds = rows.iter().map(second).collect::<Result<Vec<f64>, _>>()?;
         self.check_times(&name, &seconds, expected, |i| rows[i].clone())?;
-        let places = (0..seconds.len()).map(|entry| (0, entry)).collect();
-        Ok(TimePlan { variable: name, units: "characters".into(), seconds, places, calendar: Some(calendar) })
+        Ok(TimePlan { variable: name, units: "characters".into(), places: places_of(&seconds), seconds, calendar: Some(calendar) })
     }
 
     fn check_times(&self, name: &str, seconds: &[f64], expected: usize, show: impl Fn(usize) -> String) -> Result<(), SourceError> {

@@ -166,6 +166,38 @@ fn a_peer_that_misbehaves_is_disconnected_and_nobody_else() {
     assert_eq!((frame(&mut healthy), frame(&mut healthy)), ((1, b"a".to_vec()), (0, b"still".to_vec())));
 }
 
+/// Whether the publisher has closed the connection.
+fn is_closed(stream: &TcpStream) -> bool {
+    stream.set_nonblocking(true).unwrap();
+    let read = stream.peek(&mut [0]);
+    stream.set_nonblocking(false).unwrap();
+    !matches!(read, Err(error) if error.kind() == std::io::ErrorKind::WouldBlock)
+}
+
+#[test]
+fn beyond_256_connections_each_new_one_takes_the_place_of_one_that_has_not_subscribed() {
+    const MORE: usize = 40;
+    let socket = bind(Limits::default());
+    let mut first = greet(&socket, b"\x00\x02\x01a");
+    until("it subscribes", || socket.is_wanted(b"a"));
+    let mut others: Vec<_> = (0..255).map(|_| greet(&socket, b"")).collect();
+    assert_eq!(socket.counts().displaced, 0);
+    assert!(!others.iter().any(is_closed), "256 are served");
+    others.extend((0..MORE).map(|_| greet(&socket, b"")));
+    assert_eq!(socket.counts().displaced, MORE as u64);
+    // Those that were idle for longest.
+    until("they are closed", || others[..MORE].iter().all(is_closed));
+    assert!(!others[MORE..].iter().any(is_closed));
+    let mut late = greet(&socket, b"\x00\x02\x01a");
+    until("it subscribes", || socket.counts().peak_subscribers == 2);
+    socket.send(&[b"a"], b"still".to_vec(), Keep::All);
+    for subscriber in [&mut first, &mut late] {
+        assert_eq!((frame(subscriber), frame(subscriber)), ((1, b"a".to_vec()), (0, b"still".to_vec())));
+    }
+    let counts = socket.counts();
+    assert_eq!((counts.displaced, counts.faults, counts.stalled), (MORE as u64 + 1, 0, 0), "{counts:?}");
+}
+
 #[test]
 fn subscribers_that_do_not_read_cost_others_nothing() {
     const BYTES: usize = 32 << 20;

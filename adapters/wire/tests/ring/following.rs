@@ -1,7 +1,10 @@
 //! Tests of a reader while the solver continues, ends, or tears the ring.
 
 use super::{Folder, cube, overwrite, publish, step, values};
-use ridgewatch_wire::{Element, Field, Following, Limits, Policy, Producer, Read, ReadAt, RingReader, WireError, block_path, blocks};
+use ridgewatch_wire::{
+    Element, Event, Field, Following, Limits, Policy, Producer, Read, ReadAt, RingFollower, RingReader, WireError, block_path, blocks,
+};
+use std::time::{Duration, Instant};
 
 #[test]
 fn what_is_published_is_read_in_order_and_the_rest_is_counted() {
@@ -53,6 +56,59 @@ fn the_end_is_told_and_the_last_follower_sweeps_up() {
     drop(Following::begin(&folder.0).unwrap());
     assert_eq!(blocks(&folder.0).collect::<Vec<_>>(), [0]);
     publish(&producer, 1, 0.0).unwrap();
+}
+
+/// The next step that a follower gets.
+fn next(follower: &mut RingFollower, buffer: &mut Vec<f32>) -> u64 {
+    let begin = Instant::now();
+    while begin.elapsed() < Duration::from_secs(60) {
+        match follower.poll(buffer) {
+            Some(Event::Step { step, missed, .. }) => {
+                assert_eq!(missed, 0);
+                return step;
+            }
+            Some(Event::Opened { .. }) => {}
+            Some(other) => panic!("{other:?}"),
+            None => std::thread::sleep(Duration::from_millis(1)),
+        }
+    }
+    panic!("no step came");
+}
+
+#[test]
+fn two_three_and_64_followers_get_every_step_and_another_one_is_refused() {
+    for count in [2, 3, 64] {
+        let folder = Folder::new(&format!("together-{count}"));
+        let producer = Producer::open(&folder.0, cube([4, 3, 2]), 2, Policy::Wait(Duration::from_secs(60))).unwrap();
+        let mut followers: Vec<_> = (0..count).map(|_| RingFollower::begin(&folder.0, Limits::default()).unwrap()).collect();
+        let mut buffer = Vec::new();
+        // None is waited for that has not found the ring.
+        let found = |follower: &mut RingFollower| matches!(follower.poll(&mut Vec::new()), Some(Event::Opened { .. }));
+        assert!(followers.iter_mut().all(found));
+        std::thread::scope(|scope| {
+            let producer = &producer;
+            scope.spawn(move || (0..5).for_each(|n| assert!(!publish(producer, n, n as f64).unwrap().overwrote)));
+            for n in 0..5 {
+                for follower in &mut followers {
+                    assert_eq!(next(follower, &mut buffer), n);
+                    assert_eq!(buffer, values(producer.description(), n).concat());
+                }
+            }
+        });
+        if count == 64 {
+            let refused = RingFollower::begin(&folder.0, Limits::default()).map(drop).unwrap_err().to_string();
+            assert!(refused.contains("64 follow") && refused.contains("at most 64"), "{refused}");
+            // It has disturbed nobody, and may come when one has left.
+            publish(&producer, 5, 5.0).unwrap();
+            assert!(followers.iter_mut().all(|follower| next(follower, &mut buffer) == 5));
+            drop(followers.pop());
+            let mut late = RingFollower::begin(&folder.0, Limits::default()).unwrap();
+            assert_eq!([next(&mut late, &mut buffer), next(&mut late, &mut buffer)], [4, 5]);
+        }
+        drop(followers);
+        drop(producer);
+        assert!(!folder.0.exists());
+    }
 }
 
 #[test]

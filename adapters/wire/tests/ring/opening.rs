@@ -2,8 +2,8 @@
 
 use super::{Folder, cube, overwrite, publish, step, values};
 use ridgewatch_wire::{
-    BlockExtent, Description, Element, Event, Field, Following, Geometry, Limits, Policy, Producer, RingFollower, RingReader, WireError,
-    block_path, blocks, producer_lives,
+    BlockExtent, Description, Element, Event, Field, Following, Geometry, Limits, Policy, Producer, RING_VARIABLE, RingFollower,
+    RingReader, WireError, block_path, blocks, producer_lives,
 };
 use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
@@ -166,10 +166,43 @@ fn rings_and_folders_of_another_user_are_refused() {
     drop(producer);
     std::fs::create_dir_all(&folder.0).unwrap();
     std::os::unix::fs::chown(&folder.0, Some(12345), None).unwrap();
-    assert!(theirs(Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err()));
-    // A folder of this user inside one of another user.
-    let error = Producer::open(&folder.0.join("ring"), cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
-    assert!(error.contains("is a folder of user 12345, who may replace"), "{error}");
+    let error = Producer::open(&folder.0, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
+    assert!(error.contains("belongs to user 12345; accepted: a folder of user") && error.contains(RING_VARIABLE), "{error}");
+    // A folder of this user inside one of another user, who may replace it whatever the mode.
+    let within = folder.0.join("ring");
+    for mode in [0o755, 0o1777] {
+        std::fs::set_permissions(&folder.0, PermissionsExt::from_mode(mode)).unwrap();
+        let error = Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap_err().to_string();
+        assert!(error.contains("is a folder of user 12345, who may replace") && error.contains(RING_VARIABLE), "{mode:o}: {error}");
+        assert!(Following::begin(&within).is_err());
+    }
+    // In a user namespace the owner of /dev/shm is nobody.
+    std::os::unix::fs::chown(&folder.0, Some(65534), None).unwrap();
+    drop(Producer::open(&within, cube([2, 2, 2]), 2, Policy::NewestWins).unwrap());
+}
+
+/// Another user has made the folder's parent first, and lets nobody else in: the error says whose it is, and not only that it cannot be used.
+#[test]
+#[ignore = "becomes another user, which needs root"]
+fn a_name_that_another_user_took_first_is_refused_with_what_to_do() {
+    let folder = Folder::alone("squatted");
+    std::fs::create_dir(&folder.0).unwrap();
+    std::os::unix::fs::chown(&folder.0, Some(12346), None).unwrap();
+    let ring = folder.0.join("run");
+    // SAFETY: the child changes its user, tries to follow, and ends without returning into the test.
+    let child = unsafe { libc::fork() };
+    if child == 0 {
+        // SAFETY: plain numbers.
+        let changed = unsafe { libc::setresuid(12345, 12345, 12345) } == 0;
+        let error = Following::begin(&ring).map_or_else(|error| error.to_string(), |_| String::new());
+        let good = changed && error.contains("is a folder of user 12346, who may replace") && error.contains(RING_VARIABLE);
+        // SAFETY: ends the child.
+        unsafe { libc::_exit(i32::from(!good)) };
+    }
+    let mut status = 0;
+    // SAFETY: a child of this process.
+    assert_eq!(unsafe { libc::waitpid(child, &raw mut status, 0) }, child);
+    assert_eq!(status, 0);
 }
 
 #[test]

@@ -1,0 +1,57 @@
+//! What one file of an archive holds, for files that have to be read together.
+
+use super::mask::holds_mask;
+use super::planner::Planner;
+use crate::archive_settings::ArchiveSettings;
+use crate::cf::coordinate::{Kind, classify};
+use crate::cf::velocity::{Component, judge};
+use crate::formats::DataFile;
+
+/// Components and times of a file.
+pub struct Content {
+    /// Whether there is a velocity along x, y and the levels.
+    pub components: [bool; 3],
+    /// Times of the components; empty without any.
+    pub seconds: Vec<f64>,
+    /// The times, in words.
+    pub when: String,
+    /// True if it holds a mask, or longitudes and latitudes of two dimensions.
+    pub helps: bool,
+}
+
+/// Contents of a file; `None` if its times are not understood.
+pub fn content(file: &DataFile, settings: &ArchiveSettings) -> Option<Content> {
+    let listing = &file.listing;
+    let found: Vec<(usize, Component)> = match settings.w.as_deref() {
+        _ if !listing.format.names_dimensions() => return None,
+        ignored => (0..listing.variables.len())
+            .filter_map(|i| judge(listing, i, settings.velocity_units()).ok().map(|c| (i, c.component)))
+            .filter(|(_, component)| *component != Component::W || ignored != Some("none"))
+            .collect(),
+    };
+    let named = [&settings.u, &settings.v, &settings.w].map(|name| name.as_deref().filter(|name| *name != "none"));
+    let variable = |k: usize| match named[k] {
+        Some(name) => listing.find(name),
+        None => found.iter().find(|(_, component)| *component as usize == k).map(|(i, _)| *i),
+    };
+    let variables = [0, 1, 2].map(variable);
+    let pair = [Kind::Longitude, Kind::Latitude].map(|kind| listing.matching(|v| v.dimensions.len() > 1 && classify(v) == kind).next());
+    let mut content = Content {
+        components: variables.map(|v| v.is_some()),
+        seconds: Vec::new(),
+        when: String::new(),
+        helps: holds_mask(listing, settings) || pair.iter().all(Option::is_some),
+    };
+    if let Some(variable) = variables.into_iter().flatten().next() {
+        let mut planner = Planner::new(file, settings);
+        let extents = planner.extents(variable).ok()?;
+        let time = planner.time(&extents).ok()?;
+        let show = |t: &f64| time.calendar.and_then(|c| c.iso(*t)).unwrap_or_else(|| format!("{t} s"));
+        content.when = match &time.seconds[..] {
+            [one] => show(one),
+            times => format!("{} times from {} to {}", times.len(), show(times.first()?), show(times.last()?)),
+        };
+        content.seconds = time.seconds;
+    }
+    Some(content)
+}

@@ -1,0 +1,318 @@
+//! Land in files whose velocity is 0 there: masks by convention or by name, at the points of each component.
+//!
+//! A mask of models (ROMS, NEMO, MITgcm, MOM) or one that the settings name always counts. One by CF (`land_binary_mask`, `flag_meanings`)
+//! counts for velocities of water only: the wind blows over land too.
+
+use super::component::{ComponentPlan, Role};
+use crate::archive_settings::ArchiveSettings;
+use crate::cf::coordinate::{Kind, classify_name};
+use crate::cf::packing::Packing;
+use crate::error::SourceError;
+use crate::formats::{DataFile, Listing, Variable};
+use std::sync::Arc;
+
+/// Value of `archive.mask` that uses no mask.
+pub const NO_MASK: &str = "none";
+/// Value of `archive.mask` that takes nodes as land whose velocity is always 0.
+pub const ZERO: &str = "zero";
+
+/// Names of masks of models at the points of u, v and tracers: 0 is land.
+const MODELS: [[&str; 3]; 5] = [
+    ["mask_u", "mask_v", "mask_rho"],
+    ["umask", "vmask", "tmask"],
+    ["umaskutil", "vmaskutil", "tmaskutil"],
+    ["hfacw", "hfacs", "hfacc"],
+    ["wet_u", "wet_v", "wet"],
+];
+/// Words in the meaning of a flag.
+const WATER_WORDS: [&str; 5] = ["sea", "ocean", "water", "wet", "lake"];
+const LAND_WORDS: [&str; 3] = ["land", "dry", "ground"];
+
+/// Points of one component on land, by their indices in the file.
+#[derive(Debug, PartialEq)]
+pub struct Mask {
+    /// Variable, or what stands for one.
+    pub name: String,
+    /// Entries along x, y and the levels; 1 if it holds for all levels.
+    shape: [usize; 3],
+    land: Vec<bool>,
+}
+
+impl Mask {
+    pub fn new(name: &str, shape: [usize; 3], land: Vec<bool>) -> Self {
+        Self { name: name.into(), shape, land }
+    }
+
+    pub fn is_land(&self, place: [usize; 3]) -> bool {
+        let [x, y, z] = [0, 1, 2].map(|k| if self.shape[k] == 1 { 0 } else { place[k] });
+        self.land[(z * self.shape[1] + y) * self.shape[0] + x]
+    }
+
+    /// True if it is for points of this shape.
+    pub fn fits(&self, shape: [usize; 3]) -> bool {
+        self.shape == shape
+    }
+
+    /// Share of the points on land.
+    pub fn share(&self) -> f64 {
+        self.land.iter().filter(|land| **land).count() as f64 / self.land.len().max(1) as f64
+    }
+}
+
+/// Which values are water.
+#[derive(Debug, Clone, PartialEq)]
+enum Water {
+    /// All but 0.
+    NotZero,
+    /// 0 alone.
+    Zero,
+    /// From one half on (fractions of sea).
+    Much,
+    /// Below one half (fractions of land).
+    Little,
+    /// These flags.
+    Flags(Vec<f64>),
+}
+
+impl Water {
+    /// A missing value is land.
+    fn holds(&self, value: f64) -> bool {
+        value.is_finite()
+            && match self {
+                Self::NotZero => value != 0.0,
+                Self::Zero => value == 0.0,
+                Self::Much => value >= 0.5,
+                Self::Little => value < 0.5,
+                Self::Flags(values) => values.contains(&value),
+            }
+    }
+
+    /// What the attributes of a mask say.
+    fn declared(variable: &Variable) -> Option<Self> {
+        match variable.text("standard_name").unwrap_or_default() {
+            "sea_binary_mask" | "sea_area_fraction" => return Some(Self::Much),
+            "land_binary_mask" | "land_area_fraction" => return Some(Self::Little),
+            _ => {}
+        }
+        let meanings = variable.text("flag_meanings")?.to_ascii_lowercase();
+        let says = |meaning: &str, words: &[&str]| words.iter().any(|word| meaning.contains(word));
+        let water = |meaning: &str| says(meaning, &WATER_WORDS) && !says(meaning, &LAND_WORDS);
+        let flags: Vec<(&str, f64)> = meanings.split_whitespace().zip(variable.numbers("flag_values").iter().copied()).collect();
+        let some = flags.iter().any(|f| water(f.0)) && flags.iter().any(|f| says(f.0, &LAND_WORDS));
+        some.then(|| Self::Flags(flags.into_iter().filter(|f| water(f.0)).map(|f| f.1).collect()))
+    }
+
+    /// Of a mask that the settings name.
+    fn of_named(variable: &Variable, opposite: bool) -> Self {
+        let name = variable.name.to_ascii_lowercase();
+        match (Self::declared(variable), opposite) {
+            (_, true) => Self::Zero,
+            (Some(water), false) => water,
+            (None, false) if name.starts_with("land") || name == "lsm" => Self::Little,
+            (None, false) => Self::NotZero,
+        }
+    }
+
+    fn described(&self) -> String {
+        match self {
+            Self::NotZero => "0 is land".into(),
+            Self::Zero => "0 is water".into(),
+            Self::Much => "from 0.5 on it is water".into(),
+            Self::Little => "from 0.5 on it is land".into(),
+            Self::Flags(values) => format!("{values:?} is water"),
+        }
+    }
+}
+
+/// Where the entries along one dimension of a mask belong.
+#[derive(Debug, Clone, Copy)]
+enum Along {
+    Axis(usize),
+    Entry(usize),
+}
+
+/// Matches the dimensions of a mask with those of a component: by name, then from the right by length. Along x and y, a mask may have one
+/// point more than faces between its points. `None` if it does not fit.
+fn fit(listing: &Listing, mask: &Variable, plan: &ComponentPlan) -> Option<Vec<Along>> {
+    let mut found: Vec<Along> = Vec::new();
+    let mut taken = [false; 3];
+    for &d in mask.dimensions.iter().rev() {
+        let dimension = &listing.dimensions[d];
+        let along = if dimension.len == 1 || classify_name(&dimension.name) == Kind::Time {
+            Along::Entry(0)
+        } else if let Some(own) = (0..plan.shape.len()).find(|&i| plan.dimensions[i] == dimension.name && plan.shape[i] == dimension.len) {
+            match plan.roles[own] {
+                Role::Axis(k) => Along::Axis(k),
+                Role::Fixed(entry) => Along::Entry(entry),
+                Role::Time => Along::Entry(0),
+            }
+        } else {
+            let k = taken.iter().position(|taken| !taken)?;
+            let own = plan.along(k);
+            let level = (0..plan.shape.len()).find_map(|i| match plan.roles[i] {
+                Role::Fixed(entry) if k == 2 && plan.shape[i] == dimension.len => Some(entry),
+                _ => None,
+            });
+            match level {
+                Some(entry) if own == 1 => Along::Entry(entry),
+                _ if dimension.len == own || (k < 2 && dimension.len == own + 1) => Along::Axis(k),
+                _ => return None,
+            }
+        };
+        if let Along::Axis(k) = along {
+            if std::mem::replace(&mut taken[k], true) {
+                return None;
+            }
+        }
+        found.push(along);
+    }
+    found.reverse();
+    (taken[0] && taken[1]).then_some(found)
+}
+
+/// A mask that may be used: the lower the rank, the better it fits.
+struct Candidate {
+    variable: usize,
+    rank: usize,
+    water: Water,
+    along: Vec<Along>,
+}
+
+/// The best mask of a file for component `which` (0, 1, 2 for u, v, w).
+fn candidate(listing: &Listing, plan: &ComponentPlan, which: usize, settings: &ArchiveSettings) -> Option<Candidate> {
+    let of = |i: usize| {
+        let variable = &listing.variables[i];
+        let name = variable.name.to_ascii_lowercase();
+        let (rank, water) = match settings.mask.as_deref() {
+            Some(named) => {
+                let opposite = named.strip_prefix('!');
+                (variable.name == opposite.unwrap_or(named)).then(|| (0, Water::of_named(variable, opposite.is_some())))?
+            }
+            None => match MODELS.iter().find_map(|names| names.iter().position(|n| *n == name)) {
+                Some(points) if points == which => (0, Water::NotZero),
+                Some(2) => (1, Water::NotZero),
+                Some(_) => return None,
+                None => (2, Water::declared(variable).filter(|_| plan.of_water)?),
+            },
+        };
+        let along = fit(listing, variable, plan).filter(|_| variable.number.is_number())?;
+        Some(Candidate { variable: i, rank, water, along })
+    };
+    (0..listing.variables.len()).filter_map(of).min_by_key(|c| c.rank)
+}
+
+/// True if a file holds a mask by convention, or the one that the settings name.
+pub fn holds_mask(listing: &Listing, settings: &ArchiveSettings) -> bool {
+    listing.variables.iter().any(|v| match settings.mask.as_deref() {
+        Some(named) if ![NO_MASK, ZERO].contains(&named) => v.name == named.strip_prefix('!').unwrap_or(named),
+        _ => {
+            let name = v.name.to_ascii_lowercase();
+            MODELS.iter().flatten().any(|n| *n == name) || Water::declared(v).is_some()
+        }
+    })
+}
+
+/// Masks of the components of a file.
+#[derive(Default)]
+pub struct Masks {
+    /// With their ranks.
+    pub found: [Option<(usize, Arc<Mask>)>; 3],
+    pub notes: Vec<String>,
+}
+
+impl Masks {
+    /// Adds those of a file which fit better than those found before.
+    ///
+    /// # Errors
+    /// Values that cannot be read; a mask that the settings name and that does not fit.
+    pub fn add(&mut self, file: &DataFile, frame: &[ComponentPlan], settings: &ArchiveSettings) -> Result<(), SourceError> {
+        let listing = &file.listing;
+        let (mut lacking, mut used) = (Vec::new(), Vec::<(usize, String)>::new());
+        for (which, plan) in frame.iter().enumerate().take(3) {
+            let Some(best) = candidate(listing, plan, which, settings) else {
+                lacking.push(plan);
+                continue;
+            };
+            if self.found[which].as_ref().is_some_and(|(rank, _)| *rank <= best.rank) {
+                continue;
+            }
+            let mask = read(file, &best, plan)?;
+            let share = 100.0 * mask.share();
+            used.push((best.variable, format!("{share:.1} % of `{}` by `{}` ({})", plan.name, mask.name, best.water.described())));
+            self.found[which] = Some((best.rank, Arc::new(mask)));
+        }
+        if !used.is_empty() {
+            let parts: Vec<String> = used.into_iter().map(|u| u.1).collect();
+            self.notes.push(format!("land, taken as missing: {}; `archive.mask` names another mask", parts.join(", ")));
+        }
+        match (settings.mask.as_deref(), lacking.first()) {
+            (Some(named), Some(plan)) if holds_mask(listing, settings) => {
+                let name = named.strip_prefix('!').unwrap_or(named);
+                let index = listing.find(name);
+                let shape = index.map(|i| listing.shape(&listing.variables[i])).unwrap_or_default();
+                let found = format!("\"{named}\", whose shape is {shape:?}");
+                let accepted =
+                    format!("a mask of numbers on the points of `{}` ({:?}), or with one more along x and y", plan.name, plan.shape);
+                Err(SourceError::setting("mask", found, accepted))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Gives them to components.
+    pub fn apply(&self, frame: &mut [ComponentPlan]) {
+        for (plan, mask) in frame.iter_mut().zip(&self.found) {
+            plan.mask = mask.as_ref().map(|(_, mask)| mask.clone());
+        }
+    }
+}
+
+fn read(file: &DataFile, candidate: &Candidate, plan: &ComponentPlan) -> Result<Mask, SourceError> {
+    let variable = &file.listing.variables[candidate.variable];
+    let packing = Packing::of(variable).map_err(|what| SourceError::variable(&file.listing.path, &variable.name, what))?;
+    let lengths = file.listing.shape(variable);
+    let part = |(along, &len): (&Along, &usize)| match *along {
+        Along::Axis(_) => (0, len),
+        Along::Entry(entry) => (entry.min(len.saturating_sub(1)), 1),
+    };
+    let (start, count): (Vec<usize>, Vec<usize>) = candidate.along.iter().zip(&lengths).map(part).unzip();
+    let water: Vec<bool> =
+        file.read(candidate.variable, start, count.clone())?.into_iter().map(|v| candidate.water.holds(packing.unpack(v))).collect();
+    // Extent and distance between neighbours along each axis of the grid.
+    let (mut extent, mut strides, mut stride) = ([1usize; 3], [0usize; 3], 1);
+    for (along, &n) in candidate.along.iter().zip(&count).rev() {
+        if let Along::Axis(k) = *along {
+            (extent[k], strides[k]) = (n, stride);
+        }
+        stride *= n;
+    }
+    let shape = [0, 1, 2].map(|k| if extent[k] == 1 { 1 } else { plan.along(k) });
+    // A face is water if the points on both sides are.
+    let reach = |k: usize| if extent[k] > shape[k] { 2 } else { 1 };
+    let mut land = Vec::with_capacity(shape.iter().product());
+    for z in 0..shape[2] {
+        for y in 0..shape[1] {
+            for x in 0..shape[0] {
+                let beside = |dy: usize| (0..reach(0)).all(|dx| water[z * strides[2] + (y + dy) * strides[1] + (x + dx) * strides[0]]);
+                land.push(!(0..reach(1)).all(beside));
+            }
+        }
+    }
+    Ok(Mask::new(&variable.name, shape, land))
+}
+
+/// True if a velocity is of water, as far as its names say.
+pub fn is_of_water(listing: &Listing, variable: &Variable) -> bool {
+    let of = |name: &str| variable.text(name).unwrap_or_default().to_ascii_lowercase();
+    let words = format!("{} {}", of("standard_name"), of("long_name"));
+    let says = |words: &str, parts: &[&str]| parts.iter().any(|part| words.contains(part));
+    if says(&words, &["wind", "air", "atmos"]) {
+        return false;
+    }
+    let name = variable.name.to_ascii_lowercase();
+    let downwards = |&d: &usize| listing.dimensions[d].name.to_ascii_lowercase().starts_with("dep");
+    says(&words, &["sea", "ocean", "current", "water"])
+        || ["uo", "vo", "wo", "uvel", "vvel", "wvel", "ucur", "vcur", "wcur", "ugos", "vgos", "ssu", "ssv"].contains(&name.as_str())
+        || says(&name, &["vozocrtx", "vomecrty", "vovecrtz", "water", "current"])
+        || variable.dimensions.iter().any(downwards)
+}
