@@ -117,10 +117,10 @@ fn coasts() {
     let share = ftle(Normalisation::Tau, by_tau).1;
     row([
         "coasts (missing cells)",
-        &format!("within {by_tau:.1} cells of a coast that a particle reaches in {TIME:.0} (off by 10 %)"),
+        &format!("within {by_tau:.1} cells of a coast, towards which particles move {TIME:.0} cells in tau (off by 10 %)"),
         &format!("`mean_lifetime_share` ({share:.2} there), `missing`"),
         "the particle stops; its stretch is divided by all of tau, so a coast shows no ridge; warns below a mean of 0.75",
-        &format!("FTLE at the coast {quiet:.2} of that at sea; divided by the lifetime it were {ridge:.1}, a false ridge"),
+        &format!("FTLE at the coast {quiet:.2} of that at sea; divided by the lifetime it would be {ridge:.1}, a false ridge"),
         "coasts",
     ]);
 }

@@ -22,6 +22,7 @@ fn size(samples: &Samples) -> f64 {
     crate::sweep::rms(samples.log_stretch.iter().map(|&s| f64::from(s)))
 }
 
+/// Fails without the roll-back of the weights.
 #[test]
 fn learning_rate_too_high() {
     let tracer = DoubleGyre::new(0.0, 10.0, 20);
@@ -49,7 +50,7 @@ fn learning_rate_too_high() {
     assert_eq!(rms(&calm, &held_out), before, "rolled back");
     row([
         "learning rate too high",
-        &format!("rate {} ({} roll-backs in 400 steps); the default is 0.01", fails.0, fails.1),
+        &format!("rate {} (roll-backs in 400 steps: {}); the default is 0.01", fails.0, fails.1),
         "`training.rollbacks`, `training.lost_steps`, a warning",
         "goes back to the last good weights at half the rate",
         &format!("{:.2} of the labels' size at that rate, {:.2} at 1, {:.2} at the default", fails.3, found[5].3, usual.3),
@@ -78,7 +79,7 @@ fn labels_without_a_value() {
     assert!(fails.0 >= 0.5, "half of the labels suffice: {found:?}");
     row([
         "labels without a value (NaN)",
-        &format!("{:.0} % of the labels lost (error doubled)", 100.0 * fails.0),
+        &format!("{:.0} % of the labels lost (error {:.1} times as large)", 100.0 * fails.0, fails.1 / found[0].1),
         "`training.dropped`",
         "drops and counts them; the others train as before",
         &format!("{:.2} of the labels' size with all of them, {:.2} there", found[0].1, fails.1),
@@ -121,7 +122,7 @@ fn velocities_without_a_value() {
     assert!(burst.0 > 0.05 && mean.0 < burst.0, "{found:?}");
     row([
         "velocities without a value (NaN), scattered",
-        &format!("{:.2} % of the nodes (10 % of the paths stop within 20 cells)", 100.0 * fails.0),
+        &format!("{:.2} % of the nodes ({:.0} % of the paths stop within 20 cells)", 100.0 * fails.0, 100.0 * fails.1),
         &format!("`mean_lifetime_share` ({:.2} there)", fails.2),
         &format!("a path that needs the node stops; warns of the lifetime from {:.1} % on, of the snapshot from 5 % on", 100.0 * mean.0),
         &format!("{:.0} % of the paths stop at the first warning", 100.0 * mean.1),
@@ -236,5 +237,48 @@ fn a_region_the_camera_never_sees() {
         "audits and labels cover the domain, whatever the picture shows",
         &format!("{:.3} where trusted ({:.0} % of the domain), stated to {:.0} %", corner.4, 100.0 * corner.2, 100.0 * corner.3),
         "a_region_the_camera_never_sees",
+    ]);
+}
+
+/// Fails without the share of audit points.
+#[test]
+fn too_few_audit_points() {
+    let mut found = Vec::new();
+    for share in [1.0, 0.3, 0.1, 0.03, 0.01] {
+        // A coarse table, whose error is that of its nodes, in eight large cells. Nothing but the share asks for points.
+        let keys = format!(
+            "surrogate.kind = \"table\"\nsurrogate.table_nodes = [33, 17, 2]\ntime.tau = 5\ntime.slides = 1\ntime.frames_per_slide = 10\n\
+             flow.steps = 40\ntransfer.low = 0.05\ntransfer.high = 0.4\ntransfer.extinction = 20\ntrust.tolerance = 0.3\ntrust.cells = [4, 2, 1]\n\
+             trust.audit_min_per_cell = 1\ntrust.audit_max_per_cell = 1\ntrust.audit_share = {share}"
+        );
+        let options = RunOptions { verify_points: 20_000, ..RunOptions::default() };
+        let (mut held, mut frames, mut width, mut points) = (0, 0, 0.0, 0.0);
+        scene::run_frames(scene::setup(&scene::double_gyre([32, 16, 2], &keys), &[]), &options, |frame| {
+            let record = &frame.record;
+            assert!(record.audited as f64 >= share * record.queries as f64, "{} points for {} queries", record.audited, record.queries);
+            let (Some(stated), Some(verified)) = (record.trusted_error, record.verified_error) else { return };
+            let [low, high] = stated.optical_rms_interval;
+            held += u32::from((low..=high).contains(&verified.optical_rms));
+            width += (high - low) / verified.optical_rms;
+            points += record.audited as f64;
+            frames += 1;
+        });
+        assert!(frames >= 9, "every frame states an error");
+        println!(
+            "share {share}: {:.0} points, width {:.2}, {held} of {frames} hold",
+            points / f64::from(frames),
+            width / f64::from(frames)
+        );
+        found.push((share, points / f64::from(frames), width / f64::from(frames), held, frames));
+    }
+    let fails = found.iter().find(|f| f.2 > 1.0).unwrap_or(&found[found.len() - 1]);
+    assert!(found[4].2 > 3.0 * found[0].2, "fewer points say less: {found:?}");
+    row([
+        "too few audit points",
+        &format!("{:.0} points (interval {:.1} times as wide as the value)", fails.1, fails.2),
+        "`trusted_error.optical_rms_interval`, `audited`",
+        "traces `trust.audit_share` of all queries, whatever the gate says, and more until the standard error is a tenth (`audit_precision`)",
+        &format!("{:.0} points: {:.2} times as wide, {} of {} intervals hold", found[0].1, found[0].2, found[0].3, found[0].4),
+        "too_few_audit_points",
     ]);
 }

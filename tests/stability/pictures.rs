@@ -2,8 +2,9 @@
 
 use crate::sweep::{rms, row};
 use ridgewatch::field::Domain;
-use ridgewatch::render::smooth::{LightVolume, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
+use ridgewatch::render::smooth::{LightVolume, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
+use std::cell::Cell;
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
 
@@ -49,6 +50,7 @@ fn opacity(film: &Film) -> (f64, f64) {
     (mean, (variance / n).sqrt())
 }
 
+/// Fails if the majorant is not raised by what exceeded it, and without the weights of collisions above it.
 #[test]
 fn majorant_too_low() {
     const EXTINCTION: f64 = 5.0;
@@ -135,59 +137,93 @@ fn marching_too_coarse() {
     for extinction in [0.5, 2.0, 8.0, 32.0, 128.0] {
         let scene = scene(16, extinction, None, 7);
         let mut renderer = Renderer::new(scene.clone(), &cube(), 1.0).unwrap();
-
         let exact = marched(&renderer, &nodes, 2, 1.0 / 16.0, 1.0 / 16.0);
-
         let size = rms(exact.iter().copied());
         let error = |found: &[f64]| rms(found.iter().zip(&exact).map(|(a, b)| a - b)) / size;
-
         let (step, light) =
             (error(&marched(&renderer, &nodes, 2, 1.0, 1.0 / 16.0)), error(&marched(&renderer, &nodes, 2, 1.0 / 16.0, 0.0)));
         let first = error(&marched(&renderer, &nodes, 2, 1.0, 0.0));
-
         // The program's own picture: it is told nothing of the truth, and refines where its audit asks for it.
         let mut picture = Picture::default();
-
-        let (mut stated, mut found_at_last) = (0.0, 0.0);
-        let truth = marched(&renderer, &nodes, 64, 1.0 / 16.0, 1.0 / 4.0);
+        let (mut stated, mut last) = (0.0, None);
         for number in 0..6 {
             let round =
                 Refinement { nodes: &nodes, missing: None, method: Method::Marched, sum: false, samples: 2.0, number, stop: &NEVER };
             let mut answers = Field(|p: [f32; 3]| nodes.at(p));
-
             let (film, _, error) = renderer.refine(&mut picture, &round, &mut answers).unwrap();
             stated = error.march_rms / size;
-            found_at_last = rms(film.rgba.iter().zip(&truth).map(|(p, t)| f64::from(p[0]) - t)) / size;
+            last = Some((film, error.rays_per_pixel));
         }
+        // The same rays, so that the pixel filter is the same.
+        let (film, rays) = last.unwrap();
+        let truth = marched(&renderer, &nodes, rays, 1.0 / 16.0, 1.0 / 4.0);
+        let found_at_last = rms(film.rgba.iter().zip(&truth).map(|(p, t)| f64::from(p[0]) - t)) / size;
         println!(
             "extinction {extinction}: step {step:.1e}, light volume {light:.1e}, both {first:.1e}; in the end {found_at_last:.1e}, stated {stated:.1e}"
         );
         found.push((extinction, first, stated, found_at_last));
     }
-
     let fails = found.iter().find(|f| f.1 > 0.02).expect("a node's step fails in the end");
     let last = found[found.len() - 1];
     assert!(fails.0 > found[0].0, "{found:?}");
-
     assert!(last.3 < 0.3 * last.1, "marching gets finer: {last:?}");
-
-    // The audit compares the first two rays of a pixel with the next two, which are nearer to one another than to the mean over the pixel.
+    // Measured on 24 pixels, a few of which make most of the sum of squares.
     assert!(found.iter().all(|f| f.2 > 0.33 * f.3), "and states its error to a factor of three: {found:?}");
-
     row([
         "marching step and light volume too coarse",
-        &format!("optical depth of a node above {:.1} (radiance off by 2 %)", fails.0 / 8.0),
+        &format!("optical depth of a node of {:.2} (radiance off by {:.1} %)", fails.0 / 8.0, 100.0 * fails.1),
         "`picture_error.march_rms`",
         "compares random pixels with a finer march, and halves the step down to a sixteenth",
         &format!(
-            "first march {:.1} % at that depth, {:.0} % at {:.0}; after six frames there {:.1} %, stated {:.1} %",
-            100.0 * fails.1,
+            "first march {:.0} % at a depth of {:.0}; after six frames there {:.1} %, stated {:.1} %",
             100.0 * last.1,
             last.0 / 8.0,
             100.0 * last.3,
             100.0 * last.2
         ),
         "marching_too_coarse",
+    ]);
+}
+
+#[test]
+fn few_rays_a_pixel() {
+    const WIDTH: usize = 16;
+    const FINER: usize = 8;
+    let nodes = nodes(9, |p| 0.5 + 0.5 * (5.0 * p[0] + 2.0 * p[2]).sin() * (4.0 * p[1] - 2.0 * p[2]).cos());
+    let of = |width: usize, rays: u64| marched(&Renderer::new(scene(width, 8.0, None, 7), &cube(), 1.0).unwrap(), &nodes, rays, 0.25, 0.25);
+    // Means over the pixels of a finer picture: no sequence of offsets within a pixel is taken to be right.
+    let fine = of(WIDTH * FINER, 4);
+    let mean = |i: usize| {
+        let [x, y] = [i % WIDTH, i / WIDTH].map(|n| n * FINER);
+        (0..FINER * FINER).map(|j| fine[(y + j / FINER) * WIDTH * FINER + x + j % FINER]).sum::<f64>() / (FINER * FINER) as f64
+    };
+    let truth: Vec<f64> = (0..WIDTH * WIDTH).map(mean).collect();
+    let size = rms(truth.iter().copied());
+    // The program's own estimate: the first two rays of each pixel against the next two.
+    let (two, four) = (of(WIDTH, 2), of(WIDTH, 4));
+    let mut control = MarchControl::default();
+    two.iter().zip(&four).for_each(|(two, four)| control.audit([*two; 3], [2.0 * four - two; 3], None));
+    let found: Vec<(u64, f64, f64)> = [1, 2, 4, 8, 16, 32]
+        .map(|rays| {
+            control.rays = rays;
+            let error = rms(of(WIDTH, rays).iter().zip(&truth).map(|(a, b)| a - b));
+            (rays, error / size, control.error().sqrt() / size)
+        })
+        .to_vec();
+    found.iter().for_each(|(rays, error, stated)| println!("{rays} rays: true {error:.1e}, stated {stated:.1e}"));
+    let fails = found.iter().rev().find(|f| f.1 > 0.01).expect("few rays are not enough");
+    let most = found[found.len() - 1];
+    // Independent rays would leave 1 / sqrt(32).
+    assert!(most.1 < 0.5 * found[0].1, "more rays, less error: {found:?}");
+    // Four rays tell the order of magnitude.
+    assert!(found[1..].iter().all(|f| f.2 > 0.25 * f.1), "stated: {found:?}");
+    row([
+        "few rays a pixel",
+        &format!("{} rays (radiance off by {:.1} % in a picture of {WIDTH}x{WIDTH})", fails.0, 100.0 * fails.1),
+        "`picture_error.march_rms`",
+        "adds rays while their error is above a tenth of the rest, up to 64",
+        &format!("{} rays: {:.2} %, stated {:.2} %", most.0, 100.0 * most.1, 100.0 * most.2),
+        "few_rays_a_pixel",
     ]);
 }
 
@@ -198,6 +234,7 @@ fn true_square(film: &Film, [a, b]: &[Film; 2]) -> f64 {
     lit.iter().flat_map(|&i| (0..3).map(move |k| (i, k))).map(|(i, k)| d(a, i, k) * d(b, i, k)).sum::<f64>() / (3 * lit.len()) as f64
 }
 
+/// Fails without the floor of half the standard error.
 #[test]
 fn a_correction_that_few_samples_hit() {
     const WIDTH: usize = 32;
@@ -228,10 +265,8 @@ fn a_correction_that_few_samples_hit() {
                 stop: &NEVER,
             };
             let (film, _, error) = renderer.refine(&mut Picture::default(), &round, &mut Field(field)).unwrap();
-
             let exact = true_square(&film, &truth).max(0.0).sqrt();
             assert!(error.rms.value > 0.0 && error.rms.value.is_finite(), "radius {radius}: {:?}", error.rms);
-
             below += u32::from(error.rms.high < exact);
             inside += u32::from((error.rms.low..=error.rms.high).contains(&exact));
             stated += error.rms.value / SEEDS as f64;
@@ -263,5 +298,80 @@ fn a_correction_that_few_samples_hit() {
             pixels(last.0)
         ),
         "a_correction_that_few_samples_hit",
+    ]);
+}
+
+/// Fails without the floor on the variance of a tile.
+#[test]
+fn a_tile_that_shows_no_difference() {
+    const WIDTH: usize = 32;
+    const FRAMES: usize = 6;
+    const SEEDS: u64 = 8;
+    let surrogate = nodes(9, |_| 0.1);
+    // Wrong in the upper right tile alone, whose light comes through no other; in the lower left one a tube as thin as a part of a pixel.
+    let in_tube = |p: &[f32; 3], radius: f32| (p[0] - 0.27).hypot(p[1] - 0.23) < radius;
+    // In the lower left tile: samples of each frame, of the mean; the stated error of its corner, of the whole; the frame that first meets the tube.
+    let run = |seed: u64, radius: f32| {
+        let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
+        let (mut picture, mut before, mut stated, mut shares, met) = (Picture::default(), 0.0, 0.0, Vec::new(), Cell::new(None));
+        for frame in 1..=FRAMES {
+            let round = Refinement {
+                nodes: &surrogate,
+                missing: None,
+                method: Method::TwoLevel,
+                sum: false,
+                samples: 2.0,
+                number: 0,
+                stop: &NEVER,
+            };
+            let mut answers = Field(|p: [f32; 3]| {
+                if in_tube(&p, radius) {
+                    met.set(met.get().or(Some(frame)));
+                    return 1.0;
+                }
+                if p[0] > 0.5 && p[1] > 0.5 { 0.5 } else { 0.1 }
+            });
+            let (film, _, error) = renderer.refine(&mut picture, &round, &mut answers).unwrap();
+            // The corner is farther from any difference than the error is averaged.
+            stated = f64::from(film.error[WIDTH * (WIDTH - 1)]) / error.rms.value;
+            let quiet = |i: &usize| i % WIDTH < WIDTH / 2 && i / WIDTH >= WIDTH / 2;
+            let samples: f64 = (0..WIDTH * WIDTH).filter(quiet).map(|i| f64::from(film.samples[i])).sum();
+            shares.push((samples - before) / (0.5 * (WIDTH * WIDTH) as f64));
+            before = samples;
+        }
+        (shares, stated, met.get())
+    };
+    let (shares, stated, _) = run(0, 0.0);
+    let later = shares[1..].iter().sum::<f64>() / (FRAMES - 1) as f64;
+    println!("samples in a tile without differences, of the mean: {shares:.2?}; stated {stated:.3} of the mean error");
+    // Even share 0.25, and 0.75 times the quotient of the deviations sqrt(0.02 / 4) and (1 + 3 sqrt(0.02 / 4)) / 4. Fails without the variance
+    // floor, which leaves 0.25.
+    let deviation = f64::sqrt(0.02 / 4.0);
+    let expected = 0.25 + 0.75 * 4.0 * deviation / (1.0 + 3.0 * deviation);
+    assert!((later / expected - 1.0).abs() < 0.1, "{later} {expected}");
+    // A twentieth of the mean square. Fails without that floor.
+    assert!(stated > 0.2, "{stated}");
+    let mut found = Vec::new();
+    for radius in [0.02f32, 0.01, 0.005, 0.0025] {
+        let pixels = std::f64::consts::PI * f64::from(radius * WIDTH as f32).powi(2);
+        let met = (0..SEEDS).filter(|seed| run(1 + seed, radius).2.is_some()).count();
+        println!("tube of {pixels:.3} pixels: met in {met} of {SEEDS} runs of {FRAMES} frames");
+        found.push((pixels, met));
+    }
+    assert_eq!(found[0].1, SEEDS as usize, "a pixel is met: {found:?}");
+    let fails = found.iter().find(|f| f.1 * 2 < SEEDS as usize).expect("a thin one is not");
+    // What a pixel of the tube shows at most, in shares of a picture without it.
+    let radiance =
+        |value: f32| rms(marched(&Renderer::new(scene(8, 5.0, None, 1), &cube(), 1.0).unwrap(), &nodes(9, |_| value), 4, 0.25, 0.25));
+    let contrast = (radiance(1.0) / radiance(0.1) - 1.0).abs();
+    row([
+        "a tile that shows no difference",
+        &format!("a ridge of {:.2} pixels in it (met in {} of {SEEDS} runs of {FRAMES} frames of 2 samples a pixel)", fails.0, fails.1),
+        "layers `samples.count` and `error`",
+        &format!(
+            "spreads a quarter of the samples evenly and takes the variance as 2 % of the mean at least: {later:.2} of the mean samples"
+        ),
+        &format!("one pixel off by {:.0} % of its radiance; the tile states {stated:.2} of the mean error", 100.0 * fails.0 * contrast),
+        "a_tile_that_shows_no_difference",
     ]);
 }
