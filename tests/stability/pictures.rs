@@ -375,3 +375,58 @@ fn a_tile_that_shows_no_difference() {
         "a_tile_that_shows_no_difference",
     ]);
 }
+
+/// Fails without the rule for a single quarter.
+#[test]
+fn too_few_pairs_for_an_interval() {
+    // Four tiles: the interval comes from one difference a tile.
+    const WIDTH: usize = 32;
+    const SEEDS: u64 = 24;
+    let surrogate = nodes(9, |_| 0.1);
+    let field = |p: [f32; 3]| 0.1 + 0.5 * p[0];
+    let truth = [1, 2].map(|seed| {
+        let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, 1000 + seed), &cube(), 1.0).unwrap();
+        renderer.render(0, &mut Field(field), 256, None, &NEVER).unwrap().0
+    });
+    let mut found = Vec::new();
+    for pairs in [1024, 256, 64, 16, 4] {
+        let samples = 2.0 * f64::from(pairs) / (WIDTH * WIDTH) as f64;
+        let (mut known, mut inside, mut width, mut silent) = (0, 0, 0.0, 0);
+        for seed in 0..SEEDS {
+            let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
+            let round =
+                Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: false, samples, number: 0, stop: &NEVER };
+            let (film, _, error) = renderer.refine(&mut Picture::default(), &round, &mut Field(field)).unwrap();
+            if !error.is_known() {
+                continue;
+            }
+            let exact = true_square(&film, &truth).max(0.0).sqrt();
+            known += 1;
+            inside += u32::from((error.rms.low..=error.rms.high).contains(&exact));
+            width += (error.rms.high - error.rms.low) / exact;
+            // One pair a tile is in one quarter, which says nothing about the scatter.
+            let shows = error.rms.value > 1.001 * error.march_rms;
+            silent += u32::from(!shows);
+            assert!(pairs > 4 || !shows || error.rms.high > 1.5 * error.rms.low, "{:?}", error.rms);
+        }
+        println!(
+            "{pairs} pairs: {known} of {SEEDS} known, {inside} inside, width {:.2}, {silent} show no difference",
+            width / f64::from(known)
+        );
+        found.push((pairs, known, inside, width / f64::from(known), silent));
+    }
+    assert!(found[0].2 * 5 >= found[0].1 * 4, "a pair a pixel suffices: {found:?}");
+    let last = found[found.len() - 1];
+    let fails = found.iter().find(|f| f.2 * 5 < f.1 * 4).unwrap_or(&last);
+    row([
+        "too few pairs of samples for an interval",
+        &format!("{} pairs in a picture of {WIDTH}x{WIDTH} ({} of {} intervals hold)", fails.0, fails.2, fails.1),
+        "`picture_error`, its interval; `samples_per_pixel`",
+        "where one quarter of the samples is empty, takes the error itself as its standard error",
+        &format!(
+            "interval {:.1} times as wide as the error; {:.1} times with {} pairs; with {} pairs {} of {} pictures show no difference and state the error of the march alone",
+            fails.3, found[0].3, found[0].0, last.0, last.4, last.1
+        ),
+        "too_few_pairs_for_an_interval",
+    ]);
+}
