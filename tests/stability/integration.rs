@@ -1,0 +1,272 @@
+//! Integration: difference gaps, steps beyond the stability limit, long integration times, vanishing velocity.
+
+use crate::kit::flow::{EVERYTHING, trace};
+use crate::kit::scene;
+use crate::sweep::{TOLERANCE, adaptive, bisect, double_gyre, gyre_box, in_square, lattice, map, rms_difference, row, traced};
+use ridgewatch::field::analytic::Analytic;
+use ridgewatch::flow::{Extras, FlowError, FlowMap, Integrator, Precision, Steps, VelocitySource, cpu_tracer};
+use ridgewatch::run::RunOptions;
+
+const TAU: f64 = 10.0;
+
+#[test]
+fn difference_gap() {
+    let (source, seeds) = (double_gyre(), lattice(&gyre_box(), [60, 30]));
+    let exact = traced(&source, &adaptive(TAU), 0.0, &seeds);
+    for precision in [Precision::F32, Precision::F64] {
+        let tangent = rms_difference(&traced(&source, &map(TAU, 200, precision), 0.0, &seeds), &exact);
+        let mut curve: Vec<(f64, f64)> = Vec::new();
+        let mut refused = None;
+        for half_decades in 2..=16 {
+            let gap = 10f64.powf(-0.5 * f64::from(half_decades));
+            let map = FlowMap { integrator: Integrator::Differences, difference_step: gap, ..map(TAU, 200, precision) };
+            match cpu_tracer(source.clone(), &map, 0.0) {
+                Err(FlowError::DifferenceStepVanishes { min_step, .. }) => refused = refused.or(Some((gap, min_step))),
+                Err(error) => panic!("{error}"),
+                Ok(_) => curve.push((gap, rms_difference(&traced(&source, &map, 0.0, &seeds), &exact))),
+            }
+        }
+        curve.iter().for_each(|(gap, error)| println!("{precision:?}, gap {gap:.1e}: {error:.1e}; tangent {tangent:.1e}"));
+        let (best, least) = curve.iter().copied().min_by(|a, b| a.1.total_cmp(&b.1)).unwrap();
+        let within: Vec<f64> = curve.iter().filter(|(_, error)| *error <= TOLERANCE).map(|(gap, _)| *gap).collect();
+        let (first, last) = (curve[0].1, curve[curve.len() - 1].1);
+        // A U: truncation (gap squared) on one side, rounding (its inverse) on the other.
+        assert!(first > 10.0 * least, "a wide gap fails");
+        if precision == Precision::F32 {
+            assert!(last > 10.0 * least, "and a narrow one");
+            // Two particles at the largest coordinate, 2, must differ: its ulp is 2.4e-7.
+            let (gap, min_step) = refused.expect("gaps that vanish are refused");
+            assert!(gap < min_step && min_step == 2.0 * f64::from(f32::EPSILON), "{gap} {min_step}");
+        } else {
+            assert!(refused.is_none() && best < 1e-4);
+        }
+        assert!(tangent < 1.01 * least, "no gap reaches the tangent: {tangent:e} {least:e}");
+        let name = format!("differences, {precision:?}").replace("F", "f");
+        let smallest = curve[curve.len() - 1].0;
+        let range = match (within.last(), within.first()) {
+            (Some(low), Some(high)) if *low > smallest => format!("gap above {high:.0e} or below {low:.0e}"),
+            (_, Some(high)) => format!("gap above {high:.0e}; none of those down to {smallest:.0e}"),
+            _ => "at every gap".to_owned(),
+        };
+        let does = match refused {
+            Some((_, least)) => format!("refuses gaps below {least:.1e}, where pairs coincide; the default is the tangent, which has none"),
+            None => "the default is the tangent, which has no gap".to_owned(),
+        };
+        let error = format!("at best {least:.1e} (gap {best:.0e}), {last:.1e} at the smallest; tangent {tangent:.1e}");
+        row([&name, &range, "none; `flow.integrator` is in the summary", &does, &error, "difference_gap"]);
+    }
+}
+
+#[test]
+fn steps_beyond_the_stability_limit() {
+    const COUNT: usize = 64;
+    // A rate of 1, so that the step is |lambda h|. Rotation: ln |R(iz)| a step. Saddle: its contracting coordinate, R(-z).
+    let grows = |flow: &Analytic, z: f64| {
+        let map = map(z * COUNT as f64, COUNT, Precision::F64);
+        let out = trace(&in_square(flow.clone()), &map, 0.0, &[[0.0, 0.5, 0.5]], EVERYTHING);
+        if matches!(flow, Analytic::Rotation { .. }) { out.log_stretch_f64[0] > 0.0 } else { out.arrival[0][1].abs() > 0.5 }
+    };
+    let chosen = |flow: &Analytic, tau: f64| {
+        let map = FlowMap { steps: Steps::Auto { tolerance: TOLERANCE }, ..map(tau, 1, Precision::F64) };
+        let tracer = cpu_tracer(in_square(flow.clone()), &map, 0.0).unwrap();
+        let error = trace(&in_square(flow.clone()), &map, 0.0, &[[0.0, 0.5, 0.5]], Extras::default()).log_stretch_f64[0];
+        (tau / tracer.steps() as f64, error, tracer.step_choice().unwrap())
+    };
+    let limits = [
+        // |R(iz)|^2 = 1 - z^6 / 72 + z^8 / 576.
+        ("RK4 steps, fast rotation", Analytic::Rotation { omega: 1.0 }, 8f64.sqrt(), 0.0),
+        // The real root of 1 - z / 2 + z^2 / 6 - z^3 / 24.
+        ("RK4 steps, stiff contraction", Analytic::Saddle { rate: 1.0 }, 2.785_293_563, 1.0),
+    ];
+    for (name, flow, limit, rate) in limits {
+        let found = bisect(1.0, 4.0, |z| grows(&flow, z));
+        assert!((found / limit - 1.0).abs() < 2e-4, "{name}: {found} {limit}");
+        // The error of the FTLE where it just fails, in shares of the rate.
+        let tau = 1.2 * found * COUNT as f64;
+        let wrong = traced(&in_square(flow.clone()), &map(tau, COUNT, Precision::F64), 0.0, &[[0.0, 0.5, 0.5]])[0] / tau;
+        let (z, stretch, choice) = chosen(&flow, 100.0);
+        assert!(choice.within_tolerance && z < 0.5 * limit, "auto stays clear of the limit: {z}");
+        // The difference to twice as many steps is 15/16 of the error (rotation 31/32: its leading term is damping).
+        let error = (stretch - rate * 100.0).abs();
+        assert!(error < 1.2 * TOLERANCE, "{error}");
+        row([
+            name,
+            &format!("rate x step above {found:.3}"),
+            "`integration_difference`, null if `flow.steps` is a number",
+            &format!("`steps = \"auto\"` takes rate x step {z:.2}; a given number is obeyed without a word"),
+            &format!("auto {error:.1e} of the log-stretch; at 1.2 times the limit FTLE {wrong:.2} of the rate instead of {rate:.0}"),
+            "steps_beyond_the_stability_limit",
+        ]);
+    }
+    // The gradient of a shear is nilpotent, so that RK4 is exact: g = rate x tau stretches by asinh(g / 2).
+    let sheared = |z: f64| {
+        let tau = z * COUNT as f64;
+        let stretch = traced(&in_square(Analytic::Shear { rate: 1.0 }), &map(tau, COUNT, Precision::F64), 0.0, &[[0.0, 0.5, 0.5]])[0];
+        (stretch / (0.5 * tau).asinh() - 1.0).abs()
+    };
+    let worst = [0.1, 1.0, 10.0, 100.0, 1000.0].map(sheared).into_iter().fold(0.0, f64::max);
+    assert!(worst < 1e-12, "{worst:e}");
+    row([
+        "RK4 steps, stiff shear",
+        "nowhere up to rate x step 1,000",
+        "none is needed",
+        "RK4 is exact: the gradient of a uniform shear is nilpotent",
+        &format!("at most {worst:.0e} of the log-stretch"),
+        "steps_beyond_the_stability_limit",
+    ]);
+}
+
+/// Fails without the rescaling of J.
+#[test]
+fn long_tau_overflows_the_jacobian() {
+    let source = in_square(Analytic::Saddle { rate: 1.0 });
+    let seed = [[0.25, 0.5, 0.5]];
+    // Ten steps a unit: the truncation of the stretch is z^4 / 120 = 8e-7 of it.
+    let out = |map: FlowMap| trace(&source, &map, 0.0, &seed, EVERYTHING);
+    let with = |tau: f64, integrator, precision| FlowMap { integrator, ..map(tau, (10.0 * tau) as usize, precision) };
+    let differences =
+        |precision| bisect(10.0, 2000.0, |tau| !out(with(tau, Integrator::Differences, precision)).log_stretch[0].is_finite());
+    let jacobian = bisect(10.0, 2000.0, |tau| !out(with(tau, Integrator::Tangent, Precision::F64)).jacobian[0][0].is_finite());
+    let [single, double] = [differences(Precision::F32), differences(Precision::F64)];
+    // ln of the largest number of each type.
+    assert!((jacobian - f64::from(f32::MAX).ln()).abs() < 1.0 && (single - jacobian).abs() < 3.0, "{jacobian} {single}");
+    assert!((double - f64::MAX.ln()).abs() < 3.0, "{double}");
+    let mut worst: f64 = 0.0;
+    for tau in [50.0, 100.0, 700.0, 800.0, 10_000.0] {
+        for precision in [Precision::F32, Precision::F64] {
+            let s = traced(&source, &with(tau, Integrator::Tangent, precision), 0.0, &seed)[0];
+            worst = worst.max((s / tau - 1.0).abs());
+            assert!((s / tau - 1.0).abs() < 2e-5, "rescaled, {precision:?}, tau {tau}: {s}");
+        }
+    }
+    row([
+        "long tau, overflow of J",
+        &format!("log-stretch above {single:.1} (differences, f32), {double:.0} (f64)"),
+        "no finite FTLE: the points count as missing",
+        "rescales the tangent and carries its logarithm",
+        &format!("at most {worst:.0e} of the log-stretch, up to 10,000"),
+        "long_tau_overflows_the_jacobian",
+    ]);
+}
+
+/// Means over squares of a lattice of this width: what pixels of several rays show of it.
+fn blocks(values: &[f64], width: usize, edge: usize) -> Vec<f64> {
+    let across = width / edge;
+    let mut means = vec![0.0; values.len() / (edge * edge)];
+    for (i, value) in values.iter().enumerate() {
+        means[i / width / edge * across + i % width / edge] += value / (edge * edge) as f64;
+    }
+    means
+}
+
+/// Kolmogorov's distance of two samples.
+fn distribution_distance(a: &[f64], b: &[f64]) -> f64 {
+    let sorted = |values: &[f64]| {
+        let mut values = values.to_vec();
+        values.sort_by(f64::total_cmp);
+        values
+    };
+    let (a, b) = (sorted(a), sorted(b));
+    let below = |values: &[f64], x: f64| values.partition_point(|v| *v <= x) as f64 / values.len() as f64;
+    a.iter().chain(&b).map(|&x| (below(&a, x) - below(&b, x)).abs()).fold(0.0, f64::max)
+}
+
+fn correlation(a: &[f64], b: &[f64]) -> f64 {
+    let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
+    let (ma, mb) = (mean(a), mean(b));
+    let sum = |f: &dyn Fn(f64, f64) -> f64| a.iter().zip(b).map(|(a, b)| f(a - ma, b - mb)).sum::<f64>();
+    sum(&|a, b| a * b) / (sum(&|a, _| a * a) * sum(&|_, b| b * b)).sqrt()
+}
+
+#[test]
+fn chaos_parts_single_from_double_precision() {
+    let (source, seeds) = (double_gyre(), lattice(&gyre_box(), [40, 20]));
+    let mut found = Vec::new();
+    for tau in [10.0, 20.0, 40.0, 60.0, 80.0, 120.0, 160.0, 240.0, 320.0] {
+        // The same steps, so that only rounding differs.
+        let [single, double] = [Precision::F32, Precision::F64]
+            .map(|precision| trace(&source, &map(tau, (20.0 * tau) as usize, precision), 0.0, &seeds, EVERYTHING));
+        let apart = |i: &usize| (0..2).map(|k| (single.arrival[*i][k] - double.arrival[*i][k]).powi(2)).sum::<f32>().sqrt() > 0.1;
+        let parted = (0..seeds.len()).filter(apart).count() as f64 / seeds.len() as f64;
+        let a: Vec<f64> = single.log_stretch.iter().map(|&s| f64::from(s) / tau).collect();
+        let b: Vec<f64> = double.log_stretch_f64.iter().map(|&s| s / tau).collect();
+        let mean = |v: &[f64]| v.iter().sum::<f64>() / v.len() as f64;
+        let drift = mean(&a) / mean(&b) - 1.0;
+        let picture = correlation(&blocks(&a, 40, 4), &blocks(&b, 40, 4));
+        found.push((tau, parted, correlation(&a, &b), drift, distribution_distance(&a, &b), picture));
+    }
+    for (tau, parted, correlation, drift, distance, picture) in &found {
+        let parted = 100.0 * parted;
+        println!(
+            "tau {tau}: {parted:.1} % parted, correlation {correlation:.4}, of 4x4 {picture:.4}, mean {drift:+.1e}, distribution {distance:.3}"
+        );
+    }
+    let parts = found.iter().find(|f| f.1 > 0.1).expect("paths part");
+    let before = found.iter().rev().find(|f| f.0 < parts.0).unwrap();
+    let last = found.last().unwrap();
+    // Rounding of 6e-8 grows to 0.1 at a rate of some 0.2: ln(1.6e6) / 0.2 = 70.
+    assert!((40.0..=160.0).contains(&parts.0), "{parts:?}");
+    assert!(last.1 > 0.5 && last.2 < 0.95, "points lose their value: {last:?}");
+    // Two samples of 800 differ by 0.068 (Kolmogorov, 5 %) if they have the same distribution.
+    assert!(found.iter().all(|f| f.3.abs() < 0.01 && f.4 < 0.068), "mean and distribution do not: {found:?}");
+    let refused = [40.0, 80.0, 160.0, 320.0].into_iter().find(|&tau| {
+        let map = FlowMap { steps: Steps::Auto { tolerance: TOLERANCE }, ..map(tau, 1, Precision::F32) };
+        matches!(cpu_tracer(source.clone(), &map, 0.0), Err(FlowError::StepsNotFound { .. }))
+    });
+    println!("steps = \"auto\" is refused from tau {refused:?}");
+    row([
+        "long tau, chaos, f32 against f64",
+        &format!("tau {} ({:.0} % of the paths part by 0.1; at {}: {:.0} %)", parts.0, 100.0 * parts.1, before.0, 100.0 * before.1),
+        "none: `integration_difference` compares steps in f64",
+        &format!(
+            "`steps = \"auto\"` is refused at tau {}: no number of steps agrees with twice as many",
+            refused.map_or("-".into(), |t| t.to_string())
+        ),
+        &format!(
+            "at tau {}: correlation of single FTLEs {:.2}, of pixels of 16 rays {:.2}; the mean {:+.1} %, distributions {:.3} apart (Kolmogorov)",
+            last.0,
+            last.2,
+            last.5,
+            100.0 * last.3,
+            last.4
+        ),
+        "chaos_parts_single_from_double_precision",
+    ]);
+}
+
+#[test]
+fn vanishing_velocity() {
+    let seeds = [[0.25, 0.5, 0.5]];
+    let lost = |precision| {
+        bisect(1.0, 1e20, |inverse| {
+            let rate = 1.0 / inverse;
+            let s = traced(&VelocitySource::clone(&in_square(Analytic::Saddle { rate })), &map(1.0, 16, precision), 0.0, &seeds)[0];
+            (s / rate - 1.0).abs() > 0.1
+        })
+    };
+    let [single, double] = [Precision::F32, Precision::F64].map(|precision| 1.0 / lost(precision));
+    // J = 1 + s: half an ulp of 1, 6e-8 and 1.1e-16, in each of 16 steps.
+    assert!((6e-8..1e-4).contains(&single) && (1.1e-16..1e-12).contains(&double), "{single:e} {double:e}");
+    // The velocity of the double gyre, scaled down until the picture says that it shows nothing.
+    let warns = |inverse: f64| {
+        let keys = format!("render.method = \"reference\"\ntime.tau = 10\nflow.steps = 50\nsource.amplitude = {:e}\n", 0.1 / inverse);
+        let mut said = false;
+        scene::run_frames(scene::setup(&scene::double_gyre([8, 4, 1], &keys), &[]), &RunOptions::default(), |frame| {
+            said |= frame.record.warnings.iter().any(|w| w.starts_with("FTLE is uniform"));
+        });
+        said
+    };
+    let mut inverse = 1.0;
+    while !warns(inverse) {
+        inverse *= 10.0;
+        assert!(inverse < 1e12, "no warning");
+    }
+    row([
+        "vanishing velocity",
+        &format!("log-stretch below {single:.0e} (f32), {double:.0e} (f64)"),
+        "warning in the record: FTLE is uniform",
+        &format!("warns when the double gyre is slower by {inverse:.0e}"),
+        "FTLE off by 10 % there",
+        "vanishing_velocity",
+    ]);
+}
