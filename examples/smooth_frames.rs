@@ -48,7 +48,8 @@ fn main() {
     .unwrap();
     let tone_map = scene.render.tone_map;
     let size = [scene.render.width, scene.render.height];
-    println!("{}: {size:?} pixels, truth of 2 x {truth_samples} samples; seconds since the window was there", file.display());
+    let name = file.file_stem().unwrap_or_default().display();
+    println!("{name}: {size:?} pixels, truth of 2 x {truth_samples} samples; seconds since the window was there");
     for method in [Method::Reference, Method::Marched, Method::TwoLevel] {
         if words.len() > 3 && !words[3..].iter().any(|word| word == method.name()) {
             continue;

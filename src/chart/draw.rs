@@ -122,6 +122,9 @@ fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl 
             None => series.push(Series { name: point.method.clone(), points: vec![(*x, *y)], is_line: false }),
         }
     }
+    // Points that fail are on no front.
+    let error = |point: &FtlePoint| if point.is_sound(panel.points) { point.rms } else { f64::INFINITY };
+    let sound: Vec<[f64; 2]> = panel.methods.iter().map(|point| [cost(point), error(point)]).collect();
     let label = |i: usize| (at[i][0], at[i][1], format!("{}, {}", panel.methods[i].setting, size(panel.methods[i].bytes)));
     Panel {
         title,
@@ -129,8 +132,8 @@ fn ftle_panel(panel: &FtlePanel, unit: &str, title: String, x: &str, cost: impl 
         y: format!("root mean square error of the FTLE{unit}"),
         is_y_log: true,
         series,
-        front: front(&at).into_iter().map(label).collect(),
-        pick: pick(&at, panel.tolerance).map(|i| (at[i][0], at[i][1])),
+        front: front(&sound).into_iter().map(label).collect(),
+        pick: pick(&sound, panel.tolerance).map(|i| (at[i][0], at[i][1])),
         levels: vec![(panel.tolerance, "tolerance".into())],
     }
 }
@@ -274,7 +277,9 @@ where
 
 /// A label of a logarithmic axis: 0.001 to 1000 in full, powers beyond.
 fn power(value: &f64) -> String {
-    if (1e-3..=1e3).contains(value) { format!("{value}") } else { format!("{value:.0e}") }
+    // Two digits, since ticks carry rounding.
+    let rounded = format!("{value:.1e}").parse().unwrap_or(*value);
+    if (1e-3..=1e3).contains(&rounded) { format!("{rounded}") } else { format!("{rounded:.0e}") }
 }
 
 fn draw_legend<B: DrawingBackend>(area: &DrawingArea<B, Shift>, panel: &Panel) -> Result<(), DrawError> {

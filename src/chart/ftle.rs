@@ -1,7 +1,8 @@
 //! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
 
-use super::{Charting, failed};
-use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
+use super::picture::with_method;
+use super::{Charting, device_name, failed};
+use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
 use crate::flow::{
@@ -10,8 +11,8 @@ use crate::flow::{
 use crate::render::Method;
 use crate::render::rng::{philox, unit};
 use crate::run::{Plan, RunError, Settings, Setup, Slide};
-use crate::surrogate::network::{Encoding, NetworkSettings};
-use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, Samples, SurrogateSettings, Trace};
+use crate::surrogate::network::{Encoding, NetworkSettings, Target};
+use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
 use serde::Serialize;
 use std::sync::atomic::AtomicBool;
 use std::time::Instant;
@@ -59,6 +60,11 @@ pub struct FtlePoint {
 }
 
 impl FtlePoint {
+    /// True if at most a thousandth of the points failed. Others are on no front, whatever the error at the points that are left.
+    pub fn is_sound(&self, points: usize) -> bool {
+        self.failed * 1000 <= points
+    }
+
     /// Seconds of `samples` samples, building included.
     pub fn seconds(&self, samples: f64) -> f64 {
         self.build_seconds + samples / self.samples_per_second
@@ -98,9 +104,7 @@ impl Opened {
         /// Intervals of a composed flow map of a closed form.
         const CLOSED: usize = 10;
         // The method of the scene plays no part.
-        let mut settings = settings.clone();
-        (settings.render.method, settings.render.until, settings.render.budget) = (Method::TwoLevel, None, None);
-        let Setup { plan, mut slides, .. } = Setup::new(settings)?;
+        let Setup { plan, mut slides, .. } = Setup::new(with_method(settings, Method::TwoLevel, settings.surrogate.kind))?;
         let slide = slides.next_slide(&NEVER)?.ok_or(RunError::EndedEarly)?;
         let (intervals, window_bytes) = match &slide.velocity {
             VelocitySource::Analytic(..) => (CLOSED, 0),
@@ -112,12 +116,7 @@ impl Opened {
                 (inner + 1, window.bytes() as u64)
             }
         };
-        let device_name = match device {
-            Device::Cpu { .. } => Cpu.name(),
-            #[cfg(feature = "cuda")]
-            Device::Cuda(device) => Cuda::new(device).name(),
-        };
-        Ok(Self { plan, slide, device_name, intervals, window_bytes })
+        Ok(Self { plan, slide, device_name: device_name(device), intervals, window_bytes })
     }
 
     /// Nodes of the grid of the velocity; `None` for closed forms.
@@ -199,21 +198,18 @@ struct Built {
 }
 
 impl Bench<'_, '_> {
-    /// Measures error and speed of a method, which writes the log-stretch at points in unit and domain coordinates.
+    /// Measures error and speed of a method. `answer` gives the log-stretch at points, `seconds` the time that points take.
     fn measure(
         &mut self,
         method: &str,
         setting: String,
         built: Built,
-        mut answer: impl FnMut(&[[f32; 3]], &[[f32; 3]], &mut Vec<f64>) -> Result<(), RunError> + Send,
+        answer: impl FnOnce(&Points) -> Result<Vec<f64>, RunError> + Send,
+        seconds: impl FnMut(&[[f32; 3]], &[[f32; 3]]) -> Result<f64, RunError> + Send,
     ) -> Result<(), RunError> {
         let tau = self.opened.plan.map.tau;
         let Self { charting, points, truth, timed, .. } = self;
-        let (values, samples_per_second) = charting.pool.install(|| {
-            let mut values = Vec::new();
-            answer(&points.unit, &points.domain, &mut values)?;
-            Ok::<_, RunError>((values, speed(timed, &mut answer)?))
-        })?;
+        let (values, samples_per_second) = charting.pool.install(|| Ok::<_, RunError>((answer(points)?, speed(timed, seconds)?)))?;
         let mut errors: Vec<f64> = Vec::with_capacity(truth.len());
         let (mut failed, mut peak) = (0, 0.0_f64);
         for (value, truth) in values.iter().zip(truth.iter()) {
@@ -248,44 +244,34 @@ impl Bench<'_, '_> {
     /// Measures a tracer of any device.
     fn measure_tracer(&mut self, method: &str, setting: String, tracer: &dyn Trace) -> Result<(), RunError> {
         let built = Built { seconds: 0.0, bytes: self.opened.window_bytes };
+        let answer = |points: &Points| {
+            let mut traced = Traced::default();
+            tracer.trace(&points.domain, Extras::default(), &mut traced).map_err(failed)?;
+            let single = || traced.log_stretch.iter().map(|s| f64::from(*s)).collect();
+            Ok(if traced.log_stretch_f64.is_empty() { single() } else { traced.log_stretch_f64 })
+        };
         let mut traced = Traced::default();
-        self.measure(method, setting, built, |_, seeds, out| {
-            tracer.trace(seeds, Extras::default(), &mut traced).map_err(failed)?;
-            out.clear();
-            if traced.log_stretch_f64.is_empty() {
-                out.extend(traced.log_stretch.iter().map(|s| f64::from(*s)));
-            } else {
-                out.extend_from_slice(&traced.log_stretch_f64);
-            }
-            Ok(())
-        })
+        self.measure(method, setting, built, answer, |_, seeds| tracer.seconds(seeds, &mut traced).map_err(failed))
     }
 
     fn measure_predictor(&mut self, method: &str, setting: String, seconds: f64, surrogate: &dyn Predict) -> Result<(), RunError> {
         let built = Built { seconds, bytes: surrogate.bytes() as u64 };
-        let mut values = Vec::new();
-        self.measure(method, setting, built, |unit, _, out| {
-            values.resize(unit.len(), 0.0);
-            surrogate.predict(unit, &mut values).map_err(failed)?;
-            out.clear();
-            out.extend(values.iter().map(|s| f64::from(*s)));
-            Ok(())
-        })
+        let answer = |points: &Points| {
+            let mut values = vec![0.0; points.unit.len()];
+            surrogate.predict(&points.unit, &mut values).map_err(failed)?;
+            Ok(values.into_iter().map(f64::from).collect())
+        };
+        let mut values = vec![0.0; self.timed.unit.len()];
+        self.measure(method, setting, built, answer, |unit, _| surrogate.seconds(unit, &mut values[..unit.len()]).map_err(failed))
     }
 }
 
 /// Samples per second: the median of three batches, after batches that grow until one takes long enough to be timed.
-fn speed(
-    timed: &Points,
-    answer: &mut impl FnMut(&[[f32; 3]], &[[f32; 3]], &mut Vec<f64>) -> Result<(), RunError>,
-) -> Result<f64, RunError> {
-    let mut values = Vec::new();
+fn speed(timed: &Points, mut seconds: impl FnMut(&[[f32; 3]], &[[f32; 3]]) -> Result<f64, RunError>) -> Result<f64, RunError> {
     let mut batch = MIN_BATCH;
     let mut time = |batch: usize| {
         let (unit, domain) = timed.first(batch);
-        let began = Instant::now();
-        answer(unit, domain, &mut values)?;
-        Ok::<_, RunError>(began.elapsed().as_secs_f64() / unit.len() as f64)
+        Ok::<_, RunError>(seconds(unit, domain)? / unit.len() as f64)
     };
     let mut seconds = time(batch)?;
     while seconds * (batch as f64) < TIMED / 3.0 && batch < timed.unit.len() {
@@ -387,8 +373,13 @@ fn tracer_of<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, what: &str,
 fn tracing<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, steps: usize, storage: &str) -> Result<(), RunError> {
     let plan = &bench.opened.plan.map;
     let sweep = |precision: Precision, factors: &[f64]| -> Vec<FlowMap> {
-        let mut numbers: Vec<usize> = factors.iter().map(|factor| ((steps as f64 * factor).round() as usize).max(1)).collect();
-        numbers.dedup();
+        let mut numbers = Vec::new();
+        for factor in factors {
+            let n = ((steps as f64 * factor).round() as usize).max(1);
+            if !numbers.contains(&n) {
+                numbers.push(n);
+            }
+        }
         let map = |n| FlowMap { integrator: Integrator::Tangent, precision, steps: Steps::Fixed(n), ..plan.clone() };
         numbers.into_iter().map(map).collect()
     };
@@ -448,7 +439,9 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
     for factor in [0.5, 1.0, 2.0] {
         let nodes = scaled(own, factor);
         let what = format!("composed flow maps of {} nodes", shape(nodes));
-        if !fits(bench, &what, nodes.iter().product::<usize>()) {
+        // Joining keeps half as many tables beside the others.
+        let count = nodes.iter().product::<usize>();
+        if !fits(bench, &what, count, 3 * count * (intervals + intervals.div_ceil(2))) {
             continue;
         }
         let began = Instant::now();
@@ -456,7 +449,7 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
         let per_interval = steps.div_ceil(intervals);
         let built = bench.charting.pool.install(|| Composition::trace(velocity, map, time, nodes, intervals, per_interval));
         let Some(plain) = built.map_err(RunError::Flow)? else {
-            bench.charting.skip(what, "not on a sphere");
+            bench.charting.skip("composed flow maps", "only on Cartesian grids, and only if particles never stop or wrap");
             return Ok(());
         };
         let plain_seconds = began.elapsed().as_secs_f64();
@@ -465,11 +458,17 @@ fn composed(bench: &mut Bench<'_, '_>, steps: usize) -> Result<(), RunError> {
         for (name, composition, seconds) in [("composition", &plain, plain_seconds), ("composition, hierarchical", &joined, joined_seconds)]
         {
             let built = Built { seconds, bytes: composition.bytes() as u64 };
-            bench.measure(name, format!("{} nodes", shape(nodes)), built, |unit, _, out| {
-                out.resize(unit.len(), 0.0);
-                composition.log_stretch(unit, out);
-                Ok(())
-            })?;
+            let of = |unit: &[[f32; 3]]| {
+                let mut values = vec![0.0; unit.len()];
+                composition.log_stretch(unit, &mut values);
+                values
+            };
+            let seconds = |unit: &[[f32; 3]], _: &[[f32; 3]]| {
+                let began = Instant::now();
+                of(unit);
+                Ok(began.elapsed().as_secs_f64())
+            };
+            bench.measure(name, format!("{} nodes", shape(nodes)), built, |points| Ok(of(&points.unit)), seconds)?;
         }
     }
     Ok(())
@@ -480,10 +479,14 @@ fn tables<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<(), 
     let map = bench.opened.plan.map.clone();
     let Some(tracer) = tracer_of(bench, backend, "the tracer of tables", &map)? else { return Ok(()) };
     let own = bench.opened.own_nodes(bench.charting.device.is_gpu());
+    // The first table compiles kernels.
+    let small = SurrogateSettings { kind: Kind::Table, table_nodes: Some(own.map(|n| n.min(8))) };
+    surrogate_of(bench, backend, "a small table", &small, &NetworkSettings::default(), &tracer)?;
     for factor in [1.0, 0.5, 2.0, 0.25, 4.0] {
         let nodes = scaled(own, factor);
         let what = format!("table of {} nodes", shape(nodes));
-        if !fits(bench, &what, nodes.iter().product()) {
+        let count = nodes.iter().product();
+        if !fits(bench, &what, count, count) {
             continue;
         }
         let settings = SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) };
@@ -521,7 +524,8 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
             Encoding::Frequency => format!("frequency, {} x {}", network.hidden_layers, network.width),
         };
         let what = format!("{name}, {size}");
-        if !fits(bench, &what, if kind == Kind::Residual { nodes.iter().product() } else { 0 }) {
+        let count = if kind == Kind::Residual { nodes.iter().product() } else { 0 };
+        if !fits(bench, &what, count, count) {
             continue;
         }
         let began = Instant::now();
@@ -533,8 +537,12 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
             if !bench.charting.has_time_for(&format!("{what}, {seconds} s of training")) {
                 break;
             }
-            let learned = bench.charting.pool.install(|| surrogate.learn(&buffer, seconds - trained, u64::MAX));
-            spent += learned.map_err(failed)?.seconds;
+            let learned = bench.charting.pool.install(|| surrogate.learn(&buffer, seconds - trained, u64::MAX)).map_err(failed)?;
+            if learned.steps == 0 {
+                bench.charting.skip(format_args!("{what}, {seconds} s of training"), "no optimizer step ended in time");
+                continue;
+            }
+            spent += learned.seconds;
             trained = seconds;
             let frozen = surrogate.freeze().map_err(failed)?;
             bench.measure_predictor(name, format!("{size}, {seconds} s"), spent, &frozen)?;
@@ -546,19 +554,19 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
 impl Bench<'_, '_> {
     /// Traces uniform random labels for some seconds; returns them with the seconds.
     fn labels(&mut self, tracer: &dyn Trace) -> Result<(ReplayBuffer, f64), RunError> {
-        let mut traced = Traced::default();
-        let time = |points: &Points, traced: &mut Traced| {
+        let network = &self.opened.plan.scene.network;
+        let arrival = network.target == Target::FlowMap;
+        let extras = Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 };
+        let trace = |count: usize, stream: u32| {
+            let points = Points::random(self.opened, count, stream);
             let began = Instant::now();
-            self.charting.pool.install(|| tracer.trace(&points.domain, Extras::default(), traced)).map_err(failed)?;
-            Ok::<_, RunError>(began.elapsed().as_secs_f64())
+            let labels = self.charting.pool.install(|| audit::trace(tracer, &points.unit, extras)).map_err(failed)?.samples;
+            Ok::<_, RunError>((labels, began.elapsed().as_secs_f64()))
         };
-        let probe = Points::random(self.opened, MIN_BATCH, 3);
-        let per_second = MIN_BATCH as f64 / time(&probe, &mut traced)?;
+        let per_second = MIN_BATCH as f64 / trace(MIN_BATCH, 3)?.1;
         let count = ((LABELS_SECONDS * per_second) as usize).clamp(MIN_BATCH, MAX_LABELS);
-        let points = Points::random(self.opened, count, 4);
-        let seconds = time(&points, &mut traced)?;
-        let samples = Samples { points: points.unit, log_stretch: std::mem::take(&mut traced.log_stretch), ..Samples::default() };
-        Ok((ReplayBuffer::holding(&samples), seconds))
+        let (labels, seconds) = trace(count, 4)?;
+        Ok((ReplayBuffer::holding(&labels), seconds))
     }
 }
 
@@ -593,16 +601,21 @@ fn shape(nodes: [usize; 3]) -> String {
     used.join("x")
 }
 
-/// True if so many nodes can be traced in a quarter of the time that is left, at the speed of the fastest tracer so far, and fit into memory.
-fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize) -> bool {
-    const MAX_NODES: usize = 1 << 27;
+/// True if so many nodes can be traced in a quarter of the time that is left, and so many values fit into memory.
+fn fits(bench: &mut Bench<'_, '_>, what: &str, nodes: usize, values: usize) -> bool {
+    /// 2 GiB of f32.
+    const MAX_VALUES: usize = 1 << 29;
     if !bench.charting.has_time_for(what) {
         return false;
     }
-    let traced = bench.found.iter().filter(|point| point.method.starts_with("tangent")).map(|point| point.samples_per_second);
-    let seconds = nodes as f64 / traced.fold(1e4, f64::max);
-    let affordable = 0.25 * bench.charting.left();
-    if nodes > MAX_NODES || seconds > affordable {
+    // The first one has the chosen steps.
+    let traced = bench.found.iter().find(|point| point.method.starts_with("tangent")).map_or(1e4, |point| point.samples_per_second);
+    let seconds = nodes as f64 / traced;
+    if values > MAX_VALUES {
+        bench.charting.skip(what, format_args!("it would take {:.1} GiB", values as f64 / f64::from(1 << 28)));
+        return false;
+    }
+    if seconds > 0.25 * bench.charting.left() {
         bench.charting.skip(what, format_args!("it would take {seconds:.0} s to trace, of {:.0} s left", bench.charting.left()));
         return false;
     }

@@ -25,7 +25,9 @@ pub use train::{Epoch, TrainOptions, TrainReport, train};
 pub use trial::{Choice, TRIAL_SECONDS, choose};
 pub use verdict::verdict;
 
-use crate::backend::{BackendError, Device};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::backend::{Backend as _, BackendError, Cpu, Device};
 use crate::run::{RunError, Settings};
 use serde::Serialize;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -94,6 +96,17 @@ impl Charting<'_> {
         self.not_measured.push(format!("{what}: {why}"));
     }
 
+    /// Notes that something was not measured because it was refused. A lost device is an error.
+    fn refused(&mut self, what: impl std::fmt::Display, error: RunError) -> Result<(), RunError> {
+        if let RunError::Device(device) = &error
+            && device.is_fault()
+        {
+            return Err(error);
+        }
+        self.skip(what, error);
+        Ok(())
+    }
+
     /// True if there is time for something. Otherwise notes that it was not measured.
     fn has_time_for(&mut self, what: &str) -> bool {
         if self.stop.load(Ordering::Relaxed) {
@@ -120,6 +133,15 @@ impl Charting<'_> {
 
     fn left(&self) -> f64 {
         self.ends.saturating_duration_since(Instant::now()).as_secs_f64()
+    }
+}
+
+/// Name of a device, as in the records.
+pub fn device_name(device: &Device) -> String {
+    match device {
+        Device::Cpu { .. } => Cpu.name(),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => Cuda::new(device).name(),
     }
 }
 

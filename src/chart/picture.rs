@@ -1,13 +1,15 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
 use super::{Charting, failed};
-use crate::backend::{Device, TracedOnce, stratified_points};
+#[cfg(feature = "cuda")]
+use crate::backend::cuda::Cuda;
+use crate::backend::{Backend, Cpu, Device};
 use crate::publish::compare_films;
-use crate::render::smooth::LIT;
+use crate::render::smooth::{LIT, squared_slope};
 use crate::render::{Film, Method, TransferSettings};
-use crate::run::{Event, Frame, RunError, RunOptions, Settings, Setup, run};
+use crate::run::{Event, Frame, Plan, RunError, RunOptions, Settings, Setup, Slide, run, settled_colours};
 use crate::surrogate::Kind;
-use crate::trust::Strata;
+use rayon::prelude::*;
 use serde::Serialize;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Instant;
@@ -38,7 +40,7 @@ pub struct PicturePoint {
     pub psnr_all: f64,
     /// Mean of squared error / (radiance^2 + 0.01) over lit pixels, linear.
     pub relmse: f64,
-    /// Structural similarity of the tone-mapped luma with the mean of the truth's halves.
+    /// Structural similarity of the tone-mapped luma with the mean of the truth's halves; of the last frame only.
     pub ssim: Option<f64>,
     /// PSNR over lit pixels that the frame states; `None` if the method states none.
     pub stated_psnr: Option<f64>,
@@ -91,13 +93,13 @@ pub struct PicturePanel {
     pub size: [usize; 2],
     /// Samples a pixel of both halves of the first window's truth.
     pub truth_samples: f64,
-    /// PSNR over lit pixels between the halves. Their mean is 6 dB better.
+    /// PSNR over lit pixels of the mean of the halves, whose noise is taken off from errors.
     pub truth_psnr: f64,
     /// One curve per method and surrogate.
     pub curves: Vec<PictureCurve>,
 }
 
-/// Two independent pictures of the same scene. The product of the differences to both is the squared error of a third one without their noise.
+/// Two independent pictures of the same scene. Half of their difference is the noise of their mean, which is taken off from squared errors against it.
 #[derive(Debug, Clone)]
 pub struct Truth {
     /// The halves.
@@ -130,33 +132,71 @@ pub struct PictureErrors {
     pub relmse: f64,
 }
 
-/// Errors of a film against the truth; lit pixels have an opacity above [`LIT`] there. `tone_map` is `[contrast, brightness, gamma]`.
-pub fn picture_errors(film: &Film, truth: &Truth, [contrast, brightness, gamma]: [f64; 3]) -> PictureErrors {
+/// Sums of [`picture_errors`] over pixels.
+#[derive(Default, Clone, Copy)]
+struct ErrorSums {
+    linear: f64,
+    relative: f64,
+    /// Tone-mapped squared error and its noise, over lit pixels and over all.
+    mapped: [[f64; 2]; 2],
+    lit: f64,
+}
+
+impl std::ops::Add for ErrorSums {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        let mapped = std::array::from_fn(|which| std::array::from_fn(|k| self.mapped[which][k] + other.mapped[which][k]));
+        Self { linear: self.linear + other.linear, relative: self.relative + other.relative, mapped, lit: self.lit + other.lit }
+    }
+}
+
+/// Errors of a film against the truth; lit pixels have an opacity above [`LIT`] there. `tone_map` is `[contrast, brightness, gamma]`. A PSNR is told
+/// up to 20 dB above that of the truth.
+pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> PictureErrors {
+    let [contrast, brightness, gamma] = tone_map;
     let tone = |c: f32| ((f64::from(c) - 0.5) * contrast + brightness).clamp(0.0, 1.0).powf(1.0 / gamma);
     let [a, b] = &truth.halves;
-    let (mut linear, mut relative, mut mapped, mut lit) = (0.0, 0.0, [0.0; 2], 0.0);
-    for i in 0..film.rgba.len() {
-        let (mut square, mut product, mut relative_square) = (0.0, 0.0, 0.0);
+    let of_pixel = |i: usize| {
+        let mut sums = ErrorSums::default();
         for k in 0..3 {
             let (c, a, b) = (film.rgba[i][k], a.rgba[i][k], b.rgba[i][k]);
+            let mean = 0.5 * (a + b);
             let error = f64::from(c - a) * f64::from(c - b) / 3.0;
-            product += error;
-            relative_square += error / (f64::from(a) * f64::from(b)).max(0.0).mul_add(1.0, 0.01);
-            square += (tone(c) - tone(a)) * (tone(c) - tone(b)) / 3.0;
+            // The tone map of a noisy picture is not that of its mean; the slope carries small noise through it.
+            let noise = f64::from(squared_slope(tone_map, mean)) * f64::from(0.5 * (a - b)).powi(2) / 3.0;
+            sums.linear += error;
+            sums.relative += error / f64::from(mean * mean + 0.01);
+            sums.mapped[1][0] += (tone(c) - tone(mean)).powi(2) / 3.0 - noise;
+            sums.mapped[1][1] += noise;
         }
-        mapped[1] += square;
         if a.rgba[i][3] + b.rgba[i][3] > 2.0 * LIT {
-            (linear, relative, mapped[0], lit) = (linear + product, relative + relative_square, mapped[0] + square, lit + 1.0);
+            ErrorSums { mapped: [sums.mapped[1]; 2], lit: 1.0, ..sums }
+        } else {
+            ErrorSums { mapped: [[0.0; 2], sums.mapped[1]], ..ErrorSums::default() }
+        }
+    };
+    let sums = (0..film.rgba.len()).into_par_iter().with_min_len(1 << 12).map(of_pixel).reduce(ErrorSums::default, |a, b| a + b);
+    // The truth's noise may leave a squared error below zero.
+    let decibels = |[square, noise]: [f64; 2], count: f64| -10.0 * (square.max(0.01 * noise) / count).max(1e-12).log10();
+    PictureErrors {
+        rms: (sums.linear / sums.lit).max(0.0).sqrt(),
+        psnr: decibels(sums.mapped[0], sums.lit),
+        psnr_all: decibels(sums.mapped[1], film.rgba.len() as f64),
+        relmse: (sums.relative / sums.lit).max(0.0),
+    }
+}
+
+/// PSNR over lit pixels, in decibels, of the mean of two independent pictures, from their difference.
+pub(super) fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
+    let (mut sum, mut lit) = (0.0, 0.0);
+    for (a, b) in a.rgba.iter().zip(&b.rgba).filter(|(a, b)| a[3] + b[3] > 2.0 * LIT) {
+        lit += 1.0;
+        for (a, b) in a[..3].iter().zip(&b[..3]) {
+            sum += f64::from(squared_slope(tone_map, 0.5 * (a + b))) * f64::from(0.5 * (a - b)).powi(2) / 3.0;
         }
     }
-    // Noise may leave a squared error below zero.
-    let decibels = |mean: f64| -10.0 * mean.max(1e-12).log10();
-    PictureErrors {
-        rms: (linear / lit).max(0.0).sqrt(),
-        psnr: decibels(mapped[0] / lit),
-        psnr_all: decibels(mapped[1] / film.rgba.len() as f64),
-        relmse: (relative / lit).max(0.0),
-    }
+    -10.0 * (sum / lit).max(1e-12).log10()
 }
 
 /// Transfer function for all pictures of a chart, scaled to the first slide's FTLE where the scene leaves it open.
@@ -167,13 +207,15 @@ pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSet
     // No method is asked for a picture here, and `auto` is not one.
     let mut setup = Setup::new(with_method(settings, Method::Reference, Kind::Table))?;
     let slide = setup.slides.next_slide(&AtomicBool::new(false))?.ok_or(RunError::EndedEarly)?;
-    let layers = if setup.plan.domain.dimensions == 3 { 16 } else { 1 };
-    let points = stratified_points(&Strata::even([64, 64, layers], 1), settings.seed, u64::MAX);
-    let seeds: Vec<[f32; 3]> = points.into_iter().map(|point| setup.plan.domain.from_unit(point)).collect();
-    let traced = device.trace(&slide.velocity, &setup.plan.map, slide.time, &seeds).map_err(failed)?;
-    let TracedOnce { flow, traced, .. } = traced;
-    let ftle: Vec<f32> = traced.log_stretch.iter().map(|s| s / flow.tau() as f32).collect();
-    Ok(settings.transfer.clone().unwrap_or_default().scaled_to(&ftle))
+    fn of<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide) -> Result<TransferSettings, RunError> {
+        let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
+        settled_colours(plan, &tracer, slide)
+    }
+    match device {
+        Device::Cpu { .. } => of(Cpu, &setup.plan, &slide),
+        #[cfg(feature = "cuda")]
+        Device::Cuda(device) => of(Cuda::new(device), &setup.plan, &slide),
+    }
 }
 
 /// Runs slide `slide` of a scene, counted from 0, until `seen` returns false for a frame. Returns the bytes of the surrogate; `None` if the source ends
@@ -187,7 +229,6 @@ pub(super) fn still(
     let mut settings = settings;
     settings.time.slides = Some(slide + 1);
     (settings.time.warmup_frames, settings.time.frames_per_slide) = (0, 1_000_000);
-    (settings.render.until, settings.render.budget) = (None, None);
     let enough = AtomicBool::new(false);
     let mut sink = |event: Event| {
         if let Event::Frame(frame) = event
@@ -209,7 +250,7 @@ pub(super) fn still(
 /// The scene with another method, and a number of samples that the method accepts.
 pub(super) fn with_method(settings: &Settings, method: Method, kind: Kind) -> Settings {
     let mut settings = settings.clone();
-    settings.render.method = method;
+    (settings.render.method, settings.render.until, settings.render.budget) = (method, None, None);
     if !method.is_smooth() {
         settings.render.samples = settings.render.samples.ceil().max(1.0);
     }
@@ -252,10 +293,20 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         Ok(Some((Truth::new([a, b])?, samples)))
     };
     let (first_truth, samples) = truth(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
-    let last_truth = truth(SLIDES - 1, TRUTH_SHARES[1])?.map(|(truth, _)| truth);
+    let last_truth = match truth(SLIDES - 1, TRUTH_SHARES[1]) {
+        Ok(found) => found.map(|(truth, _)| truth),
+        Err(error) => {
+            charting.refused("the truth of a window that slides", error)?;
+            None
+        }
+    };
     let truth = first_truth;
-    let one = Truth::new([truth.halves[1].clone(), truth.halves[1].clone()])?;
-    let truth_psnr = picture_errors(&truth.halves[0], &one, settings.render.tone_map).psnr;
+    if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
+        charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
+        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new() });
+    }
+    let [a, b] = &truth.halves;
+    let truth_psnr = noise_psnr(a, b, settings.render.tone_map);
     let mut curves = Vec::new();
     let candidates = [
         (Method::TwoLevel, Kind::Table),
@@ -267,6 +318,8 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         (Method::TwoLevel, Kind::Network),
         (Method::Gated, Kind::Network),
     ];
+    // The first frame compiles kernels.
+    still(with_method(&settings, Method::TwoLevel, Kind::Table), &options, 0, |_| false)?;
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
         let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
         let mut curve = PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None };
@@ -275,8 +328,17 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         }
         let longest = (charting.left() / (candidates.len() - number) as f64).min(LONGEST[usize::from(charting.device.is_gpu())]);
         let scene = with_method(&settings, method, kind);
-        curve.bytes = measure(&scene, &options, &truth, 0.8 * longest, charting.stop, &mut curve.frames)?;
-        curve.sliding = sliding(&scene, &options, last_truth.as_ref(), 0.2 * longest)?;
+        match measure(&scene, &options, &truth, 0.8 * longest, charting.stop, &mut curve.frames) {
+            Ok(bytes) => curve.bytes = bytes,
+            Err(error) => {
+                charting.refused(format_args!("pictures by {}", curve.name()), error)?;
+                continue;
+            }
+        }
+        match sliding(&scene, &options, last_truth.as_ref(), 0.2 * longest, charting.stop) {
+            Ok(found) => curve.sliding = found,
+            Err(error) => charting.refused(format_args!("a sliding window by {}", curve.name()), error)?,
+        }
         curves.push(curve);
     }
     Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves })
@@ -292,7 +354,7 @@ fn measure(
     frames: &mut Vec<PicturePoint>,
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
-    let mut seconds = 0.0;
+    let (mut seconds, mut last) = (0.0, None);
     let bytes = still(scene.clone(), options, 0, |frame| {
         let record = &frame.record;
         seconds += record.seconds.slide + record.seconds.total;
@@ -307,19 +369,29 @@ fn measure(
             psnr: errors.psnr,
             psnr_all: errors.psnr_all,
             relmse: errors.relmse,
-            ssim: compare_films(film, &truth.mean, frame.tone_map).ok().and_then(|compared| compared.ssim),
+            ssim: None,
             stated_psnr: record.picture_error.map(|stated| stated.psnr.value),
         });
+        last = Some((frame.film.clone(), frame.tone_map));
         errors.psnr < ENOUGH && seconds < longest && !stop.load(Ordering::Relaxed)
     })?;
+    if let (Some((film, tone_map)), Some(point)) = (last, frames.last_mut()) {
+        let film = if scene.render.method.is_smooth() { &*film } else { &sum };
+        point.ssim = compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
+    }
     Ok(bytes.unwrap_or(0))
 }
 
 /// A window that slides at every frame; `None` if the source has too few slides, or a frame took too long.
-fn sliding(scene: &Settings, options: &RunOptions, truth: Option<&Truth>, longest: f64) -> Result<Option<Sliding>, RunError> {
+fn sliding(
+    scene: &Settings,
+    options: &RunOptions,
+    truth: Option<&Truth>,
+    longest: f64,
+    stop: &AtomicBool,
+) -> Result<Option<Sliding>, RunError> {
     let mut scene = scene.clone();
     (scene.time.slides, scene.time.frames_per_slide, scene.time.warmup_frames) = (Some(SLIDES), 1, 0);
-    (scene.render.until, scene.render.budget) = (None, None);
     let (mut seconds, mut frames, mut psnr) = (0.0, 0, None);
     let enough = AtomicBool::new(false);
     let mut sink = |event: Event| {
@@ -331,7 +403,7 @@ fn sliding(scene: &Settings, options: &RunOptions, truth: Option<&Truth>, longes
             if record.slide + 1 == SLIDES as u64 {
                 psnr = truth.map(|truth| picture_errors(&film, truth, tone_map).psnr);
             }
-            enough.store(seconds > longest, Ordering::Relaxed);
+            enough.store(seconds > longest || stop.load(Ordering::Relaxed), Ordering::Relaxed);
         }
     };
     run(Setup::new(scene)?, options, &mut sink, &enough)?;

@@ -4,8 +4,8 @@ use super::ftle::Opened;
 use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
-use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest};
-use crate::flow::{Extras, FlowMap, Traced};
+use crate::backend::{Backend, BackendError, Cpu, Device, DeviceError, Surrogate as _, SurrogateRequest};
+use crate::flow::{FlowMap, Traced};
 use crate::run::RunError;
 use crate::source::SourceKind;
 use crate::surrogate::network::NetworkSettings;
@@ -88,13 +88,18 @@ fn point(
     if !charting.has_time_for(&what) {
         return Ok(None);
     }
+    let affordable = 0.25 * charting.left();
     let measured = match charting.device {
-        Device::Cpu { .. } => charting.pool.install(|| on(&mut Cpu, opened, map, BATCH[0])),
+        Device::Cpu { .. } => charting.pool.install(|| on(&mut Cpu, opened, map, false, affordable)),
         #[cfg(feature = "cuda")]
-        Device::Cuda(device) => charting.pool.install(|| on(&mut Cuda::new(device), opened, map, BATCH[1])),
+        Device::Cuda(device) => charting.pool.install(|| on(&mut Cuda::new(device), opened, map, true, affordable)),
     };
     match measured {
-        Ok(costs) => Ok(Some(costs.at(axis, value))),
+        Ok(Some(costs)) => Ok(Some(costs.at(axis, value))),
+        Ok(None) => {
+            charting.skip(what, format_args!("its table would take more than {affordable:.0} s"));
+            Ok(None)
+        }
         Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
         Err(error) => {
             charting.skip(what, error);
@@ -125,26 +130,28 @@ impl Costs {
     }
 }
 
-/// Seconds of a sample, the fastest of three batches.
-fn fastest(samples: usize, mut work: impl FnMut() -> Result<(), BackendError>) -> Result<f64, BackendError> {
-    let mut best = f64::INFINITY;
-    for _ in 0..3 {
-        let began = Instant::now();
-        work()?;
-        best = best.min(began.elapsed().as_secs_f64());
-    }
-    Ok(best / samples as f64)
+/// Seconds of a sample, the median of three batches.
+fn median(samples: usize, mut seconds: impl FnMut() -> Result<f64, DeviceError>) -> Result<f64, BackendError> {
+    let mut three = [seconds()?, seconds()?, seconds()?];
+    three.sort_unstable_by(f64::total_cmp);
+    Ok(three[1] / samples as f64)
 }
 
-fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, batch: usize) -> Result<Costs, BackendError> {
+/// `None` if the table would take longer than `affordable` seconds.
+fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, is_gpu: bool, affordable: f64) -> Result<Option<Costs>, BackendError> {
     static NEVER: AtomicBool = AtomicBool::new(false);
     let chosen = FlowMap { steps: opened.auto_steps(), ..map.clone() };
     let tracer = backend.tracer(&opened.slide.velocity, &chosen, opened.slide.time)?;
+    let batch = BATCH[usize::from(is_gpu)];
     let [unit, seeds] = opened.random_points(batch);
     let mut traced = Traced::default();
-    let trace = fastest(batch, || Ok(tracer.trace(&seeds, Extras::default(), &mut traced)?))?;
+    let trace = median(batch, || tracer.seconds(&seeds, &mut traced))?;
+    let nodes = opened.own_nodes(is_gpu);
+    if trace * nodes.iter().product::<usize>() as f64 > affordable {
+        return Ok(None);
+    }
     let request = SurrogateRequest {
-        settings: &SurrogateSettings { kind: Kind::Table, table_nodes: Some(opened.own_nodes(batch > BATCH[0])) },
+        settings: &SurrogateSettings { kind: Kind::Table, table_nodes: Some(nodes) },
         network: &NetworkSettings::default(),
         domain: &opened.plan.domain,
         seed: opened.plan.scene.seed,
@@ -156,6 +163,6 @@ fn on<B: Backend>(backend: &mut B, opened: &Opened, map: &FlowMap, batch: usize)
     let table_seconds = began.elapsed().as_secs_f64();
     let frozen = surrogate.freeze()?;
     let mut values = vec![0.0; batch];
-    let table = fastest(batch, || Ok(frozen.predict(&unit, &mut values)?))?;
-    Ok(Costs { steps: tracer.flow().steps(), trace, table, table_seconds })
+    let table = median(batch, || frozen.seconds(&unit, &mut values))?;
+    Ok(Some(Costs { steps: tracer.flow().steps(), trace, table, table_seconds }))
 }

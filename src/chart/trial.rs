@@ -1,16 +1,17 @@
 //! A short trial of methods on a scene: the choice of `method = "auto"`.
 
-use super::Truth;
-use super::picture::{fixed_colours, picture_errors, still, with_method};
+use super::device_name;
+use super::picture::{fixed_colours, noise_psnr, still, with_method};
 use crate::backend::Device;
 use crate::render::{Film, Method};
 use crate::run::{RunError, RunOptions, Settings};
-use crate::surrogate::Kind;
 use serde::{Deserialize, Serialize};
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Seconds of a trial, all methods together, preparation of the slide not counted.
 pub const TRIAL_SECONDS: f64 = 4.0;
+/// Samples a pixel of a frame.
+const SAMPLES: f64 = 2.0;
 /// PSNR over lit pixels, in decibels, to which the methods race.
 const TARGET: f64 = 40.0;
 
@@ -43,29 +44,29 @@ pub fn choose(settings: &Settings, device: &Device, threads: usize, stop: &Atomi
     let mut settings = settings.clone();
     settings.transfer = Some(fixed_colours(&settings, device)?);
     let options = RunOptions { device: device.clone(), threads, ..RunOptions::default() };
-    let target = match settings.render.until {
-        Some(crate::render::Target::Psnr(decibels)) => decibels,
-        _ => TARGET,
-    };
-    let (mut seconds, mut name) = (Vec::new(), String::new());
+    // Small frames, so that a method ends soon after the target.
+    settings.render.samples = SAMPLES;
+    let kind = settings.surrogate.kind;
+    // The first frame compiles kernels.
+    still(with_method(&settings, Method::TwoLevel, kind), &options, 0, |_| false)?;
+    let mut seconds = Vec::new();
     for method in METHODS {
-        let scene = with_method(&settings, method, Kind::Table);
+        let scene = with_method(&settings, method, kind);
         let longest = TRIAL_SECONDS / METHODS.len() as f64;
         let (mut since, mut spent, mut reached) = (0.0, 0.0, Reached::default());
         still(scene, &options, 0, |frame| {
             let record = &frame.record;
             (since, spent) = (since + record.seconds.slide + record.seconds.total, spent + record.seconds.total);
-            name.clone_from(&record.device);
             match record.picture_error {
                 Some(stated) => reached.stated(since, record.seconds.total, stated.psnr.value),
                 None => reached.independent(since, record.seconds.total, &frame.film, frame.tone_map),
             }
-            reached.psnr < target && (spent < longest || reached.frames < 2) && !stop.load(Ordering::Relaxed)
+            reached.psnr < TARGET && (spent < longest || reached.frames < 2) && !stop.load(Ordering::Relaxed)
         })?;
-        seconds.push((method, reached.seconds_to(target)));
+        seconds.push((method, reached.seconds_to(TARGET)));
     }
     let method = seconds.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(Method::TwoLevel, |(method, _)| *method);
-    Ok(Choice { method, seconds, target, device: name })
+    Ok(Choice { method, seconds, target: TARGET, device: device_name(device) })
 }
 
 /// State of a racing method.
@@ -76,8 +77,8 @@ struct Reached {
     seconds: f64,
     last: f64,
     psnr: f64,
-    /// The first frame of a method that states no error.
-    first: Option<Film>,
+    /// Sums of the odd and of the even frames of a method that states no error.
+    halves: Option<[Film; 2]>,
 }
 
 impl Reached {
@@ -85,15 +86,15 @@ impl Reached {
         (self.frames, self.seconds, self.last, self.psnr) = (self.frames + 1, seconds, last, psnr);
     }
 
-    /// Frames with independent noise: half the squared difference of two is the error of one, and their mean has less in proportion to their number.
+    /// Frames with independent noise, which the two halves tell.
     fn independent(&mut self, seconds: f64, last: f64, film: &Film, tone_map: [f64; 3]) {
         (self.frames, self.seconds, self.last) = (self.frames + 1, seconds, last);
-        let Some(first) = &self.first else {
-            self.first = Some(film.clone());
-            return;
-        };
-        if let Ok(other) = Truth::new([film.clone(), film.clone()]) {
-            self.psnr = picture_errors(first, &other, tone_map).psnr + 10.0 * (2.0 * self.frames as f64).log10();
+        let halves = self.halves.get_or_insert_with(|| [(); 2].map(|()| Film::new(film.width, film.height)));
+        // All films of a trial have one size.
+        let added = halves[self.frames as usize % 2].accumulate(film).is_ok();
+        if added && self.frames.is_multiple_of(2) {
+            let [a, b] = &*halves;
+            self.psnr = noise_psnr(a, b, tone_map);
         }
     }
 
@@ -137,7 +138,7 @@ mod tests {
         let linear = [1.0, 0.5, 1.0];
         reached.independent(1.0, 1.0, &film(0.01), linear);
         reached.independent(2.0, 1.0, &film(-0.01), linear);
-        // Their squared difference is 4e-4; one frame has half of it, the mean of two a quarter: 40 dB.
+        // Their difference is 0.02; half of it is the noise of their mean: 40 dB.
         assert!((reached.psnr - 40.0).abs() < 0.01, "{}", reached.psnr);
     }
 }

@@ -32,46 +32,60 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
 fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
     let per = if time_unit.is_empty() { String::new() } else { format!(" /{time_unit}") };
     let tolerance = panel.tolerance;
+    let methods: Vec<&FtlePoint> = panel.methods.iter().filter(|point| point.is_sound(panel.points)).collect();
+    let best_of = |class: &[&str]| {
+        let errors = methods.iter().filter(|point| class.iter().any(|prefix| point.method.starts_with(prefix))).map(|point| point.rms);
+        errors.fold(f64::INFINITY, f64::min)
+    };
     for samples in CHARGED {
-        let points: Vec<[f64; 2]> = panel.methods.iter().map(|point| [point.seconds(samples), point.rms]).collect();
-        match pick(&points, tolerance) {
-            Some(best) => {
-                let best = &panel.methods[best];
-                said.push(format!(
-                    "{samples:.0e} FTLE samples within {tolerance:.2e}{per}: {} takes {}, building included (rms {:.1e}, {}).",
-                    name(best),
-                    duration(best.seconds(samples)),
-                    best.rms,
-                    size(best.bytes)
-                ));
-            }
-            None => said.push(format!("No method is within {tolerance:.2e}{per}.")),
-        }
-    }
-    // The classes of methods, and from how many samples on the cheapest of each within the tolerance beats tracing.
-    let within =
-        |prefix: &str| panel.methods.iter().filter(|point| point.method.starts_with(prefix) && point.rms <= tolerance).collect::<Vec<_>>();
-    let fastest = |points: &[&FtlePoint]| points.iter().map(|point| point.samples_per_second).fold(0.0, f64::max);
-    let tracing = fastest(&within("tangent"));
-    for class in ["composition", "table", "base + residual", "network"] {
-        let points = within(class);
-        let pays = |point: &&FtlePoint| {
-            let saved = 1.0 / tracing - 1.0 / point.samples_per_second;
-            if saved > 0.0 { point.build_seconds / saved } else { f64::INFINITY }
+        let points: Vec<[f64; 2]> = methods.iter().map(|point| [point.seconds(samples), point.rms]).collect();
+        let Some(best) = pick(&points, tolerance) else {
+            said.push(format!("No method is within {tolerance:.2e}{per}."));
+            break;
         };
-        let from = points.iter().map(pays).fold(f64::INFINITY, f64::min);
-        said.push(if points.is_empty() {
-            let best =
-                panel.methods.iter().filter(|point| point.method.starts_with(class)).map(|point| point.rms).fold(f64::INFINITY, f64::min);
-            if best.is_finite() {
+        let best = methods[best];
+        said.push(format!(
+            "{samples:.0e} FTLE samples within {tolerance:.2e}{per}: {} takes {}, building included (rms {:.1e}, {}).",
+            name(best),
+            duration(best.seconds(samples)),
+            best.rms,
+            size(best.bytes)
+        ));
+    }
+    // From how many samples on the cheapest setting of each class within the tolerance beats the fastest tracing within it.
+    const TRACING: [&str; 3] = ["tangent", "differences", "Dormand-Prince"];
+    let within = |class: &[&str]| {
+        let of_class = |point: &&&FtlePoint| class.iter().any(|prefix| point.method.starts_with(prefix)) && point.rms <= tolerance;
+        methods.iter().filter(of_class).copied().collect::<Vec<_>>()
+    };
+    let fastest = within(&TRACING).into_iter().max_by(|a, b| a.samples_per_second.total_cmp(&b.samples_per_second));
+    for class in ["composition", "table", "base + residual", "network"] {
+        let points = within(&[class]);
+        if points.is_empty() {
+            let best = best_of(&[class]);
+            said.push(if best.is_finite() {
                 format!("{class}: not within the tolerance; its best rms is {best:.1e}{per}.")
             } else {
                 format!("{class}: not measured.")
-            }
-        } else if from.is_finite() && tracing > 0.0 {
-            format!("{class}: cheaper than tracing from {from:.1e} samples on, at {:.1} times its speed.", fastest(&points) / tracing)
-        } else {
-            format!("{class}: within the tolerance, and never cheaper than tracing.")
+            });
+            continue;
+        }
+        let Some(tracing) = fastest else {
+            said.push(format!("{class}: within the tolerance, as no tracing that was measured is."));
+            continue;
+        };
+        let pays = |point: &FtlePoint| {
+            let saved = 1.0 / tracing.samples_per_second - 1.0 / point.samples_per_second;
+            if saved > 0.0 { point.build_seconds / saved } else { f64::INFINITY }
+        };
+        let first = points.into_iter().map(|point| (pays(point), point)).min_by(|a, b| a.0.total_cmp(&b.0));
+        said.push(match first {
+            Some((from, point)) if from.is_finite() => format!(
+                "{class} ({}): cheaper than tracing from {from:.1e} samples on, at {:.1} times its speed.",
+                point.setting,
+                point.samples_per_second / tracing.samples_per_second
+            ),
+            _ => format!("{class}: within the tolerance, and never cheaper than tracing."),
         });
     }
 }

@@ -3,7 +3,7 @@
 use super::messages;
 use anyhow::{Context, Result, bail};
 use ridgewatch::backend::{Device, DeviceChoice};
-use ridgewatch::chart::{Choice, choose};
+use ridgewatch::chart::{Choice, choose, device_name};
 use ridgewatch::config::{ConfigError, SceneFile};
 use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
@@ -94,7 +94,8 @@ pub fn scene(common: &Common, paths: &[PathBuf]) -> Result<SceneFile> {
     Ok(scene)
 }
 
-/// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene on the same device.
+/// Replaces `render.method = "auto"` by the method that wins a trial on the scene, or that won an earlier one of the same scene and data on the same
+/// device.
 pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], device: &Device) -> Result<()> {
     if scene.render.method != Method::Auto {
         return Ok(());
@@ -108,7 +109,10 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
         [one] if is_config(one) => Some(one.with_extension("auto.json")),
         _ => None,
     };
-    let asked = format!("{} {:?} {}", env!("CARGO_PKG_VERSION"), common.device, scene.to_toml()?);
+    let data: Vec<_> =
+        scene.archive.files.iter().map(|file| std::fs::metadata(file).map(|found| (found.len(), found.modified().ok())).ok()).collect();
+    let version = env!("CARGO_PKG_VERSION");
+    let asked = format!("{version} {} {} threads {data:?} {}", device_name(device), common.threads, scene.to_toml()?);
     let earlier = remembered.as_deref().and_then(|file| std::fs::read(file).ok()).and_then(|bytes| serde_json::from_slice(&bytes).ok());
     let choice = match earlier.filter(|earlier: &Remembered| earlier.asked == asked) {
         Some(Remembered { choice, .. }) => choice,
@@ -134,7 +138,7 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
 /// File beside a scene file with the choice of `render.method = "auto"`.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Remembered {
-    /// What was asked: version, device and scene.
+    /// What was asked: version, device, threads, lengths and times of the data files, and scene.
     asked: String,
     choice: Choice,
 }
@@ -178,7 +182,7 @@ pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Res
     let Some(path) = path else { return Ok(()) };
     let refuse = |why: &str| bail!(Usage(format!("{option} {}: {why}", path.display())));
     if scene.render.method == Method::Reference {
-        return refuse("method reference has no surrogate; accepted with methods surrogate and gated");
+        return refuse("method reference has no surrogate; accepted with the other methods");
     }
     if scene.surrogate.kind == Kind::Table {
         return refuse("a table is traced anew for every window and is not trained; accepted with surrogate.kind network and residual");

@@ -3,7 +3,7 @@
 //! interval only.
 
 use super::stretch::log_stretch;
-use super::{Extras, FlowError, FlowMap, Traced, VelocitySource, cpu_tracer};
+use super::{Boundary, Extras, FlowError, FlowMap, Normalisation, Traced, VelocitySource, cpu_tracer};
 use rayon::prelude::*;
 use ridgewatch_field::{Domain, Geometry};
 
@@ -27,7 +27,8 @@ pub struct Composition {
 
 impl Composition {
     /// Traces the displacements over `intervals` equal parts of tau, with the interpolation, boundary and direction of `map`, and `steps` Runge-Kutta
-    /// steps per part. `None` on a sphere, where a displacement in degrees jumps at the dateline and the poles.
+    /// steps per part. `None` on a sphere, where a displacement in degrees jumps at the dateline and the poles, and if particles stop or wrap, which
+    /// the displacement does not tell.
     ///
     /// # Errors
     /// As [`cpu_tracer`].
@@ -42,6 +43,9 @@ impl Composition {
         if let VelocitySource::Window(window) = velocity
             && window.grid().is_some_and(|grid| grid.geometry != Geometry::Cartesian)
         {
+            return Ok(None);
+        }
+        if !matches!(map.boundary, Boundary::Clamp | Boundary::Unbounded) || map.normalisation == Normalisation::Lifetime {
             return Ok(None);
         }
         let part = map.tau / intervals.max(1) as f64;
@@ -78,22 +82,21 @@ impl Composition {
     /// Each joining interpolates once more.
     #[must_use]
     pub fn joined(&self) -> Self {
-        let mut joined = self.clone();
-        while joined.tables.len() > 1 {
-            let pairs: Vec<Vec<DisplacementTable>> = joined.tables.chunks(2).map(<[_]>::to_vec).collect();
-            joined.tables = pairs.into_iter().map(|pair| joined.join(pair)).collect();
+        let join = |tables: &[DisplacementTable]| tables.chunks(2).map(|pair| self.join(pair)).collect::<Vec<_>>();
+        let mut tables = join(&self.tables);
+        while tables.len() > 1 {
+            tables = join(&tables);
         }
-        joined
+        Self { nodes: self.nodes, domain: self.domain.clone(), tables }
     }
 
-    fn join(&self, mut pair: Vec<DisplacementTable>) -> DisplacementTable {
-        let second = if pair.len() > 1 { pair.pop() } else { None };
-        let mut first = pair.swap_remove(0);
-        if let Some(second) = second {
+    fn join(&self, pair: &[DisplacementTable]) -> DisplacementTable {
+        let mut first = pair[0].clone();
+        if let Some(second) = pair.get(1) {
             first.0.par_iter_mut().enumerate().for_each(|(node, displacement)| {
                 let from = self.unit(node).map(f64::from);
                 let there: [f64; 3] = std::array::from_fn(|axis| from[axis] + f64::from(displacement[axis]));
-                let (further, _) = self.interpolate(&second, there);
+                let (further, _) = self.interpolate(second, there);
                 *displacement = std::array::from_fn(|axis| (f64::from(displacement[axis]) + further[axis]) as f32);
             });
         }
@@ -102,7 +105,7 @@ impl Composition {
 
     /// Bytes of the tables.
     pub fn bytes(&self) -> usize {
-        self.tables.len() * self.nodes.iter().product::<usize>() * self.domain.dimensions * size_of::<f32>()
+        self.tables.len() * self.nodes.iter().product::<usize>() * size_of::<[f32; 3]>()
     }
 
     /// Unit coordinates of a node. Two-dimensional flows are traced in the middle of the slab.

@@ -24,6 +24,7 @@ pub use checkpoints::CheckpointTotals;
 pub use cycle::{Event, RunOptions, RunReport, run, run_on};
 pub use error::RunError;
 pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
+pub use scene::settled_colours;
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
 pub use setup::{Plan, Setup};
 pub use slides::{Slide, Slides, open_snapshots};

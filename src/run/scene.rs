@@ -6,17 +6,34 @@ use super::slides::Slide;
 use super::stop::{RunEnd, check_stop};
 use crate::backend::{Interruptible, audit, stratified_points};
 use crate::flow::Extras;
-use crate::render::Scene;
+use crate::render::{Scene, TransferSettings};
 use crate::surrogate::Trace;
 use crate::trust::Strata;
 use std::sync::atomic::AtomicBool;
 
-/// Scene of the picture. Values of the transfer function that the scene file leaves open are scaled to the FTLE of the first slide and kept
-/// for the whole run, so that colours are comparable.
+/// Scene of the picture, with the colours of [`settled_colours`].
 pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<Scene, RunEnd> {
+    Ok(Scene { transfer: colours(plan, tracer, slide, stop)?, ..assemble(&plan.scene, &plan.domain) })
+}
+
+/// Transfer function of a run. Values that the scene leaves open are scaled to the FTLE of the first slide and kept for the whole run, so that
+/// colours are comparable.
+///
+/// # Errors
+/// The device fails, or every probed point is missing.
+pub fn settled_colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide) -> Result<TransferSettings, RunError> {
+    match colours(plan, tracer, slide, &AtomicBool::new(false)) {
+        Ok(transfer) => Ok(transfer),
+        Err(RunEnd::Failed(error)) => Err(error),
+        Err(RunEnd::Device(error)) => Err(RunError::Device(Box::new(error))),
+        Err(RunEnd::TimeIsUp | RunEnd::Stopped) => Err(RunError::EndedEarly),
+    }
+}
+
+fn colours(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop: &AtomicBool) -> Result<TransferSettings, RunEnd> {
     let file = &plan.scene;
-    let mut scene = assemble(file, &plan.domain);
-    if scene.transfer.low.is_none() || scene.transfer.high.is_none() {
+    let transfer = file.transfer.clone().unwrap_or_default();
+    if transfer.low.is_none() || transfer.high.is_none() {
         const PROBES: usize = 64;
         let z = if plan.domain.dimensions == 3 { 16 } else { 1 };
         let unit = stratified_points(&Strata::even([PROBES, PROBES, z], 1), file.seed, u64::MAX);
@@ -30,7 +47,7 @@ pub(super) fn settled_scene(plan: &Plan, tracer: &dyn Trace, slide: &Slide, stop
                 when: slide.date.clone().unwrap_or_else(|| format!("time {}", slide.time)),
             }));
         }
-        scene.transfer = scene.transfer.scaled_to(&ftle);
+        return Ok(transfer.scaled_to(&ftle));
     }
-    Ok(scene)
+    Ok(transfer)
 }

@@ -135,6 +135,16 @@ pub trait Predict: Send + Sync {
     /// The device that predicts fails or is out of memory; `out` is then unspecified.
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError>;
 
+    /// Predicts at unit points and returns the seconds that the processor takes. Copies to and from a device do not count.
+    ///
+    /// # Errors
+    /// As [`Predict::predict`].
+    fn seconds(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<f64, DeviceError> {
+        let began = std::time::Instant::now();
+        self.predict(points, out)?;
+        Ok(began.elapsed().as_secs_f64())
+    }
+
     /// Memory that prediction reads, bytes.
     fn bytes(&self) -> usize;
 }

@@ -13,6 +13,16 @@ pub trait Trace: Send + Sync {
     /// # Errors
     /// The device fails; `out` is then unspecified.
     fn trace(&self, seeds: &[[f32; 3]], extras: Extras, out: &mut Traced) -> Result<(), DeviceError>;
+
+    /// Traces seeds and returns the seconds that the processor takes. Copies to and from a device do not count.
+    ///
+    /// # Errors
+    /// The device fails or lacks memory.
+    fn seconds(&self, seeds: &[[f32; 3]], out: &mut Traced) -> Result<f64, DeviceError> {
+        let began = std::time::Instant::now();
+        self.trace(seeds, Extras::default(), out)?;
+        Ok(began.elapsed().as_secs_f64())
+    }
 }
 
 impl<T: Tracer> Trace for T {

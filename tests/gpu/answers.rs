@@ -219,8 +219,13 @@ fn gated_frames_are_the_cpu_s_pictures_to_50_db() {
 #[ignore = "needs a GPU"]
 fn a_budget_ends_tracing_in_the_course_of_a_frame() {
     let stage = turbulent();
-    let (mut renderer, mut side) = (stage.renderer(), Side::new(&stage.gpu));
-    let (.., whole, _) = stage.on_gpu(&mut side, &mut renderer, 0, 8, &GATED);
+    let mut side = Side::new(&stage.gpu);
+    // Other tests may use the device at the same time: the shortest of a few frames has least of them in it.
+    let mut whole = Tally { trace_seconds: f64::INFINITY, ..Tally::default() };
+    for _ in 0..5 {
+        let (.., tally, _) = stage.on_gpu(&mut side, &mut stage.renderer(), 0, 8, &GATED);
+        whole = if tally.trace_seconds < whole.trace_seconds { tally } else { whole };
+    }
     let half = How { budget: Some(0.5 * whole.trace_seconds), ..GATED };
     let mut renderer = stage.renderer();
     let (.., tally, _) = stage.on_gpu(&mut side, &mut renderer, 0, 8, &half);

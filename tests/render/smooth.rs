@@ -2,7 +2,7 @@
 
 use crate::NEVER;
 use ridgewatch::field::Domain;
-use ridgewatch::render::smooth::{IsMissing, Nodes, Picture, PictureError, Refinement};
+use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, Refinement};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Arc;
 
@@ -149,6 +149,41 @@ fn a_marched_picture_is_the_mean_of_tracked_ones() {
             assert!(difference.abs() < 0.005, "{what}, missing cells: {missing}: means differ by {difference}");
         }
     }
+}
+
+/// In a uniform medium the depth to the light is the extinction times the way to the wall, right up to walls that light comes in through.
+#[test]
+fn the_light_volume_is_exact_in_a_uniform_medium() {
+    let domain = cube();
+    let nodes = nodes(&domain, [9; 3], |_| 1.2);
+    // Along an axis, nearly so, through one, two and three walls, with all signs.
+    let mut directions = vec![[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1e-17, 1.0, -1e-17], [1e-4, 1.0, 0.0]];
+    for sign in 0..8 {
+        let signed = |k: usize, size: f64| if sign >> k & 1 == 1 { -size } else { size };
+        directions.extend([[signed(0, 0.5), signed(1, 1.0), 0.0], [signed(0, 0.6), signed(1, 0.9), signed(2, 1.0)]]);
+        directions.push([signed(0, 1.0), signed(1, 0.2), signed(2, 0.97)]);
+    }
+    let mut worst = 0.0_f32;
+    for toward in directions {
+        let scene = scene(&domain, 8, true, LightSettings::directional(toward, 1.0));
+        let renderer = Renderer::new(scene, &domain, TAU).unwrap();
+        let frame = renderer.frame_scene(0);
+        let medium = Medium { scene: &frame, nodes: &nodes, missing: None };
+        let volume = LightVolume::new(&medium, 1 << 20, 1);
+        let length = toward.iter().map(|c| c * c).sum::<f64>().sqrt();
+        for i in 0..13_u32 * 13 * 13 {
+            // Walls and points near them are among these.
+            let unit = [i % 13, i / 13 % 13, i / 169].map(|n| (n as f32 / 12.0).clamp(0.003, 0.997));
+            let exit = (0..3).filter(|&k| toward[k] != 0.0).map(|k| {
+                let wall = if toward[k] > 0.0 { 1.0 } else { 0.0 };
+                (wall - f64::from(unit[k])) * length / toward[k]
+            });
+            let depth = medium.extinction(unit) * exit.fold(f64::INFINITY, f64::min) as f32;
+            worst = worst.max((volume.at(unit) - depth).abs());
+        }
+    }
+    println!("light volume: off by at most {worst:.1e}");
+    assert!(worst < 1e-4, "{worst:e}");
 }
 
 #[test]

@@ -1,7 +1,7 @@
 //! The CUDA implementation of [`Backend`]: plans the placement of a slide, and calls the GPU or the CPU accordingly.
 
 use super::driver::Gpu;
-use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu};
+use super::network::{CudaTraining, DeviceNetwork, DeviceTraining, OnGpu, seconds_of_prediction};
 use super::rendering::{CudaSamples, GpuFrames};
 use super::tracing::{CudaTracer, Tuning};
 use super::window::SnapshotStore;
@@ -259,6 +259,12 @@ impl Predict for CudaFrozen {
     }
     fn predict(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<(), DeviceError> {
         either!(CudaFrozen, self, frozen => frozen.predict(points, out))
+    }
+    fn seconds(&self, points: &[[f32; 3]], out: &mut [f32]) -> Result<f64, DeviceError> {
+        match self {
+            Self::Resident(frozen) => seconds_of_prediction(frozen, points),
+            Self::OnHost(frozen) => frozen.seconds(points, out),
+        }
     }
     fn bytes(&self) -> usize {
         either!(CudaFrozen, self, frozen => frozen.bytes())

@@ -24,6 +24,6 @@ pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},
     march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching},
-    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS},
+    picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS, squared_slope},
     statement::LIT,
 };

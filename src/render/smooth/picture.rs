@@ -67,6 +67,15 @@ pub struct Picture {
     allocation: Allocation,
 }
 
+/// Squared slope of the tone map `[contrast, brightness, gamma]` at a radiance.
+pub fn squared_slope(tone_map: [f64; 3], radiance: f32) -> f32 {
+    let [contrast, brightness, gamma] = tone_map.map(|v| v as f32);
+    let value = (radiance - 0.5) * contrast + brightness;
+    // The map is constant where it saturates, and steep without bound at black; one 8-bit step bounds it.
+    let slope = contrast / gamma * value.max(1.0 / 255.0).powf(1.0 / gamma - 1.0);
+    if value <= 0.0 || value >= 1.0 { 0.0 } else { slope * slope }
+}
+
 impl Picture {
     /// Starts anew if the picture shows anything else.
     fn settle(&mut self, scene: &Scene, inverse_tau: f32, nodes: &Nodes, number: u64) {
@@ -266,13 +275,7 @@ impl Picture {
 
     /// Sums of the squared errors of each tile.
     fn tile_sums(&self, scene: &Scene, film: &Film, combined: &Combined) -> Vec<TileSums> {
-        let [contrast, brightness, gamma] = scene.settings.tone_map.map(|v| v as f32);
-        let squared_slope = |c: f32| {
-            let value = (c - 0.5) * contrast + brightness;
-            // The map is constant where it saturates, and steep without bound at black; one 8-bit step bounds it.
-            let slope = contrast / gamma * value.max(1.0 / 255.0).powf(1.0 / gamma - 1.0);
-            if value <= 0.0 || value >= 1.0 { 0.0 } else { slope * slope }
-        };
+        let squared_slope = |c: f32| squared_slope(scene.settings.tone_map, c);
         let (width, height) = (film.width, film.height);
         let [across, down] = tiles(width, height);
         let of_tile = |tile: usize| {

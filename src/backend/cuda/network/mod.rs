@@ -13,7 +13,7 @@ mod training;
 pub use batched::Tiling;
 pub use network::{DeviceNetwork, NetworkAbove, is_fused, network_defines};
 pub use resident::{CudaTable, CudaTraining, OnGpu};
-pub(super) use resident::{LabelPool, LabelSink, frozen_parts};
+pub(super) use resident::{LabelPool, LabelSink, frozen_parts, seconds_of_prediction};
 pub use samples::DeviceSamples;
 pub(super) use samples::Filled;
 pub use training::DeviceTraining;

@@ -69,6 +69,26 @@ pub(in crate::cuda) fn frozen_parts(frozen: &FrozenHybrid<OnGpu>) -> Result<(Opt
     Ok((frozen.table.as_ref().map(CudaTable::device).transpose()?, frozen.network.as_deref()))
 }
 
+/// Device time of a prediction at points in unit coordinates, in seconds; copies do not count.
+///
+/// # Errors
+/// The device fails or lacks memory.
+pub(in crate::cuda) fn seconds_of_prediction(frozen: &FrozenHybrid<OnGpu>, points: &[[f32; 3]]) -> Result<f64, DeviceError> {
+    let time = |gpu: &Gpu, by: &dyn DevicePredict| {
+        let points = gpu.upload("points", points)?;
+        let out = gpu.alloc::<f32>("predictions", points.len())?;
+        let begin = gpu.mark()?;
+        // SAFETY: both buffers hold as many entries as there are points, and live until the marks are compared, which waits for the stream.
+        unsafe { by.predict(points.address(), points.len(), out.address())? };
+        Ok(1e-3 * f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?))
+    };
+    match frozen_parts(frozen)? {
+        (Some(table), None) => time(table.gpu(), table),
+        (base, Some(network)) => time(&network.gpu, &network.network.above(base.map(|base| (base, frozen.shrinkage))).at(frozen.times)),
+        (None, None) => Ok(0.0),
+    }
+}
+
 /// Predicts at points on the host, in unit coordinates.
 ///
 /// # Errors

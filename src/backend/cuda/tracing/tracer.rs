@@ -80,6 +80,23 @@ impl CudaTracer {
 }
 
 impl Trace for CudaTracer {
+    fn seconds(&self, seeds: &[[f32; 3]], _: &mut Traced) -> Result<f64, DeviceError> {
+        let gpu = self.device.gpu();
+        let seeds = gpu.upload("seeds", seeds)?;
+        let [log_stretch, lifetime_share] = [gpu.alloc::<f32>("results", seeds.len())?, gpu.alloc::<f32>("results", seeds.len())?];
+        let double = self.double.then(|| gpu.alloc::<f64>("results", seeds.len())).transpose()?;
+        let out = Outputs {
+            log_stretch: log_stretch.address(),
+            lifetime_share: lifetime_share.address(),
+            log_stretch_f64: double.as_ref().map_or(0, Buffer::address),
+            ..Outputs::default()
+        };
+        let begin = gpu.mark()?;
+        // SAFETY: every buffer holds as many entries as there are seeds, and lives until the marks are compared, which waits for the stream.
+        unsafe { self.device.trace(seeds.address(), seeds.len(), &out)? };
+        Ok(1e-3 * f64::from(gpu.milliseconds(&begin, &gpu.mark()?)?))
+    }
+
     fn flow(&self) -> &dyn Tracer {
         &*self.host
     }
