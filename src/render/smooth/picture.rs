@@ -190,14 +190,15 @@ impl Picture {
         let (width, height) = (medium.scene.width, medium.scene.height);
         let pairs_per_pixel = if round.method == Method::Marched { AUDIT_PAIRS } else { round.samples / 2.0 };
         let mut allocation = self.allocation.clone();
-        let chosen = pixels(&allocation.next(pairs_per_pixel), width, height);
+        let plan = allocation.next(pairs_per_pixel);
+        let mut chosen = pixels(&plan, width, height).peekable();
         // Number of each pair within its pixel, which selects its random numbers.
         let mut next: Vec<u32> = self.sums.iter().map(PairSums::pairs).collect();
         let mut stats = RenderStats::default();
         let mut paths = Vec::new();
-        for chosen in chosen.chunks(MAX_PAIRS) {
+        while chosen.peek().is_some() {
             paths.clear();
-            for &pixel in chosen {
+            for pixel in chosen.by_ref().take(MAX_PAIRS) {
                 let number = &mut next[pixel as usize];
                 paths.extend([(pixel, 2 * *number), (pixel, 2 * *number + 1)]);
                 *number += 1;
@@ -226,7 +227,7 @@ impl Picture {
                 sums.pairs[quarter] += 1;
             }
         }
-        self.pairs += chosen.len() as u64;
+        self.pairs += stats.paths / 2;
         self.allocation = allocation;
         Some(stats)
     }
