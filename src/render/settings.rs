@@ -5,6 +5,8 @@ use super::error::{RenderError, require};
 use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
+/// Factor by which the upper end of the interval of the mean square error may miss `until`: 0.8 dB.
+const UNTIL_SLACK: f64 = 1.2;
 /// Largest number of frames that `until` gives a slide.
 pub const MAX_FRAMES_UNTIL: usize = 4096;
 /// Largest picture edge, in pixels.
@@ -76,11 +78,12 @@ pub enum Target {
 }
 
 impl Target {
-    /// True if a stated error is within the target.
+    /// True if a stated error is within the target, and the worse end of its interval at most `UNTIL_SLACK` beyond it. The estimate alone is within it
+    /// too early: of many frames, a lucky one stops.
     pub fn is_met_by(self, error: &PictureError) -> bool {
         match self {
-            Self::Psnr(decibels) => error.psnr.value >= decibels,
-            Self::Relmse(most) => error.relmse.value <= most,
+            Self::Psnr(decibels) => error.psnr.value >= decibels && error.psnr.low >= decibels - 10.0 * UNTIL_SLACK.log10(),
+            Self::Relmse(most) => error.relmse.value <= most && error.relmse.high <= UNTIL_SLACK * most,
         }
     }
 }
@@ -211,7 +214,8 @@ pub struct RenderSettings {
     pub samples: f64,
     /// How the correction of `two_level` is added.
     pub combine: Combine,
-    /// Smooth methods: stated error at which a slide needs no further frames. A slide gets frames until then, at most `MAX_FRAMES_UNTIL`.
+    /// Smooth methods: stated error at which a slide needs no further frames (see [`Target::is_met_by`]). A slide gets frames until then, at most
+    /// `MAX_FRAMES_UNTIL`.
     pub until: Option<Target>,
     /// Smooth methods: milliseconds of coupled samples per frame, instead of `samples`.
     pub budget: Option<f64>,
@@ -286,5 +290,23 @@ impl RenderSettings {
             require(cells.iter().product::<usize>() <= 1 << 24, "render.majorant_cells", cells, "at most 16777216 cells in all")?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::smooth::ErrorEstimate;
+
+    #[test]
+    fn a_target_is_met_with_its_interval() {
+        let stated = |value, low, high| ErrorEstimate { value, low, high };
+        let met = |relmse, psnr| {
+            let error = PictureError { relmse, psnr, ..PictureError::default() };
+            [Target::Relmse(0.1), Target::Psnr(40.0)].map(|target| target.is_met_by(&error))
+        };
+        assert_eq!(met(stated(0.09, 0.07, 0.11), stated(40.5, 39.4, 41.5)), [true, true]);
+        assert_eq!(met(stated(0.09, 0.05, 0.13), stated(40.5, 39.0, 42.0)), [false, false], "an interval that is too wide");
+        assert_eq!(met(stated(0.11, 0.11, 0.11), stated(39.9, 39.9, 39.9)), [false, false]);
     }
 }

@@ -2,7 +2,7 @@
 //! finely.
 
 use super::{ErrorEstimate, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
-use crate::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
+use crate::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, Target, TransferSettings};
 use rayon::prelude::*;
 use ridgewatch_field::Domain;
 use std::sync::Arc;
@@ -124,4 +124,38 @@ fn intervals_hold_over_scenes_and_numbers_of_samples() {
     }
     let [known, inside, above, below] = all;
     assert!(inside * 100 >= known * 93 && above > 0 && below > 0, "{all:?}");
+}
+
+/// Fails if the estimate alone decides: most of the frames that it picks are lucky ones.
+#[test]
+fn a_target_is_reached_when_it_is_met() {
+    const WIDTH: usize = 32;
+    const MOST: f64 = 4e-3;
+    const SEEDS: u64 = 24;
+    let target = Target::Relmse(MOST);
+    let [traced, surrogate] = fields(1);
+    let exact = exact(&traced, WIDTH);
+    let reached = |seed: u64| {
+        let mut renderer = renderer(WIDTH, 100 + seed);
+        let (mut picture, mut early) = (Picture::default(), None);
+        for number in 0..400 {
+            let round =
+                Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: false, samples: 1.0, number, stop: &NEVER };
+            let (film, _, error) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
+            let missed = true_square(&film, &exact, |c| 1.0 / (c * c + 0.01)) / MOST;
+            if error.relmse.value <= MOST {
+                early.get_or_insert(missed);
+            }
+            if target.is_met_by(&error) {
+                assert!(error.relmse.value <= MOST && error.relmse.high <= 1.2 * MOST);
+                return [missed, early.unwrap(), number as f64];
+            }
+        }
+        panic!("{target:?} is not reached");
+    };
+    let found: Vec<[f64; 3]> = (0..SEEDS).into_par_iter().map(reached).collect();
+    println!("true error by target, that of the first estimate within it, frames: {found:.2?}");
+    let held = |which: usize| found.iter().filter(|found| found[which] <= 1.2).count() * 100 >= found.len() * 93;
+    assert!(held(0), "{found:.2?}");
+    assert!(!held(1), "the estimate alone would do: {found:.2?}");
 }
