@@ -210,14 +210,14 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Samples per pixel and frame. Smooth methods accept fractions.
+    /// Samples per pixel and frame. Smooth methods accept fractions; `marched` takes twice [`super::smooth::AUDIT_PAIRS`] instead.
     pub samples: f64,
     /// How the correction of `two_level` is added.
     pub combine: Combine,
     /// Smooth methods: stated error at which a slide needs no further frames (see [`Target::is_met_by`]). A slide gets frames until then, at most
     /// `MAX_FRAMES_UNTIL`.
     pub until: Option<Target>,
-    /// Smooth methods: milliseconds of coupled samples per frame, instead of `samples`.
+    /// `two_level`: milliseconds of coupled samples per frame, instead of `samples`.
     pub budget: Option<f64>,
     /// Background colour, linear.
     pub background: [f64; 3],
@@ -275,9 +275,11 @@ impl RenderSettings {
         if let Some(budget) = settings.budget {
             require((0.1..=600_000.0).contains(&budget), "render.budget", budget, "milliseconds, 0.1 to 600000")?;
         }
-        for (key, given) in [("render.until", settings.until.is_some()), ("render.budget", settings.budget.is_some())] {
-            require(!given || settings.method.is_smooth(), key, "given", "with render.method = \"marched\" or \"two_level\"")?;
-        }
+        let until = settings.until.is_none() || settings.method.is_smooth();
+        require(until, "render.until", "given", "with render.method = \"marched\" or \"two_level\"")?;
+        // A marched picture has a fixed number of samples.
+        let budget = settings.budget.is_none() || matches!(settings.method, Method::TwoLevel | Method::Auto);
+        require(budget, "render.budget", "given", "with render.method = \"two_level\"")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
         require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;
@@ -297,6 +299,13 @@ impl RenderSettings {
 mod tests {
     use super::*;
     use crate::smooth::ErrorEstimate;
+
+    #[test]
+    fn a_marched_picture_has_no_budget() {
+        let given = |method| RenderSettings { method, budget: Some(50.0), ..RenderSettings::default() }.check();
+        assert!(given(Method::TwoLevel).is_ok());
+        assert!(given(Method::Marched).unwrap_err().to_string().contains("render.budget"));
+    }
 
     #[test]
     fn a_target_is_met_with_its_interval() {
