@@ -117,7 +117,6 @@ fn intervals_hold_over_scenes_and_numbers_of_samples() {
             ] {
                 let found = counted(&fields, width, method, pairs, rounds);
                 all = std::array::from_fn(|i| all[i] + found[i]);
-                println!("field {which}, {width}x{width}, {method:?}, {pairs} pairs x {rounds}: {found:?}");
                 assert!(found[1] * 10 >= found[0] * 8, "field {which}, {width}x{width}, {method:?}, {pairs} pairs x {rounds}: {found:?}");
             }
         }
@@ -154,7 +153,6 @@ fn a_target_is_reached_when_it_is_met() {
         panic!("{target:?} is not reached");
     };
     let found: Vec<[f64; 3]> = (0..SEEDS).into_par_iter().map(reached).collect();
-    println!("true error by target, that of the first estimate within it, frames: {found:.2?}");
     let held = |which: usize| found.iter().filter(|found| found[which] <= 1.2).count() * 100 >= found.len() * 93;
     assert!(held(0), "{found:.2?}");
     assert!(!held(1), "the estimate alone would do: {found:.2?}");

@@ -183,7 +183,6 @@ mod tests {
             for uneven in [0.0, 1.0] {
                 let deviations: Vec<f64> = (0..tiles).map(|tile| 0.1 * f64::powf(1.0 + f64::from(tile), -uneven)).collect();
                 let [above, below] = misses(&deviations, tiles as u32);
-                println!("{tiles} tiles, uneven {uneven}: {:.2} % above, {:.2} % below", 100.0 * above, 100.0 * below);
                 assert!((0.005..0.03).contains(&above) && (0.005..0.03).contains(&below), "{tiles} {uneven}: {above} {below}");
             }
         }
