@@ -180,9 +180,9 @@ struct Combine {
 static_assert(sizeof(Combine) == 88, "layout");
 
 constexpr int TILE = 16, TILE_PIXELS = TILE * TILE;
-// Squared errors from all pairs and from those of either quarter, each without weight, relative and tone-mapped, and the pixels that have them; over
-// all pixels and over the lit ones. Then the variance of one sample, summed over the pixels that have pairs.
-constexpr int ERROR_FIELDS = 12, TILE_FIELDS = 2 * ERROR_FIELDS + 1;
+// Sums of the squared error, its scatter and the squared radiance, each without weight, relative and tone-mapped, the pixels that have pairs, and
+// their pairs; over all pixels and over the lit ones. Then the variance of one sample, summed over the pixels that have pairs.
+constexpr int ERROR_FIELDS = 11, TILE_FIELDS = 2 * ERROR_FIELDS + 1;
 constexpr int TILE_STRIDE = TILE_PIXELS + 1, TILE_PARTS = 8;
 constexpr int TILE_MEMORY = TILE_FIELDS * (TILE_STRIDE + TILE_PARTS);
 
@@ -204,54 +204,58 @@ RW_FN void finish_pixel(const Combine& c, int x, int y, float* fields, int strid
     for (int k = 0; k < RAY_FIELDS; ++k) base[k] = c.base[k * pixels + at];
     float alpha = float(base[3] * c.per_ray);
     if (c.how == SUMMED) alpha += c.sums[PAIR_ALPHA * pixels + at] / (2.0f * most);
-    float colour[3], squared[3][3], difference = 0.0f;
+    // Squared error, its scatter, and squared radiance.
+    float colour[3], found[3][3], difference = 0.0f;
+    const bool known = all > 0.0f, both = pairs[0] > 0.0f && pairs[1] > 0.0f, is_lit = alpha > c.lit;
     for (int k = 0; k < 3; ++k) {
-        // Means of the halves over all pairs, and over those of either quarter.
-        float means[2][3];
+        // Means of the halves, and halved differences between their quarters.
+        float mean[2], apart[2];
         for (int half = 0; half < 2; ++half) {
             const float first = c.sums[(6 * half + k) * pixels + at], second = c.sums[(6 * half + 3 + k) * pixels + at];
-            means[half][0] = (first + second) / most;
-            means[half][1] = first / max_(pairs[0], 1.0f);
-            means[half][2] = second / max_(pairs[1], 1.0f);
+            mean[half] = (first + second) / most;
+            apart[half] = 0.5f * (first / max_(pairs[0], 1.0f) - second / max_(pairs[1], 1.0f));
         }
         float a = 0.0f, b = 0.0f;
-        if (c.how == SUMMED) a = means[0][0], b = means[1][0];
+        if (c.how == SUMMED) a = mean[0], b = mean[1];
         if (c.how == SHRUNK) a = c.halves[k * pixels + at], b = c.halves[(3 + k) * pixels + at];
-        const float r = 0.5f * (a + b);
-        for (int which = 0; which < 3; ++which) {
-            const float d_a = means[0][which], d_b = means[1][which];
-            squared[which][k] = r * r - (a * d_b + b * d_a) + d_a * d_b;
-        }
-        const float apart = (means[0][0] - means[1][0]) * all;
-        difference += apart * apart;
+        const float r = 0.5f * (a + b), product = mean[0] * mean[1];
         colour[k] = float(base[k] * c.per_ray) + r;
+        found[0][k] = r * r - (a * mean[1] + b * mean[0]) + product;
+        if (both) {
+            found[1][k] = c.how == SUMMED ? apart[0] * apart[1] : (mean[0] - a) * apart[1] + (mean[1] - b) * apart[0];
+        } else {
+            const float estimate = c.how == SUMMED ? product : found[0][k];
+            found[1][k] = pairs[0] > 0.0f ? estimate : -estimate;
+        }
+        found[2][k] = colour[k] * colour[k];
+        const float between = (mean[0] - mean[1]) * all;
+        difference += between * between;
     }
     reinterpret_cast<Float4*>(c.film)[at] = {colour[0], colour[1], colour[2], alpha};
     float* planes = c.film + 4 * pixels + at;
     planes[0] = base[3] > 0.0 ? float(base[4] / base[3]) : not_a_number();
     planes[2 * pixels] = float(base[5] * c.per_ray);
     planes[3 * pixels] = 2.0f * all;
-    const bool known[3] = {all > 0.0f, pairs[0] > 0.0f, pairs[1] > 0.0f}, is_lit = alpha > c.lit;
-    c.squared[at] = known[0] ? (squared[0][0] + squared[0][1] + squared[0][2]) / 3.0f : 0.0f;
-    c.squared[pixels + at] = known[0] ? 1.0f : 0.0f;
+    c.squared[at] = known ? (found[0][0] + found[0][1] + found[0][2]) / 3.0f : 0.0f;
+    c.squared[pixels + at] = known ? 1.0f : 0.0f;
+    auto put = [&](int field, float value) {
+        fields[field * stride] = value;
+        fields[(ERROR_FIELDS + field) * stride] = is_lit ? value : 0.0f;
+    };
     for (int which = 0; which < 3; ++which) {
         float sums[3] = {0.0f, 0.0f, 0.0f};
-        for (int k = 0; known[which] && k < 3; ++k) {
-            const float third = squared[which][k] / 3.0f;
+        for (int k = 0; known && k < 3; ++k) {
+            const float third = found[which][k] / 3.0f;
             sums[0] += third;
             sums[1] += third / (colour[k] * colour[k] + 0.01f);
             sums[2] += third * tone_weight(c, colour[k]);
         }
-        const float one = known[which] ? 1.0f : 0.0f;
-        for (int weighting = 0; weighting < 3; ++weighting) {
-            fields[(3 * which + weighting) * stride] = sums[weighting];
-            fields[(ERROR_FIELDS + 3 * which + weighting) * stride] = is_lit ? sums[weighting] : 0.0f;
-        }
-        fields[(9 + which) * stride] = one;
-        fields[(ERROR_FIELDS + 9 + which) * stride] = is_lit ? one : 0.0f;
+        for (int weighting = 0; weighting < 3; ++weighting) put(3 * which + weighting, sums[weighting]);
     }
+    put(9, known ? 1.0f : 0.0f);
+    put(10, all);
     // Sums of the halves differ by twice the pairs times the variance of one sample.
-    fields[2 * ERROR_FIELDS * stride] = known[0] ? difference / (6.0f * all) : 0.0f;
+    fields[2 * ERROR_FIELDS * stride] = known ? difference / (6.0f * all) : 0.0f;
 }
 
 // Finishes the pixels of a tile and sums over it.

@@ -51,7 +51,7 @@ struct Coupled {
     bool in_shadow;
     float difference[3];
     float alpha;
-    uint32_t pixel, sample, dimension, traced;
+    uint32_t pixel, sample, dimension;
 };
 
 // A collision that waits for f, with what else decides there.
@@ -207,7 +207,6 @@ RW_FN void take_answer(const CoupledFrame& frame, Coupled& path, const Collision
     counts.queries += 1;
     counts.traced += answer.by == TRACED ? 1 : 0;
     counts.over_budget += answer.by == OVER_BUDGET ? 1 : 0;
-    path.traced += answer.by == TRACED ? 1 : 0;
     if (!is_finite(answer.log_stretch)) {
         counts.missing += 1;
         observe_missing(frame.watch, at.hit.cell);
@@ -276,7 +275,7 @@ struct CoupledSlots {
     Float4* colour;        // of f, and red of s
     Float2* colour_rest;   // green and blue of s
     Float4* found;         // difference, alpha
-    Uint4* progress;       // dimension, sample and (in the upper five bits) flags, traced, first record
+    Uint4* progress;       // dimension, sample and (in the upper five bits) flags, first record, nothing
 };
 static_assert(sizeof(CoupledSlots) == 72, "layout");
 
@@ -291,8 +290,7 @@ RW_FN void load_path(const CoupledSlots& slots, uint32_t slot, Coupled& path, ui
     path.shines[F] = progress.y >> 29 & 1u;
     path.shines[S] = progress.y >> 30 & 1u;
     path.in_shadow = progress.y >> 31;
-    path.traced = progress.z;
-    first = progress.w;
+    first = progress.z;
     path.way = {{place.x, place.y, place.z}, {way.x, way.y, way.z}, place.w, way.w};
     path.weight[F] = factors.x, path.weight[S] = factors.y;
     path.transmittance[F] = factors.z, path.transmittance[S] = factors.w;
@@ -310,7 +308,7 @@ RW_FN void load_path(const CoupledSlots& slots, uint32_t slot, Coupled& path, ui
 RW_FN void store_path(const CoupledSlots& slots, uint32_t slot, const Coupled& path, uint32_t first) {
     const uint32_t flags = (path.flies[F] ? 1u : 0u) | (path.flies[S] ? 2u : 0u) | (path.shines[F] ? 4u : 0u) | (path.shines[S] ? 8u : 0u) |
                            (path.in_shadow ? 16u : 0u);
-    slots.progress[slot] = {path.dimension, path.sample | flags << 27, path.traced, first};
+    slots.progress[slot] = {path.dimension, path.sample | flags << 27, first, 0};
     slots.place[slot] = {path.way.origin[0], path.way.origin[1], path.way.origin[2], path.way.t};
     slots.way[slot] = {path.way.direction[0], path.way.direction[1], path.way.direction[2], path.way.end};
     slots.factors[slot] = {path.weight[F], path.weight[S], path.transmittance[F], path.transmittance[S]};
@@ -343,7 +341,6 @@ struct CoupledWork {
     const uint32_t* list;
     const float* sums;   // SUM_PLANES arrays of `pixels` values
     Float4* found;       // per path of the list: difference, alpha
-    uint32_t* traced;    // per path of the list
     uint32_t width;      // of the picture
     uint32_t pixels;
     uint32_t entries;
@@ -351,10 +348,10 @@ struct CoupledWork {
     uint32_t count;      // paths of the band, one a slot
     uint32_t pad;
 };
-static_assert(sizeof(CoupledWork) == 56, "layout");
+static_assert(sizeof(CoupledWork) == 48, "layout");
 
-// Planes of the sums: differences by half, quarter and channel, then pairs by quarter, differences of alpha, traced queries.
-constexpr uint32_t PAIR_PLANE = 12, ALPHA_PLANE = 14, TRACED_PLANE = 15, SUM_PLANES = 16;
+// Planes of the sums: differences by half, quarter and channel, then pairs by quarter, differences of alpha.
+constexpr uint32_t PAIR_PLANE = 12, ALPHA_PLANE = 14, SUM_PLANES = 15;
 
 RW_FN float& sum_at(float* sums, uint32_t pixels, uint32_t plane, uint32_t pixel) { return sums[(size_t)plane * pixels + pixel]; }
 
@@ -407,7 +404,6 @@ RW_FN bool advance_coupled(const CoupledFrame& frame, const CoupledWork& work, c
         if (!guess) {
             if (!waits) {
                 work.found[number] = {path.difference[0], path.difference[1], path.difference[2], path.alpha};
-                work.traced[number] = path.traced;
                 counts.paths += 1;
                 return false;
             }
@@ -450,17 +446,15 @@ RW_FN void add_pair(const CoupledWork& work, float* sums, uint32_t entry) {
     const uint32_t pixel = work.list[entry];
     const uint32_t pair = pairs_before(sums, work.pixels, pixel);
     const uint32_t quarter = (bit_parity(pixel % work.width) + bit_parity(pixel / work.width) + pair) & 1u;
-    float alpha = 0.0f, traced = 0.0f;
+    float alpha = 0.0f;
     for (uint32_t half = 0; half < 2; ++half) {
         const Float4 found = work.found[2 * entry + half];
         const float difference[3] = {found.x, found.y, found.z};
         for (uint32_t k = 0; k < 3; ++k) sum_at(sums, work.pixels, 3 * (2 * half + quarter) + k, pixel) += difference[k];
         alpha += found.w;
-        traced += (float)work.traced[2 * entry + half];
     }
     sum_at(sums, work.pixels, PAIR_PLANE + quarter, pixel) += 1.0f;
     sum_at(sums, work.pixels, ALPHA_PLANE, pixel) += alpha;
-    sum_at(sums, work.pixels, TRACED_PLANE, pixel) += traced;
 }
 
 // Pixels per tile edge of the list.

@@ -23,10 +23,10 @@ pub struct Options {
     /// Samples a pixel; overrides the scene's `render.samples`. Fractions are accepted by marched and two_level.
     #[arg(long, value_name = "N")]
     spp: Option<f64>,
-    /// marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3.
+    /// marched and two_level: refine until the stated error is below this, e.g. 40dB or relmse=1e-3, and its interval reaches at most 20 % beyond.
     #[arg(long, value_name = "TARGET")]
     until: Option<Target>,
-    /// marched and two_level: milliseconds of sampling per frame, instead of --spp.
+    /// two_level: milliseconds of sampling per frame, instead of --spp.
     #[arg(long, value_name = "MS")]
     budget: Option<f64>,
     /// Number of frames rendered and discarded first, with the scene's samples; they train the surrogate and tighten the majorants.

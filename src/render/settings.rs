@@ -5,6 +5,8 @@ use super::error::{RenderError, require};
 use super::smooth::PictureError;
 use serde::{Deserialize, Deserializer, Serialize};
 
+/// Factor by which the upper end of the interval of the mean square error may miss `until`: 0.8 dB.
+const UNTIL_SLACK: f64 = 1.2;
 /// Largest number of frames that `until` gives a slide.
 pub const MAX_FRAMES_UNTIL: usize = 4096;
 /// Largest picture edge, in pixels.
@@ -76,11 +78,12 @@ pub enum Target {
 }
 
 impl Target {
-    /// True if a stated error is within the target.
+    /// True if a stated error is within the target, and the worse end of its interval at most `UNTIL_SLACK` beyond it. The estimate alone is within it
+    /// too early: of many frames, a lucky one stops.
     pub fn is_met_by(self, error: &PictureError) -> bool {
         match self {
-            Self::Psnr(decibels) => error.psnr.value >= decibels,
-            Self::Relmse(most) => error.relmse.value <= most,
+            Self::Psnr(decibels) => error.psnr.value >= decibels && error.psnr.low >= decibels - 10.0 * UNTIL_SLACK.log10(),
+            Self::Relmse(most) => error.relmse.value <= most && error.relmse.high <= UNTIL_SLACK * most,
         }
     }
 }
@@ -207,13 +210,14 @@ pub struct RenderSettings {
     pub width: usize,
     /// Pixels down.
     pub height: usize,
-    /// Samples per pixel and frame. Smooth methods accept fractions.
+    /// Samples per pixel and frame. Smooth methods accept fractions; `marched` takes twice [`super::smooth::AUDIT_PAIRS`] instead.
     pub samples: f64,
     /// How the correction of `two_level` is added.
     pub combine: Combine,
-    /// Smooth methods: stated error at which a slide needs no further frames. A slide gets frames until then, at most `MAX_FRAMES_UNTIL`.
+    /// Smooth methods: stated error at which a slide needs no further frames (see [`Target::is_met_by`]). A slide gets frames until then, at most
+    /// `MAX_FRAMES_UNTIL`.
     pub until: Option<Target>,
-    /// Smooth methods: milliseconds of coupled samples per frame, instead of `samples`.
+    /// `two_level`: milliseconds of coupled samples per frame, instead of `samples`.
     pub budget: Option<f64>,
     /// Background colour, linear.
     pub background: [f64; 3],
@@ -271,9 +275,11 @@ impl RenderSettings {
         if let Some(budget) = settings.budget {
             require((0.1..=600_000.0).contains(&budget), "render.budget", budget, "milliseconds, 0.1 to 600000")?;
         }
-        for (key, given) in [("render.until", settings.until.is_some()), ("render.budget", settings.budget.is_some())] {
-            require(!given || settings.method.is_smooth(), key, "given", "with render.method = \"marched\" or \"two_level\"")?;
-        }
+        let until = settings.until.is_none() || settings.method.is_smooth();
+        require(until, "render.until", "given", "with render.method = \"marched\" or \"two_level\"")?;
+        // A marched picture has a fixed number of samples.
+        let budget = settings.budget.is_none() || matches!(settings.method, Method::TwoLevel | Method::Auto);
+        require(budget, "render.budget", "given", "with render.method = \"two_level\"")?;
         let colour = |c: [f64; 3]| c.iter().all(|v| v.is_finite() && *v >= 0.0);
         require(colour(settings.background), "render.background", settings.background, "three finite numbers, 0 or above")?;
         require(colour(settings.missing_color), "render.missing_color", settings.missing_color, "three finite numbers, 0 or above")?;
@@ -286,5 +292,30 @@ impl RenderSettings {
             require(cells.iter().product::<usize>() <= 1 << 24, "render.majorant_cells", cells, "at most 16777216 cells in all")?;
         }
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::smooth::ErrorEstimate;
+
+    #[test]
+    fn a_marched_picture_has_no_budget() {
+        let given = |method| RenderSettings { method, budget: Some(50.0), ..RenderSettings::default() }.check();
+        assert!(given(Method::TwoLevel).is_ok());
+        assert!(given(Method::Marched).unwrap_err().to_string().contains("render.budget"));
+    }
+
+    #[test]
+    fn a_target_is_met_with_its_interval() {
+        let stated = |value, low, high| ErrorEstimate { value, low, high };
+        let met = |relmse, psnr| {
+            let error = PictureError { relmse, psnr, ..PictureError::default() };
+            [Target::Relmse(0.1), Target::Psnr(40.0)].map(|target| target.is_met_by(&error))
+        };
+        assert_eq!(met(stated(0.09, 0.07, 0.11), stated(40.5, 39.4, 41.5)), [true, true]);
+        assert_eq!(met(stated(0.09, 0.05, 0.13), stated(40.5, 39.0, 42.0)), [false, false], "an interval that is too wide");
+        assert_eq!(met(stated(0.11, 0.11, 0.11), stated(39.9, 39.9, 39.9)), [false, false]);
     }
 }

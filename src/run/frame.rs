@@ -12,6 +12,7 @@ use super::{FrameRecord, StageSeconds};
 use crate::backend::{AuditRequest, Backend, DeviceError, FrameJob, FrameSamples, FrozenOf, Routing, Smooth, Surrogate};
 use crate::flow::VelocitySource;
 use crate::progress;
+use crate::render::smooth::AUDIT_PAIRS;
 use crate::render::{Combine, Method};
 use crate::surrogate::{Learned, Predict, Trace};
 use crate::trust::{Gate, Strata};
@@ -164,6 +165,8 @@ impl Run<'_> {
         // Warm-up frames use separate random numbers, so that the first frame after them does not depend on their number.
         let number = if picture.place.is_warmup { WARMUP_PICTURES + self.progress.frame } else { self.progress.pictures };
         let samples_per_pixel = match scene.time.warmup_samples.filter(|_| picture.place.is_warmup) {
+            // Its samples only measure the error.
+            _ if scene.render.method == Method::Marched => 2.0 * AUDIT_PAIRS,
             Some(samples) => samples as f64,
             None => self.progress.affordable_samples(&scene.render),
         };

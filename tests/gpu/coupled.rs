@@ -108,7 +108,6 @@ fn the_same_answers_give_the_cpu_s_sums() {
             }
             add(12 + quarter, 1.0);
             add(14, halves[0].alpha + halves[1].alpha);
-            add(15, (halves[0].traced + halves[1].traced) as f32);
         }
         let stats = held.round(&mut tracker, &mut on_gpu, round, &mut ThroughHost(&gpu), &NEVER).unwrap();
         let queries: u64 = reference.iter().map(|path| u64::from(path.queries)).sum();

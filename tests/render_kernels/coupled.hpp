@@ -3,7 +3,7 @@
 #include "rendering/coupled.cuh"
 
 // Reads: parameters, majorants, cells that may miss, list, sums; look-ahead, guesses per wave, paths of a band. Gives: counts, evaluated points,
-// waves; difference, alpha and traced queries of each path; the new sums; observations.
+// waves; difference and alpha of each path; the new sums; observations.
 template <class Answers> static void coupled(const Surrogate& surrogate, const Answers& answers) {
     const FrameScene scene = take_one<FrameScene>();
     const size_t cells = size_t(scene.box.cells[0]) * scene.box.cells[1] * scene.box.cells[2];
@@ -24,10 +24,9 @@ template <class Answers> static void coupled(const Surrogate& surrogate, const A
         colour(band, none), found_so_far(band, none), found(2 * entries, none);
     std::vector<Float2> colour_rest(band, {NAN, NAN});
     std::vector<Uint4> progress(band);
-    std::vector<uint32_t> traced(2 * entries);
     const CoupledSlots slots = {place.data(),  way.data(),         kept_place.data(),   kept_way.data(), factors.data(),
                                 colour.data(), colour_rest.data(), found_so_far.data(), progress.data()};
-    CoupledWork work = {list.data(), sums.data(), found.data(), traced.data(), scene.width, pixels, entries, 0, 0, 0};
+    CoupledWork work = {list.data(), sums.data(), found.data(), scene.width, pixels, entries, 0, 0, 0};
 
     const size_t capacity = size_t(band) + most_guesses;
     std::vector<float> points(3 * capacity), log_stretch(capacity);
@@ -65,7 +64,6 @@ template <class Answers> static void coupled(const Surrogate& surrogate, const A
     give_one(evaluated);
     give_one(waves);
     give(found);
-    give(traced);
     give(sums);
     give(count);
     give(highest);

@@ -3,8 +3,8 @@
 use super::*;
 use ridgewatch::render::smooth::{CoupledPath, Nodes};
 
-/// Planes of the sums: differences by half, quarter and channel, pairs by quarter, differences of alpha, traced queries.
-const PLANES: usize = 16;
+/// Planes of the sums: differences by half, quarter and channel, pairs by quarter, differences of alpha.
+const PLANES: usize = 15;
 const PIXELS: usize = 37 * 23;
 
 /// A smooth field near [`Waves`], on nodes.
@@ -54,7 +54,6 @@ struct Round {
     waves: u32,
     /// Difference and alpha of each path.
     found: Vec<[f32; 4]>,
-    traced: Vec<u32>,
     seen: CellObservations,
 }
 
@@ -84,11 +83,11 @@ fn round(
     let mut output = &output[..];
     let counts = read::<[u32; 6]>(&mut output, 1)[0];
     let [evaluated, waves] = read::<[u32; 2]>(&mut output, 1)[0];
-    let (found, traced) = (read(&mut output, 2 * list.len()), read(&mut output, 2 * list.len()));
+    let found = read(&mut output, 2 * list.len());
     *sums = read(&mut output, PLANES * PIXELS);
     let seen = CellObservations { count: read(&mut output, cells), highest: read(&mut output, cells), missing: read(&mut output, cells) };
     assert!(output.is_empty());
-    Round { counts, evaluated, waves, found, traced, seen }
+    Round { counts, evaluated, waves, found, seen }
 }
 
 /// [`Waves`] outside of missing cells.
@@ -142,9 +141,9 @@ fn coupled_paths_are_the_same_bits() {
             let waving = [PLAIN, FAR, Waving { ahead: 5, most_guesses: 700, band: 300 }][pair as usize];
             let found = round(&mut renderer, (&table, dimensions as i32), &missing_cells, false, &list, &mut sums, waving);
             for (i, expected) in expected.iter().enumerate() {
-                let CoupledPath { radiance: [r, g, b], alpha, traced, .. } = *expected;
-                let equal = found.found[i].map(f32::to_bits) == [r, g, b, alpha].map(f32::to_bits) && found.traced[i] == traced;
-                assert!(equal, "round {pair}, path {i}: {:?}, {} traced, instead of {expected:?}", found.found[i], found.traced[i]);
+                let CoupledPath { radiance: [r, g, b], alpha, .. } = *expected;
+                let equal = found.found[i].map(f32::to_bits) == [r, g, b, alpha].map(f32::to_bits);
+                assert!(equal, "round {pair}, path {i}: {:?} instead of {expected:?}", found.found[i]);
             }
             let total = |of: fn(&CoupledPath) -> u32| expected.iter().map(of).sum::<u32>();
             let [queries, traced, missing, exceeded, ended, over_budget] = found.counts;
@@ -173,7 +172,6 @@ fn add(sums: &mut [f32], list: &[u32], paths: &[CoupledPath], pair: u32) {
         }
         at(12 + quarter, 1.0);
         at(14, halves[0].alpha + halves[1].alpha);
-        at(15, (halves[0].traced + halves[1].traced) as f32);
     }
 }
 
@@ -194,7 +192,7 @@ fn the_look_ahead_changes_waves_alone() {
     assert!(plain.evaluated > queries - missing && plain.evaluated < queries, "{} of {queries}, {missing} missing", plain.evaluated);
     for waving in [FAR, Waving { ahead: 3, ..FAR }, Waving { most_guesses: 50, band: 64, ..FAR }] {
         let (found, other) = run(waving);
-        assert_eq!((found.counts, &found.seen, &found.traced), (plain.counts, &plain.seen, &plain.traced));
+        assert_eq!((found.counts, &found.seen), (plain.counts, &plain.seen));
         assert!(other.iter().zip(&sums).all(|(a, b)| a.to_bits() == b.to_bits()));
         if waving.band == FAR.band {
             assert!(found.waves < plain.waves && found.evaluated > plain.evaluated);

@@ -376,7 +376,7 @@ fn a_tile_that_shows_no_difference() {
     ]);
 }
 
-/// Fails without the rule for a single quarter.
+/// Fails with the quantile of the normal distribution, and without the rule of three where no pair shows a difference.
 #[test]
 fn too_few_pairs_for_an_interval() {
     // Four tiles: the interval comes from one difference a tile.
@@ -404,10 +404,9 @@ fn too_few_pairs_for_an_interval() {
             known += 1;
             inside += u32::from((error.rms.low..=error.rms.high).contains(&exact));
             width += (error.rms.high - error.rms.low) / exact;
-            // One pair a tile is in one quarter, which says nothing about the scatter.
-            let shows = error.rms.value > 1.001 * error.march_rms;
-            silent += u32::from(!shows);
-            assert!(pairs > 4 || !shows || error.rms.high > 1.5 * error.rms.low, "{:?}", error.rms);
+            // One pair a tile is in one quarter, and may show no difference.
+            silent += u32::from(error.rms.value <= 1.001 * error.march_rms);
+            assert!(pairs > 4 || error.rms.high > 1.5 * error.rms.low, "{:?}", error.rms);
         }
         println!(
             "{pairs} pairs: {known} of {SEEDS} known, {inside} inside, width {:.2}, {silent} show no difference",
@@ -415,17 +414,17 @@ fn too_few_pairs_for_an_interval() {
         );
         found.push((pairs, known, inside, width / f64::from(known), silent));
     }
-    assert!(found[0].2 * 5 >= found[0].1 * 4, "a pair a pixel suffices: {found:?}");
     let last = found[found.len() - 1];
-    let fails = found.iter().find(|f| f.2 * 5 < f.1 * 4).unwrap_or(&last);
+    // Of 24 intervals of 95 %, 20 or more hold with a probability of 0.99.
+    assert!(found.iter().all(|f| f.2 * 6 >= f.1 * 5), "intervals hold with any number of pairs: {found:?}");
     row([
         "too few pairs of samples for an interval",
-        &format!("{} pairs in a picture of {WIDTH}x{WIDTH} ({} of {} intervals hold)", fails.0, fails.2, fails.1),
+        &format!("not down to {} pairs in a picture of {WIDTH}x{WIDTH} ({} of {} intervals hold)", last.0, last.2, last.1),
         "`picture_error`, its interval; `samples_per_pixel`",
-        "where one quarter of the samples is empty, takes the error itself as its standard error",
+        "takes Student's quantile for the number of tiles, and at least the rule of three",
         &format!(
-            "interval {:.1} times as wide as the error; {:.1} times with {} pairs; with {} pairs {} of {} pictures show no difference and state the error of the march alone",
-            fails.3, found[0].3, found[0].0, last.0, last.4, last.1
+            "interval {:.1} times as wide as the error; {:.1} times with {} pairs; with {} pairs {} of {} pictures show no difference",
+            last.3, found[0].3, found[0].0, last.0, last.4, last.1
         ),
         "too_few_pairs_for_an_interval",
     ]);

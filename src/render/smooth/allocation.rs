@@ -76,23 +76,20 @@ impl Allocation {
     }
 }
 
-/// The pixels of a picture that get a pair; a pixel may come several times.
-pub(super) fn pixels(round: &[TilePairs], width: usize, height: usize) -> Vec<u32> {
+/// The pixels of a picture that get a pair; a pixel may come several times. One by one, since a round of many samples has more than memory should hold.
+pub(super) fn pixels(round: &[TilePairs], width: usize, height: usize) -> impl Iterator<Item = u32> {
     let across = tiles(width, height)[0];
-    let mut chosen = Vec::new();
-    for (tile, &TilePairs { cursor, pairs }) in round.iter().enumerate() {
+    round.iter().enumerate().flat_map(move |(tile, &TilePairs { cursor, pairs })| {
         let corner = [tile % across * TILE, tile / across * TILE];
-        for first in (0..pairs).step_by(TILE_PIXELS) {
+        (0..pairs).step_by(TILE_PIXELS).flat_map(move |first| {
             let now = (pairs - first).min(TILE_PIXELS);
-            for (y, x) in (0..TILE).flat_map(|y| (0..TILE).map(move |x| (y, x))) {
+            (0..TILE_PIXELS).map(|i| (i % TILE, i / TILE)).filter_map(move |(x, y)| {
                 let is_inside = corner[0] + x < width && corner[1] + y < height;
-                if is_inside && usize::from(bayer_rank(x, y).wrapping_sub(cursor)) < now {
-                    chosen.push(((corner[1] + y) * width + corner[0] + x) as u32);
-                }
-            }
-        }
-    }
-    chosen
+                let is_due = usize::from(bayer_rank(x, y).wrapping_sub(cursor)) < now;
+                (is_inside && is_due).then(|| ((corner[1] + y) * width + corner[0] + x) as u32)
+            })
+        })
+    })
 }
 
 #[cfg(test)]
@@ -105,7 +102,7 @@ mod tests {
         let mut allocation = Allocation::new(width, height);
         let mut pairs = vec![0; width * height];
         for _ in 0..32 {
-            pixels(&allocation.next(0.375), width, height).iter().for_each(|&pixel| pairs[pixel as usize] += 1);
+            pixels(&allocation.next(0.375), width, height).for_each(|pixel| pairs[pixel as usize] += 1);
         }
         assert!(pairs.iter().all(|&n| (11..=13).contains(&n)), "{:?} of 12", (pairs.iter().min(), pairs.iter().max()));
     }

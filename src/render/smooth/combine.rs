@@ -185,8 +185,14 @@ pub enum Correction {
 pub struct Combined {
     /// Radiance to add to the marched picture, per pixel.
     pub correction: Vec<[f32; 3]>,
-    /// Per pixel and channel, estimates of the squared error: from all pairs, and from those of one quarter. NaN where there are none.
-    pub squared: Vec<[[f32; 3]; 3]>,
+    /// Per pixel and channel, an estimate of the squared error, and its scatter: a number of about the variance of that estimate, of either sign.
+    /// NaN where there are no pairs.
+    ///
+    /// With e_A and e_B the noise of d_A and d_B, the estimate is wrong by (c - a) e_B + (c - b) e_A + e_A e_B. Halved differences between the quarters
+    /// are noise of the same variance; with them in place of e_A and e_B and d_A, d_B in place of c this is the scatter of a pixel that has both
+    /// quarters, at least as large on average. The product is in d_A and d_B already, except where the sum is shown, a = d_A. In a pixel with one
+    /// quarter it is the estimate itself (for a sum d_A d_B), with the sign of the quarter, so that a tile's sum is the difference between its quarters.
+    pub squared: Vec<[[f32; 3]; 2]>,
 }
 
 /// The correction of `sums` (row by row, `width` pixels each) and its squared error, from the products of differences between halves.
@@ -212,14 +218,21 @@ pub fn combine(sums: &[PairSums], width: usize, how: Correction) -> Combined {
         .with_min_len(1 << 10)
         .map(|i| {
             let (sums, a, b, r) = (&sums[i], a[i], b[i], correction[i]);
-            let score = |known: bool, d_a: [f32; 3], d_b: [f32; 3]| -> [f32; 3] {
-                if !known {
-                    return [f32::NAN; 3];
+            if sums.pairs() == 0 {
+                return [[f32::NAN; 3]; 2];
+            }
+            let [d_a, d_b] = [sums.half(0), sums.half(1)];
+            let apart = |half: usize, k: usize| 0.5 * (sums.quarter(half, 0)[k] - sums.quarter(half, 1)[k]);
+            let squared = std::array::from_fn(|k| r[k] * r[k] - (a[k] * d_b[k] + b[k] * d_a[k]) + d_a[k] * d_b[k]);
+            let scatter = std::array::from_fn(|k| {
+                if sums.pairs.contains(&0) {
+                    let estimate = if how == Correction::Summed { d_a[k] * d_b[k] } else { squared[k] };
+                    return if sums.pairs[0] > 0 { estimate } else { -estimate };
                 }
-                std::array::from_fn(|k| r[k] * r[k] - (a[k] * d_b[k] + b[k] * d_a[k]) + d_a[k] * d_b[k])
-            };
-            let quarter = |q: usize| score(sums.pairs[q] > 0, sums.quarter(0, q), sums.quarter(1, q));
-            [score(sums.pairs() > 0, sums.half(0), sums.half(1)), quarter(0), quarter(1)]
+                let (e_a, e_b) = (apart(0, k), apart(1, k));
+                if how == Correction::Summed { e_a * e_b } else { (d_a[k] - a[k]) * e_b + (d_b[k] - b[k]) * e_a }
+            });
+            [squared, scatter]
         })
         .collect();
     Combined { correction, squared }

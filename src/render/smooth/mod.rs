@@ -6,6 +6,8 @@
 mod allocation;
 mod combine;
 mod coupled;
+#[cfg(test)]
+mod coverage_tests;
 mod light_volume;
 mod march;
 mod march_control;

@@ -199,14 +199,15 @@ impl Picture {
         let (width, height) = (medium.scene.width, medium.scene.height);
         let pairs_per_pixel = if round.method == Method::Marched { AUDIT_PAIRS } else { round.samples / 2.0 };
         let mut allocation = self.allocation.clone();
-        let chosen = pixels(&allocation.next(pairs_per_pixel), width, height);
+        let plan = allocation.next(pairs_per_pixel);
+        let mut chosen = pixels(&plan, width, height).peekable();
         // Number of each pair within its pixel, which selects its random numbers.
         let mut next: Vec<u32> = self.sums.iter().map(PairSums::pairs).collect();
         let mut stats = RenderStats::default();
         let mut paths = Vec::new();
-        for chosen in chosen.chunks(MAX_PAIRS) {
+        while chosen.peek().is_some() {
             paths.clear();
-            for &pixel in chosen {
+            for pixel in chosen.by_ref().take(MAX_PAIRS) {
                 let number = &mut next[pixel as usize];
                 paths.extend([(pixel, 2 * *number), (pixel, 2 * *number + 1)]);
                 *number += 1;
@@ -235,7 +236,7 @@ impl Picture {
                 sums.pairs[quarter] += 1;
             }
         }
-        self.pairs += chosen.len() as u64;
+        self.pairs += stats.paths / 2;
         self.allocation = allocation;
         Some(stats)
     }
@@ -283,17 +284,25 @@ impl Picture {
             let mut sums = TileSums::default();
             for i in (top..(top + TILE).min(height)).flat_map(|y| (y * width + left)..(y * width + (left + TILE).min(width))) {
                 let colour = film.rgba[i];
-                for (which, e) in combined.squared[i].iter().enumerate().filter(|(_, e)| e[0].is_finite()) {
-                    let mean = |weight: &dyn Fn(f32) -> f32| (0..3).map(|k| e[k] * weight(colour[k])).sum::<f32>() / 3.0;
-                    let squared = [mean(&|_| 1.0), mean(&|c| 1.0 / (c * c + 0.01)), mean(&squared_slope)];
-                    let add = |errors: &mut TileErrors| {
-                        (0..3).for_each(|weighting| errors.squared[which][weighting] += squared[weighting]);
-                        errors.pixels[which] += 1.0;
-                    };
-                    add(&mut sums.all);
-                    if colour[3] > LIT {
-                        add(&mut sums.lit);
+                let [squared, scatter] = combined.squared[i];
+                if squared[0].is_nan() {
+                    continue;
+                }
+                let pairs = self.sums[i].pairs() as f32;
+                let radiance: [f32; 3] = std::array::from_fn(|k| colour[k] * colour[k]);
+                let mean = |e: [f32; 3], weight: &dyn Fn(f32) -> f32| (0..3).map(|k| e[k] * weight(colour[k])).sum::<f32>() / 3.0;
+                let weighted = |e: [f32; 3]| [mean(e, &|_| 1.0), mean(e, &|c| 1.0 / (c * c + 0.01)), mean(e, &squared_slope)];
+                let found = [squared, scatter, radiance].map(weighted);
+                let add = |errors: &mut TileErrors| {
+                    for (sums, found) in [&mut errors.squared, &mut errors.scatter, &mut errors.radiance].into_iter().zip(found) {
+                        (0..3).for_each(|weighting| sums[weighting] += found[weighting]);
                     }
+                    errors.pixels += 1.0;
+                    errors.pairs += pairs;
+                };
+                add(&mut sums.all);
+                if colour[3] > LIT {
+                    add(&mut sums.lit);
                 }
                 sums.variance += self.sums[i].sample_variance();
             }

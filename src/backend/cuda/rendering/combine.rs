@@ -64,7 +64,7 @@ struct CombineArgument {
 const _: () = assert!(size_of::<QuartersArgument>() == 64 && size_of::<LevelArgument>() == 24 && size_of::<CombineArgument>() == 88);
 
 const TILE_FIELDS: usize = size_of::<TileSums>() / size_of::<f32>();
-const _: () = assert!(TILE_FIELDS == 25);
+const _: () = assert!(TILE_FIELDS == 23);
 
 device_repr!(QuartersArgument, LevelArgument, CombineArgument);
 

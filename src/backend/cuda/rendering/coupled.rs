@@ -30,8 +30,8 @@ const MIN_QUEUE_PER_SLOT: u64 = 2;
 /// Pixels in a tile.
 const TILE_PIXELS: usize = TILE * TILE;
 /// Planes of the sums, one value per pixel each: summed differences by half, quarter and channel (the channel fastest), pairs in quarters 0 and
-/// 1, summed differences of alpha, traced queries.
-pub const SUM_PLANES: usize = 16;
+/// 1, summed differences of alpha.
+pub const SUM_PLANES: usize = 15;
 
 /// The surrogate's log-stretch on the device, at nodes i / (n - 1) of the unit domain, x fastest.
 #[derive(Debug, Clone, Copy)]
@@ -102,7 +102,6 @@ struct WorkArgument {
     list: u64,
     sums: u64,
     found: u64,
-    traced: u64,
     width: u32,
     pixels: u32,
     entries: u32,
@@ -150,7 +149,7 @@ struct Control {
 
 // Sizes that the kernels assert.
 const _: () = assert!(size_of::<PairTile>() == 8 && size_of::<SurrogateArgument>() == 120 && size_of::<Control>() == 64);
-const _: () = assert!(size_of::<WorkArgument>() == 56 && size_of::<SlotsArgument>() == 72 && size_of::<QueueArgument>() == 64);
+const _: () = assert!(size_of::<WorkArgument>() == 48 && size_of::<SlotsArgument>() == 72 && size_of::<QueueArgument>() == 64);
 
 // SAFETY: `repr(C)`, plain numbers and device addresses, laid out as the structs of `kernels/rendering/coupled.cuh` and `coupled.cu`.
 unsafe impl DeviceRepr for PairTile {}
@@ -458,7 +457,6 @@ struct Layout {
     by: u64,
     list: u64,
     found: u64,
-    traced: u64,
     tiles: u64,
     majorants: u64,
     may_miss: u64,
@@ -485,7 +483,6 @@ impl Layout {
             by: take(plan.queue, 1),
             list: take(plan.entries, 4),
             found: take(2 * plan.entries, 16),
-            traced: take(2 * plan.entries, 4),
             tiles: take(plan.tiles, size_of::<PairTile>() as u64),
             majorants: take(plan.cells, 4),
             may_miss: take(plan.cells, 1),
@@ -558,7 +555,6 @@ impl Memory {
                 list: self.at(l.list),
                 sums,
                 found: self.at(l.found),
-                traced: self.at(l.traced),
                 width: parameters.size()[0] as u32,
                 pixels: parameters.pixels() as u32,
                 entries: entries as u32,
@@ -648,7 +644,7 @@ mod tests {
         let [a, b, c, d, e, f, g, h, i] = l.slots;
         let slots = [(a, 16), (b, 16), (c, 16), (d, 16), (e, 16), (f, 16), (g, 8), (h, 16), (i, 16), (l.live[0], 4), (l.live[1], 4)];
         let queue = [(l.points, 12), (l.records[0], 16), (l.records[1], 16), (l.log_stretch, 4), (l.by, 1)];
-        let rest = [(l.list, 8000), (l.found, 64_000), (l.traced, 16_000), (l.tiles, 616), (l.majorants, 200), (l.may_miss, 50)];
+        let rest = [(l.list, 8000), (l.found, 64_000), (l.tiles, 616), (l.majorants, 200), (l.may_miss, 50)];
         let ends = slots.map(|(at, size)| (at, 3000 * size)).into_iter().chain(queue.map(|(at, size)| (at, 7000 * size))).chain(rest);
         let ends: Vec<(u64, u64)> = ends.chain([(l.watch, 600), (l.control, 64), (l.end, 0)]).collect();
         for pair in ends.windows(2) {

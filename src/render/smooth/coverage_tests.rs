@@ -1,0 +1,159 @@
+//! How often the stated intervals hold, over pictures and scenes whose exact picture is known: the traced field is that of nodes, which are marched
+//! finely.
+
+use super::{ErrorEstimate, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
+use crate::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, Target, TransferSettings};
+use rayon::prelude::*;
+use ridgewatch_field::Domain;
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+
+static NEVER: AtomicBool = AtomicBool::new(false);
+const NODES: usize = 33;
+const SEEDS: u64 = 24;
+
+struct Traced<'a>(&'a Nodes);
+
+impl LogStretch for Traced<'_> {
+    fn evaluate(&mut self, points: &[[f32; 3]], log_stretch: &mut [f32], traced: &mut [bool]) {
+        points.iter().zip(log_stretch).for_each(|(p, s)| *s = self.0.at(*p));
+        traced.fill(true);
+    }
+}
+
+fn nodes(of: impl Fn([f32; 3]) -> f32) -> Nodes {
+    Nodes::new([NODES; 3], Arc::new((0..NODES.pow(3)).map(|i| of(Nodes::unit([NODES; 3], i))).collect()))
+}
+
+fn ridges(p: [f32; 3]) -> f32 {
+    0.5 + 0.5 * (5.0 * p[0] + 2.0 * p[2]).sin() * (6.0 * p[1] - p[2]).cos()
+}
+
+/// The traced field and the surrogate.
+fn fields(which: usize) -> [Nodes; 2] {
+    match which {
+        0 => [nodes(ridges), nodes(|p| ridges(p) + 0.1 * (11.0 * p[0]).sin())],
+        1 => [nodes(|p| 0.1 + 0.5 * p[0]), nodes(|_| 0.1)],
+        // A tube that the surrogate does not know.
+        _ => [nodes(|p| if (p[0] - 0.53).hypot(p[1] - 0.47) < 0.15 { 0.8 } else { 0.1 }), nodes(|_| 0.1)],
+    }
+}
+
+fn scene(width: usize, seed: u64) -> Scene {
+    let camera =
+        CameraSettings { eye: [0.5, 0.5, 1.5], look_at: [0.5, 0.5, 1.0], up: [0.0, 1.0, 0.0], field_of_view: 90.0, orthographic: true };
+    Scene {
+        camera,
+        light: LightSettings::directional([0.3, 0.2, -1.0], 4.0 * std::f64::consts::PI),
+        transfer: TransferSettings { low: Some(0.0), high: Some(1.0), extinction: Some(5.0), albedo: [vec![0.8], vec![0.6], vec![0.4]] },
+        settings: RenderSettings { width, height: width, background: [0.0; 3], ..RenderSettings::default() },
+        seed,
+        scale: [1.0; 3],
+    }
+}
+
+fn renderer(width: usize, seed: u64) -> Renderer {
+    Renderer::new(scene(width, seed), &Domain::cuboid([0.0; 3], [1.0; 3]), 1.0).unwrap()
+}
+
+/// Radiance of every pixel of a field, without noise.
+fn exact(traced: &Nodes, width: usize) -> Vec<[f64; 3]> {
+    const RAYS: u64 = 16;
+    let renderer = renderer(width, 1);
+    let scene = renderer.frame_scene(0);
+    let medium = Medium { scene: &scene, nodes: traced, missing: None };
+    let spacing = medium.spacing() as f32;
+    let pixel = |pixel: u32| {
+        let mut sum = RaySum::default();
+        (0..RAYS).for_each(|j| sum.add(&medium.ray(pixel, j, 0.25 * spacing, ToLight::March(0.5 * spacing), false)));
+        sum.radiance.map(|c| f64::from(c) / RAYS as f64)
+    };
+    (0..(width * width) as u32).into_par_iter().map(pixel).collect()
+}
+
+/// Weighted mean square error over lit pixels and channels.
+fn true_square(film: &Film, exact: &[[f64; 3]], weight: impl Fn(f64) -> f64) -> f64 {
+    let lit: Vec<usize> = (0..exact.len()).filter(|&i| film.rgba[i][3] > 0.01).collect();
+    let square = |i: usize, k: usize| {
+        let found = f64::from(film.rgba[i][k]);
+        (found - exact[i][k]).powi(2) * weight(found)
+    };
+    lit.iter().flat_map(|&i| (0..3).map(move |k| (i, k))).map(|(i, k)| square(i, k)).sum::<f64>() / (3 * lit.len()) as f64
+}
+
+/// Numbers of pictures that state an error, whose interval holds the true one, is above it and below it.
+fn counted([traced, surrogate]: &[Nodes; 2], width: usize, (method, sum): (Method, bool), pairs_per_pixel: f64, rounds: u64) -> [usize; 4] {
+    let exact = exact(traced, width);
+    let found = |seed: u64| {
+        let mut renderer = renderer(width, 100 + seed);
+        let mut picture = Picture::default();
+        let mut last = None;
+        for number in 0..rounds {
+            let samples = 2.0 * pairs_per_pixel;
+            let round = Refinement { nodes: surrogate, missing: None, method, sum, samples, number, stop: &NEVER };
+            last = renderer.refine(&mut picture, &round, &mut Traced(traced));
+        }
+        let (film, _, error) = last.unwrap();
+        let truth = true_square(&film, &exact, |_| 1.0).sqrt();
+        let ErrorEstimate { low, high, .. } = error.rms;
+        [error.is_known(), (low..=high).contains(&truth), low > truth, high < truth].map(|is| usize::from(is && error.is_known()))
+    };
+    (0..SEEDS).into_par_iter().map(found).reduce(|| [0; 4], |a, b| std::array::from_fn(|i| a[i] + b[i]))
+}
+
+/// Fails with the quantile of the normal distribution, and with the difference between a tile's quarters as the scatter of a sum.
+#[test]
+fn intervals_hold_over_scenes_and_numbers_of_samples() {
+    let mut all = [0; 4];
+    for which in 0..3 {
+        let fields = fields(which);
+        for width in [16, 32] {
+            for (method, pairs, rounds) in [
+                ((Method::TwoLevel, false), 1.0 / 16.0, 1),
+                ((Method::TwoLevel, false), 1.0, 1),
+                ((Method::TwoLevel, true), 1.0, 2),
+                ((Method::TwoLevel, false), 1.0 / 64.0, 1),
+                ((Method::Marched, false), 1.0, 2),
+            ] {
+                let found = counted(&fields, width, method, pairs, rounds);
+                all = std::array::from_fn(|i| all[i] + found[i]);
+                assert!(found[1] * 10 >= found[0] * 8, "field {which}, {width}x{width}, {method:?}, {pairs} pairs x {rounds}: {found:?}");
+            }
+        }
+    }
+    let [known, inside, above, below] = all;
+    assert!(inside * 100 >= known * 93 && above > 0 && below > 0, "{all:?}");
+}
+
+/// Fails if the estimate alone decides: most of the frames that it picks are lucky ones.
+#[test]
+fn a_target_is_reached_when_it_is_met() {
+    const WIDTH: usize = 32;
+    const MOST: f64 = 4e-3;
+    const SEEDS: u64 = 24;
+    let target = Target::Relmse(MOST);
+    let [traced, surrogate] = fields(1);
+    let exact = exact(&traced, WIDTH);
+    let reached = |seed: u64| {
+        let mut renderer = renderer(WIDTH, 100 + seed);
+        let (mut picture, mut early) = (Picture::default(), None);
+        for number in 0..400 {
+            let round =
+                Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: false, samples: 1.0, number, stop: &NEVER };
+            let (film, _, error) = renderer.refine(&mut picture, &round, &mut Traced(&traced)).unwrap();
+            let missed = true_square(&film, &exact, |c| 1.0 / (c * c + 0.01)) / MOST;
+            if error.relmse.value <= MOST {
+                early.get_or_insert(missed);
+            }
+            if target.is_met_by(&error) {
+                assert!(error.relmse.value <= MOST && error.relmse.high <= 1.2 * MOST);
+                return [missed, early.unwrap(), number as f64];
+            }
+        }
+        panic!("{target:?} is not reached");
+    };
+    let found: Vec<[f64; 3]> = (0..SEEDS).into_par_iter().map(reached).collect();
+    let held = |which: usize| found.iter().filter(|found| found[which] <= 1.2).count() * 100 >= found.len() * 93;
+    assert!(held(0), "{found:.2?}");
+    assert!(!held(1), "the estimate alone would do: {found:.2?}");
+}
