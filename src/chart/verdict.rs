@@ -1,7 +1,7 @@
 //! What a chart says, in words.
 
 use super::ftle::{FtlePanel, FtlePoint};
-use super::picture::{PicturePanel, TARGETS};
+use super::picture::{PicturePanel, RESOLVED, TARGETS};
 use super::{Chart, pick};
 
 /// Numbers of samples for which building is charged.
@@ -22,8 +22,13 @@ pub fn verdict(chart: &Chart) -> Vec<String> {
             None => "the table never pays".into(),
         };
         said.push(format!(
-            "{} {}: {} steps, {:.0} ns a traced sample, {:.1} ns from a table that takes {:.2} s; {from}.",
-            point.axis, point.value, point.steps, point.trace_ns, point.table_ns, point.table_seconds
+            "{} {}: {} steps, {:.2} ns a traced sample, {:.3} ns from a table that takes {}; {from}.",
+            point.axis,
+            point.value,
+            point.steps,
+            point.trace_ns,
+            point.table_ns,
+            duration(point.table_seconds)
         ));
     }
     said
@@ -92,6 +97,11 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
 
 fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
     for target in TARGETS {
+        let resolved = panel.truth_psnr + RESOLVED;
+        if target > resolved {
+            said.push(format!("{target} dB over lit pixels: the truth tells up to {resolved:.1} dB; more --seconds give it more samples."));
+            continue;
+        }
         let reached = |curve: &super::PictureCurve| curve.seconds_to(target).map(|seconds| (seconds, curve.name()));
         let mut times: Vec<(f64, String)> = panel.curves.iter().filter_map(reached).collect();
         times.sort_by(|a, b| a.0.total_cmp(&b.0));
@@ -132,6 +142,7 @@ pub(super) fn size(bytes: u64) -> String {
 /// Seconds in a unit that reads well.
 fn duration(seconds: f64) -> String {
     match seconds {
+        s if s < 1e-3 => format!("{:.0} us", 1e6 * s),
         s if s < 1.0 => format!("{:.0} ms", 1e3 * s),
         s if s < 600.0 => format!("{s:.2} s"),
         s if s < 36_000.0 => format!("{:.0} min", s / 60.0),
