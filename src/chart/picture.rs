@@ -154,7 +154,7 @@ impl std::ops::Add for ErrorSums {
 }
 
 /// Errors of a film against the truth; lit pixels have an opacity above [`LIT`] there. `tone_map` is `[contrast, brightness, gamma]`. A PSNR is told
-/// up to [`RESOLVED`] above that of the truth.
+/// up to 6 dB above that of the truth.
 pub fn picture_errors(film: &Film, truth: &Truth, tone_map: [f64; 3]) -> PictureErrors {
     let [contrast, brightness, gamma] = tone_map;
     let tone = |c: f32| ((f64::from(c) - 0.5) * contrast + brightness).clamp(0.0, 1.0).powf(1.0 / gamma);
