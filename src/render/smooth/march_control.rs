@@ -5,13 +5,15 @@ use crate::rng::FrameRandom;
 /// Rays per pixel of the first round. They come two by two, on opposite sides of the pixel's centre.
 pub const FIRST_RAYS: u64 = 2;
 /// Rays per pixel that a picture gets in any case, one pair a round, and the most it gets.
-const MIN_RAYS: u64 = 4;
+pub const MIN_RAYS: u64 = 4;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
+/// Rays after the first `MIN_RAYS` against which these are audited. They share no coordinate with them, so that edges along the axes show too.
+pub const AUDIT_RAYS: u64 = 16;
 /// Once the error of the pixel filter is this share of what it may be, no more rays are marched.
 const SPARE: f64 = 0.25;
 /// Audits that a picture gets in any case, one a round.
@@ -32,7 +34,7 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `FIRST_RAYS` rays.
+    /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `MIN_RAYS` rays.
     audited: [f64; 2],
     quadrature: f64,
     filter: f64,
@@ -84,17 +86,18 @@ impl MarchControl {
         (0..AUDITED_PIXELS).map(pixel).collect()
     }
 
-    /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
-    pub fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
+    /// Takes in an audited pixel: the means of the first `MIN_RAYS` rays and of the `AUDIT_RAYS` that follow, and those of the first `FIRST_RAYS` as
+    /// marched and marched finely.
+    pub fn audit(&mut self, [first, following]: [[f64; 3]; 2], quadrature: Option<[[f64; 3]; 2]>) {
         let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
         // Pixels that show the background alone agree exactly. They do not count, since errors are stated over lit pixels.
-        let filter = square(coarse, following);
+        let filter = square(first, following);
         if filter > 0.0 {
             self.audited[0] += 1.0;
-            // Both means have the error of the filter.
-            self.filter += 0.5 * filter;
+            // The rays that follow have an error of their own, so that this is rather too much.
+            self.filter += filter;
         }
-        let quadrature = fine.map_or(0.0, |fine| square(coarse, fine));
+        let quadrature = quadrature.map_or(0.0, |[coarse, fine]| square(coarse, fine));
         if quadrature > 0.0 {
             self.audited[1] += 1.0;
             self.quadrature += quadrature;
@@ -107,7 +110,7 @@ impl MarchControl {
 
     /// Error of the pixel filter, which falls at least as fast as with independent rays.
     fn filter(&self) -> f64 {
-        self.filter / self.audited[0].max(1.0) * FIRST_RAYS as f64 / self.rays.max(1) as f64
+        self.filter / self.audited[0].max(1.0) * MIN_RAYS as f64 / self.rays.max(1) as f64
     }
 
     /// Mean square error of marching, mean over channels.
@@ -129,7 +132,7 @@ impl MarchControl {
             return Marching::Anew;
         }
         if self.filter() > allowed && self.rays < MAX_RAYS {
-            self.next_rays = self.rays;
+            self.next_rays = self.rays.min(MAX_RAYS - self.rays);
             return Marching::More;
         }
         Marching::Enough

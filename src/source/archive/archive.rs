@@ -225,9 +225,8 @@ impl Archive {
         Ok(archive)
     }
 
-    /// For each component, the points whose velocity is 0 at all of a few times: the given ones, or all in the order of the file. Stops as soon
-    /// as there are none.
-    fn zeros(&mut self, points: Option<&Orders>) -> Result<Zeros, SourceError> {
+    /// For each component, those of its `points` whose velocity is 0 at all of a few times. Stops as soon as there are none.
+    fn zeros(&mut self, points: impl Fn(&ComponentPlan) -> Orders) -> Result<Zeros, SourceError> {
         let found = self.zeros_of_open(points);
         if self.files.len() > 1 {
             // A file that changes from here on is noticed.
@@ -236,13 +235,13 @@ impl Archive {
         found
     }
 
-    fn zeros_of_open(&mut self, points: Option<&Orders>) -> Result<Zeros, SourceError> {
+    fn zeros_of_open(&mut self, points: impl Fn(&ComponentPlan) -> Orders) -> Result<Zeros, SourceError> {
         let mut zeros = Zeros::new();
         for index in sampled(self.times.len()) {
             let place = self.open_at(index)?;
             let Some((_, file)) = &self.open else { return Err(SourceError::NoFiles) };
             for (which, plan) in self.files[place.file].frames[place.frame].iter().enumerate().take(2) {
-                let orders = points.cloned().unwrap_or_else(|| plan.file_order());
+                let orders = points(plan);
                 let values = read_component(file, plan, &orders, place.entry)?;
                 match zeros.get_mut(which) {
                     Some((_, zero)) => zero.iter_mut().zip(values).for_each(|(zero, v)| *zero &= v == 0.0),
@@ -263,7 +262,8 @@ impl Archive {
 
     /// Takes points as land whose velocity is 0 at all sampled times.
     fn mask_zeros(&mut self) -> Result<(), SourceError> {
-        let mut masks: Vec<Arc<Mask>> = self.zeros(None)?.into_iter().map(|(shape, land)| Arc::new(Mask::new(ZERO, shape, land))).collect();
+        let mut masks: Vec<Arc<Mask>> =
+            self.zeros(ComponentPlan::file_order)?.into_iter().map(|(shape, land)| Arc::new(Mask::new(ZERO, shape, land))).collect();
         // w has a mask only on the points of u.
         masks.extend(masks.first().cloned());
         for plan in self.files.iter_mut().flat_map(|file| &mut file.frames).flat_map(|frame| frame.iter_mut().zip(&masks)) {
@@ -282,14 +282,14 @@ impl Archive {
     /// Tells of cells whose corners are 0 at all sampled times, in the middle one of the levels: probably land.
     fn tell_zeros(&mut self) {
         let level = self.axes.get(2).map_or(0, |axis| axis.order[axis.order.len() / 2]);
-        // Nodes of a resampled mesh are no entries of the file.
-        let along = |k: usize| match &self.resampling {
-            None => self.axes[k].order.clone(),
-            Some(_) => (0..self.files[0].frames[0][0].along(k)).collect(),
+        // Nodes of a resampled mesh are no entries of the file, whose components may differ in shape.
+        let region = self.resampling.is_none().then(|| [self.axes[0].order.clone(), self.axes[1].order.clone()]);
+        let points = |plan: &ComponentPlan| {
+            let [x, y] = region.clone().unwrap_or_else(|| [0, 1].map(|k| (0..plan.along(k)).collect()));
+            [x, y, vec![level]]
         };
-        let points = [along(0), along(1), vec![level]];
         // What cannot be read is reported when it is needed.
-        let Ok(zeros) = self.zeros(Some(&points)) else { return };
+        let Ok(zeros) = self.zeros(points) else { return };
         let Some(([nx, ny, _], zero)) = zeros.first() else { return };
         let corners = |cell: usize| [0, 1, *nx, nx + 1].map(|corner| cell / (nx - 1) * nx + cell % (nx - 1) + corner);
         let cells = nx.saturating_sub(1) * ny.saturating_sub(1);
