@@ -132,6 +132,8 @@ mod tests {
                 let noise = if i % 2 == 0 { offset } else { -offset };
                 *pixel = [0.4 + noise, 0.4 + noise, 0.4 + noise, 1.0];
             }
+            // Films are weighted by their samples.
+            film.samples.fill(1.0);
             film
         };
         let mut reached = Reached::default();
