@@ -182,7 +182,7 @@ pub fn check_learns(scene: &SceneFile, option: &str, path: Option<&Path>) -> Res
     let Some(path) = path else { return Ok(()) };
     let refuse = |why: &str| bail!(Usage(format!("{option} {}: {why}", path.display())));
     if scene.render.method == Method::Reference {
-        return refuse("method reference has no surrogate; accepted with the other methods");
+        return refuse("method reference has no surrogate; accepted with methods two_level, marched, surrogate and gated");
     }
     if scene.surrogate.kind == Kind::Table {
         return refuse("a table is traced anew for every window and is not trained; accepted with surrogate.kind network and residual");

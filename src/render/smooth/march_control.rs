@@ -2,9 +2,9 @@
 
 use crate::rng::FrameRandom;
 
-/// Rays per pixel of the first round. They come two by two, on opposite sides of the pixel's centre.
+/// Rays come two by two, on opposite sides of the pixel's centre. The first pair is audited against a finer march.
 pub const FIRST_RAYS: u64 = 2;
-/// Rays per pixel that a picture gets in any case, one pair a round, and the most it gets.
+/// Rays per pixel of the first round, and the most a picture gets.
 pub const MIN_RAYS: u64 = 4;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
@@ -55,7 +55,7 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
+        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
     }
 }
 
@@ -121,13 +121,13 @@ impl MarchControl {
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let wanted = self.rays < MIN_RAYS || self.filter() > SPARE * allowed;
+        let wanted = self.filter() > SPARE * allowed;
         self.next_rays = if wanted && self.rays < MAX_RAYS { FIRST_RAYS } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
         if self.quadrature() > allowed && self.step > MIN_STEP {
-            let next_rays = self.rays.max(FIRST_RAYS);
+            let next_rays = self.rays.max(MIN_RAYS);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
             return Marching::Anew;
         }
