@@ -2,18 +2,16 @@
 
 use crate::rng::FrameRandom;
 
-/// Rays come two by two, on opposite sides of the pixel's centre. The first pair is audited against a finer march.
+/// Rays per pixel of the first round. They come two by two, on opposite sides of the pixel's centre.
 pub const FIRST_RAYS: u64 = 2;
-/// Rays per pixel of the first round, and the most a picture gets.
-pub const MIN_RAYS: u64 = 4;
+/// Rays per pixel that a picture gets in any case, one pair a round, and the most it gets.
+const MIN_RAYS: u64 = 4;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
 const MIN_STEP: f32 = 1.0 / 16.0;
 /// The mean square error of marching stays this share of the stated one (10 dB below it).
 const SHARE: f64 = 0.1;
-/// Rays after the first `MIN_RAYS` against which these are audited. They share no coordinate with them, so that edges along the axes show too.
-pub const AUDIT_RAYS: u64 = 16;
 /// Once the error of the pixel filter is this share of what it may be, no more rays are marched.
 const SPARE: f64 = 0.25;
 /// Audits that a picture gets in any case, one a round.
@@ -34,7 +32,7 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `MIN_RAYS` rays.
+    /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `FIRST_RAYS` rays.
     audited: [f64; 2],
     quadrature: f64,
     filter: f64,
@@ -55,7 +53,7 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
+        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
     }
 }
 
@@ -86,18 +84,17 @@ impl MarchControl {
         (0..AUDITED_PIXELS).map(pixel).collect()
     }
 
-    /// Takes in an audited pixel: the means of the first `MIN_RAYS` rays and of the `AUDIT_RAYS` that follow, and those of the first `FIRST_RAYS` as
-    /// marched and marched finely.
-    pub fn audit(&mut self, [first, following]: [[f64; 3]; 2], quadrature: Option<[[f64; 3]; 2]>) {
+    /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
+    pub fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
         let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
         // Pixels that show the background alone agree exactly. They do not count, since errors are stated over lit pixels.
-        let filter = square(first, following);
+        let filter = square(coarse, following);
         if filter > 0.0 {
             self.audited[0] += 1.0;
-            // The rays that follow have an error of their own, so that this is rather too much.
-            self.filter += filter;
+            // Both means have the error of the filter.
+            self.filter += 0.5 * filter;
         }
-        let quadrature = quadrature.map_or(0.0, |[coarse, fine]| square(coarse, fine));
+        let quadrature = fine.map_or(0.0, |fine| square(coarse, fine));
         if quadrature > 0.0 {
             self.audited[1] += 1.0;
             self.quadrature += quadrature;
@@ -110,7 +107,7 @@ impl MarchControl {
 
     /// Error of the pixel filter, which falls at least as fast as with independent rays.
     fn filter(&self) -> f64 {
-        self.filter / self.audited[0].max(1.0) * MIN_RAYS as f64 / self.rays.max(1) as f64
+        self.filter / self.audited[0].max(1.0) * FIRST_RAYS as f64 / self.rays.max(1) as f64
     }
 
     /// Mean square error of marching, mean over channels.
@@ -121,13 +118,13 @@ impl MarchControl {
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let wanted = self.filter() > SPARE * allowed;
+        let wanted = self.rays < MIN_RAYS || self.filter() > SPARE * allowed;
         self.next_rays = if wanted && self.rays < MAX_RAYS { FIRST_RAYS } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
         if self.quadrature() > allowed && self.step > MIN_STEP {
-            let next_rays = self.rays.max(MIN_RAYS);
+            let next_rays = self.rays.max(FIRST_RAYS);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
             return Marching::Anew;
         }

@@ -25,7 +25,7 @@ pub use picture::{Picture, Refinement};
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},
-    march_control::{AUDIT_RAYS, FINELY_AUDITED, FIRST_RAYS, MIN_RAYS, MarchControl, Marching},
+    march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS, squared_slope},
     statement::LIT,
 };

@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{IsMissing, Medium, RaySum, ToLight};
-use super::march_control::{AUDIT_RAYS, FINELY_AUDITED, FIRST_RAYS, MIN_RAYS, MarchControl, Marching};
+use super::march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
 use crate::renderer::RenderStats;
@@ -169,22 +169,22 @@ impl Picture {
             }
         });
         self.march.rays = rays.end;
-        let compared: Vec<([[f64; 3]; 2], Option<[[f64; 3]; 2]>)> = audited
+        let compared: Vec<([f64; 3], [f64; 3], Option<[f64; 3]>)> = audited
             .into_par_iter()
             .enumerate()
             .map(|(number, pixel)| {
                 let mean = |rays: Range<u64>, step: f32, light: ToLight<'_>| {
-                    let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
+                    let mut sum = RaySum::default();
                     rays.for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
-                    sum.radiance.map(|c| f64::from(c) / count)
+                    sum.radiance.map(|c| f64::from(c) / FIRST_RAYS as f64)
                 };
-                let coarse = |rays: Range<u64>| mean(rays, step, ToLight::Volume(light));
-                let fine = || mean(0..FIRST_RAYS, 0.25 * step, ToLight::March(0.5 * step));
-                let quadrature = (number < FINELY_AUDITED).then(|| [coarse(0..FIRST_RAYS), fine()]);
-                ([coarse(0..MIN_RAYS), coarse(MIN_RAYS..MIN_RAYS + AUDIT_RAYS)], quadrature)
+                let coarse = mean(0..FIRST_RAYS, step, ToLight::Volume(light));
+                let following = mean(FIRST_RAYS..2 * FIRST_RAYS, step, ToLight::Volume(light));
+                let fine = (number < FINELY_AUDITED).then(|| mean(0..FIRST_RAYS, 0.25 * step, ToLight::March(0.5 * step)));
+                (coarse, following, fine)
             })
             .collect();
-        compared.into_iter().for_each(|(filter, quadrature)| self.march.audit(filter, quadrature));
+        compared.into_iter().for_each(|(coarse, following, fine)| self.march.audit(coarse, following, fine));
         began.elapsed().as_secs_f64()
     }
 

@@ -12,8 +12,7 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, AUDIT_RAYS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FINELY_AUDITED, FIRST_RAYS, LIT, MIN_RAYS, MarchControl, Marching,
-    PictureError, TileSums,
+    AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FINELY_AUDITED, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
@@ -183,24 +182,23 @@ impl GpuSmooth {
         let random = FrameRandom::new(renderer.scene().seed, self.number);
         let pixels = self.control.audit_pixels(&random, parameters.pixels());
         self.control.rays += due;
-        let rays = |pixel: u32, count: u64, step: f32, shadow_step: f32| {
-            (0..count).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
+        let rays = |pixel: u32, first: u64, step: f32, shadow_step: f32| {
+            (first..first + FIRST_RAYS).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
         };
-        let (each, finely) = ((MIN_RAYS + AUDIT_RAYS) as usize, FIRST_RAYS as usize);
         let checks: Vec<RayCheck> = pixels
             .iter()
-            .flat_map(|&pixel| rays(pixel, each as u64, step, 0.0))
-            .chain(pixels[..FINELY_AUDITED].iter().flat_map(|&pixel| rays(pixel, FIRST_RAYS, 0.25 * step, 0.5 * step)))
+            .flat_map(|&pixel| rays(pixel, 0, step, 0.0).chain(rays(pixel, FIRST_RAYS, step, 0.0)))
+            .chain(pixels[..FINELY_AUDITED].iter().flat_map(|&pixel| rays(pixel, 0, 0.25 * step, 0.5 * step)))
             .collect();
         let radiance = self.march.check(&medium, &checks, round.smooth.sum)?;
-        let mean = |rays: &[[f32; 3]]| -> [f64; 3] {
-            std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
+        let per_mean = FIRST_RAYS as usize;
+        let mean = |part: usize| -> [f64; 3] {
+            let rays = &radiance[part * per_mean..(part + 1) * per_mean];
+            std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / per_mean as f64)
         };
-        let (coarse, fine) = radiance.split_at(each * pixels.len());
-        for (number, of_pixel) in coarse.chunks_exact(each).enumerate() {
-            let (first, following) = of_pixel.split_at(MIN_RAYS as usize);
-            let quadrature = fine.chunks_exact(finely).nth(number).map(|fine| [mean(&of_pixel[..finely]), mean(fine)]);
-            self.control.audit([mean(first), mean(following)], quadrature);
+        for pixel in 0..pixels.len() {
+            let fine = (pixel < FINELY_AUDITED).then(|| mean(2 * pixels.len() + pixel));
+            self.control.audit(mean(2 * pixel), mean(2 * pixel + 1), fine);
         }
         Ok(began.elapsed().as_secs_f64())
     }
