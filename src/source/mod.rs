@@ -23,7 +23,7 @@ mod source_settings;
 
 pub use archive::{
     Archive, AxisReport, DEFAULT_READ_AHEAD, GlobeTurbulence, Inspection, MemorySource, MissingReport, ReadAhead, ResamplingReport,
-    ResolutionReport, Steady, TimeReport, VariableReport, inspect, read_ahead, synthesize,
+    ResolutionReport, Steady, TimeReport, VariableReport, expand, inspect, read_ahead, synthesize,
 };
 pub use archive_settings::{ArchiveSettings, Metric, Staggering, SyntheticSettings, SyntheticShape, VelocityUnit};
 pub use error::SourceError;

@@ -130,6 +130,17 @@ fn zip_files_are_stores() {
             same(&mut open(&[&path]), &mut open(&[&file]), &format!("{layout:?} in `{top}`, {deflated}"));
         }
     }
+    // Some programs add folders of their own.
+    let below = |tops: &[&str]| {
+        let stores =
+            tops.iter().flat_map(|top| parts(&currents(), &V2).into_iter().map(move |(name, data)| (format!("{top}/{name}"), data)));
+        std::iter::once(("__MACOSX/._store".to_owned(), vec![0])).chain(stores).collect::<Vec<_>>()
+    };
+    let copied = dir.path().join("copied.zip");
+    std::fs::write(&copied, zipped(&below(&["store"]), "", false)).unwrap();
+    same(&mut open(&[&copied]), &mut open(&[&file]), "beside a stray folder");
+    std::fs::write(&copied, zipped(&below(&["a", "b"]), "", false)).unwrap();
+    refused(&[&copied], "", &["copied.zip", "holds 2 stores, among them a and b"]);
     let shards = dir.path().join("shards.zip");
     std::fs::write(&shards, zipped(&parts(&currents(), &Layout { shards: 2, chunks: CUT, ..V3 }), "", true)).unwrap();
     refused(&[&shards], "", &["shards.zip", "shard that the zip file compresses", "zip -0"]);
@@ -156,9 +167,8 @@ fn stores_are_found_by_what_they_hold() {
     assert!(program.stdout.contains("Zarr 2") && program.stdout.contains("4 nodes from 0 to 3 m"), "{}", program.stdout);
     let none = dir.path().join("none.zarr");
     std::fs::create_dir(&none).unwrap();
-    refused(&[&none], "", &["none.zarr", "*.zarr"]);
     // A copy that was interrupted.
-    for files in [dir.path().to_owned(), dir.path().join("*.zarr")] {
+    for files in [none.clone(), dir.path().to_owned(), dir.path().join("*.zarr")] {
         refused(&[files], "", &["none.zarr", "holds no `zarr.json`"]);
     }
     std::fs::remove_dir(&none).unwrap();
@@ -219,13 +229,12 @@ fn chunks_that_are_not_stored_hold_the_fill_value() {
     let layout = Layout { chunks: &[("time", 1)], ..V2 };
     let field = || plane(CLASSIC, &[0.0, 1.0, 2.0], DAYS);
     // In version 2 the fill value says what is missing; without one, nothing was ever written there.
-    for (fill, expected) in [("-1.5", None), ("null", None), ("\"NaN\"", None)] {
+    for fill in ["-1.5", "null", "\"NaN\""] {
         let store = write(&field(), &layout, &dir.path().join(format!("2{}.zarr", fill.len())));
         std::fs::remove_file(store.join("u/1.0.0")).unwrap();
         change(&store, "u/.zarray", "\"fill_value\": null", &format!("\"fill_value\": {fill}"));
         let mut archive = open(&[&store]);
         assert_eq!((archive.read(0).unwrap().missing_nodes(), archive.read(1).unwrap().missing_nodes()), (0, 12), "{fill}");
-        assert!(expected.is_none_or(|e: f32| us(&archive.read(1).unwrap()) == [e; 12]));
     }
     // In version 3 it is a value like others, unless the attribute says that it is missing.
     let store = write(&field(), &Layout { version: 3, ..layout }, &dir.path().join("3.zarr"));

@@ -210,6 +210,10 @@ impl Archive {
             archive.declare_synthetic(what);
         }
         archive.description.notes.extend(together.map(|names| format!("read as one, and others alike: {names}")));
+        if let [first, rest @ ..] = &masks[..] {
+            let more = if rest.is_empty() { String::new() } else { format!(" and {} more", rest.len()) };
+            archive.description.notes.push(format!("no velocities, but a mask of land: {}{more}", in_words(first)));
+        }
         archive.description.notes.extend(land.notes);
         match settings.mask.as_deref() {
             Some(ZERO) => archive.mask_zeros()?,

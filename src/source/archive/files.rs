@@ -19,7 +19,7 @@ pub fn expand(paths: &[PathBuf]) -> Result<Vec<PathBuf>, SourceError> {
     for path in paths {
         let text = path.to_string_lossy();
         refuse_dangling(path)?;
-        if is_store(path) {
+        if is_called_store(path) {
             files.push(path.clone());
         } else if path.is_dir() {
             files.extend(folder(path)?);

@@ -15,6 +15,7 @@ mod steady;
 mod synthetic;
 
 pub use archive::Archive;
+pub use files::expand;
 pub use inspect::{AxisReport, Inspection, MissingReport, ResamplingReport, ResolutionReport, TimeReport, VariableReport, inspect};
 pub use memory::MemorySource;
 pub use read_ahead::{DEFAULT_READ_AHEAD, ReadAhead, read_ahead};

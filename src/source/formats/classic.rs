@@ -6,7 +6,7 @@
 
 use super::limits::{MAX_ATTRIBUTE_BYTES, MAX_ATTRIBUTES, MAX_OBJECTS};
 use super::messages::{Attribute, Dimension, FormatError, FormatFault, Listing, NumberType, Variable};
-use super::store::Store;
+use super::store::{Store, advance};
 use std::fs::File;
 use std::io::{self, BufReader, Read, Seek, SeekFrom};
 
@@ -87,18 +87,6 @@ impl Store for ClassicStore {
             }
         }
     }
-}
-
-/// Advances an index in row-major order; false after the last.
-fn advance(index: &mut [usize], count: &[usize]) -> bool {
-    for k in (0..index.len()).rev() {
-        index[k] += 1;
-        if index[k] < count[k] {
-            return true;
-        }
-        index[k] = 0;
-    }
-    false
 }
 
 /// Decodes the elements of a block from a piece of bytes.

@@ -11,3 +11,15 @@ pub trait Store: Send {
     /// Error message of the library or of the operating system.
     fn read(&self, index: usize, variable: &Variable, start: &[usize], count: &[usize], out: &mut Vec<f64>) -> Result<(), String>;
 }
+
+/// Advances an index in row-major order; false after the last.
+pub fn advance(index: &mut [usize], count: &[usize]) -> bool {
+    for k in (0..index.len()).rev() {
+        index[k] += 1;
+        if index[k] < count[k] {
+            return true;
+        }
+        index[k] = 0;
+    }
+    false
+}

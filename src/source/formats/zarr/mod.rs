@@ -15,7 +15,7 @@ use super::guard::{guarded, open_guarded};
 use super::limits::{Limits, MAX_ATTRIBUTE_BYTES, MAX_ATTRIBUTES, MAX_DEPTH, MAX_OBJECTS};
 use super::messages::{Attribute, Dimension, Format, FormatError, FormatFault, Listing, NumberType, Variable};
 use super::scan::Chunks;
-use super::store::Store;
+use super::store::{Store, advance};
 use cache::Cache;
 use codecs::{most_stored, unpack};
 use metadata::{Array, Codecs, Shard, collect};
@@ -235,18 +235,6 @@ fn strides(extents: &[usize], order: &[usize]) -> Vec<usize> {
 
 fn strides_of(extents: &[usize]) -> Vec<usize> {
     strides(extents, &(0..extents.len()).collect::<Vec<_>>())
-}
-
-/// Advances an index in row-major order; false after the last.
-fn advance(index: &mut [usize], count: &[usize]) -> bool {
-    for k in (0..index.len()).rev() {
-        index[k] += 1;
-        if index[k] < count[k] {
-            return true;
-        }
-        index[k] = 0;
-    }
-    false
 }
 
 /// Elements of an unpacked chunk.

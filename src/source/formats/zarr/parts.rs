@@ -177,12 +177,22 @@ impl ZipParts {
         }
         let described =
             |entries: &HashMap<String, Entry>, folder: &str| METADATA[..4].iter().any(|name| entries.contains_key(&within(folder, name)));
-        if !described(&entries, "")
-            && let Some(top) = entries.keys().next().and_then(|name| name.split_once('/')).map(|(top, _)| top.to_owned())
-            && described(&entries, &top)
-        {
-            let inner = |(name, entry): (String, Entry)| Some((name.strip_prefix(&top)?.strip_prefix('/')?.to_owned(), entry));
-            entries = entries.into_iter().filter_map(inner).collect();
+        if !described(&entries, "") {
+            // Programs that make zip files add entries of their own beside the store.
+            let mut tops: BTreeSet<String> = entries.keys().filter_map(|name| Some(name.split_once('/')?.0.to_owned())).collect();
+            tops.retain(|top| described(&entries, top));
+            if tops.len() > 1 {
+                let names: Vec<&str> = tops.iter().take(2).map(String::as_str).collect();
+                return Err(FormatFault::Refused(format!(
+                    "it holds {} stores, among them {}; accepted is one",
+                    tops.len(),
+                    names.join(" and ")
+                )));
+            }
+            if let Some(top) = tops.pop_first() {
+                let inner = |(name, entry): (String, Entry)| Some((name.strip_prefix(&top)?.strip_prefix('/')?.to_owned(), entry));
+                entries = entries.into_iter().filter_map(inner).collect();
+            }
         }
         let mut folders: HashMap<String, BTreeSet<String>> = HashMap::new();
         for name in entries.keys() {
