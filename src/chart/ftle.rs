@@ -2,7 +2,7 @@
 
 use super::picture::with_method;
 use super::{Charting, device_name, failed};
-use crate::backend::{Backend, BackendError, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
+use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
 use crate::backend::{CudaDevice, Storage, cuda::Cuda};
 use crate::flow::{
@@ -11,7 +11,7 @@ use crate::flow::{
 use crate::render::Method;
 use crate::render::rng::{philox, unit};
 use crate::run::{Plan, RunError, Settings, Setup, Slide};
-use crate::surrogate::network::{Encoding, NetworkSettings, Target};
+use crate::surrogate::network::{Encoding, NetworkSettings};
 use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
 use serde::Serialize;
 use std::sync::atomic::AtomicBool;
@@ -361,11 +361,7 @@ fn tracer_of<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B, what: &str,
     let (velocity, time) = (&bench.opened.slide.velocity, bench.opened.slide.time);
     match bench.charting.pool.install(|| backend.tracer(velocity, map, time)) {
         Ok(tracer) => Ok(Some(tracer)),
-        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
-        Err(error) => {
-            bench.charting.skip(what, error);
-            Ok(None)
-        }
+        Err(error) => bench.charting.refused(what, failed(error)).map(|()| None),
     }
 }
 
@@ -554,9 +550,7 @@ fn networks<B: Backend>(bench: &mut Bench<'_, '_>, backend: &mut B) -> Result<()
 impl Bench<'_, '_> {
     /// Traces uniform random labels for some seconds; returns them with the seconds.
     fn labels(&mut self, tracer: &dyn Trace) -> Result<(ReplayBuffer, f64), RunError> {
-        let network = &self.opened.plan.scene.network;
-        let arrival = network.target == Target::FlowMap;
-        let extras = Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 };
+        let extras = self.opened.plan.scene.network.label_extras();
         let trace = |count: usize, stream: u32| {
             let points = Points::random(self.opened, count, stream);
             let began = Instant::now();
@@ -584,11 +578,7 @@ fn surrogate_of<B: Backend>(
         SurrogateRequest { settings, network, domain: &plan.domain, seed: plan.scene.seed, replay_buffer: MAX_LABELS, stop: &NEVER };
     match bench.charting.pool.install(|| backend.surrogate(&request, tracer)) {
         Ok(surrogate) => Ok(Some(surrogate)),
-        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
-        Err(error) => {
-            bench.charting.skip(what, error);
-            Ok(None)
-        }
+        Err(error) => bench.charting.refused(what, failed(error)).map(|()| None),
     }
 }
 

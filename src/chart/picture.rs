@@ -250,6 +250,14 @@ pub(super) fn still(
     Ok(Some(run(setup, options, &mut sink, &enough)?.surrogate_bytes))
 }
 
+/// Renders a frame that is not measured: on a GPU the first one compiles kernels.
+pub(super) fn compile(settings: &Settings, options: &RunOptions) -> Result<(), RunError> {
+    if options.device.is_gpu() {
+        still(with_method(settings, Method::TwoLevel, settings.surrogate.kind), options, 0, |_| false)?;
+    }
+    Ok(())
+}
+
 /// The scene with another method, and a number of samples that the method accepts.
 pub(super) fn with_method(settings: &Settings, method: Method, kind: Kind) -> Settings {
     let mut settings = settings.clone();
@@ -274,7 +282,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
     let size = [settings.render.width, settings.render.height];
     let left = charting.left();
-    let truth = |slide: usize, share: f64| {
+    let true_picture = |slide: usize, share: f64| {
         (charting.tell)("the true picture: two halves of reference");
         let mut samples = 0.0;
         // Seeds of their own: the charted pictures must not share random numbers with the truth.
@@ -298,19 +306,18 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         let [Some(a), Some(b)] = halves else { return Ok::<_, RunError>(None) };
         Ok(Some((Truth::new([a, b])?, samples)))
     };
-    let (first_truth, samples) = truth(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
-    let last_truth = match truth(SLIDES - 1, TRUTH_SHARES[1]) {
+    let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
+    if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
+        charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
+        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new() });
+    }
+    let last_truth = match true_picture(SLIDES - 1, TRUTH_SHARES[1]) {
         Ok(found) => found.map(|(truth, _)| truth),
         Err(error) => {
             charting.refused("the truth of a window that slides", error)?;
             None
         }
     };
-    let truth = first_truth;
-    if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
-        charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
-        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new() });
-    }
     let [a, b] = &truth.halves;
     let truth_psnr = noise_psnr(a, b, settings.render.tone_map);
     let mut curves = Vec::new();
@@ -324,8 +331,9 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         (Method::TwoLevel, Kind::Network),
         (Method::Gated, Kind::Network),
     ];
-    // The first frame compiles kernels.
-    still(with_method(&settings, Method::TwoLevel, Kind::Table), &options, 0, |_| false)?;
+    if let Err(error) = compile(&settings, &options) {
+        charting.refused("a first frame, which compiles kernels", error)?;
+    }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
         let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
         let mut curve = PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None };

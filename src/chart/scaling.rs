@@ -100,11 +100,7 @@ fn point(
             charting.skip(what, format_args!("its table would take more than {affordable:.0} s"));
             Ok(None)
         }
-        Err(BackendError::Device(error)) if error.is_fault() => Err(failed(error)),
-        Err(error) => {
-            charting.skip(what, error);
-            Ok(None)
-        }
+        Err(error) => charting.refused(what, failed(error)).map(|()| None),
     }
 }
 

@@ -8,7 +8,6 @@ use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogat
 use crate::flow::Extras;
 use crate::render::{Film, Renderer, Scene};
 use crate::run::{RunError, Settings};
-use crate::surrogate::network::Target;
 use crate::surrogate::{Predict, ReplayBuffer, Samples};
 use crate::trust::Gate;
 use serde::Serialize;
@@ -105,8 +104,7 @@ impl Training<'_> {
         let Self { settings, options, opened, stop } = self;
         let (plan, slide) = (&opened.plan, &opened.slide);
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
-        let arrival = settings.network.target == Target::FlowMap;
-        let extras = Extras { arrival, jacobian: arrival && settings.network.jacobian_weight > 0.0 };
+        let extras = settings.network.label_extras();
         let began = Instant::now();
         let labels =
             crate::backend::audit::trace(&tracer, &Points::random(opened, options.labels, 6).unit, extras).map_err(failed)?.samples;

@@ -1,7 +1,7 @@
 //! A short trial of methods on a scene: the choice of `method = "auto"`.
 
 use super::device_name;
-use super::picture::{fixed_colours, noise_psnr, still, with_method};
+use super::picture::{compile, fixed_colours, noise_psnr, still, with_method};
 use crate::backend::Device;
 use crate::render::{Film, Method};
 use crate::run::{RunError, RunOptions, Settings};
@@ -47,8 +47,7 @@ pub fn choose(settings: &Settings, device: &Device, threads: usize, stop: &Atomi
     // Small frames, so that a method ends soon after the target.
     settings.render.samples = SAMPLES;
     let kind = settings.surrogate.kind;
-    // The first frame compiles kernels.
-    still(with_method(&settings, Method::TwoLevel, kind), &options, 0, |_| false)?;
+    compile(&settings, &options)?;
     let mut seconds = Vec::new();
     for method in METHODS {
         let scene = with_method(&settings, method, kind);

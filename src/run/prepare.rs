@@ -10,7 +10,7 @@ use crate::backend::{
 };
 use crate::flow::{Extras, FlowMap, Steps, Traced, Tracer};
 use crate::render::Method;
-use crate::surrogate::network::{Input, Target, uniform};
+use crate::surrogate::network::{Input, uniform};
 use crate::surrogate::{Kind, Samples, Trace};
 use crate::trust::{Audited, Gate, Residual, Strata};
 use rayon::prelude::*;
@@ -231,9 +231,8 @@ impl Run<'_> {
 
     /// Labels that the network needs besides the log-stretch.
     pub(super) fn label_extras(&self) -> Extras {
-        let network = &self.plan.scene.network;
-        let arrival = network.target == Target::FlowMap && self.plan.scene.surrogate.kind != Kind::Table;
-        Extras { arrival, jacobian: arrival && network.jacobian_weight > 0.0 }
+        let scene = &self.plan.scene;
+        if scene.surrogate.kind == Kind::Table { Extras::default() } else { scene.network.label_extras() }
     }
 
     /// Traces labels of durations below tau, if the duration is an input of the network: stratified durations in (0, tau], drawn again for every

@@ -1,6 +1,7 @@
 //! `[network]` of a scene file.
 
 use crate::SurrogateError;
+use ridgewatch_flow::Extras;
 use serde::{Deserialize, Serialize};
 
 /// Encoding of the inputs of the MLP.
@@ -130,6 +131,12 @@ impl Default for NetworkSettings {
 }
 
 impl NetworkSettings {
+    /// Labels that the network needs besides the log-stretch.
+    pub fn label_extras(&self) -> Extras {
+        let arrival = self.target == Target::FlowMap;
+        Extras { arrival, jacobian: arrival && self.jacobian_weight > 0.0 }
+    }
+
     /// Checks every value that has a range.
     ///
     /// # Errors
