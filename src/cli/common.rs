@@ -9,7 +9,7 @@ use ridgewatch::publish::PublishError;
 use ridgewatch::render::Method;
 use ridgewatch::run::{RunError, Setup};
 use ridgewatch::setting::Refused;
-use ridgewatch::source::SourceError;
+use ridgewatch::source::{SourceError, expand};
 use ridgewatch::surrogate::Kind;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::AtomicBool;
@@ -105,12 +105,14 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
         messages::note("render.method = \"auto\": two_level, since only smooth methods have render.until and render.budget");
         return Ok(());
     }
+    let files = if scene.archive.files.is_empty() { Vec::new() } else { expand(&scene.archive.files)? };
+    let data: Vec<_> = files.iter().filter_map(|file| std::fs::metadata(file).ok().filter(std::fs::Metadata::is_file)).collect();
     let remembered = match paths {
-        [one] if is_config(one) => Some(one.with_extension("auto.json")),
+        // A folder does not tell of changes inside.
+        [one] if is_config(one) && data.len() == files.len() => Some(one.with_extension("auto.json")),
         _ => None,
     };
-    let data: Vec<_> =
-        scene.archive.files.iter().map(|file| std::fs::metadata(file).map(|found| (found.len(), found.modified().ok())).ok()).collect();
+    let data: Vec<_> = files.iter().zip(&data).map(|(file, found)| (file, found.len(), found.modified().ok())).collect();
     let version = env!("CARGO_PKG_VERSION");
     let asked = format!("{version} {} {} threads {data:?} {}", device_name(device), common.threads, scene.to_toml()?);
     let earlier = remembered.as_deref().and_then(|file| std::fs::read(file).ok()).and_then(|bytes| serde_json::from_slice(&bytes).ok());
@@ -138,7 +140,7 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
 /// File beside a scene file with the choice of `render.method = "auto"`.
 #[derive(serde::Serialize, serde::Deserialize)]
 struct Remembered {
-    /// What was asked: version, device, threads, lengths and times of the data files, and scene.
+    /// What was asked: version, device, threads, names, lengths and times of the data files, and scene.
     asked: String,
     choice: Choice,
 }
