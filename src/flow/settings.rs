@@ -55,9 +55,9 @@ pub struct FlowSettings {
     pub precision: Precision,
     /// Runge-Kutta steps per path.
     pub steps: StepsSetting,
-    /// With `steps = "auto"`: root mean square by which the log-stretch may change if the steps are doubled. `None`: 0.01 for closed forms and
-    /// the synthetic turbulence, 0.1 for archives, whose interpolated gradient converges slowly, and with linear interpolation also 1.5 % of
-    /// the log-stretch. The summary contains the value reached.
+    /// With `steps = "auto"`: root mean square by which the log-stretch may change if the steps are doubled. `None`: 0.01 for closed forms,
+    /// 0.1 for grids, whose interpolated gradient converges slowly, and with linear interpolation also 1.5 % of the log-stretch. The summary
+    /// contains the value reached.
     pub tolerance: Option<f64>,
     /// Distance of the particles of `differences` from the seed, in coordinate units.
     pub difference_step: f64,

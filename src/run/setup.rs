@@ -133,8 +133,9 @@ impl Setup {
             steps: match scene.flow.steps {
                 StepsSetting::Auto => match scene.flow.tolerance {
                     Some(tolerance) => Steps::Auto { tolerance },
-                    None if archive && interpolation == Interpolation::Linear => Steps::AutoByShare { tolerance: 0.1, share: 0.015 },
-                    None => Steps::Auto { tolerance: if archive { 0.1 } else { 0.01 } },
+                    None if closed.is_some() => Steps::Auto { tolerance: 0.01 },
+                    None if interpolation == Interpolation::Linear => Steps::AutoByShare { tolerance: 0.1, share: 0.015 },
+                    None => Steps::Auto { tolerance: 0.1 },
                 },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },
