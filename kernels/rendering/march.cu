@@ -55,11 +55,11 @@ struct Check {
     float shadow_step;
 };
 
-// A block a check. radiance: 3 floats a check.
+// A block a check. found: radiance and opacity of each check.
 extern "C" __global__ void __launch_bounds__(1024)
 march_checks(const __grid_constant__ FrameScene scene, const __grid_constant__ March march, const Check* __restrict__ checks,
-             float* __restrict__ radiance) {
+             float* __restrict__ found) {
     __shared__ float memory[CHECK_MEMORY];
     const Check check = checks[blockIdx.x];
-    check_ray(Block{}, scene, march, check.pixel, check.ray, check.step, check.shadow_step, radiance + 3 * blockIdx.x, memory);
+    check_ray(Block{}, scene, march, check.pixel, check.ray, check.step, check.shadow_step, found + 4 * blockIdx.x, memory);
 }

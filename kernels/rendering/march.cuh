@@ -500,10 +500,10 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
 constexpr int CHECK_POINTS = 1024;
 constexpr int CHECK_MEMORY = 4 * CHECK_POINTS + 3;
 
-// Radiance of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light marched with
+// Radiance and opacity of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light marched with
 // steps of `shadow_step`, or from the light volume if that is 0.
 RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, float step,
-                     float shadow_step, float* radiance, float* memory) {
+                     float shadow_step, float* found, float* memory) {
     float* absorbed = memory;                         // negative in missing cells
     float* scattered = memory + CHECK_POINTS;         // three planes
     float* state = memory + 4 * CHECK_POINTS;         // transmittance, missing points, points
@@ -511,7 +511,8 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
     const bool hit = begin_ray(scene, march.shifted != 0, pixel, number, step, ray);
     block.each(1, [&](int) {
         state[0] = 1.0f, state[1] = state[2] = 0.0f;
-        for (int k = 0; k < 3; ++k) radiance[k] = hit ? 0.0f : scene.background[k];
+        for (int k = 0; k < 3; ++k) found[k] = hit ? 0.0f : scene.background[k];
+        found[3] = 0.0f;
     });
     if (!hit) return;
     for (int first = 0; first < ray.points && state[0] >= OPAQUE; first += CHECK_POINTS) {
@@ -547,16 +548,17 @@ RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& m
                     continue;
                 }
                 const float weight = transmittance * absorbed[i];
-                for (int k = 0; k < 3; ++k) radiance[k] += weight * scattered[k * CHECK_POINTS + i];
+                for (int k = 0; k < 3; ++k) found[k] += weight * scattered[k * CHECK_POINTS + i];
+                found[3] += weight;
                 transmittance *= 1.0f - absorbed[i];
             }
             state[0] = transmittance;
         });
     }
     block.each(1, [&](int) {
-        RaySum sum = {{radiance[0], radiance[1], radiance[2]}, 0.0f, 0.0f, 0.0f};
+        RaySum sum = {{found[0], found[1], found[2]}, 0.0f, 0.0f, 0.0f};
         add_behind(scene, state[0], int(state[1]), int(state[2]), sum);
-        for (int k = 0; k < 3; ++k) radiance[k] = sum.radiance[k];
+        for (int k = 0; k < 3; ++k) found[k] = sum.radiance[k];
     });
 }
 

@@ -2,7 +2,7 @@
 
 use crate::NEVER;
 use ridgewatch::field::Domain;
-use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, Refinement};
+use ridgewatch::render::smooth::{IsMissing, LightVolume, Medium, Nodes, Picture, PictureError, RaySum, Refinement, ToLight};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::sync::Arc;
 
@@ -96,6 +96,21 @@ impl Smooth {
     }
 }
 
+/// A picture by many rays with small steps and a fine light volume.
+fn converged(medium: &Medium<'_>) -> Film {
+    const RAYS: u64 = 64;
+    let (width, height) = (medium.scene.width, medium.scene.height);
+    let (step, volume) = (0.25 * medium.spacing() as f32, LightVolume::new(medium, 1 << 24, 4));
+    let mut film = Film::new(width, height);
+    for (pixel, rgba) in film.rgba.iter_mut().enumerate() {
+        let mut sum = RaySum::default();
+        (0..RAYS).for_each(|j| sum.add(&medium.ray(pixel as u32, j, step, ToLight::Volume(&volume), false)));
+        let [red, green, blue] = sum.radiance;
+        *rgba = [red, green, blue, sum.alpha].map(|c| c / RAYS as f32);
+    }
+    film
+}
+
 /// Deviation of the mean of every block of 8 x 8 pixels from that of a tracked picture, in standard errors of the latter; the variances of the
 /// former are added. Returns root mean square and maximum over blocks and channels.
 fn deviations(found: &Film, truth: &Film, variance: impl Fn(usize) -> f64) -> (f64, f64) {
@@ -135,15 +150,18 @@ fn a_marched_picture_is_the_mean_of_tracked_ones() {
             let truth = [scene.seed, scene.seed + 1].map(|seed| tracked(&Scene { seed, ..scene.clone() }, &domain, 8, of));
             // No difference between the fields: all that is left is the march.
             let (film, stated) = Smooth::new(&scene, &domain).round(&nodes, missing.then_some(gone), (Method::Marched, false, 2.0), of);
-            let found = true_error(&film, &truth);
-            // The noise of the truth leaves some 1e-6 of its product. The march is audited on a few pixels, and its errors at edges are rare and large.
-            let allowed = 4.0 * stated.march_rms.powi(2) + 3e-6;
-            // Next to a light inside the box the radiance has no bound, which the audit of a few pixels does not see: only the mean is compared.
+            let renderer = Renderer::new(scene.clone(), &domain, TAU).unwrap();
+            let marched = converged(&Medium { scene: &renderer.frame_scene(0), nodes: &nodes, missing: missing.then_some(gone) });
+            // The noise of the truth leaves some 1e-6 of its product. Next to a light inside the box the radiance has no bound, so that only the mean
+            // is compared.
+            let apart = true_error(&marched, &truth);
             assert!(
-                found < allowed || what == "point light inside",
-                "{what}, missing cells: {missing}: mean square {found}, stated {}",
-                stated.march_rms.powi(2)
+                apart.abs() < 3e-6 || what == "point light inside",
+                "{what}, missing cells: {missing}: a fine march is off by {apart:e}"
             );
+            let (found, stated) = (true_error(&film, &[marched.clone(), marched]), stated.march_rms.powi(2));
+            let sound = (0.7 * found..6.0 * found).contains(&stated);
+            assert!(sound, "{what}, missing cells: {missing}: mean square of the march {found:e}, stated {stated:e}");
             let mean = |film: &Film| film.rgba.iter().flatten().map(|&c| f64::from(c)).sum::<f64>() / film.rgba.len() as f64;
             let difference = mean(&film) - 0.5 * (mean(&truth[0]) + mean(&truth[1]));
             assert!(difference.abs() < 0.005, "{what}, missing cells: {missing}: means differ by {difference}");

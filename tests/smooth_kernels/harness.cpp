@@ -123,13 +123,13 @@ int main(int, char** arguments) {
         Marched marched;
         marched.march.shifted = take_one<int>();
         const int n = take_one<int>();
-        std::vector<float> radiance(3 * n, NAN), memory(CHECK_MEMORY, NAN);
+        std::vector<float> found(4 * n, NAN), memory(CHECK_MEMORY, NAN);
         for (int i = 0; i < n; ++i) {
             const auto which = take<uint32_t>(2);
             const auto steps = take<float>(2);
-            check_ray(Block{}, marched.scene, marched.march, which[0], which[1], steps[0], steps[1], &radiance[3 * i], memory.data());
+            check_ray(Block{}, marched.scene, marched.march, which[0], which[1], steps[0], steps[1], &found[4 * i], memory.data());
         }
-        give(radiance);
+        give(found);
     } else if (request == "combine") {
         Combine c = {};
         c.width = take_one<int>();

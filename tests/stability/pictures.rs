@@ -2,7 +2,9 @@
 
 use crate::sweep::{rms, row};
 use ridgewatch::field::Domain;
-use ridgewatch::render::smooth::{LightVolume, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight};
+use ridgewatch::render::smooth::{
+    AUDIT_RAYS, AuditedPixel, LightVolume, MIN_RAYS, MarchControl, Medium, Nodes, Picture, RaySum, Refinement, ToLight,
+};
 use ridgewatch::render::{CameraSettings, Film, LightSettings, LogStretch, Method, RenderSettings, Renderer, Scene, TransferSettings};
 use std::cell::Cell;
 use std::sync::Arc;
@@ -199,10 +201,14 @@ fn few_rays_a_pixel() {
     };
     let truth: Vec<f64> = (0..WIDTH * WIDTH).map(mean).collect();
     let size = rms(truth.iter().copied());
-    // The program's own estimate: the first two rays of each pixel against the next two.
-    let (two, four) = (of(WIDTH, 2), of(WIDTH, 4));
+    // The program's own estimate: the first rays of each pixel against those that follow.
+    let (first, all) = (of(WIDTH, MIN_RAYS), of(WIDTH, MIN_RAYS + AUDIT_RAYS));
+    let [few, more] = [MIN_RAYS, AUDIT_RAYS].map(|n| n as f64);
     let mut control = MarchControl::default();
-    two.iter().zip(&four).for_each(|(two, four)| control.audit([*two; 3], [2.0 * four - two; 3], None));
+    for (first, all) in first.iter().zip(&all) {
+        let following = ((few + more) * all - few * first) / more;
+        control.audit(&AuditedPixel { alpha: 1.0, first: [*first; 3], following: [following; 3], ..AuditedPixel::default() });
+    }
     let found: Vec<(u64, f64, f64)> = [1, 2, 4, 8, 16, 32]
         .map(|rays| {
             control.rays = rays;

@@ -187,3 +187,29 @@ impl Medium<'_> {
         sum
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::offsets;
+    use crate::smooth::{AUDIT_RAYS, AuditedPixel, MIN_RAYS, MarchControl};
+
+    /// Edges across a pixel, also along its axes: their error is not understated by much, and not overstated by more.
+    #[test]
+    fn edges_of_all_directions_are_audited() {
+        for angle in [0.0, 0.02, 0.1, 0.4, 0.785, 1.2, 1.5508, std::f32::consts::FRAC_PI_2] {
+            let (mut control, mut square, mut count) = (MarchControl::default(), 0.0, 0.0);
+            for place in 0..400 {
+                let edge = -0.75 + 1.5 * (place as f32 + 0.5) / 400.0;
+                let shown = |[x, y]: [f32; 2]| if (x - 0.5) * f32::cos(angle) + (y - 0.5) * f32::sin(angle) < edge { 1.0 } else { 0.0 };
+                let mean = |from: u64, to: u64| (from..to).map(|j| shown([offsets(j)[0], offsets(j)[1]])).sum::<f64>() / (to - from) as f64;
+                let [first, following] = [mean(0, MIN_RAYS), mean(MIN_RAYS, MIN_RAYS + AUDIT_RAYS)];
+                let truth = (0..6400).map(|i| shown([i % 80, i / 80].map(|n| (n as f32 + 0.5) / 80.0))).sum::<f64>() / 6400.0;
+                control.audit(&AuditedPixel { alpha: 1.0, first: [first; 3], following: [following; 3], ..AuditedPixel::default() });
+                (square, count) = (square + (first - truth).powi(2), count + 1.0);
+            }
+            control.rays = MIN_RAYS;
+            let (stated, found) = (control.error(), square / count);
+            assert!(stated > 0.9 * found && stated < 2.0 * found, "angle {angle}: {stated} stated, {found} found");
+        }
+    }
+}

@@ -1,11 +1,12 @@
 //! How finely a picture is marched: its error is measured on random pixels and kept well below that of the picture.
 
+use super::statement::LIT;
 use crate::rng::FrameRandom;
 
-/// Rays per pixel of the first round. They come two by two, on opposite sides of the pixel's centre.
-pub const FIRST_RAYS: u64 = 2;
-/// Rays per pixel that a picture gets in any case, one pair a round, and the most it gets.
-const MIN_RAYS: u64 = 4;
+/// Rays come two by two, on opposite sides of the pixel's centre.
+pub const PAIR: u64 = 2;
+/// Rays per pixel of the first round, and the most a picture gets.
+pub const MIN_RAYS: u64 = 4;
 const MAX_RAYS: u64 = 64;
 /// First step, as a share of the distance between nodes, and the smallest one.
 const FIRST_STEP: f32 = 1.0;
@@ -15,13 +16,59 @@ const SHARE: f64 = 0.1;
 /// Once the error of the pixel filter is this share of what it may be, no more rays are marched.
 const SPARE: f64 = 0.25;
 /// Audits that a picture gets in any case, one a round.
-const MIN_AUDITS: u64 = 8;
-/// Pixels per call whose rays are compared with others of the same pixel.
-const AUDITED_PIXELS: u64 = 256;
-/// Number of audited pixels whose rays are compared with a finer march as well.
-pub const FINELY_AUDITED: usize = 24;
+const MIN_AUDITS: u64 = 4;
+/// Pixels per audit. Most of the error is at edges, in few of them.
+const AUDITED_PIXELS: u64 = 1024;
+/// Rays after the first `MIN_RAYS` against which these are audited. They share no coordinate with them, so that edges along the axes show too.
+pub const AUDIT_RAYS: u64 = 16;
+/// Steps of an audit in one step of the march.
+pub const AUDIT_STEPS: u64 = 4;
+/// Number of audited pixels in which the depth to the light is marched, which takes long.
+pub const LIT_BY_MARCH: usize = 24;
+/// Steps to the light of an audit in one step of the march.
+pub const LIGHT_STEPS: u64 = 2;
 /// Counter word of the draw of these pixels, which no path reaches.
 const AUDIT_DIMENSION: u32 = u32::MAX - 2;
+
+/// An audited pixel: linear radiances, each the mean of some rays.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct AuditedPixel {
+    /// Opacity, the mean over all of its rays.
+    pub alpha: f64,
+    /// The first `MIN_RAYS` rays, as marched.
+    pub first: [f64; 3],
+    /// The `AUDIT_RAYS` rays that follow.
+    pub following: [f64; 3],
+    /// The first `PAIR` rays, as marched.
+    pub pair: [f64; 3],
+    /// The same with `AUDIT_STEPS` steps in one.
+    pub fine: [f64; 3],
+    /// The same, with the depth to the light marched instead of read from the light volume; `None` for most pixels.
+    pub lit: Option<[f64; 3]>,
+}
+
+/// A mean over audited pixels.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+struct Mean {
+    sum: f64,
+    squares: f64,
+    count: f64,
+}
+
+impl Mean {
+    fn add(&mut self, value: f64) {
+        self.sum += value;
+        self.squares += value * value;
+        self.count += 1.0;
+    }
+
+    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low.
+    fn bound(&self) -> f64 {
+        let n = self.count.max(1.0);
+        let mean = self.sum / n;
+        mean + ((self.squares / n - mean * mean).max(0.0) / n).sqrt()
+    }
+}
 
 /// State of the march of a picture.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -32,10 +79,11 @@ pub struct MarchControl {
     pub next_rays: u64,
     /// Step, as a share of the distance between nodes.
     pub step: f32,
-    /// Sums of squared errors over the audited pixels: of quadrature, and of the pixel filter, for the mean of `FIRST_RAYS` rays.
-    audited: [f64; 2],
-    quadrature: f64,
-    filter: f64,
+    /// Squared errors of the pixel filter with the first `MIN_RAYS` rays, of the steps and of the light volume, and twice the product of the last two.
+    filter: Mean,
+    steps: Mean,
+    light: Mean,
+    both: Mean,
     /// Number of audits so far.
     audits: u64,
 }
@@ -53,7 +101,8 @@ pub enum Marching {
 
 impl Default for MarchControl {
     fn default() -> Self {
-        Self { rays: 0, next_rays: FIRST_RAYS, step: FIRST_STEP, audited: [0.0; 2], quadrature: 0.0, filter: 0.0, audits: 0 }
+        let none = Mean::default();
+        Self { rays: 0, next_rays: MIN_RAYS, step: FIRST_STEP, filter: none, steps: none, light: none, both: none, audits: 0 }
     }
 }
 
@@ -84,30 +133,33 @@ impl MarchControl {
         (0..AUDITED_PIXELS).map(pixel).collect()
     }
 
-    /// Takes in an audited pixel: the means of rays 0 to `FIRST_RAYS` and of as many following ones as marched, and the former marched finely.
-    pub fn audit(&mut self, coarse: [f64; 3], following: [f64; 3], fine: Option<[f64; 3]>) {
-        let square = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f64>() / 3.0;
-        // Pixels that show the background alone agree exactly. They do not count, since errors are stated over lit pixels.
-        let filter = square(coarse, following);
-        if filter > 0.0 {
-            self.audited[0] += 1.0;
-            // Both means have the error of the filter.
-            self.filter += 0.5 * filter;
+    /// Takes in an audited pixel, if it is lit.
+    pub fn audit(&mut self, pixel: &AuditedPixel) {
+        if pixel.alpha <= f64::from(LIT) {
+            return;
         }
-        let quadrature = fine.map_or(0.0, |fine| square(coarse, fine));
-        if quadrature > 0.0 {
-            self.audited[1] += 1.0;
-            self.quadrature += quadrature;
+        let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);
+        let dot = |a: [f64; 3], b: [f64; 3]| (0..3).map(|k| a[k] * b[k]).sum::<f64>() / 3.0;
+        // The rays that follow have an error of their own, so that this is rather too much.
+        let filter = minus(pixel.first, pixel.following);
+        self.filter.add(dot(filter, filter));
+        let steps = minus(pixel.pair, pixel.fine);
+        self.steps.add(dot(steps, steps));
+        if let Some(lit) = pixel.lit {
+            let light = minus(pixel.fine, lit);
+            self.light.add(dot(light, light));
+            self.both.add(2.0 * dot(steps, light));
         }
     }
 
+    /// Error of the steps and of the light volume together. That they cancel is not trusted, since it was seen on few pixels.
     fn quadrature(&self) -> f64 {
-        self.quadrature / self.audited[1].max(1.0)
+        self.steps.bound() + self.light.bound() + self.both.bound().max(0.0)
     }
 
     /// Error of the pixel filter, which falls at least as fast as with independent rays.
     fn filter(&self) -> f64 {
-        self.filter / self.audited[0].max(1.0) * FIRST_RAYS as f64 / self.rays.max(1) as f64
+        self.filter.bound() * MIN_RAYS as f64 / self.rays.max(1) as f64
     }
 
     /// Mean square error of marching, mean over channels.
@@ -118,13 +170,13 @@ impl MarchControl {
     /// Decides how to go on if the rest of the picture has the mean square error `others`. With `may_go_on` false the rest is left to later rounds.
     pub fn decide(&mut self, others: f64, may_go_on: bool) -> Marching {
         let allowed = SHARE * others.max(0.0);
-        let wanted = self.rays < MIN_RAYS || self.filter() > SPARE * allowed;
-        self.next_rays = if wanted && self.rays < MAX_RAYS { FIRST_RAYS } else { 0 };
+        let wanted = self.filter() > SPARE * allowed;
+        self.next_rays = if wanted && self.rays < MAX_RAYS { PAIR } else { 0 };
         if !may_go_on {
             return Marching::Enough;
         }
         if self.quadrature() > allowed && self.step > MIN_STEP {
-            let next_rays = self.rays.max(FIRST_RAYS);
+            let next_rays = self.rays.max(MIN_RAYS);
             *self = Self { step: 0.5 * self.step, next_rays, audits: self.audits, ..Self::default() };
             return Marching::Anew;
         }

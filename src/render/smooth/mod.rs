@@ -25,7 +25,7 @@ pub use picture::{Picture, Refinement};
 pub use statement::{ErrorEstimate, PictureError, TileErrors, TileSums};
 pub use {
     allocation::{Allocation, TILE},
-    march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching},
+    march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, PAIR},
     picture::{AUDIT_PAIRS, ERROR_FLOOR, ERROR_RADIUS, squared_slope},
     statement::LIT,
 };

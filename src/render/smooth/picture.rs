@@ -5,7 +5,7 @@ use super::combine::{Combined, Correction, PairSums, combine, smoothed};
 use super::coupled::track;
 use super::light_volume::LightVolume;
 use super::march::{IsMissing, Medium, RaySum, ToLight};
-use super::march_control::{FINELY_AUDITED, FIRST_RAYS, MarchControl, Marching};
+use super::march_control::{AUDIT_RAYS, AUDIT_STEPS, AuditedPixel, LIGHT_STEPS, LIT_BY_MARCH, MIN_RAYS, MarchControl, Marching, PAIR};
 use super::nodes::Nodes;
 use super::statement::{LIT, PictureError, TileErrors, TileSums};
 use crate::renderer::RenderStats;
@@ -169,22 +169,29 @@ impl Picture {
             }
         });
         self.march.rays = rays.end;
-        let compared: Vec<([f64; 3], [f64; 3], Option<[f64; 3]>)> = audited
+        let compared: Vec<AuditedPixel> = audited
             .into_par_iter()
             .enumerate()
             .map(|(number, pixel)| {
                 let mean = |rays: Range<u64>, step: f32, light: ToLight<'_>| {
-                    let mut sum = RaySum::default();
+                    let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
                     rays.for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
-                    sum.radiance.map(|c| f64::from(c) / FIRST_RAYS as f64)
+                    (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
                 };
-                let coarse = mean(0..FIRST_RAYS, step, ToLight::Volume(light));
-                let following = mean(FIRST_RAYS..2 * FIRST_RAYS, step, ToLight::Volume(light));
-                let fine = (number < FINELY_AUDITED).then(|| mean(0..FIRST_RAYS, 0.25 * step, ToLight::March(0.5 * step)));
-                (coarse, following, fine)
+                let (volume, fine) = (ToLight::Volume(light), step / AUDIT_STEPS as f32);
+                let [(first, alpha), (following, more)] =
+                    [0..MIN_RAYS, MIN_RAYS..MIN_RAYS + AUDIT_RAYS].map(|rays| mean(rays, step, volume));
+                AuditedPixel {
+                    alpha: (alpha + more) / (MIN_RAYS + AUDIT_RAYS) as f64,
+                    first,
+                    following,
+                    pair: mean(0..PAIR, step, volume).0,
+                    fine: mean(0..PAIR, fine, volume).0,
+                    lit: (number < LIT_BY_MARCH).then(|| mean(0..PAIR, fine, ToLight::March(step / LIGHT_STEPS as f32)).0),
+                }
             })
             .collect();
-        compared.into_iter().for_each(|(coarse, following, fine)| self.march.audit(coarse, following, fine));
+        compared.iter().for_each(|pixel| self.march.audit(pixel));
         began.elapsed().as_secs_f64()
     }
 

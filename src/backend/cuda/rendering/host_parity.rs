@@ -258,6 +258,11 @@ fn rays_agree() {
     }
 }
 
+fn with_alpha(ray: &RaySum) -> [f32; 4] {
+    let [red, green, blue] = ray.radiance;
+    [red, green, blue, ray.alpha]
+}
+
 #[test]
 fn checked_rays_agree() {
     for case in cases() {
@@ -272,14 +277,14 @@ fn checked_rays_agree() {
                 input.extend(bytes(&[check.2, check.3]));
             }
             let output = ask("checks", &input);
-            let found = read::<[f32; 3]>(&mut &output[..], checks.len());
+            let found = read::<[f32; 4]>(&mut &output[..], checks.len());
             with_medium(renderer, &mut |medium| {
                 let volume = LightVolume::new(medium, case.values, 1);
                 for (&(pixel, ray, step, shadow), found) in checks.iter().zip(&found) {
                     let light = if shadow > 0.0 { ToLight::March(shadow) } else { ToLight::Volume(&volume) };
-                    let expected = medium.ray(pixel, u64::from(ray), step, light, case.shifted).radiance;
+                    let expected = with_alpha(&medium.ray(pixel, u64::from(ray), step, light, case.shifted));
                     let allowed = if case.holes { 2e-2 } else { 3e-4 };
-                    let near = (0..3).all(|k| (found[k] - expected[k]).abs() <= allowed * (1.0 + expected[k]));
+                    let near = (0..4).all(|k| (found[k] - expected[k]).abs() <= allowed * (1.0 + expected[k]));
                     assert!(near, "{}, pixel {pixel}, ray {ray}: {found:?} and {expected:?}", case.name);
                 }
             });
@@ -332,8 +337,8 @@ fn a_device_agrees() {
                 assert!(apart as usize <= pixels / 50, "{}: {apart} values of {pixels} pixels apart", case.name);
                 for (check, found) in checks.iter().zip(&checked) {
                     let light = if check.shadow_step > 0.0 { ToLight::March(check.shadow_step) } else { ToLight::Volume(&volume) };
-                    let expected = medium.ray(check.pixel, u64::from(check.ray), check.step, light, case.shifted).radiance;
-                    let near = (0..3).all(|k| (found[k] - expected[k]).abs() <= 3e-4 * (1.0 + expected[k]));
+                    let expected = with_alpha(&medium.ray(check.pixel, u64::from(check.ray), check.step, light, case.shifted));
+                    let near = (0..4).all(|k| (found[k] - expected[k]).abs() <= 3e-4 * (1.0 + expected[k]));
                     assert!(near, "{}, {check:?}: {found:?} and {expected:?}", case.name);
                 }
             });

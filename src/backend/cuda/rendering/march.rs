@@ -429,11 +429,11 @@ impl GpuMarch {
         self.pixels
     }
 
-    /// Marches single rays apart from the picture and returns their radiance. Waits for the result.
+    /// Marches single rays apart from the picture and returns their radiances and opacities. Waits for the result.
     ///
     /// # Errors
     /// Nothing was prepared, or the device fails or lacks memory.
-    pub fn check(&mut self, medium: &Medium<'_>, checks: &[RayCheck], shifted: bool) -> Result<Vec<[f32; 3]>, DeviceError> {
+    pub fn check(&mut self, medium: &Medium<'_>, checks: &[RayCheck], shifted: bool) -> Result<Vec<[f32; 4]>, DeviceError> {
         if checks.is_empty() {
             return Ok(Vec::new());
         }
@@ -443,15 +443,15 @@ impl GpuMarch {
         let what = "checks of the march";
         let from = room(&gpu, &mut self.checks, what, checks.len())?;
         from.write(checks)?;
-        let out = room(&gpu, &mut self.checked, what, 3 * checks.len())?;
+        let out = room(&gpu, &mut self.checked, what, 4 * checks.len())?;
         let (given, found) = (from.address(), out.address());
         let config = LaunchConfig { grid_dim: (checks.len() as u32, 1, 1), block_dim: (CHECK_BLOCK, 1, 1), shared_mem_bytes: 0 };
         let mut call = gpu.work().launch_builder(&self.kernels.checks);
         call.arg(&parameters).arg(&argument).arg(&given).arg(&found);
         // SAFETY: the arguments of `march_checks`; both arrays have an entry for each block.
         unsafe { launch(&mut call, config) }?;
-        let mut radiance = vec![0.0; 3 * checks.len()];
-        out.read(&mut radiance)?;
-        Ok(radiance.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect())
+        let mut found = vec![0.0; 4 * checks.len()];
+        out.read(&mut found)?;
+        Ok(found.chunks_exact(4).map(|c| [c[0], c[1], c[2], c[3]]).collect())
     }
 }

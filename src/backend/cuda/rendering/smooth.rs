@@ -12,7 +12,8 @@ use crate::cuda::tracing::{CudaTracer, DeviceTable};
 use crate::cuda::{Buffer, DeviceError};
 use ridgewatch_render::rng::FrameRandom;
 use ridgewatch_render::smooth::{
-    AUDIT_PAIRS, Allocation, ERROR_FLOOR, ERROR_RADIUS, FINELY_AUDITED, FIRST_RAYS, LIT, MarchControl, Marching, PictureError, TileSums,
+    AUDIT_PAIRS, AUDIT_RAYS, AUDIT_STEPS, Allocation, AuditedPixel, ERROR_FLOOR, ERROR_RADIUS, LIGHT_STEPS, LIT, LIT_BY_MARCH, MIN_RAYS,
+    MarchControl, Marching, PAIR, PictureError, TileSums,
 };
 use ridgewatch_render::{Combine, Film, FrameParameters, Method, RenderStats, Renderer, Scene};
 use std::sync::Arc;
@@ -182,23 +183,29 @@ impl GpuSmooth {
         let random = FrameRandom::new(renderer.scene().seed, self.number);
         let pixels = self.control.audit_pixels(&random, parameters.pixels());
         self.control.rays += due;
-        let rays = |pixel: u32, first: u64, step: f32, shadow_step: f32| {
-            (first..first + FIRST_RAYS).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
+        let rays = |pixel: u32, count: u64, step: f32, shadow_step: f32| {
+            (0..count).map(move |ray| RayCheck { pixel, ray: ray as u32, step, shadow_step })
         };
+        let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
+        let (each, pair) = ((MIN_RAYS + AUDIT_RAYS) as usize, PAIR as usize);
         let checks: Vec<RayCheck> = pixels
             .iter()
-            .flat_map(|&pixel| rays(pixel, 0, step, 0.0).chain(rays(pixel, FIRST_RAYS, step, 0.0)))
-            .chain(pixels[..FINELY_AUDITED].iter().flat_map(|&pixel| rays(pixel, 0, 0.25 * step, 0.5 * step)))
+            .flat_map(|&pixel| rays(pixel, each as u64, step, 0.0))
+            .chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0)))
+            .chain(pixels[..LIT_BY_MARCH].iter().flat_map(|&pixel| rays(pixel, PAIR, fine, to_light)))
             .collect();
-        let radiance = self.march.check(&medium, &checks, round.smooth.sum)?;
-        let per_mean = FIRST_RAYS as usize;
-        let mean = |part: usize| -> [f64; 3] {
-            let rays = &radiance[part * per_mean..(part + 1) * per_mean];
-            std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / per_mean as f64)
-        };
-        for pixel in 0..pixels.len() {
-            let fine = (pixel < FINELY_AUDITED).then(|| mean(2 * pixels.len() + pixel));
-            self.control.audit(mean(2 * pixel), mean(2 * pixel + 1), fine);
+        let found = self.march.check(&medium, &checks, round.smooth.sum)?;
+        fn mean<const N: usize>(rays: &[[f32; 4]]) -> [f64; N] {
+            std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
+        }
+        let (coarse, finer) = found.split_at(each * pixels.len());
+        let (fine, lit) = finer.split_at(pair * pixels.len());
+        let mut lit = lit.chunks_exact(pair);
+        for (coarse, fine) in coarse.chunks_exact(each).zip(fine.chunks_exact(pair)) {
+            let (first, following) = coarse.split_at(MIN_RAYS as usize);
+            let [.., alpha] = mean::<4>(coarse);
+            let (pair, lit) = (mean(&first[..pair]), lit.next().map(mean));
+            self.control.audit(&AuditedPixel { alpha, first: mean(first), following: mean(following), pair, fine: mean(fine), lit });
         }
         Ok(began.elapsed().as_secs_f64())
     }
