@@ -1,6 +1,6 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
-use super::{Charting, failed};
+use super::{Charting, choose, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device};
@@ -73,6 +73,11 @@ pub struct Sliding {
 }
 
 impl PictureCurve {
+    fn new(method: Method, kind: Kind) -> Self {
+        let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
+        Self { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None }
+    }
+
     /// Method and surrogate.
     pub fn name(&self) -> String {
         match &self.surrogate {
@@ -99,6 +104,17 @@ pub struct PicturePanel {
     pub truth_psnr: f64,
     /// One curve per method and surrogate.
     pub curves: Vec<PictureCurve>,
+    /// What `render.method = "auto"` chooses; `None` if there was no time for its trial.
+    pub auto: Option<Auto>,
+}
+
+/// The choice of `render.method = "auto"`.
+#[derive(Debug, Clone, Serialize)]
+pub struct Auto {
+    /// Name of the curve of the chosen method and the scene's surrogate.
+    pub curve: String,
+    /// Seconds of the trial, once for a scene on a device.
+    pub trial_seconds: f64,
 }
 
 /// Two independent pictures of the same scene. Half of their difference is the noise of their mean, which is taken off from squared errors against it.
@@ -309,7 +325,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
     let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
     if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
         charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
-        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new() });
+        return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new(), auto: None });
     }
     let last_truth = match true_picture(SLIDES - 1, TRUTH_SHARES[1]) {
         Ok(found) => found.map(|(truth, _)| truth),
@@ -331,12 +347,23 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         (Method::TwoLevel, Kind::Network),
         (Method::Gated, Kind::Network),
     ];
+    // Measured before the curves, which take all the time that is left.
+    let mut auto = None;
+    if charting.has_time_for("the trial of auto") {
+        let began = Instant::now();
+        match choose(charting.settings, charting.device, options.threads, charting.stop) {
+            Ok(choice) => {
+                let curve = PictureCurve::new(choice.method, charting.settings.surrogate.kind).name();
+                auto = Some(Auto { curve, trial_seconds: began.elapsed().as_secs_f64() });
+            }
+            Err(error) => charting.refused("the trial of auto", error)?,
+        }
+    }
     if let Err(error) = compile(&settings, &options) {
         charting.refused("a first frame, which compiles kernels", error)?;
     }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
-        let surrogate = (method != Method::Reference).then(|| kind.name().to_owned());
-        let mut curve = PictureCurve { method: method.name().to_owned(), surrogate, bytes: 0, frames: Vec::new(), sliding: None };
+        let mut curve = PictureCurve::new(method, kind);
         if !charting.has_time_for(&format!("pictures by {}", curve.name())) {
             continue;
         }
@@ -355,7 +382,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         }
         curves.push(curve);
     }
-    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves })
+    Ok(PicturePanel { size, truth_samples: samples, truth_psnr, curves, auto })
 }
 
 /// Frames of a still window for some seconds; returns the bytes of the surrogate.

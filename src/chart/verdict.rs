@@ -1,7 +1,7 @@
 //! What a chart says, in words.
 
 use super::ftle::{FtlePanel, FtlePoint};
-use super::picture::{PicturePanel, RESOLVED, TARGETS};
+use super::picture::{Auto, PicturePanel, RESOLVED, TARGETS};
 use super::{Chart, pick};
 
 /// Numbers of samples for which building is charged.
@@ -114,6 +114,7 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
             }
         });
     }
+    said.extend(panel.auto.as_ref().map(|auto| of_auto(panel, auto)));
     let sliding = |curve: &super::PictureCurve| {
         curve.sliding.map(|found| {
             let psnr = found.psnr.map_or(String::new(), |psnr| format!(" at {psnr:.1} dB"));
@@ -124,6 +125,22 @@ fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
     if !rates.is_empty() {
         said.push(format!("Frames of a window that slides at every frame: {}.", rates.join(", ")));
     }
+}
+
+/// How far the choice of `auto` is from the best curve.
+fn of_auto(panel: &PicturePanel, auto: &Auto) -> String {
+    let chosen = panel.curves.iter().find(|curve| curve.name() == auto.curve);
+    let compared = TARGETS.iter().filter_map(|&target| {
+        let best = panel.curves.iter().filter_map(|curve| curve.seconds_to(target)).min_by(f64::total_cmp)?;
+        Some(match chosen.and_then(|curve| curve.seconds_to(target)) {
+            Some(seconds) if seconds <= best => format!("first at {target} dB"),
+            Some(seconds) => format!("{:.0} % after the first at {target} dB", 100.0 * (seconds / best - 1.0)),
+            None => format!("not at {target} dB, as others are"),
+        })
+    });
+    let compared: Vec<String> = compared.collect();
+    let compared = if compared.is_empty() { "no target was reached".to_owned() } else { compared.join(", ") };
+    format!("render.method = \"auto\" chooses {} in a trial of {}: {compared}.", auto.curve, duration(auto.trial_seconds))
 }
 
 fn name(point: &FtlePoint) -> String {
