@@ -1,6 +1,7 @@
 //! Errors and costs of FTLE samples: tracing over steps, gaps and tolerances, composed flow maps, tables, networks.
 
 use super::picture::with_method;
+use super::slides::FirstSlides;
 use super::{Charting, device_name, failed};
 use crate::backend::{Backend, Cpu, Device, Surrogate as _, SurrogateRequest, audit};
 #[cfg(feature = "cuda")]
@@ -100,12 +101,12 @@ pub(super) struct Opened {
 }
 
 impl Opened {
-    pub(super) fn new(settings: &Settings, device: &Device) -> Result<Self, RunError> {
+    pub(super) fn new(settings: &Settings, device: &Device, slides: &FirstSlides) -> Result<Self, RunError> {
         /// Intervals of a composed flow map of a closed form.
         const CLOSED: usize = 10;
         // The method of the scene plays no part.
-        let Setup { plan, mut slides, .. } = Setup::new(with_method(settings, Method::TwoLevel, settings.surrogate.kind))?;
-        let slide = slides.next_slide(&NEVER)?.ok_or(RunError::EndedEarly)?;
+        let plan = Setup::new(with_method(settings, Method::TwoLevel, settings.surrogate.kind))?.plan;
+        let slide = slides.first().clone();
         let (intervals, window_bytes) = match &slide.velocity {
             VelocitySource::Analytic(..) => (CLOSED, 0),
             VelocitySource::Window(window) => {

@@ -10,6 +10,7 @@ mod front;
 mod ftle;
 mod picture;
 mod scaling;
+mod slides;
 mod table;
 mod train;
 mod trial;
@@ -30,6 +31,7 @@ use crate::backend::cuda::Cuda;
 use crate::backend::{Backend as _, BackendError, Cpu, Device};
 use crate::run::{RunError, Settings};
 use serde::Serialize;
+use slides::FirstSlides;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
@@ -168,7 +170,8 @@ pub fn chart(
     let threads = pool.current_num_threads();
     let ends = began + Duration::from_secs_f64(options.seconds);
     let mut charting = Charting { settings, device, pool, ends, stop, tell, not_measured: Vec::new() };
-    let opened = ftle::Opened::new(settings, device)?;
+    let slides = FirstSlides::read(settings, if options.pictures { picture::SLIDES } else { 1 }, stop)?;
+    let opened = ftle::Opened::new(settings, device, &slides)?;
     let (source, tau, time_unit) = (opened.plan.source.clone(), opened.plan.map.tau, opened.plan.time_unit.clone());
     let ftle = if options.ftle {
         let share = if options.pictures { 0.45 } else { 0.85 };
@@ -177,7 +180,7 @@ pub fn chart(
         None
     };
     let scaling = if options.scaling { Some(charting.with_share(0.15, |charting| scaling::panel(charting, &opened))?) } else { None };
-    let pictures = if options.pictures { Some(picture::panel(&mut charting)?) } else { None };
+    let pictures = if options.pictures { Some(picture::panel(&mut charting, &slides)?) } else { None };
     Ok(Chart {
         scene: settings.title.clone(),
         source,

@@ -1,6 +1,8 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
-use super::{Charting, choose, failed};
+use super::slides::FirstSlides;
+use super::trial::race;
+use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device};
@@ -27,7 +29,7 @@ const LONGEST: [f64; 2] = [20.0, 6.0];
 /// Samples a pixel of a frame of the truth.
 const TRUTH_SAMPLES: f64 = 16.0;
 /// Slides of a sliding window; the first one is not counted.
-const SLIDES: usize = 3;
+pub(super) const SLIDES: usize = 3;
 
 /// A frame of a curve.
 #[derive(Debug, Clone, Copy, Serialize)]
@@ -223,30 +225,31 @@ pub(super) fn noise_psnr(a: &Film, b: &Film, tone_map: [f64; 3]) -> f64 {
 /// # Errors
 /// The source cannot be opened, or the device fails.
 pub fn fixed_colours(settings: &Settings, device: &Device) -> Result<TransferSettings, RunError> {
-    // No method is asked for a picture here, and `auto` is not one.
-    let mut setup = Setup::new(with_method(settings, Method::Reference, Kind::Table))?;
-    let slide = setup.slides.next_slide(&AtomicBool::new(false))?.ok_or(RunError::EndedEarly)?;
+    colours_of(settings, device, &FirstSlides::read(settings, 1, &AtomicBool::new(false))?)
+}
+
+/// As [`fixed_colours`], with slides that were read before.
+pub(super) fn colours_of(settings: &Settings, device: &Device, slides: &FirstSlides) -> Result<TransferSettings, RunError> {
+    let plan = Setup::new(with_method(settings, Method::Reference, Kind::Table))?.plan;
     fn of<B: Backend>(mut backend: B, plan: &Plan, slide: &Slide) -> Result<TransferSettings, RunError> {
         let tracer = backend.tracer(&slide.velocity, &plan.map, slide.time).map_err(failed)?;
         settled_colours(plan, &tracer, slide)
     }
     match device {
-        Device::Cpu { .. } => of(Cpu, &setup.plan, &slide),
+        Device::Cpu { .. } => of(Cpu, &plan, slides.first()),
         #[cfg(feature = "cuda")]
-        Device::Cuda(device) => of(Cuda::new(device), &setup.plan, &slide),
+        Device::Cuda(device) => of(Cuda::new(device), &plan, slides.first()),
     }
 }
 
-/// Runs slide `slide` of a scene, counted from 0, until `seen` returns false for a frame. Returns the bytes of the surrogate; `None` if the source ends
-/// before.
+/// Runs slide `slide` of a scene, counted from 0, until `seen` returns false for a frame. Returns the bytes of the surrogate.
 pub(super) fn still(
     settings: Settings,
     options: &RunOptions,
-    slide: usize,
+    (slides, slide): (&FirstSlides, usize),
     mut seen: impl FnMut(&Frame) -> bool + Send,
-) -> Result<Option<usize>, RunError> {
+) -> Result<usize, RunError> {
     let mut settings = settings;
-    settings.time.slides = Some(slide + 1);
     (settings.time.warmup_frames, settings.time.frames_per_slide) = (0, 1_000_000);
     let enough = AtomicBool::new(false);
     let mut sink = |event: Event| {
@@ -257,19 +260,13 @@ pub(super) fn still(
             enough.store(true, Ordering::Relaxed);
         }
     };
-    let mut setup = Setup::new(settings)?;
-    for _ in 0..slide {
-        if setup.slides.next_slide(&enough)?.is_none() {
-            return Ok(None);
-        }
-    }
-    Ok(Some(run(setup, options, &mut sink, &enough)?.surrogate_bytes))
+    Ok(run(slides.setup(settings, slide)?, options, &mut sink, &enough)?.surrogate_bytes)
 }
 
 /// Renders a frame that is not measured: on a GPU the first one compiles kernels.
-pub(super) fn compile(settings: &Settings, options: &RunOptions) -> Result<(), RunError> {
+pub(super) fn compile(settings: &Settings, options: &RunOptions, slides: &FirstSlides) -> Result<(), RunError> {
     if options.device.is_gpu() {
-        still(with_method(settings, Method::TwoLevel, settings.surrogate.kind), options, 0, |_| false)?;
+        still(with_method(settings, Method::TwoLevel, settings.surrogate.kind), options, (slides, 0), |_| false)?;
     }
     Ok(())
 }
@@ -292,9 +289,9 @@ pub(super) fn with_method(settings: &Settings, method: Method, kind: Kind) -> Se
 }
 
 /// Renders the truth and the curves.
-pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunError> {
+pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result<PicturePanel, RunError> {
     let mut settings = charting.settings.clone();
-    settings.transfer = Some(fixed_colours(&settings, charting.device)?);
+    settings.transfer = Some(colours_of(&settings, charting.device, slides)?);
     let options = RunOptions { device: charting.device.clone(), threads: charting.pool.current_num_threads(), ..RunOptions::default() };
     let size = [settings.render.width, settings.render.height];
     let left = charting.left();
@@ -308,7 +305,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
             // Opening the source does not count.
             let mut began = None;
             let mut sum = Film::new(size[0], size[1]);
-            let bytes = still(scene, &options, slide, |frame| {
+            still(scene, &options, (slides, slide), |frame| {
                 samples += TRUTH_SAMPLES;
                 // Both films have the size of the scene.
                 let whole = sum.accumulate(&frame.film).is_ok();
@@ -316,22 +313,26 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
                     && began.get_or_insert_with(Instant::now).elapsed().as_secs_f64() < 0.5 * share * left
                     && !charting.stop.load(Ordering::Relaxed)
             })?;
-            Ok::<_, RunError>(bytes.map(|_| sum))
+            Ok::<_, RunError>(sum)
         };
         let halves = [half(settings.seed ^ 0x5eed_0001)?, half(settings.seed ^ 0x5eed_0002)?];
-        let [Some(a), Some(b)] = halves else { return Ok::<_, RunError>(None) };
-        Ok(Some((Truth::new([a, b])?, samples)))
+        Ok::<_, RunError>((Truth::new(halves)?, samples))
     };
-    let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?.ok_or(RunError::EndedEarly)?;
+    let (truth, samples) = true_picture(0, TRUTH_SHARES[0])?;
     if !truth.mean.rgba.iter().any(|pixel| pixel[3] > LIT) {
         charting.skip("pictures", "nothing of the flow is shown: the transfer function is 0 everywhere (transfer.low, transfer.high)");
         return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new(), auto: None });
     }
-    let last_truth = match true_picture(SLIDES - 1, TRUTH_SHARES[1]) {
-        Ok(found) => found.map(|(truth, _)| truth),
-        Err(error) => {
-            charting.refused("the truth of a window that slides", error)?;
-            None
+    let last_truth = if slides.count() < SLIDES {
+        charting.skip("a sliding window", format_args!("it takes {SLIDES} slides, the source has {}", slides.count()));
+        None
+    } else {
+        match true_picture(SLIDES - 1, TRUTH_SHARES[1]) {
+            Ok((truth, _)) => Some(truth),
+            Err(error) => {
+                charting.refused("the truth of a window that slides", error)?;
+                None
+            }
         }
     };
     let [a, b] = &truth.halves;
@@ -351,7 +352,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
     let mut auto = None;
     if charting.has_time_for("the trial of auto") {
         let began = Instant::now();
-        match choose(charting.settings, charting.device, options.threads, charting.stop) {
+        match race(charting.settings, charting.device, options.threads, charting.stop, slides) {
             Ok(choice) => {
                 let curve = PictureCurve::new(choice.method, charting.settings.surrogate.kind).name();
                 auto = Some(Auto { curve, trial_seconds: began.elapsed().as_secs_f64() });
@@ -359,7 +360,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
             Err(error) => charting.refused("the trial of auto", error)?,
         }
     }
-    if let Err(error) = compile(&settings, &options) {
+    if let Err(error) = compile(&settings, &options, slides) {
         charting.refused("a first frame, which compiles kernels", error)?;
     }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
@@ -369,16 +370,18 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
         }
         let longest = (charting.left() / (candidates.len() - number) as f64).min(LONGEST[usize::from(charting.device.is_gpu())]);
         let scene = with_method(&settings, method, kind);
-        match measure(&scene, &options, &truth, 0.8 * longest, charting.stop, &mut curve.frames) {
+        match measure(&scene, &options, slides, &truth, 0.8 * longest, charting.stop, &mut curve.frames) {
             Ok(bytes) => curve.bytes = bytes,
             Err(error) => {
                 charting.refused(format_args!("pictures by {}", curve.name()), error)?;
                 continue;
             }
         }
-        match sliding(&scene, &options, last_truth.as_ref(), 0.2 * longest, charting.stop) {
-            Ok(found) => curve.sliding = found,
-            Err(error) => charting.refused(format_args!("a sliding window by {}", curve.name()), error)?,
+        if slides.count() >= SLIDES {
+            match sliding(&scene, &options, slides, last_truth.as_ref(), 0.2 * longest, charting.stop) {
+                Ok(found) => curve.sliding = found,
+                Err(error) => charting.refused(format_args!("a sliding window by {}", curve.name()), error)?,
+            }
         }
         curves.push(curve);
     }
@@ -389,6 +392,7 @@ pub(super) fn panel(charting: &mut Charting<'_>) -> Result<PicturePanel, RunErro
 fn measure(
     scene: &Settings,
     options: &RunOptions,
+    slides: &FirstSlides,
     truth: &Truth,
     longest: f64,
     stop: &AtomicBool,
@@ -396,7 +400,7 @@ fn measure(
 ) -> Result<usize, RunError> {
     let mut sum = Film::new(scene.render.width, scene.render.height);
     let (mut seconds, mut last) = (0.0, None);
-    let bytes = still(scene.clone(), options, 0, |frame| {
+    let bytes = still(scene.clone(), options, (slides, 0), |frame| {
         let record = &frame.record;
         seconds += record.seconds.slide + record.seconds.total;
         // Films of the other methods have their own samples only.
@@ -420,19 +424,20 @@ fn measure(
         let film = if scene.render.method.is_smooth() { &*film } else { &sum };
         point.ssim = compare_films(film, &truth.mean, tone_map).ok().and_then(|compared| compared.ssim);
     }
-    Ok(bytes.unwrap_or(0))
+    Ok(bytes)
 }
 
-/// A window that slides at every frame; `None` if the source has too few slides, or a frame took too long.
+/// A window that slides at every frame; `None` if a frame took too long.
 fn sliding(
     scene: &Settings,
     options: &RunOptions,
+    slides: &FirstSlides,
     truth: Option<&Truth>,
     longest: f64,
     stop: &AtomicBool,
 ) -> Result<Option<Sliding>, RunError> {
     let mut scene = scene.clone();
-    (scene.time.slides, scene.time.frames_per_slide, scene.time.warmup_frames) = (Some(SLIDES), 1, 0);
+    (scene.time.frames_per_slide, scene.time.warmup_frames) = (1, 0);
     let (mut seconds, mut frames, mut psnr) = (0.0, 0, None);
     let enough = AtomicBool::new(false);
     let mut sink = |event: Event| {
@@ -447,6 +452,6 @@ fn sliding(
             enough.store(seconds > longest || stop.load(Ordering::Relaxed), Ordering::Relaxed);
         }
     };
-    run(Setup::new(scene)?, options, &mut sink, &enough)?;
+    run(slides.setup(scene, 0)?, options, &mut sink, &enough)?;
     Ok((frames > 0).then(|| Sliding { frames_per_second: f64::from(frames) / seconds, psnr }))
 }

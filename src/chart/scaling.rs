@@ -1,6 +1,7 @@
 //! Cost of a sample against the size of the task: tau, nodes of the window, threads.
 
 use super::ftle::Opened;
+use super::slides::FirstSlides;
 use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
@@ -58,7 +59,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Scal
             let mut settings = charting.settings.clone();
             let fewer = nodes.map(|n| ((n as f64 * factor) as usize).max(4));
             settings.source.nodes = Some(fewer);
-            let other = Opened::new(&settings, charting.device)?;
+            let other = Opened::new(&settings, charting.device, &FirstSlides::read(&settings, 1, charting.stop)?)?;
             points.extend(point(charting, &other, &opened.plan.map, "nodes", fewer.iter().product::<usize>() as f64)?);
         }
         points.extend(point(charting, opened, &opened.plan.map, "nodes", nodes.iter().product::<usize>() as f64)?);

@@ -1,7 +1,9 @@
 //! Training offline on a still window: the loss on points that the network never sees, epoch by epoch, and pictures on the way.
 
+use super::failed;
 use super::ftle::{Opened, Points};
-use super::{failed, fixed_colours};
+use super::picture::colours_of;
+use super::slides::FirstSlides;
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
 use crate::backend::{Backend, Cpu, Device, FrameJob, Rendered, Routing, Surrogate as _, SurrogateRequest};
@@ -81,8 +83,9 @@ pub fn train(
     stop: &AtomicBool,
 ) -> Result<TrainReport, RunError> {
     let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build()?;
-    let opened = Opened::new(settings, device)?;
-    let colours = fixed_colours(settings, device)?;
+    let slides = FirstSlides::read(settings, 1, stop)?;
+    let opened = Opened::new(settings, device, &slides)?;
+    let colours = colours_of(settings, device, &slides)?;
     let settings = Settings { transfer: Some(colours), ..settings.clone() };
     let training = Training { settings: &settings, options, opened: &opened, stop };
     pool.install(|| match device {

@@ -1,7 +1,8 @@
 //! A short trial of methods on a scene: the choice of `method = "auto"`.
 
 use super::device_name;
-use super::picture::{compile, fixed_colours, noise_psnr, still, with_method};
+use super::picture::{colours_of, compile, noise_psnr, still, with_method};
+use super::slides::FirstSlides;
 use crate::backend::Device;
 use crate::render::{Film, Method};
 use crate::run::{RunError, RunOptions, Settings};
@@ -40,20 +41,31 @@ impl std::fmt::Display for Choice {
 /// # Errors
 /// The source cannot be opened, or the device fails.
 pub fn choose(settings: &Settings, device: &Device, threads: usize, stop: &AtomicBool) -> Result<Choice, RunError> {
+    race(settings, device, threads, stop, &FirstSlides::read(settings, 1, stop)?)
+}
+
+/// As [`choose`], with slides that were read before.
+pub(super) fn race(
+    settings: &Settings,
+    device: &Device,
+    threads: usize,
+    stop: &AtomicBool,
+    slides: &FirstSlides,
+) -> Result<Choice, RunError> {
     const METHODS: [Method; 2] = [Method::TwoLevel, Method::Reference];
     let mut settings = settings.clone();
-    settings.transfer = Some(fixed_colours(&settings, device)?);
+    settings.transfer = Some(colours_of(&settings, device, slides)?);
     let options = RunOptions { device: device.clone(), threads, ..RunOptions::default() };
     // Small frames, so that a method ends soon after the target.
     settings.render.samples = SAMPLES;
     let kind = settings.surrogate.kind;
-    compile(&settings, &options)?;
+    compile(&settings, &options, slides)?;
     let mut seconds = Vec::new();
     for method in METHODS {
         let scene = with_method(&settings, method, kind);
         let longest = TRIAL_SECONDS / METHODS.len() as f64;
         let (mut since, mut spent, mut reached) = (0.0, 0.0, Reached::default());
-        still(scene, &options, 0, |frame| {
+        still(scene, &options, (slides, 0), |frame| {
             let record = &frame.record;
             (since, spent) = (since + record.seconds.slide + record.seconds.total, spent + record.seconds.total);
             match record.picture_error {

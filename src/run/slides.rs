@@ -19,6 +19,7 @@ use std::time::{Duration, Instant};
 const LOOK_UP: Duration = Duration::from_millis(100);
 
 /// A position of the window in time, with the velocity to integrate.
+#[derive(Clone)]
 pub struct Slide {
     /// Number of the slide, from 0.
     pub index: u64,
