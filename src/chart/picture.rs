@@ -348,6 +348,9 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         (Method::TwoLevel, Kind::Network),
         (Method::Gated, Kind::Network),
     ];
+    if let Err(error) = compile(&settings, &options, slides) {
+        charting.refused("a first frame, which compiles kernels", error)?;
+    }
     // Measured before the curves, which take all the time that is left.
     let mut auto = None;
     if charting.has_time_for("the trial of auto") {
@@ -359,9 +362,6 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
             }
             Err(error) => charting.refused("the trial of auto", error)?,
         }
-    }
-    if let Err(error) = compile(&settings, &options, slides) {
-        charting.refused("a first frame, which compiles kernels", error)?;
     }
     for (number, (method, kind)) in candidates.into_iter().enumerate() {
         let mut curve = PictureCurve::new(method, kind);

@@ -21,8 +21,9 @@ const TARGET: f64 = 40.0;
 pub struct Choice {
     /// The method that reaches the target first.
     pub method: Method,
-    /// Seconds since a slide to the target, by method; extrapolated for methods that did not reach it in the trial.
-    pub seconds: Vec<(Method, f64)>,
+    /// Seconds since a slide to the target, by method; extrapolated for methods that did not reach it in the trial. `None` for methods that never
+    /// reach it.
+    pub seconds: Vec<(Method, Option<f64>)>,
     /// The target, in decibels over lit pixels.
     pub target: f64,
     /// Device on which the trial ran.
@@ -31,7 +32,8 @@ pub struct Choice {
 
 impl std::fmt::Display for Choice {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let times: Vec<String> = self.seconds.iter().map(|(method, seconds)| format!("{} {seconds:.2} s", method.name())).collect();
+        let time = |seconds: &Option<f64>| seconds.map_or("not".to_owned(), |seconds| format!("{seconds:.2} s"));
+        let times: Vec<String> = self.seconds.iter().map(|(method, seconds)| format!("{} {}", method.name(), time(seconds))).collect();
         write!(f, "render.method = \"auto\": {}, first to {} dB in a trial ({})", self.method.name(), self.target, times.join(", "))
     }
 }
@@ -52,7 +54,7 @@ pub(super) fn race(
     stop: &AtomicBool,
     slides: &FirstSlides,
 ) -> Result<Choice, RunError> {
-    const METHODS: [Method; 2] = [Method::TwoLevel, Method::Reference];
+    const METHODS: [Method; 3] = [Method::TwoLevel, Method::Marched, Method::Reference];
     let mut settings = settings.clone();
     settings.transfer = Some(colours_of(&settings, device, slides)?);
     let options = RunOptions { device: device.clone(), threads, ..RunOptions::default() };
@@ -74,9 +76,12 @@ pub(super) fn race(
             }
             reached.psnr < TARGET && (spent < longest || reached.frames < 2) && !stop.load(Ordering::Relaxed)
         })?;
-        seconds.push((method, reached.seconds_to(TARGET)));
+        // The error of a marched picture is that of the surrogate, which samples do not lower.
+        let never = method == Method::Marched && reached.psnr < TARGET;
+        seconds.push((method, if never { None } else { reached.seconds_to(TARGET) }));
     }
-    let method = seconds.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(Method::TwoLevel, |(method, _)| *method);
+    let times = seconds.iter().filter_map(|(method, seconds)| Some((*method, (*seconds)?)));
+    let method = times.min_by(|a, b| a.1.total_cmp(&b.1)).map_or(Method::TwoLevel, |(method, _)| method);
     Ok(Choice { method, seconds, target: TARGET, device: device_name(device) })
 }
 
@@ -109,13 +114,13 @@ impl Reached {
         }
     }
 
-    /// Seconds to a PSNR: those taken, or extrapolated as if the squared error fell in proportion to the number of frames.
-    fn seconds_to(&self, target: f64) -> f64 {
-        if self.psnr >= target || self.frames == 0 {
-            return if self.frames == 0 { f64::INFINITY } else { self.seconds };
+    /// Seconds to a PSNR: those taken, or extrapolated as if the squared error fell in proportion to the number of frames. `None` without a frame.
+    fn seconds_to(&self, target: f64) -> Option<f64> {
+        if self.frames == 0 {
+            return None;
         }
-        let more = self.frames as f64 * (10f64.powf((target - self.psnr) / 10.0) - 1.0);
-        self.seconds + more * self.last
+        let more = self.frames as f64 * (10f64.powf((target - self.psnr) / 10.0) - 1.0).max(0.0);
+        Some(self.seconds + more * self.last)
     }
 }
 
@@ -126,12 +131,12 @@ mod tests {
     #[test]
     fn times_are_extrapolated_as_noise_falls() {
         let mut reached = Reached::default();
-        assert_eq!(reached.seconds_to(40.0), f64::INFINITY, "without a frame");
+        assert_eq!(reached.seconds_to(40.0), None, "without a frame");
         for _ in 0..4 {
             reached.stated(reached.seconds + 0.5, 0.5, 30.0);
         }
-        assert!((reached.seconds_to(40.0) - (2.0 + 36.0 * 0.5)).abs() < 1e-9, "ten times as many frames");
-        assert_eq!(reached.seconds_to(30.0), 2.0, "those taken");
+        assert!((reached.seconds_to(40.0).unwrap() - (2.0 + 36.0 * 0.5)).abs() < 1e-9, "ten times as many frames");
+        assert_eq!(reached.seconds_to(30.0), Some(2.0), "those taken");
     }
 
     #[test]
