@@ -108,7 +108,7 @@ fn panels(chart: &Chart) -> Vec<Panel> {
             panels.push(ftle_panel(panel, &unit, title, "seconds", |point| point.seconds(samples)));
         }
     }
-    panels.extend(chart.pictures.as_ref().map(picture_panel));
+    panels.extend(chart.pictures.as_ref().filter(|panel| !panel.curves.is_empty()).map(picture_panel));
     panels.extend(chart.scaling.as_ref().and_then(|panel| scaling_panel(panel, &chart.time_unit)));
     panels
 }
@@ -221,6 +221,9 @@ fn log(range: Range<f64>) -> Range<f64> {
     low / 1.6..high * 1.6
 }
 
+/// Width and height that a label takes, in pixels.
+const LABEL: [i32; 2] = [160, 16];
+
 fn draw_panel<B, X, Y>(area: &DrawingArea<B, Shift>, panel: &Panel, x: X, y: Y) -> Result<(), DrawError>
 where
     B: DrawingBackend,
@@ -265,7 +268,14 @@ where
         }
     }
     plot.draw_series(LineSeries::new(panel.front.iter().map(|(x, y, _)| (*x, *y)), BLACK.stroke_width(1))).map_err(plot_error)?;
+    let mut drawn: Vec<(i32, i32)> = Vec::new();
     for (x, y, label) in &panel.front {
+        // A label that would lie on another one is left out; the table has them all.
+        let (across, down) = plot.backend_coord(&(*x, *y));
+        if drawn.iter().any(|&(x, y)| (across - x).abs() < LABEL[0] && (down - y).abs() < LABEL[1]) {
+            continue;
+        }
+        drawn.push((across, down));
         let at = EmptyElement::at((*x, *y)) + Text::new(label.clone(), (8, -16), (FONT, 13).into_font());
         plot.draw_series([at]).map_err(plot_error)?;
     }

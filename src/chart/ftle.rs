@@ -189,6 +189,8 @@ struct Bench<'a, 'b> {
     points: Points,
     truth: Vec<f64>,
     timed: Points,
+    /// Bytes of the window as the backend in use stores it.
+    window_bytes: u64,
     found: Vec<FtlePoint>,
 }
 
@@ -244,7 +246,7 @@ impl Bench<'_, '_> {
 
     /// Measures a tracer of any device.
     fn measure_tracer(&mut self, method: &str, setting: String, tracer: &dyn Trace) -> Result<(), RunError> {
-        let built = Built { seconds: 0.0, bytes: self.opened.window_bytes };
+        let built = Built { seconds: 0.0, bytes: self.window_bytes };
         let answer = |points: &Points| {
             let mut traced = Traced::default();
             tracer.trace(&points.domain, Extras::default(), &mut traced).map_err(failed)?;
@@ -296,7 +298,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
     let auto = FlowMap { steps: opened.auto_steps(), ..opened.plan.map.clone() };
     let chosen_steps = charting.pool.install(|| opened.on_cpu(&auto))?.step_choice().map(|choice| choice.steps);
     let timed = Points::random(opened, MAX_BATCH[usize::from(charting.device.is_gpu())], 1);
-    let mut bench = Bench { charting, opened, points, truth, timed, found: Vec::new() };
+    let mut bench = Bench { charting, opened, points, truth, timed, window_bytes: opened.window_bytes, found: Vec::new() };
     let steps = chosen_steps.or(match opened.plan.map.steps {
         Steps::Fixed(steps) => Some(steps),
         Steps::Auto { .. } | Steps::AutoByShare { .. } => None,
@@ -316,7 +318,9 @@ pub(super) fn panel(charting: &mut Charting<'_>, opened: &Opened) -> Result<Ftle
             let mut backend = Cuda::new(&CudaDevice { storage: Storage::F32, ..device.clone() });
             tracing(&mut bench, &mut backend, steps, "")?;
             let mut half = Cuda::new(&CudaDevice { storage: Storage::F16, ..device.clone() });
+            bench.window_bytes = opened.window_bytes / Storage::F32.bytes() * Storage::F16.bytes();
             tracing(&mut bench, &mut half, steps, ", f16 storage")?;
+            bench.window_bytes = opened.window_bytes;
             tables(&mut bench, &mut backend)?;
             differences(&mut bench, &mut backend, steps)?;
             networks(&mut bench, &mut backend)?;

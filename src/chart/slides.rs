@@ -4,6 +4,7 @@ use super::picture::with_method;
 use crate::render::Method;
 use crate::run::{RunError, Settings, Setup, Slide, Slides};
 use crate::surrogate::Kind;
+use std::collections::VecDeque;
 use std::sync::atomic::AtomicBool;
 
 /// The first slides of a scene, which share their snapshots.
@@ -42,16 +43,17 @@ impl FirstSlides {
     /// A setting is not accepted, or the source cannot be opened.
     pub(super) fn setup(&self, settings: Settings, from: usize) -> Result<Setup, RunError> {
         let mut setup = Setup::new(settings)?;
-        setup.slides = Box::new(Again(self.0[from..].to_vec().into_iter()));
+        setup.slides = Box::new(Again(self.0[from..].iter().cloned().collect()));
         Ok(setup)
     }
 }
 
-struct Again(std::vec::IntoIter<Slide>);
+/// Slides that are still to be shown.
+struct Again(VecDeque<Slide>);
 
 impl Slides for Again {
     fn next_slide(&mut self, _: &AtomicBool) -> Result<Option<Slide>, RunError> {
-        Ok(self.0.next())
+        Ok(self.0.pop_front())
     }
 
     fn expected(&self) -> Option<u64> {

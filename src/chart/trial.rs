@@ -16,10 +16,13 @@ const SAMPLES: f64 = 2.0;
 /// PSNR over lit pixels, in decibels, to which the methods race.
 const TARGET: f64 = 40.0;
 
+/// Times that differ by less than this factor count as equal, since the times of a trial do.
+const MARGIN: f64 = 1.1;
+
 /// Result of a trial.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Choice {
-    /// The method that reaches the target first.
+    /// The method that reaches the target first; `two_level`, which goes on from there, if it takes at most 10 % longer.
     pub method: Method,
     /// Seconds since a slide to the target, by method; extrapolated for methods that did not reach it in the trial. `None` for methods that never
     /// reach it.
@@ -80,8 +83,10 @@ pub(super) fn race(
         let never = method == Method::Marched && reached.psnr < TARGET;
         seconds.push((method, if never { None } else { reached.seconds_to(TARGET) }));
     }
-    let times = seconds.iter().filter_map(|(method, seconds)| Some((*method, (*seconds)?)));
-    let method = times.min_by(|a, b| a.1.total_cmp(&b.1)).map_or(Method::TwoLevel, |(method, _)| method);
+    let best = seconds.iter().filter_map(|(_, seconds)| *seconds).fold(f64::INFINITY, f64::min);
+    // The first in their order that is about as fast as the best.
+    let as_fast = |(_, seconds): &&(Method, Option<f64>)| seconds.is_some_and(|seconds| seconds <= MARGIN * best);
+    let method = seconds.iter().find(as_fast).map_or(Method::TwoLevel, |(method, _)| *method);
     Ok(Choice { method, seconds, target: TARGET, device: device_name(device) })
 }
 

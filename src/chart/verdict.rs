@@ -96,6 +96,10 @@ fn of_ftle(panel: &FtlePanel, time_unit: &str, said: &mut Vec<String>) {
 }
 
 fn of_pictures(panel: &PicturePanel, said: &mut Vec<String>) {
+    if panel.curves.is_empty() {
+        said.push("Pictures: not measured.".into());
+        return;
+    }
     for target in TARGETS {
         let resolved = panel.truth_psnr + RESOLVED;
         if target > resolved {

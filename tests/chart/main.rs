@@ -67,7 +67,7 @@ fn columns(line: &str) -> usize {
 fn pictures_converge_and_the_chart_is_drawn() {
     let folder = tempfile::tempdir().unwrap();
     let out = folder.path().join("chart");
-    run(&mut ridgewatch(command("chart", &out, &["--only", "pictures,scaling", "--seconds", "40"]))).success();
+    run(&mut ridgewatch(command("chart", &out, &["--only", "pictures,scaling", "--seconds", "60"]))).success();
     let chart = json(&out.join("chart.json"));
     let curves = chart["pictures"]["curves"].as_array().unwrap();
     let frames = |method: &str| {
@@ -92,6 +92,8 @@ fn pictures_converge_and_the_chart_is_drawn() {
         .collect();
     off.sort_by(f64::total_cmp);
     assert!(!off.is_empty() && off[(off.len() - 1) / 2] < 2.5, "stated and measured PSNR differ by {off:?} dB");
+    let chosen = chart["pictures"]["auto"]["curve"].as_str().unwrap();
+    assert!(["two_level, table", "marched, table", "reference"].contains(&chosen), "auto: {chosen}");
     let steps: Vec<f64> =
         chart["scaling"]["points"].as_array().unwrap().iter().filter(|p| p["axis"] == "tau").map(|p| number(&p["steps"])).collect();
     assert!(steps.len() >= 2 && steps[0] < steps[steps.len() - 1], "a longer tau takes more steps: {steps:?}");
@@ -119,7 +121,7 @@ fn a_trial_is_remembered_beside_its_scene() {
     let choice = json(&folder.path().join("scene.auto.json"));
     let method = choice["choice"]["method"].as_str().unwrap().to_owned();
     assert!(
-        ["two_level", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")),
+        ["two_level", "marched", "reference"].contains(&method.as_str()) && first.stderr.contains(&format!("\"auto\": {method}")),
         "{}",
         first.stderr
     );
@@ -130,7 +132,10 @@ fn a_trial_is_remembered_beside_its_scene() {
     changed["choice"]["method"] = other.into();
     std::fs::write(folder.path().join("scene.auto.json"), changed.to_string()).unwrap();
     assert_eq!(serde_json::from_str::<Value>(&render(&[]).stdout).unwrap()["method"], other);
-    assert_eq!(serde_json::from_str::<Value>(&render(&["--set", "time.tau=5.5"]).stdout).unwrap()["method"], method.as_str());
+    let again = render(&["--set", "time.tau=5.5"]);
+    let remembered = json(&folder.path().join("scene.auto.json"));
+    assert_ne!(remembered["asked"], choice["asked"]);
+    assert_eq!(serde_json::from_str::<Value>(&again.stdout).unwrap()["method"], remembered["choice"]["method"], "of another trial");
 }
 
 #[test]
