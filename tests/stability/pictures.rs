@@ -240,6 +240,11 @@ fn true_square(film: &Film, [a, b]: &[Film; 2]) -> f64 {
     lit.iter().flat_map(|&i| (0..3).map(move |k| (i, k))).map(|(i, k)| d(a, i, k) * d(b, i, k)).sum::<f64>() / (3 * lit.len()) as f64
 }
 
+/// A round of `two_level` with this many samples a pixel.
+fn corrected(nodes: &Nodes, samples: f64) -> Refinement<'_> {
+    Refinement { nodes, missing: None, method: Method::TwoLevel, sum: false, samples, number: 0, stop: &NEVER }
+}
+
 /// Fails without the floor of half the standard error.
 #[test]
 fn a_correction_that_few_samples_hit() {
@@ -261,15 +266,7 @@ fn a_correction_that_few_samples_hit() {
         let (mut below, mut inside, mut stated, mut true_mean) = (0, 0, 0.0, 0.0);
         for seed in 0..SEEDS {
             let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
-            let round = Refinement {
-                nodes: &surrogate,
-                missing: None,
-                method: Method::TwoLevel,
-                sum: false,
-                samples: 2.0,
-                number: 0,
-                stop: &NEVER,
-            };
+            let round = corrected(&surrogate, 2.0);
             let (film, _, error) = renderer.refine(&mut Picture::default(), &round, &mut Field(field)).unwrap();
             let exact = true_square(&film, &truth).max(0.0).sqrt();
             assert!(error.rms.value > 0.0 && error.rms.value.is_finite(), "radius {radius}: {:?}", error.rms);
@@ -321,15 +318,7 @@ fn a_tile_that_shows_no_difference() {
         let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
         let (mut picture, mut before, mut stated, mut shares, met) = (Picture::default(), 0.0, 0.0, Vec::new(), Cell::new(None));
         for frame in 1..=FRAMES {
-            let round = Refinement {
-                nodes: &surrogate,
-                missing: None,
-                method: Method::TwoLevel,
-                sum: false,
-                samples: 2.0,
-                number: 0,
-                stop: &NEVER,
-            };
+            let round = corrected(&surrogate, 2.0);
             let mut answers = Field(|p: [f32; 3]| {
                 if in_tube(&p, radius) {
                     met.set(met.get().or(Some(frame)));
@@ -400,8 +389,7 @@ fn too_few_pairs_for_an_interval() {
         let (mut known, mut inside, mut width, mut silent) = (0, 0, 0.0, 0);
         for seed in 0..SEEDS {
             let mut renderer = Renderer::new(scene(WIDTH, 5.0, None, seed), &cube(), 1.0).unwrap();
-            let round =
-                Refinement { nodes: &surrogate, missing: None, method: Method::TwoLevel, sum: false, samples, number: 0, stop: &NEVER };
+            let round = corrected(&surrogate, samples);
             let (film, _, error) = renderer.refine(&mut Picture::default(), &round, &mut Field(field)).unwrap();
             if !error.is_known() {
                 continue;
