@@ -11,7 +11,7 @@ use crate::flow::{
 };
 use crate::render::Method;
 use crate::render::rng::{philox, unit};
-use crate::run::{Plan, RunError, Settings, Setup, Slide};
+use crate::run::{Plan, RunError, Settings, Setup, Slide, auto_steps};
 use crate::surrogate::network::{Encoding, NetworkSettings};
 use crate::surrogate::{Kind, MAX_DEVICE_NODES, MAX_OWN_NODES, Predict, ReplayBuffer, SurrogateSettings, Trace};
 use serde::Serialize;
@@ -139,7 +139,7 @@ impl Opened {
     /// Steps chosen by their error, also if the scene gives their number.
     pub(super) fn auto_steps(&self) -> Steps {
         match self.plan.map.steps {
-            Steps::Fixed(_) => Steps::Auto { tolerance: 0.01 },
+            Steps::Fixed(_) => auto_steps(self.shape().is_some(), self.plan.map.interpolation),
             auto => auto,
         }
     }

@@ -1,7 +1,7 @@
 //! Time to error of pictures: the true error of each frame against the seconds since the window was new.
 
 use super::slides::FirstSlides;
-use super::trial::race;
+use super::trial::{TRIAL_SECONDS, race};
 use super::{Charting, failed};
 #[cfg(feature = "cuda")]
 use crate::backend::cuda::Cuda;
@@ -324,7 +324,7 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
         return Ok(PicturePanel { size, truth_samples: samples, truth_psnr: f64::INFINITY, curves: Vec::new(), auto: None });
     }
     let last_truth = if slides.count() < SLIDES {
-        charting.skip("a sliding window", format_args!("it takes {SLIDES} slides, the source has {}", slides.count()));
+        charting.skip("a sliding window", format_args!("it takes {SLIDES} slides, {} could be read: {}", slides.count(), slides.end()));
         None
     } else {
         match true_picture(SLIDES - 1, TRUTH_SHARES[1]) {
@@ -353,7 +353,9 @@ pub(super) fn panel(charting: &mut Charting<'_>, slides: &FirstSlides) -> Result
     }
     // Measured before the curves, which take all the time that is left.
     let mut auto = None;
-    if charting.has_time_for("the trial of auto") {
+    if charting.left() < 4.0 * TRIAL_SECONDS {
+        charting.skip("the trial of auto", "too little time was left (--seconds)");
+    } else if charting.has_time_for("the trial of auto") {
         let began = Instant::now();
         match race(charting.settings, charting.device, options.threads, charting.stop, slides) {
             Ok(choice) => {

@@ -1,17 +1,23 @@
-//! Slides that are read once and shown to many runs.
+//! Slides that are read once and shown to many runs, each of which still opens the source.
 
 use super::picture::with_method;
+use crate::flow::VelocitySource;
 use crate::render::Method;
 use crate::run::{RunError, Settings, Setup, Slide, Slides};
 use crate::surrogate::Kind;
+use ridgewatch_base::memory;
 use std::collections::VecDeque;
 use std::sync::atomic::AtomicBool;
 
 /// The first slides of a scene, which share their snapshots.
-pub(super) struct FirstSlides(Vec<Slide>);
+pub(super) struct FirstSlides {
+    slides: Vec<Slide>,
+    /// Why there are no more.
+    end: String,
+}
 
 impl FirstSlides {
-    /// Reads `count` slides, or as many as the source has.
+    /// Reads `count` slides, or as many as the source has and as half of the free memory holds.
     ///
     /// # Errors
     /// The source cannot be opened or has no slide.
@@ -20,21 +26,46 @@ impl FirstSlides {
         let mut settings = with_method(settings, Method::Reference, Kind::Table);
         settings.time.slides = Some(count);
         let mut setup = Setup::new(settings)?;
-        let mut slides = Vec::new();
-        while let Some(slide) = setup.slides.next_slide(stop)? {
-            slides.push(Slide { waited: 0.0, ..slide });
+        let first = setup.slides.next_slide(stop)?.ok_or(RunError::EndedEarly)?;
+        let per_slide = match &first.velocity {
+            VelocitySource::Window(window) => {
+                let snapshots = window.snapshots().count().max(1) as u64;
+                window.bytes() as u64 / snapshots * setup.plan.scene.time.snapshots_per_slide as u64
+            }
+            VelocitySource::Analytic(..) => 0,
+        };
+        let (mut slides, mut end) = (vec![Slide { waited: 0.0, ..first }], "the source has no more".to_owned());
+        while slides.len() < count {
+            if memory::available().is_some_and(|free| per_slide > free / 2) {
+                end = format!("another takes {:.1} GiB of memory, more than half of what is free", memory::gib(per_slide));
+                break;
+            }
+            match setup.slides.next_slide(stop) {
+                Ok(Some(slide)) => slides.push(Slide { waited: 0.0, ..slide }),
+                Ok(None) => break,
+                // The slides before it can be charted.
+                Err(error) => {
+                    end = error.to_string();
+                    break;
+                }
+            }
         }
-        if slides.is_empty() { Err(RunError::EndedEarly) } else { Ok(Self(slides)) }
+        Ok(Self { slides, end })
+    }
+
+    /// Why there are fewer slides than were asked for.
+    pub(super) fn end(&self) -> &str {
+        &self.end
     }
 
     /// The first slide.
     pub(super) fn first(&self) -> &Slide {
-        &self.0[0]
+        &self.slides[0]
     }
 
     /// Number of slides.
     pub(super) fn count(&self) -> usize {
-        self.0.len()
+        self.slides.len()
     }
 
     /// Sets up a run over these slides, from number `from` on.
@@ -43,7 +74,7 @@ impl FirstSlides {
     /// A setting is not accepted, or the source cannot be opened.
     pub(super) fn setup(&self, settings: Settings, from: usize) -> Result<Setup, RunError> {
         let mut setup = Setup::new(settings)?;
-        setup.slides = Box::new(Again(self.0[from..].iter().cloned().collect()));
+        setup.slides = Box::new(Again(self.slides[from..].iter().cloned().collect()));
         Ok(setup)
     }
 }

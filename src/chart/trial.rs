@@ -35,7 +35,9 @@ pub struct Choice {
 
 impl std::fmt::Display for Choice {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let time = |seconds: &Option<f64>| seconds.map_or("not".to_owned(), |seconds| format!("{seconds:.2} s"));
+        let time = |seconds: &Option<f64>| {
+            seconds.filter(|seconds| seconds.is_finite()).map_or("never".to_owned(), |seconds| format!("{seconds:.2} s"))
+        };
         let times: Vec<String> = self.seconds.iter().map(|(method, seconds)| format!("{} {}", method.name(), time(seconds))).collect();
         write!(f, "render.method = \"auto\": {}, first to {} dB in a trial ({})", self.method.name(), self.target, times.join(", "))
     }
@@ -74,6 +76,8 @@ pub(super) fn race(
             let record = &frame.record;
             (since, spent) = (since + record.seconds.slide + record.seconds.total, spent + record.seconds.total);
             match record.picture_error {
+                // A march does not improve, so that it must be sure to be there.
+                Some(stated) if method == Method::Marched => reached.stated(since, record.seconds.total, stated.psnr.low),
                 Some(stated) => reached.stated(since, record.seconds.total, stated.psnr.value),
                 None => reached.independent(since, record.seconds.total, &frame.film, frame.tone_map),
             }

@@ -139,7 +139,7 @@ fn of_auto(panel: &PicturePanel, auto: &Auto) -> String {
         Some(match chosen.and_then(|curve| curve.seconds_to(target)) {
             Some(seconds) if seconds <= best => format!("first at {target} dB"),
             Some(seconds) => format!("{:.0} % after the first at {target} dB", 100.0 * (seconds / best - 1.0)),
-            None => format!("not at {target} dB, as others are"),
+            None => format!("does not reach {target} dB, which others do"),
         })
     });
     let compared: Vec<String> = compared.collect();

@@ -105,7 +105,11 @@ pub fn settle_method(common: &Common, scene: &mut SceneFile, paths: &[PathBuf], 
         messages::note("render.method = \"auto\": two_level, since only smooth methods have render.until and render.budget");
         return Ok(());
     }
-    let files = if scene.archive.files.is_empty() { Vec::new() } else { expand(&scene.archive.files)? };
+    let files = if scene.archive.files.is_empty() {
+        Vec::new()
+    } else {
+        expand(&scene.archive.files).map_err(|error| located(scene, RunError::from(error), RunError::refused))?
+    };
     let data: Vec<_> = files.iter().filter_map(|file| std::fs::metadata(file).ok().filter(std::fs::Metadata::is_file)).collect();
     let remembered = match paths {
         // A folder does not tell of changes inside.

@@ -26,5 +26,6 @@ pub use error::RunError;
 pub use record::{CheckpointRecord, Frame, FrameRecord, StageSeconds, TransferRecord};
 pub use scene::settled_colours;
 pub use settings::{Settings, TimeSettings, TimeSpan, TrainingSettings};
+pub(crate) use setup::auto_steps;
 pub use setup::{Plan, Setup};
 pub use slides::{Slide, Slides, open_snapshots};

@@ -36,6 +36,15 @@ pub struct Setup {
     pub notes: Vec<String>,
 }
 
+/// The rule by which steps are chosen on a closed form or a grid.
+pub(crate) fn auto_steps(is_gridded: bool, interpolation: Interpolation) -> Steps {
+    match (is_gridded, interpolation) {
+        (false, _) => Steps::Auto { tolerance: 0.01 },
+        (true, Interpolation::Linear) => Steps::AutoByShare { tolerance: 0.1, share: 0.015 },
+        (true, Interpolation::Cubic) => Steps::Auto { tolerance: 0.1 },
+    }
+}
+
 impl Setup {
     /// Opens the source and chooses the settings that the scene leaves open.
     ///
@@ -133,9 +142,7 @@ impl Setup {
             steps: match scene.flow.steps {
                 StepsSetting::Auto => match scene.flow.tolerance {
                     Some(tolerance) => Steps::Auto { tolerance },
-                    None if closed.is_some() => Steps::Auto { tolerance: 0.01 },
-                    None if interpolation == Interpolation::Linear => Steps::AutoByShare { tolerance: 0.1, share: 0.015 },
-                    None => Steps::Auto { tolerance: 0.1 },
+                    None => auto_steps(closed.is_none(), interpolation),
                 },
                 StepsSetting::Fixed(n) => Steps::Fixed(n),
             },

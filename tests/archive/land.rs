@@ -55,7 +55,8 @@ fn masks_by_convention_are_land() {
     for (n, fixture) in files.into_iter().enumerate() {
         let file = fixture.write(&dir.path().join(format!("{n}.nc")));
         assert_eq!(missing_columns(&[&file], ""), DRY, "file {n}");
-        assert!(notes(&open(&[&file])).contains("37.5 % of `uo` by"), "file {n}");
+        let said = notes(&open(&[&file]));
+        assert!(said.contains("37.5 % of `uo` by") && !said.contains("no velocities"), "file {n}: {said}");
         assert!(missing_columns(&[&file], "mask = \"none\"").is_empty(), "file {n}");
     }
     // The wind blows over land, and quality flags are no mask.
@@ -94,7 +95,10 @@ fn a_mask_lies_in_a_file_of_its_own() {
     for files in [[&usual, &file], [&file, &usual]] {
         assert_eq!(missing_columns(&files, ""), DRY);
         assert!(missing_columns(&files, "mask = \"none\"").is_empty());
-        assert_eq!(open(&files).files().len(), 1);
+        let archive = open(&files);
+        assert_eq!(archive.files().len(), 1);
+        let said = notes(&archive);
+        assert!(said.contains("no velocities, but a mask of land: ") && said.contains("a_tmask.nc"), "{said}");
     }
     assert_eq!(missing_columns(&[&own, &file], "mask = \"shore\""), DRY);
     refused(&[&own, &file], "", &["a_shore.nc", "no velocity"]);

@@ -23,7 +23,7 @@ const AUDITED_PIXELS: u64 = 1024;
 pub const AUDIT_RAYS: u64 = 16;
 /// Steps of an audit in one step of the march.
 pub const AUDIT_STEPS: u64 = 4;
-/// Number of audited pixels in which the depth to the light is marched, which takes long.
+/// Number of lit pixels of an audit in which the depth to the light is marched, which takes long.
 pub const LIT_BY_MARCH: usize = 24;
 /// Steps to the light of an audit in one step of the march.
 pub const LIGHT_STEPS: u64 = 2;
@@ -47,6 +47,13 @@ pub struct AuditedPixel {
     pub lit: Option<[f64; 3]>,
 }
 
+impl AuditedPixel {
+    /// Errors are stated over lit pixels, so that others do not count.
+    pub fn is_lit(&self) -> bool {
+        self.alpha > f64::from(LIT)
+    }
+}
+
 /// A mean over audited pixels.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 struct Mean {
@@ -62,11 +69,13 @@ impl Mean {
         self.count += 1.0;
     }
 
-    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low.
+    /// The mean and its standard error, added up: few pixels hold most of the error, so that the mean alone is often too low. A single value is its own
+    /// standard error.
     fn bound(&self) -> f64 {
         let n = self.count.max(1.0);
         let mean = self.sum / n;
-        mean + ((self.squares / n - mean * mean).max(0.0) / n).sqrt()
+        let variance = if n > 1.0 { (self.squares / n - mean * mean).max(0.0) / (n - 1.0) } else { mean * mean };
+        mean + variance.sqrt()
     }
 }
 
@@ -135,7 +144,7 @@ impl MarchControl {
 
     /// Takes in an audited pixel, if it is lit.
     pub fn audit(&mut self, pixel: &AuditedPixel) {
-        if pixel.alpha <= f64::from(LIT) {
+        if !pixel.is_lit() {
             return;
         }
         let minus = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] - b[k]);

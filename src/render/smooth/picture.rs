@@ -169,28 +169,26 @@ impl Picture {
             }
         });
         self.march.rays = rays.end;
-        let compared: Vec<AuditedPixel> = audited
-            .into_par_iter()
-            .enumerate()
-            .map(|(number, pixel)| {
-                let mean = |rays: Range<u64>, step: f32, light: ToLight<'_>| {
-                    let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
-                    rays.for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
-                    (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
-                };
-                let (volume, fine) = (ToLight::Volume(light), step / AUDIT_STEPS as f32);
-                let [(first, alpha), (following, more)] =
-                    [0..MIN_RAYS, MIN_RAYS..MIN_RAYS + AUDIT_RAYS].map(|rays| mean(rays, step, volume));
-                AuditedPixel {
-                    alpha: (alpha + more) / (MIN_RAYS + AUDIT_RAYS) as f64,
-                    first,
-                    following,
-                    pair: mean(0..PAIR, step, volume).0,
-                    fine: mean(0..PAIR, fine, volume).0,
-                    lit: (number < LIT_BY_MARCH).then(|| mean(0..PAIR, fine, ToLight::March(step / LIGHT_STEPS as f32)).0),
-                }
-            })
-            .collect();
+        let mean = |pixel: u32, rays: Range<u64>, step: f32, light: ToLight<'_>| {
+            let (mut sum, count) = (RaySum::default(), (rays.end - rays.start) as f64);
+            rays.take_while(|_| !round.stop.load(Ordering::Relaxed)).for_each(|j| sum.add(&medium.ray(pixel, j, step, light, shift)));
+            progress::mark();
+            (sum.radiance.map(|c| f64::from(c) / count), f64::from(sum.alpha))
+        };
+        let (volume, fine) = (ToLight::Volume(light), step / AUDIT_STEPS as f32);
+        let look = |&pixel: &u32| {
+            let [(first, alpha), (following, more)] =
+                [0..MIN_RAYS, MIN_RAYS..MIN_RAYS + AUDIT_RAYS].map(|rays| mean(pixel, rays, step, volume));
+            let alpha = (alpha + more) / (MIN_RAYS + AUDIT_RAYS) as f64;
+            let [pair, fine] = [step, fine].map(|step| mean(pixel, 0..PAIR, step, volume).0);
+            AuditedPixel { alpha, first, following, pair, fine, lit: None }
+        };
+        let mut compared: Vec<AuditedPixel> = audited.par_iter().map(look).collect();
+        let mut lit: Vec<(&mut AuditedPixel, u32)> =
+            compared.iter_mut().zip(audited).filter(|(pixel, _)| pixel.is_lit()).take(LIT_BY_MARCH).collect();
+        lit.par_iter_mut().for_each(|(audited, pixel)| {
+            audited.lit = Some(mean(*pixel, 0..PAIR, fine, ToLight::March(step / LIGHT_STEPS as f32)).0);
+        });
         compared.iter().for_each(|pixel| self.march.audit(pixel));
         began.elapsed().as_secs_f64()
     }

@@ -210,7 +210,8 @@ impl Archive {
             archive.declare_synthetic(what);
         }
         archive.description.notes.extend(together.map(|names| format!("read as one, and others alike: {names}")));
-        if let [first, rest @ ..] = &masks[..] {
+        let taken: Vec<&Vec<PathBuf>> = masks.iter().filter(|mask| archive.files.iter().all(|file| &file.group != *mask)).collect();
+        if let ([first, rest @ ..], false) = (&taken[..], land.found.iter().all(Option::is_none)) {
             let more = if rest.is_empty() { String::new() } else { format!(" and {} more", rest.len()) };
             archive.description.notes.push(format!("no velocities, but a mask of land: {}{more}", in_words(first)));
         }

@@ -188,25 +188,26 @@ impl GpuSmooth {
         };
         let (fine, to_light) = (step / AUDIT_STEPS as f32, step / LIGHT_STEPS as f32);
         let (each, pair) = ((MIN_RAYS + AUDIT_RAYS) as usize, PAIR as usize);
-        let checks: Vec<RayCheck> = pixels
-            .iter()
-            .flat_map(|&pixel| rays(pixel, each as u64, step, 0.0))
-            .chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0)))
-            .chain(pixels[..LIT_BY_MARCH].iter().flat_map(|&pixel| rays(pixel, PAIR, fine, to_light)))
-            .collect();
+        let coarse = pixels.iter().flat_map(|&pixel| rays(pixel, each as u64, step, 0.0));
+        let checks: Vec<RayCheck> = coarse.chain(pixels.iter().flat_map(|&pixel| rays(pixel, PAIR, fine, 0.0))).collect();
         let found = self.march.check(&medium, &checks, round.smooth.sum)?;
         fn mean<const N: usize>(rays: &[[f32; 4]]) -> [f64; N] {
             std::array::from_fn(|k| rays.iter().map(|ray| f64::from(ray[k])).sum::<f64>() / rays.len() as f64)
         }
         let (coarse, finer) = found.split_at(each * pixels.len());
-        let (fine, lit) = finer.split_at(pair * pixels.len());
-        let mut lit = lit.chunks_exact(pair);
-        for (coarse, fine) in coarse.chunks_exact(each).zip(fine.chunks_exact(pair)) {
+        let look = |(coarse, fine): (&[[f32; 4]], &[[f32; 4]])| {
             let (first, following) = coarse.split_at(MIN_RAYS as usize);
             let [.., alpha] = mean::<4>(coarse);
-            let (pair, lit) = (mean(&first[..pair]), lit.next().map(mean));
-            self.control.audit(&AuditedPixel { alpha, first: mean(first), following: mean(following), pair, fine: mean(fine), lit });
+            AuditedPixel { alpha, first: mean(first), following: mean(following), pair: mean(&first[..pair]), fine: mean(fine), lit: None }
+        };
+        let mut compared: Vec<AuditedPixel> = coarse.chunks_exact(each).zip(finer.chunks_exact(pair)).map(look).collect();
+        let lit: Vec<usize> = (0..pixels.len()).filter(|&number| compared[number].is_lit()).take(LIT_BY_MARCH).collect();
+        let checks: Vec<RayCheck> = lit.iter().flat_map(|&number| rays(pixels[number], PAIR, fine, to_light)).collect();
+        let found = self.march.check(&medium, &checks, round.smooth.sum)?;
+        for (&number, rays) in lit.iter().zip(found.chunks_exact(pair)) {
+            compared[number].lit = Some(mean(rays));
         }
+        compared.iter().for_each(|pixel| self.control.audit(pixel));
         Ok(began.elapsed().as_secs_f64())
     }
 
