@@ -15,7 +15,6 @@ pub const TRIAL_SECONDS: f64 = 4.0;
 const SAMPLES: f64 = 2.0;
 /// PSNR over lit pixels, in decibels, to which the methods race.
 const TARGET: f64 = 40.0;
-
 /// Times that differ by less than this factor count as equal, since the times of a trial do.
 const MARGIN: f64 = 1.1;
 
