@@ -500,8 +500,8 @@ RW_FN void march_ray(const FrameScene& scene, const March& march, uint32_t pixel
 constexpr int CHECK_POINTS = 1024;
 constexpr int CHECK_MEMORY = 4 * CHECK_POINTS + 3;
 
-// Radiance and opacity of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light marched with
-// steps of `shadow_step`, or from the light volume if that is 0.
+// Radiance and opacity of one ray, with all threads of a block, as a check of the march: with steps of at most `step`, and the depth to the light
+// marched with steps of `shadow_step`, or from the light volume if that is 0.
 RW_FN void check_ray(const Block& block, const FrameScene& scene, const March& march, uint32_t pixel, uint32_t number, float step,
                      float shadow_step, float* found, float* memory) {
     float* absorbed = memory;                         // negative in missing cells
