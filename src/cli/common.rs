@@ -180,7 +180,7 @@ pub fn ring_folder(option: Option<&Path>) -> Result<PathBuf> {
 
 /// Describes a number of steps that was chosen by its error.
 pub fn chosen_steps(steps: u64, difference: f64) -> String {
-    format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of twice as many")
+    format!("{steps} steps a path: the log-stretch differs by {difference:.3} rms from that of more steps")
 }
 
 /// Refuses a checkpoint option if nothing is trained.

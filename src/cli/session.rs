@@ -305,6 +305,7 @@ fn run_json(report: &RunReport) -> serde_json::Map<String, serde_json::Value> {
         "optimizer_steps": report.train_steps,
         "integration_steps": report.integration_steps,
         "integration_difference": report.integration_difference,
+        "integration_residual": report.integration_residual,
         "transfer": report.transfer,
         "surrogate_bytes": report.surrogate_bytes,
         "sizes": report.sizes,

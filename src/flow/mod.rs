@@ -246,6 +246,8 @@ pub struct StepChoice {
     pub within_tolerance: bool,
     /// Points, of [`Self::POINTS`], whose log-stretch is not finite.
     pub not_finite: usize,
+    /// Numbers of steps are multiples of this: the snapshot intervals in tau, so that stages lie at the times of snapshots; 1 for closed forms.
+    pub multiple_of: usize,
 }
 
 impl StepChoice {

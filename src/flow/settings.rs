@@ -57,7 +57,7 @@ pub struct FlowSettings {
     pub steps: StepsSetting,
     /// With `steps = "auto"`: root mean square by which the log-stretch may change if the steps are doubled. `None`: 0.01 for closed forms,
     /// 0.1 for grids, whose interpolated gradient converges slowly, and with linear interpolation also 1.5 % of the log-stretch. The summary
-    /// contains the value reached.
+    /// contains the value reached. Smooth pictures then take fewer steps if their colours do not tell them apart.
     pub tolerance: Option<f64>,
     /// Distance of the particles of `differences` from the seed, in coordinate units.
     pub difference_step: f64,

@@ -105,13 +105,14 @@ pub fn choose_steps(
     } else {
         MAX_STEPS
     };
-    let mut last = StepChoice { steps, difference: f64::INFINITY, within_tolerance: false, not_finite: 0 };
+    let multiple_of = intervals.max(1);
+    let mut last = StepChoice { steps, difference: f64::INFINITY, within_tolerance: false, not_finite: 0, multiple_of };
     while steps <= max_steps {
         trace(steps, &points, &mut once);
         trace(2 * steps, &points, &mut twice);
         let (difference, not_finite) = trimmed_difference(&once, &twice, trimmed);
         let within_tolerance = difference <= tolerance.min((share * rms_of_whole(&twice)).max(MIN_BOUND * tolerance));
-        last = StepChoice { steps, difference, within_tolerance, not_finite };
+        last = StepChoice { steps, difference, within_tolerance, not_finite, multiple_of };
         if last.within_tolerance {
             return Ok(last);
         }

@@ -9,6 +9,7 @@ use super::record::Frame;
 use super::scene::settled_scene;
 use super::setup::{Plan, Setup};
 use super::slides::{Slide, Slides};
+use super::steps::picture_steps;
 use super::stop::{RunEnd, check_stop};
 use super::training::{Threads, TrainingBudget};
 use super::transaction::{On, Recovering, Session, transaction, with};
@@ -82,8 +83,10 @@ pub struct RunReport {
     pub train_steps: u64,
     /// Runge-Kutta steps per path; `None` if each path chooses its own steps, or if there was no tracer yet.
     pub integration_steps: Option<usize>,
-    /// Difference of the log-stretch from that of twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
+    /// Difference of the log-stretch from that of at least twice as many steps; `None` if the steps were given (see [`crate::flow::StepChoice`]).
     pub integration_difference: Option<f64>,
+    /// Optical residual of the steps; `None` unless they were chosen by it.
+    pub integration_residual: Option<f64>,
     /// Transfer function; `None` if the run ended before it was chosen.
     pub transfer: Option<TransferRecord>,
     /// Size of the surrogate, bytes.
@@ -294,6 +297,7 @@ fn drive<B: Backend>(
     let run = with!(&session, on => Run::new(from, settled, on.tracer().flow(), &slide))?;
     sink(Event::Note(run.colours()));
     let mut cycle = Cycle { run, session, map };
+    cycle.settle_steps(&mut slide)?;
     let ended = cycle.all_slides(&mut *slides, slide, begun, sink);
     // The checkpoint is written even if the run was stopped.
     match ended {
@@ -397,6 +401,22 @@ impl<'a> Run<'a> {
 }
 
 impl<B: Backend> Cycle<'_, B> {
+    /// Replaces the flow map of the first slide by one with the steps of the picture.
+    fn settle_steps(&mut self, slide: &mut Slide) -> Result<(), RunEnd> {
+        let chosen = with!(&self.session, on => on.tracer().flow().step_choice());
+        slide.warnings.extend(with!(&self.session, on => self.run.flow_warnings(on.tracer().flow())));
+        let Run { plan, threads, renderer, .. } = &self.run;
+        let Some(settled) = threads.render().install(|| picture_steps(plan, slide, renderer.transfer(), chosen))? else { return Ok(()) };
+        tracing::info!("{settled:?} instead of {chosen:?}");
+        self.map.steps = Steps::Fixed(settled.steps);
+        transaction!(self, slide, run, on => run.next_tracer(on, slide, &self.map));
+        let report = &mut self.run.report;
+        report.integration_steps = Some(settled.steps);
+        report.integration_difference = Some(settled.difference).filter(|difference| difference.is_finite());
+        report.integration_residual = Some(settled.residual);
+        Ok(())
+    }
+
     /// Renders all slides. The preparation of the first one began at `begun`.
     fn all_slides(&mut self, slides: &mut dyn Slides, mut slide: Slide, mut begun: Instant, sink: &mut Sink<'_>) -> Result<(), RunEnd> {
         self.prepare_first(&mut slide)?;
@@ -441,8 +461,6 @@ impl<B: Backend> Cycle<'_, B> {
                 transaction!(self, slide, run, on => run.slide_surrogate(on));
             }
         }
-        let flow_warnings = with!(&self.session, on => self.run.flow_warnings(on.tracer().flow()));
-        slide.warnings.extend(flow_warnings);
         if let VelocitySource::Window(window) = &slide.velocity {
             let resolution = self.run.threads.render().install(|| time_resolution(window, &self.map, slide.time))?;
             if let Some(change) = resolution.ftle_change.filter(|change| *change > COARSE_IN_TIME * resolution.ftle_rms) {

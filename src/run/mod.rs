@@ -15,6 +15,7 @@ mod scene;
 mod settings;
 mod setup;
 mod slides;
+mod steps;
 mod stop;
 mod training;
 mod transaction;

@@ -73,8 +73,11 @@ pub struct FrameRecord {
     pub picture_error: Option<PictureError>,
     /// Runge-Kutta steps a path. `None` for Dormand-Prince.
     pub integration_steps: Option<u64>,
-    /// Difference of the log-stretch from twice as many steps: the error of the truth itself. `None` if the steps were given.
+    /// Difference of the log-stretch from at least twice as many steps: the error of the traced field itself. `None` if the steps were given.
     pub integration_difference: Option<f64>,
+    /// Optical residual of the steps against twice as many as the log-stretch asks for. `None` unless the steps were chosen by it.
+    #[serde(default)]
+    pub integration_residual: Option<f64>,
     /// Points traced before the frame, to open the gate and tighten the majorants (first frame of a slide).
     pub preparation_traces: u64,
     /// Audit points traced for the frame, except at missing cells.

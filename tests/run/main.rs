@@ -11,6 +11,7 @@ mod messages;
 mod network_support;
 mod scene_file;
 mod stated_error;
+mod steps;
 mod window_memory;
 
 use kit::program::{Outcome, run};

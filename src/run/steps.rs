@@ -1,0 +1,77 @@
+//! Runge-Kutta steps of a smooth picture: as few as its colours do not tell from more.
+
+use super::setup::Plan;
+use super::slides::Slide;
+use crate::backend::stratified_points;
+use crate::flow::{Extras, FlowError, FlowMap, Precision, StepChoice, Steps, StepsSetting, Traced, cpu_tracer};
+use crate::render::Transfer;
+use crate::trust::Strata;
+
+/// Largest optical residual of the steps, as a part of `trust.tolerance`: where the surrogate has that residual, the steps add a fifth to it.
+const SHARE: f64 = 2.0 / 3.0;
+/// Random stream of the points on which steps are compared.
+const STREAM: u64 = u64::MAX - 1;
+
+/// A number of steps, and how far it is from twice as many as the log-stretch asks for. Root mean squares over points of the domain.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PictureSteps {
+    pub(super) steps: usize,
+    /// Difference of the log-stretch.
+    pub(super) difference: f64,
+    /// Optical residual: difference of the ramp of the transfer function.
+    pub(super) residual: f64,
+}
+
+/// Returns the smallest number of steps, below those `chosen` for the log-stretch, whose optical residual is at most [`SHARE`] of the tolerance.
+/// `None` if there is none, or if the method or the scene asks for the steps of the log-stretch. The colours are a coarser measure: they do not
+/// change where the FTLE is below or above the ramp.
+///
+/// # Errors
+/// As for [`cpu_tracer`].
+pub(super) fn picture_steps(
+    plan: &Plan,
+    slide: &Slide,
+    transfer: &Transfer,
+    chosen: Option<StepChoice>,
+) -> Result<Option<PictureSteps>, FlowError> {
+    let scene = &plan.scene;
+    let is_open = scene.flow.steps == StepsSetting::Auto && scene.flow.tolerance.is_none() && scene.render.method.is_smooth();
+    let Some(chosen) = chosen.filter(|choice| is_open && choice.within_tolerance) else { return Ok(None) };
+    let cells = if plan.domain.dimensions == 3 { [16, 16, 8] } else { [64, 32, 1] };
+    let unit = stratified_points(&Strata::even(cells, 1), scene.seed, STREAM);
+    let mut points: Vec<[f32; 3]> = unit.into_iter().map(|unit| plan.domain.from_unit(unit)).collect();
+    // In double precision, as the steps of the log-stretch are chosen.
+    let tracer = |steps: usize| {
+        let map = FlowMap { steps: Steps::Fixed(steps), precision: Precision::F64, ..plan.map.clone() };
+        cpu_tracer(slide.velocity.clone(), &map, slide.time)
+    };
+    let reference = tracer(2 * chosen.steps)?;
+    points.retain(|&point| !reference.is_missing(point));
+    let (mut truth, mut traced) = (Traced::default(), Traced::default());
+    reference.trace(&points, Extras::default(), &mut truth);
+    let unit = chosen.multiple_of;
+    let mut multiple = 1;
+    while multiple * unit < chosen.steps {
+        let steps = multiple * unit;
+        tracer(steps)?.trace(&points, Extras::default(), &mut traced);
+        let ramp = |s: f32| transfer.ramp(s / plan.map.tau as f32);
+        // Where only one of the two has a value, the colours may differ as much as they can.
+        let residual = |a: f32, b: f32| if a.is_finite() && b.is_finite() { f64::from(ramp(a) - ramp(b)) } else { 1.0 };
+        let residual = upper_rms(&traced, &truth, residual);
+        if residual <= SHARE * scene.trust.tolerance {
+            let difference = upper_rms(&traced, &truth, |a, b| f64::from(a - b));
+            return Ok(Some(PictureSteps { steps, difference, residual }));
+        }
+        multiple = (multiple + 1).max(multiple * 5 / 4);
+    }
+    Ok(None)
+}
+
+/// Root mean square over the points of both, from the mean square and its standard error added up: few points hold most of the difference.
+fn upper_rms(a: &Traced, b: &Traced, difference: impl Fn(f32, f32) -> f64) -> f64 {
+    let squares: Vec<f64> = a.log_stretch.iter().zip(&b.log_stretch).map(|(&a, &b)| difference(a, b).powi(2)).collect();
+    let n = squares.len().max(1) as f64;
+    let mean = squares.iter().sum::<f64>() / n;
+    let variance = squares.iter().map(|square| (square - mean).powi(2)).sum::<f64>() / n;
+    (mean + (variance / n).sqrt()).sqrt()
+}

@@ -1,0 +1,59 @@
+//! The Runge-Kutta steps that a run chooses.
+
+use crate::kit::{flow::quasi_random, scene};
+use ridgewatch::flow::{Extras, FlowMap, Steps, Traced, cpu_tracer, dormand_prince_tracer};
+use ridgewatch::run::{RunOptions, RunReport, settled_colours};
+use ridgewatch::trust::TrustSettings;
+use std::sync::atomic::AtomicBool;
+
+const SCENES: [(&str, &str); 2] = [
+    (
+        "turbulence",
+        "source.nodes = [48, 24, 24]\nsource.amplitude = 8.0\nsource.k_max = 30.0\nsource.snapshots = 8\ntime.tau = 7.0\ntime.slides = 1",
+    ),
+    ("double_gyre", "domain.min = [0, 0, 0]\ndomain.max = [2, 1, 0.2]\ntime.tau = 10\ntime.slides = 1"),
+];
+
+fn report(kind: &str, keys: &str, method: &str, others: &[&str]) -> RunReport {
+    let text = scene::scene(kind, [16, 8, 1], &format!("{keys}\nrender.method = \"{method}\"\nsurrogate.kind = \"table\""));
+    scene::run_frames(scene::setup(&text, others), &RunOptions::default(), |_| {})
+}
+
+#[test]
+fn a_smooth_picture_takes_as_few_steps_as_its_colours_do_not_tell_from_more() {
+    for (kind, keys) in SCENES {
+        let full = report(kind, keys, "reference", &[]);
+        let found = report(kind, keys, "two_level", &[]);
+        let (most, steps) = (full.integration_steps.unwrap(), found.integration_steps.unwrap());
+        assert_eq!(full.integration_residual, None, "tracking is the reference of other methods");
+        assert!(3 * steps <= 2 * most, "{kind}: {steps} of {most} steps");
+        assert_eq!(report(kind, keys, "marched", &[]).integration_steps, Some(steps));
+        // A tolerance of the user's is about the log-stretch.
+        let obeyed = report(kind, keys, "two_level", &["flow.tolerance=0.01"]);
+        assert_eq!(obeyed.integration_residual, None);
+        assert!(obeyed.integration_difference.unwrap() <= 0.01);
+
+        // The truth, by another integrator, on points of its own.
+        let text = scene::scene(kind, [16, 8, 1], keys);
+        let mut setup = scene::setup(&text, &[]);
+        let slide = setup.slides.next_slide(&AtomicBool::new(false)).ok().flatten().unwrap();
+        let plan = &setup.plan;
+        let fixed = |steps| FlowMap { steps: Steps::Fixed(steps), ..plan.map.clone() };
+        let tracer = cpu_tracer(slide.velocity.clone(), &fixed(steps), slide.time).unwrap();
+        let colours = settled_colours(plan, &tracer, &slide).unwrap();
+        let truth = dormand_prince_tracer(slide.velocity.clone(), &fixed(steps), slide.time, 1e-10).unwrap();
+        let points: Vec<[f32; 3]> = (0..4096).map(|i| plan.domain.from_unit(quasi_random(i).map(|x| x as f32))).collect();
+        let ramps = |tracer: &dyn ridgewatch::flow::Tracer| {
+            let mut out = Traced::default();
+            tracer.trace(&points, Extras::default(), &mut out);
+            let (low, high, tau) = (colours.low.unwrap(), colours.high.unwrap(), plan.map.tau);
+            out.log_stretch.iter().map(|&s| ((f64::from(s) / tau - low) / (high - low)).clamp(0.0, 1.0)).collect::<Vec<_>>()
+        };
+        let (ours, theirs) = (ramps(&*tracer), ramps(&*truth));
+        let rms = (ours.iter().zip(&theirs).map(|(a, b)| (a - b).powi(2)).sum::<f64>() / points.len() as f64).sqrt();
+        println!("{kind}: {steps} of {most} steps: residual {rms:.4}, stated {:.4}", found.integration_residual.unwrap());
+        assert!(rms <= TrustSettings::default().tolerance, "{kind}: {rms} with {steps} steps");
+        let stated = found.integration_residual.unwrap();
+        assert!((0.7..=1.5).contains(&(stated / rms)), "{kind}: {rms}, stated {stated}");
+    }
+}
